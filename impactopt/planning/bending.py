@@ -82,8 +82,9 @@ def moved_solution(
 
 
 def _polished(budget: Budget, t: Transcription, first: SolverResult, old: SolverResult) -> SolverResult:
-    """From the first-order plan where that is near its rows. Else, or where that leads nowhere, from the plan
-    itself, which is a better start then.
+    """Solution of the changed program, started from the first-order step if that nearly satisfies the
+    constraints. Otherwise, or if the solver fails from there, it starts from the old solution, which is the
+    better guess then.
     """
     result = budget.near_by().run(t.program, first, _BARRIER) if first.status.usable else None
     for barrier, most in _FROM_PLAN:

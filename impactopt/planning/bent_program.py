@@ -98,7 +98,7 @@ class Bent:
 
 
 def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
-    """Whether programs of the two differ in bounds, constants and parameters only."""
+    """True if the programs of the two problems differ in bounds, constants and parameters only."""
     changing = {"point", "law", "target", "name"}
     pairs = [
         (getattr(problem, f.name), getattr(other, f.name)) for f in fields(problem) if f.name not in changing

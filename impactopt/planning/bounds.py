@@ -87,7 +87,7 @@ class Bound:
     is_time: bool = False
 
     def relaxation(self, t: Transcription) -> Relaxation:
-        """Of a program with the same variables."""
+        """Relaxation of this bound in any program with the same variables."""
         rows = _NO if self.chosen is None else _rows(t, self.chosen)
         return Relaxation(rows, self.variables, self.unit)
 
@@ -98,7 +98,7 @@ def bounds_of(t: Transcription) -> list[Bound]:
 
 
 def _durations(t: Transcription) -> Iterator[Bound]:
-    """Of swing, follow-through and the phases of contact."""
+    """Bounds on the durations of swing, follow-through and the phases of contact."""
     p = t.problem
     found: dict[str, list[int]] = {}
     for name, group in t.layout.groups.items():

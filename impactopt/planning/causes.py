@@ -47,7 +47,7 @@ _NONE = 1e-4  # what a relaxation comes to that is none
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Search:
-    """What came of it.
+    """Result of a search for the bounds that make a problem infeasible.
 
     causes : bounds any one of which would do, the one that moves least first.  met : a program of
     the problem with rows of all terms on demand, and variables (n,) that meet it; None if none are known.
@@ -117,7 +117,9 @@ class _Relaxing:
         return Search(causes=tuple(causes))
 
     def _common(self) -> tuple[Array, Array] | None:
-        """As `_solved`, of all bounds together."""
+        """A point that meets the program with all bounds relaxed at once, if a start leads to one (see
+        `_solved`).
+        """
         for start in self.starts:
             found = self._solved(self.bounds, start, _ITERATIONS)
             if found is not None:

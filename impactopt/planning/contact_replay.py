@@ -37,7 +37,7 @@ _WORTH = 1e-3  # of the planned contact's duration: a gap that is told
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
-    """How far a model of the collision is from full dynamics, at a plan's state at contact.
+    """Error of a collision model against full dynamics, at a plan's state at contact.
 
     impulse_pct : [%], positive where it promises too much.  zmp_mm : largest distance; None where one of them
     has no ZMP.
@@ -86,7 +86,7 @@ class ContactReplay:
         return abs(self.impulse_pct - self.known)
 
     def __str__(self) -> str:
-        """What a plan leaves out."""
+        """Message: how the replayed contact differs from the planned one."""
         off = f"its impulse is {self.impulse:.4g} N s, {self.planned:.4g} N s as planned"
         if self.partings:
             times = "once" if self.partings == 1 else f"{self.partings} times"

@@ -49,14 +49,14 @@ _TIMES = 25  # that constraints enter in one solve, at most
 
 
 def same_bodies(one: ImpactProblem, other: ImpactProblem) -> bool:
-    """Whether constraints between bodies mean the same in two problems."""
+    """True if clearance constraints mean the same in two problems."""
     if not (one.keeps_apart and other.keeps_apart) or one.robot is not other.robot:
         return False
     return [body.name for body in one.bodies.world] == [body.name for body in other.bodies.world]
 
 
 class Margins:
-    """How far each pair of a problem's bodies is to be apart [m].
+    """Required clearance [m] of each pair of a problem's bodies.
 
     Attributes
     ----------
@@ -93,7 +93,9 @@ class Margins:
         return self.own if pair[1] >= 0 else self.world
 
     def of(self, pair: Pair) -> float:
-        """Of a pair's hulls: the term's, or less where they are near at the start already."""
+        """Required clearance [m] of a pair's hulls: the term's, or less if they are nearer at the start
+        already.
+        """
         if pair not in self._least:
             start = self.bodies.exact(self._start, 0, pair)
             self._least[pair] = min(self.term(pair).margin, max(OF_START * start, 0.0))
@@ -119,7 +121,7 @@ def spots_of(t: ContactProgram, x: Array) -> Spots:
 
 
 class Watch:
-    """Which bodies of a program come near while it is solved, and how far a step may go.
+    """Watches clearances while a program is solved and limits the solver's step where bodies come near.
 
     Attributes
     ----------
@@ -214,19 +216,21 @@ class Watch:
 
     # ------------------------------------------------------------------ what is too near
     def _bare(self, found: Looked, within: Array | float) -> NDArray[np.bool_]:
-        """Which of those that are near are nearer than this [m], or than (P,), and have no constraint."""
+        """Mask of the pairs found that are nearer than ``within`` [m], a number or (P,), and have no
+        constraint.
+        """
         least = np.broadcast_to(within, len(self._shapes))[found.pair]
         return np.asarray(~self._has[found.spot, found.pair] & (found.gap < least))
 
     def _too_near(self, before: Looked, found: Looked) -> bool:
-        """Whether a step's end has bodies without a constraint too near."""
+        """True if a step has brought bodies without a constraint too close to each other."""
         fell = found.gap < OF_GAP * before.gaps[found.spot, found.pair]
         return bool((fell & self._bare(found, LEAST)).any())
 
     def _passes(
         self, x: Array, step: Array, length: float, one: tuple[Placed, Looked], two: tuple[Placed, Looked]
     ) -> bool:
-        """Whether bodies are apart before and after a step, but in each other half way."""
+        """True if bodies are clear before and after a step, but penetrate each other half way."""
         spot, pair = self._shapes.may_meet(one, two, self._margins.wanted)
         if not len(spot):
             return False

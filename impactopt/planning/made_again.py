@@ -1,4 +1,4 @@
-"""From a solution to its program, and from a program's result to what a solution says of it."""
+"""Reconstructs a solution's program, and assembles a `Solution`'s data from a solver's result."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside t
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """What came of one start.
+    """Result of the solve from one initial guess.
 
     start : its name; impulse [N s]; seconds: of the solver; kept: it is the one that was best.
     """
@@ -57,7 +57,7 @@ class Attempt:
     kept: bool = False
 
     def summary(self) -> dict[str, Any]:
-        """As in ``summary.json``."""
+        """JSON form, as it stands in ``summary.json``."""
         return {
             "start": self.start,
             "status": self.status.value,
@@ -126,7 +126,7 @@ class Budget:
 
     @property
     def interior(self) -> bool:
-        """Whether the solver is the interior-point method."""
+        """True if the solver is the interior-point method."""
         return self.solver == "sqp" and (self.options or {}).get("qp_solver", "interior") == "interior"
 
     @property
@@ -139,7 +139,7 @@ class Budget:
         return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
 
     def _told(self, record: IterationRecord) -> bool:
-        """Whether the solver is to stop after an iteration."""
+        """Reports an iteration to the caller; true if the solver is to stop after it."""
         asked = self.callback is not None and self.callback(record) is True
         return asked or self.stop.asked
 
@@ -252,7 +252,7 @@ def solve_from(
 
 
 def attempt_of(t: ContactProgram, name: str, result: SolverResult) -> Attempt:
-    """What came of a start, or of a round, of that name."""
+    """Result of the solve, or of the refinement round, of that name."""
     return Attempt(
         start=name,
         status=result.status,
@@ -265,7 +265,7 @@ def attempt_of(t: ContactProgram, name: str, result: SolverResult) -> Attempt:
 
 
 def violations_of(t: ContactProgram, x: Array, rows: Array) -> tuple[Violation, ...]:
-    """What is not met at solver variables (n,), whose rows are (m,), worst first."""
+    """Violated constraints at solver variables (n,), worst first; their values are ``rows`` (m,)."""
     return tuple(worst_rows(t.program, x, rows, tolerance=VIOLATED, count=NAMED))
 
 

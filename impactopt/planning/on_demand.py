@@ -97,7 +97,7 @@ def kept_on_demand(
 def _broken(
     t: Program, result: SolverResult, finer: Callable[[Program, Array], tuple[PlannedCollision, ...]]
 ) -> dict[str, str]:
-    """What is broken of terms on demand that have no rows, by name, in words."""
+    """Violations of lazy terms that have no constraints yet: message by name of the term."""
     problem, has, out = t.problem, rows_on_demand(t.problem), dict[str, str]()
     planned: Plan | PlannedStrike = t.decode(result.x)
     for name, kind in _KINDS.items():
@@ -117,7 +117,7 @@ def _broken(
 def _loads(
     t: Program, planned: Plan | PlannedStrike, finer: tuple[PlannedCollision, ...]
 ) -> list[DriveLoads]:
-    """Of all motions and all collisions."""
+    """Gear and motor loads of all motions and all collisions."""
     hits = finer or [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
     if isinstance(planned, PlannedStrike):
         still = np.zeros(t.robot.nv)

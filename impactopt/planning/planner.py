@@ -198,8 +198,8 @@ def _explained(
     work: Callable[[Transcription, Array], tuple[Transcription, SolverResult]],
     report: Callable[[str], None] | None,
 ) -> tuple[Transcription, dict[str, Any], tuple[Cause, ...]]:
-    """Where there is no solution: the bounds that keep it from being; or a solution from a point that meets
-    them all, if there is such a point.
+    """Diagnosis of a failed solve: the bounds that make it infeasible, or a solution from a feasible point
+    that the diagnosis has found.
 
     A limit that the caller has set is an answer, and stays one.
     """
@@ -238,7 +238,9 @@ def _meets_rows(t: Transcription, start: SolverResult) -> bool:
 def _led(
     refining: Refining, to_its_end: bool, t: Transcription, start: Array | SolverResult
 ) -> tuple[Transcription, SolverResult]:
-    """What comes of a start, with the rows on demand that it needs.  to_its_end : round by round."""
+    """Solves from one initial guess, adding the lazy constraints that it needs.  to_its_end : refines it,
+    too.
+    """
     work = refining.solve if to_its_end else refining.first
     found, result = _bounded(refining, *work(t, start), (t, start), to_its_end)
 
@@ -260,7 +262,7 @@ def _bounded(
     first: tuple[Transcription, Array | SolverResult],
     to_its_end: bool,
 ) -> tuple[Transcription, SolverResult]:
-    """As `kept_on_demand`."""
+    """Adds lazy constraints until none is violated (`kept_on_demand`)."""
 
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         own = refining.anew(other)

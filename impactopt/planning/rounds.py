@@ -1,4 +1,4 @@
-"""From a program's solution to one that is right between its nodes too, round by round."""
+"""Refinement loop: solve, check between nodes, add nodes, elements or clearance constraints, solve again."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ class Round:
 
 
 def start_of(finer: Transcription, t: Transcription, x0: Array) -> Array:
-    """What a program started from, for one with more nodes or elements."""
+    """Initial guess of a program, mapped to one with more nodes or elements."""
     return carried_over(finer, t, x0, np.zeros(t.program.m), np.zeros(t.layout.n))[0]
 
 
 def more_of(nodes: int, elements: Elements | None, rows: int) -> str:
-    """What is more in a program, in words."""
+    """Text for the additions to a program."""
     words = [f"{nodes} more node{'s' if nodes > 1 else ''}"] if nodes else []
     words += [f"{sum(map(len, elements))} contact elements"] if elements is not None else []
     words += [f"{rows} constraint{'s' if rows > 1 else ''} between bodies with more margin"] if rows else []
@@ -74,7 +74,7 @@ def more_of(nodes: int, elements: Elements | None, rows: int) -> str:
 
 
 class Refining:
-    """The way from a program's solution to one that is right between its nodes too.
+    """Refines a program until its solution is valid between the nodes, too.
 
     Where a solution brings bodies into each other between nodes, leaves its limits there, or has a contact
     that is too coarse, its program gets more nodes, elements or margins there and is solved again, from where
@@ -102,7 +102,7 @@ class Refining:
         self.blocked = False  # whether it ended with bodies in each other: another start may not
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
-        """Of a program's contact at its solution; the last one that was asked for is known."""
+        """Discretization error of a program's contact at its solution; the last one is cached."""
         if self._known is None or self._known[0] is not t or self._known[1] is not x:
             self._known = t, x, contact_error(t, x)
         return self._known[2]
@@ -112,8 +112,8 @@ class Refining:
         return Refining(self.budget, self.margins, t.apart_rows, self.report)
 
     def contact(self, t: Transcription, x: Array) -> PlannedContact | None:
-        """Of a program at its solution, with what comes of it in full dynamics; the last one that was asked
-        for is known. None while gains are open, as the robot is another one then.
+        """Planned contact of a program at its solution, with its replay in full dynamics; the last one is
+        cached. None while gains are open, as the robot is another one then.
         """
         if t.problem.gains:
             return None
@@ -130,7 +130,7 @@ class Refining:
         return self._contact[2]
 
     def replay(self, t: Transcription, x: Array) -> ContactReplay | None:
-        """What comes of it."""
+        """Replay of the planned contact in full dynamics."""
         contact = self.contact(t, x)
         return None if contact is None else contact.replay
 
@@ -159,7 +159,7 @@ class Refining:
         return t, result
 
     def _violated(self, t: Transcription, x: Array) -> Violated | None:
-        """What a program lacks at its variables; the last that was asked for is known."""
+        """Clearance violations of a program at its variables; the last ones are cached."""
         if self.margins is None:
             return None
         if self._near is None or self._near[0] is not t or self._near[1] is not x:
@@ -186,7 +186,7 @@ class Refining:
         return self.judged(*self.rounds(t, looked, x0)[:2])
 
     def _stuck(self, result: SolverResult) -> bool:
-        """Whether the solver has ended without a solution, and not at a limit that the caller has set."""
+        """True if the solver has ended without a solution, and not at a limit that the caller has set."""
         if result.status is Status.ITERATION_LIMIT:
             return "max_iterations" not in (self.budget.options or {})
         return result.status in _STUCK
@@ -194,11 +194,12 @@ class Refining:
     def _led_out(
         self, free: Transcription, t: Transcription, stuck: SolverResult, x0: Array
     ) -> tuple[Transcription, SolverResult]:
-        """What comes of a start that leads nowhere with the first rows between bodies of a program ``t``.
+        """Solves from an initial guess with which the first clearance constraints of a program ``t`` lead
+        nowhere.
 
-        That is where a solver stopped, not that there is no motion: the rows know the bodies as they are at
-        the start. So the motion without them is led out of what it is in; where that fails too, the rows say
-        what is in the way.
+        A solver that stops there does not show that there is no motion: the constraints are linearized for
+        the bodies as they are in the guess. So the motion is first found without them and then moved out of
+        penetration; if that fails too, the violated constraints name the obstacle.
         """
         if self.report is not None:
             self.report("no motion was found from there with rows between bodies: first without them")
@@ -235,7 +236,7 @@ class Refining:
         return t, result, found
 
     def _is_apart(self, result: SolverResult) -> bool:
-        """Whether a result has been looked at, and nothing touches anything."""
+        """True if a result has been checked and found without contacts between bodies."""
         return self._apart is not None and self._apart[1] is result
 
     def judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
@@ -256,7 +257,7 @@ class Refining:
         return t, self.checked(t, result)
 
     def _next(self, t: Transcription, old: SolverResult, x0: Array) -> Round | None:
-        """What is to be solved next; None if the solution is right."""
+        """Next program to solve; None if the solution is valid."""
         shares, violated = t.hit.shares, None
         elements: Elements | None = None
         error: ContactError | None = None

@@ -1,4 +1,4 @@
-"""What a number of a problem is worth to a plan, and which rows bind: from the plan's KKT system."""
+"""Parametric sensitivity and active constraints of a plan, from its KKT system."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Binding:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Sensitivity:
-    """What a number of a problem does to a plan, to first order.
+    """First-order sensitivity of a plan to a parameter of its problem.
 
     parameter, value : its name and value.  impulse : d impulse / d parameter [N s / unit].
     objective : d (weighted sum of the objectives, less the prices on motion) / d parameter.
@@ -57,7 +57,8 @@ class Sensitivity:
 
 
 def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
-    """How the impulse answers to a number of the problem, and which rows bind: `Solution.sensitivity`.
+    """Sensitivity of impulse and objective to a parameter, and the active constraints:
+    `Solution.sensitivity`.
 
     Derivatives of the program by the parameter are central differences at the solution; the solution's own
     follow from the KKT system.
@@ -94,7 +95,7 @@ def _slope(bent: Bent, number: Parameter, half: float) -> tuple[Array, Array, Ar
 
 
 def _extrapolated(whole: Array, half: Array) -> Array:
-    """Of differences with a step and its half."""
+    """Richardson extrapolation of central differences with a step and its half."""
     return (4 * half - whole) / 3
 
 

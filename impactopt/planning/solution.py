@@ -1,4 +1,4 @@
-"""What a solve gives back, and the record that it leaves on disk."""
+"""Result of a solve, and its record on disk."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Solved:
 
     @property
     def caution(self) -> str:
-        """What the planned contact leaves out, in words; empty where it is as planned."""
+        """Warning about effects that the planned contact leaves out; empty if the replay agrees with it."""
         replay = self.contact_replay
         return str(replay) if replay is not None and (replay.partings or replay.off > AGREED) else ""
 
@@ -100,7 +100,9 @@ class Solved:
         return self.result.status
 
     def outcome(self) -> dict[str, Any]:
-        """How the solve ended: what ``summary.json`` says even of a plan whose motion cannot be completed."""
+        """Outcome of the solve, as in ``summary.json``; known even of a plan whose motion cannot be
+        completed.
+        """
         return {
             "status": self.status.value,
             "message": self.result.message,
@@ -154,7 +156,7 @@ class Solution(Solved):
 
     @property
     def contact_elements(self) -> list[int]:
-        """How many each phase of the contact has; none of an impact without duration."""
+        """Number of collocation elements in each phase of the contact; none for an impact without duration."""
         if not self.problem.lasts:
             return []
         return [len(phase) for phase in self.elements or contact_elements(self.problem)]
@@ -234,9 +236,9 @@ class Solution(Solved):
         return found
 
     def sensitivity(self, parameter: str) -> Any:
-        """How impulse and objective answer to a number of the problem, such as ``"target.mass"``,
-        ``"contact.stiffness"``, ``"point.x"`` or ``"terms.torque_limit.fraction"``, and which rows bind, with
-        their shadow prices: a :class:`impactopt.planning.sensitivity.Sensitivity`.
+        """Derivatives of impulse and objective by a parameter of the problem, such as ``"target.mass"``,
+        ``"contact.stiffness"``, ``"point.x"`` or ``"terms.torque_limit.fraction"``, and the active
+        constraints with their shadow prices: a :class:`impactopt.planning.sensitivity.Sensitivity`.
 
         Raises
         ------
@@ -297,9 +299,9 @@ class Solution(Solved):
         return [Path(path) for path in export(self, to, directory, rate=rate, joints=joints)]
 
     def clearance(self) -> dict[str, Any]:
-        """How far bodies are apart in the plan, and what touches what, by exact geometry at 1 ms: the keys
-        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those of a missed blow
-        are among them, and say so.
+        """Clearances and unintended contacts in the plan, by exact geometry at 1 ms: the keys
+        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those after a missed blow
+        are among them, marked as such.
         """
         least, nearest, touches = self._clearance
         return {"clearance_mm": 1e3 * least, "nearest": nearest, "contacts_besides": [{**t} for t in touches]}
@@ -323,7 +325,7 @@ class Solution(Solved):
 
     @cached_property
     def slide(self) -> float:
-        """How far [m] the striking point goes across the target while the contact lasts, as planned."""
+        """Distance [m] that the striking point slides across the target during contact, as planned."""
         return slide(self.problem, self.plan)
 
     @property
@@ -352,7 +354,7 @@ class Solution(Solved):
 
     @cached_property
     def loads(self) -> DriveLoads:
-        """What gears and motors bear at most, as planned with the expected target."""
+        """Peak loads of gears and motors, as planned with the expected target."""
         return motion_loads(self.problem.robot, self.trajectory, self.collision)
 
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
@@ -399,7 +401,7 @@ class Solution(Solved):
 
 
 def blow_numbers(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
-    """What ``summary.json`` says of a planned blow; one without duration knows no force."""
+    """Data of a planned impact for ``summary.json``; one without duration has no force."""
     duration = hit.compression + hit.restitution
     return {
         "impulse_Ns": hit.impulse,

@@ -256,7 +256,7 @@ def clear_strike(
 def _clean_strike(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
-    """As `clear_strike`; what still has bodies in each other is no solution."""
+    """Strike without penetration (`clear_strike`); a result that still has some does not count as a solution."""
     t, result = clear_strike(budget, margins, t, start)
     if margins is None or not result.status.usable:
         return t, result
@@ -270,7 +270,7 @@ def _clean_strike(
 def _bounded_strike(
     work: Work, report: Callable[[str], None] | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
-    """What comes of a start, with the rows on demand that it needs."""
+    """Solves a strike from one initial guess, adding the lazy constraints that it needs."""
     found, result = work(t, start)
     return kept_on_demand(found, result, (t, start), work, lambda *_: (), report)
 

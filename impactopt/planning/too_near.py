@@ -1,4 +1,4 @@
-"""Where a solution brings bodies too near to each other between its places, and what it lacks for that.
+"""Detects clearance violations of a solution and selects the constraints and nodes to add.
 
 At places a program's constraints keep all apart that is near (`keeping_apart`). Where two bodies are too near
 between two places at which they are not, there is to be a node at that instant, which gets constraints as its
@@ -37,8 +37,8 @@ INNER = 0.2  # of the time between two nodes: another one is not nearer to them
 
 
 class Violated(NamedTuple):
-    """What a solution lacks: constraints in place of its own, how deep [m] bodies are in each other without
-    them, which pairs are too near, and the program's nodes with those that it needs.
+    """Additions that a solution's clearance violations call for: constraints in place of its own, the depth
+    [m] of the penetration without them, the violating pairs, and the program's nodes with those to add.
     """
 
     rows: Rows
@@ -48,7 +48,7 @@ class Violated(NamedTuple):
 
 
 class _Between(NamedTuple):
-    """Where two bodies are nearest between two places: how far apart [m], when [s], on which motion."""
+    """Closest approach of two bodies between two nodes: distance [m], time [s], motion."""
 
     apart: float
     time: float
@@ -56,7 +56,8 @@ class _Between(NamedTuple):
 
 
 def bodies_too_near(t: Transcription, x: Array, margins: Margins, *, share: float = SHARE) -> Violated | None:
-    """What keeps apart bodies that are too near, at the nodes of a solution or between them; None: none is.
+    """Additions that remove clearance violations at a solution's nodes or between them; None if there are
+    none.
 
     Too near is what gives up more than a ``share`` of its margin by exact geometry.
     """
@@ -86,7 +87,7 @@ def bodies_too_near(t: Transcription, x: Array, margins: Margins, *, share: floa
 
 
 def deepest(t: ContactProgram, x: Array, margins: Margins) -> tuple[float, list[Pair]]:
-    """How deep [m] bodies are in each other at a program's places, < 0 if they are not; and which pairs."""
+    """Deepest penetration [m] at a program's nodes, < 0 if there is none, and the pairs in contact."""
     touching = list(_near(margins, spots_of(t, x).at, 1.0))
     return max((-apart for _, _, apart in touching), default=-np.inf), [pair for _, pair, _ in touching]
 
@@ -117,7 +118,7 @@ class _Asked:
         self._gaps = shapes.look(margins.bodies.placed(spots.at), np.inf, ways, margins.wanted).gaps
 
     def more(self, beside: Sequence[int], pair: Pair, apart: float) -> None:
-        """Of two bodies at these places, what is missing between them [m]."""
+        """Raises the required clearance of two bodies at these nodes by what is missing between them [m]."""
         missing, index = min(self._margins.of(pair) - apart, MOST), self._margins.bodies.shapes.index
         for k in beside:
             own = {

@@ -1,4 +1,4 @@
-"""What a solve that ended without a solution is worth: another solver's word, and why there is none."""
+"""Diagnosis of a failed solve: a second solver's result, and the cause of infeasibility."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _rank(result: SolverResult) -> tuple[bool, bool, float]:
 
 
 def lacks_rows(t: ContactProgram, result: SolverResult) -> bool:
-    """Whether a solver has ended by itself, with rows that are not met."""
+    """True if a solver has ended by itself with violated constraints."""
     if result.status not in (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT):
         return False
     return max_violation(t.program, result.x, t.program.constraints(result.x)) > VIOLATED

@@ -1,4 +1,4 @@
-"""What the time that a contact may take costs a plan: it is a window to look in, no property of the blow."""
+"""Warning about a plan that is limited by the longest permitted contact, which is no property of the impact."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _DEAR = 0.1  # of the objective, for a window twice as long and to first order: 
 
 
 def window_caution(t: Transcription, result: SolverResult) -> str:
-    """What is to be said of a plan whose contact ends because it may not last longer; "" if none does.
+    """Warning about a contact that ends because it may not last longer; "" if none does.
 
     The price is the multiplier of the bound times the bound.
     """

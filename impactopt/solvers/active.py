@@ -36,7 +36,7 @@ _TINY = 1e-9  # a multiplier that is nothing
 
 @dataclass(frozen=True, kw_only=True)
 class Offset:
-    """What a program with other numbers leaves of the KKT conditions of a solution.
+    """Residual of a solution's KKT conditions in a program with other parameters.
 
     dual (n,) : grad f + J'y + z.  rows (m,) : g minus the bound that each row is at, where it is at one.
     variables (n,) : likewise of x.
@@ -49,7 +49,7 @@ class Offset:
     variables: Vector
 
     def less(self, other: Offset) -> Offset:
-        """What is left without another."""
+        """Difference of two residuals."""
         return Offset(
             dual=self.dual - other.dual,
             rows=self.rows - other.rows,
@@ -59,7 +59,7 @@ class Offset:
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """Of variables (n,), multipliers of rows (m,) and of bounds (n,); or their values."""
+    """Values or changes of variables (n,), multipliers of constraints (m,) and multipliers of bounds (n,)."""
 
     x: Vector
     y: Vector
@@ -114,7 +114,7 @@ class ActiveSystem:
         return self._factors[rounding]
 
     def offset(self, program: NonlinearProgram, at: Change | None = None) -> Offset:
-        """Of a program with other numbers, and the same variables and rows.
+        """KKT residual of a program with other parameters, and the same variables and constraints.
 
         at : variables and multipliers; None: those of the solution.
         """
@@ -155,7 +155,7 @@ class ActiveSystem:
 
 
 def _at(values: Vector, lower: Vector, upper: Vector, multipliers: Vector) -> tuple[Side, Vector]:
-    """Which bound each value is at, or near by; and its slack over its multiplier."""
+    """Bound that each value is at, or near; and its slack over its multiplier."""
     gap = np.abs(np.where(multipliers > 0, upper - values, values - lower))
     size = np.abs(multipliers)
     equal = lower == upper

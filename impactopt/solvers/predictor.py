@@ -1,4 +1,4 @@
-"""What becomes of a program's solution when the program's numbers change: a few quadratic programs.
+"""Predicts a program's solution for changed parameters by a few quadratic programs.
 
 Each has the changed program's rows made linear, and the known solution's Hessian. Its active set is found by
 Newton's method on its augmented Lagrangian, with exact line searches: rows that begin to hold and rows
@@ -78,7 +78,7 @@ class Predictor:
         self._sides = np.sign(own - self._weak).astype(np.int8)
 
     def _bounds(self, program: NonlinearProgram) -> tuple[Vector, Vector]:
-        """Of rows and variables; those that do not move have none."""
+        """Bounds of constraints and variables; infinite for variables that do not move."""
         lower, upper = (
             np.where(self._moves, program.x_lower, -np.inf),
             np.where(self._moves, program.x_upper, np.inf),
@@ -142,7 +142,7 @@ class _QP:
         return out
 
     def solve(self, sides: Sides) -> bool:
-        """From an active set (as of `sides`) to that of the solution, or near; whether it gets there."""
+        """Iterates from an active set (as of `sides`) towards the solution's; true if it gets there."""
         rows, short = self._of._inequal, 0
         at = np.zeros(len(rows))
         for k in range(_SETS):
@@ -203,7 +203,7 @@ class _QP:
         return d
 
     def _length(self, step: Vector, at: Vector, along: Vector) -> float:
-        """How far to go along a step for the least augmented Lagrangian, 1 at most."""
+        """Step length that minimizes the augmented Lagrangian along a step, 1 at most."""
         hessian, more = self._of._hessian, _PROXIMAL + self._newton.shift
         linear = float((self._q + hessian @ self.d + more * self.d) @ step)
         square = float(step @ (hessian @ step) + more * (step @ step))
@@ -216,7 +216,7 @@ class _QP:
         return float(brentq(slope, 0.0, 1.0, xtol=1e-6))
 
     def multipliers(self) -> tuple[Vector, Vector]:
-        """Of rows (m,) and bounds (n,), as of the last active set."""
+        """Multipliers of constraints (m,) and bounds (n,), as of the last active set."""
         found = self._y + self._constant
         y, z = found[: self._m], found[self._m :].copy()
         held = ~self._of._moves

@@ -1,4 +1,4 @@
-"""What a nonlinear program is to our solvers, and what a solver gives back.
+"""Interface of nonlinear programs and of solver results.
 
 The border between the symbolic and the numeric half of the package: everything below it is NumPy and SciPy.
 """
@@ -73,11 +73,11 @@ class NonlinearProgram(Protocol):
         ...
 
     def row_name(self, i: int) -> str:
-        """What row i of g is to the reader: "torque limit, swing, node 7, arm_right_4_joint"."""
+        """Readable name of constraint i: "torque limit, swing, node 7, arm_right_4_joint"."""
         ...
 
     def variable_name(self, j: int) -> str:
-        """What entry j of x is to the reader."""
+        """Readable name of variable j."""
         ...
 
 
@@ -96,7 +96,9 @@ class SpokenProgram(NonlinearProgram, Protocol):
 
 @dataclass(frozen=True)
 class Violation:
-    """What is not met: as a person reads it, how far it is off, and the amount in the row's own unit."""
+    """Violated constraint or bound: its name, the violation in words, and the amount in the constraint's own
+    unit.
+    """
 
     what: str
     by: str
@@ -110,7 +112,7 @@ MINOR = 0.01  # of the worst row's violation: what a message leaves out
 
 
 class Status(enum.Enum):
-    """How a solver ended."""
+    """Status that a solver ended with."""
 
     SOLVED = "solved"
     ACCEPTABLE = "acceptable"
@@ -127,7 +129,7 @@ class Status(enum.Enum):
 
     @property
     def usable(self) -> bool:
-        """Whether the iterate meets the solver's tolerances, or nearly so (SOLVED, ACCEPTABLE)."""
+        """True if the iterate meets the solver's tolerances, or nearly so (SOLVED, ACCEPTABLE)."""
         return self in (Status.SOLVED, Status.ACCEPTABLE)
 
 
@@ -278,7 +280,7 @@ def complementarity(
 def is_stationary_violation(
     program: NonlinearProgram, x: Vector, g: Vector, jacobian: Matrix, tolerance: float = 1e-3
 ) -> bool:
-    """Whether no small step lessens the violation 1/2 |v|^2 of the rows: a locally infeasible point.
+    """True if no small step reduces the violation 1/2 |v|^2 of the constraints: a locally infeasible point.
 
     True if the gradient J' v, without the part that only the variables' bounds hold, is small beside |J||v|.
     """
@@ -300,9 +302,9 @@ def worst_rows(
     count: int = 5,
     once_a_term: bool = False,
 ) -> list[Violation]:
-    """What is violated by more than the tolerance, largest first.
+    """Violations beyond the tolerance, largest first.
 
-    Of a term's rows at a place the worst one only; ``once_a_term``: of all its rows.
+    Only the worst one of each term's constraints at a node; ``once_a_term``: of all its constraints.
     """
     violations = np.concatenate([row_violations(program, g), bound_violations(program, x)])
     violations = np.where(np.isnan(violations), np.inf, violations)

@@ -84,7 +84,7 @@ class RelaxedProgram:
         self._number_entries(program.jacobian(x))
 
     def _number_entries(self, jacobian: Matrix) -> None:
-        """Where the Jacobian's entries come from: the program's, a one, or the coupling's weights."""
+        """Sources of the Jacobian's entries: the program's entries, a one, or the coupling's weights."""
         n, own = self._program.n, jacobian.nnz
         theirs = sp.csc_array(
             (np.arange(1, own + 1), jacobian.indices, jacobian.indptr), shape=jacobian.shape
@@ -100,7 +100,7 @@ class RelaxedProgram:
         self._indices, self._indptr = (a.astype(np.int32) for a in (numbered.indices, numbered.indptr))
 
     def sizes(self, x: Vector) -> Vector:
-        """How far each relaxation's bounds have moved, in its unit; x : of this program."""
+        """Relaxation of each group of bounds, in its unit; x : variables of this program."""
         return np.asarray(x[self._program.n :])
 
     def start(self, x: Vector, room: float) -> Vector:

@@ -166,7 +166,7 @@ def spring(c: StanceCoordinates, chosen: Joints = ()) -> BlockExpression:
 
 
 def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
-    """What is left after the impact.
+    """Balance after the impact: capture point, vertical speed and angular momentum.
 
     The capture point [m], the vertical speed of the CoM [m/s], the angular momentum [N m s].
     z = y, y', legs, T;  p = the support polygon's edges (inward normal, offset: 3 an edge).  out = distance

@@ -1,4 +1,4 @@
-"""What the parts of a program are built with: variables, blocks and rows, and the limits that all keep."""
+"""Builder that the parts of a program share: variables, blocks and constraints, and the common limits."""
 
 from __future__ import annotations
 

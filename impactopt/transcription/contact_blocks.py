@@ -46,12 +46,12 @@ RESTITUTING = 6  # which parameter of `force` says so
 
 
 def base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
-    """Of base rows: the weight [N], and with the lever [m] of moments."""
+    """Scale of the base's equations: the weight [N], and for moments the weight times the lever [m]."""
     return ca.vertcat(*[weight] * 3, *[weight * lever] * 3) if c.base else ca.SX(0, 1)
 
 
 def leg_part(c: StanceCoordinates, v: Any) -> Any:
-    """Of the held legs' joints (nl), out of (nv)."""
+    """Entries of the constrained legs' joints (nl), out of (nv)."""
     return ca.vertcat(*[v[c.base + int(j)] for j in c.dependent])
 
 
@@ -265,7 +265,7 @@ def force(
 
 
 def moved(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """Where the robot is in contact, to freeze there anew, and how fast its hand moves.
+    """Position of the robot in contact, for a new freeze there, and its hand's speed along the normal.
 
     z = y0, d1, T1, d, T, u as in :func:`collision`;  p = normal (3).  out = y; speed along the normal [m/s].
     """
@@ -278,7 +278,8 @@ def moved(c: StanceCoordinates, striker: str) -> BlockExpression:
 
 
 def carried(c: StanceCoordinates) -> BlockExpression:
-    """What soles bear beside the forces of a model without bias: weight, Coriolis and centrifugal forces.
+    """Base load of the soles beside the forces of a model without bias: weight, Coriolis and centrifugal
+    forces.
 
     z = y, legs, u at contact; wrenches (6 a sole);  p = weight [N], lever [m].  out = base rows.
     """

@@ -1,4 +1,4 @@
-"""How far a planned contact is from the one that its equations have, and the elements that bring it nearer.
+"""Estimates the discretization error of a planned contact, and selects the elements that reduce it.
 
 The contact is integrated once more from the plan's state at contact, by the same equations on elements half
 as long, over the same time, and by the contact law with its switches in place of one branch a phase. What
@@ -44,7 +44,7 @@ _MOST = 16  # elements of a phase
 
 @dataclass(frozen=True, kw_only=True)
 class ContactError:
-    """Of a plan's contact, the worst of those with its targets.
+    """Error of a plan's contact, the worst over its targets.
 
     pct : error of the impulse [%]; inf where an event is missed, or no contact was found.
     coarse : what of it is the elements'; the rest is that phases hold to one branch of the law.
@@ -244,12 +244,12 @@ def _strained(t: ContactProgram, hit: PlannedCollision, stages: Sequence[Colloca
 
 
 def _scale(old: Collision, x: Array) -> float:
-    """From impulses [N s] to [%] of that of a plan (n,)."""
+    """Factor of impulses [N s] to [%] of the impulse of a plan (n,)."""
     return 100 / max(abs(float(old.p.read(x)[-1, 0])), 1e-9)
 
 
 def _grown(new: Collision, old: Collision, z: Array, x: Array) -> Array:
-    """What each element adds to the error of the impulse [%]: (elements,)."""
+    """Contribution of each element to the error of the impulse [%]: (elements,)."""
     planned, found = old.p.read(x)[:, 0], new.p.read(z)[:, 0]
     ends = [
         float(found[i] - planned[k])

@@ -31,7 +31,7 @@ class TorqueCourse(NamedTuple):
 def torque_courses(
     b: Builder, swing: MotionPhase, follows: Sequence[MotionPhase], torques: Sequence[Affine]
 ) -> list[TorqueCourse]:
-    """Of the swing from its start on, where the torque is given, and of each motion to rest.
+    """Torque profiles of the swing, whose initial torque is given, and of each motion to rest.
 
     torques : over limit, at the nodes of all of these, one motion after the other.
     """

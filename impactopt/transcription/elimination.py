@@ -15,7 +15,7 @@ from impactopt.transcription.rows import Index
 
 
 class Turn(IntEnum):
-    """Of variables that rows determine; those of a lower turn are eliminated first."""
+    """Order of elimination of determined variables; lower ones are eliminated first."""
 
     NODE = 0  # legs at a node, and the first sole's wrench
     LIFTED = 1  # what equals outputs of blocks

@@ -36,7 +36,7 @@ from impactopt.transcription.rows import Measure, Place, along, by_leg, rates
 
 @dataclass(frozen=True)
 class _Freeze:
-    """Where something is frozen: in which phase, at which place in it; coordinates, rates, legs."""
+    """Point at which the dynamics is frozen: phase, place in it; coordinates, rates, legs."""
 
     phase: int
     place: float
@@ -189,7 +189,7 @@ class FrozenCollision(Collision):
         return [*own, at.y, at.u, at.legs, *more]
 
     def _hand_slope(self, i: int) -> Affine:
-        """Of its speed along the normal, which is that of the robot at the beginning of a segment."""
+        """Slope of the hand's speed along the normal, which starts each segment at the robot's speed."""
         s, k = self.stages[i], self._segments[i]
         first = s.previous < 0 or self._segments[s.previous] != k
         slope = self.speed[s.members[0]] * 0.0
@@ -359,6 +359,6 @@ class FrozenCollision(Collision):
             group.write(x, legs)
 
     def _speed(self, y: Array, rates: Array, legs: Array) -> float:
-        """Of the hand along the normal [m/s]."""
+        """Speed of the hand along the normal [m/s]."""
         p = self._b.problem
         return effective_mass(self._b.coordinates, p.strikers, p.normal, y, legs, rates)[1]

@@ -1,4 +1,4 @@
-"""Where the search for a contact starts: a point mass in the robot's place meets the target.
+"""Initial guess of a contact: a point mass in place of the robot meets the target.
 
 The law and the target are the true ones, switches and all, integrated by SciPy.
 """
@@ -75,7 +75,7 @@ def effective_mass(
 
 
 def mass_at_contact(problem: ImpactProblem) -> float:
-    """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
+    """Effective mass [kg] of the robot at its striker, where inverse kinematics reaches the target."""
     c = problem.coordinates
     y, legs = c.split(problem.contact_posture)
     return effective_mass(c, problem.strikers, problem.normal, y, legs, np.zeros(c.ny))[0]
@@ -104,7 +104,7 @@ def _motions(c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: 
 
 
 def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, limit: Array) -> float:
-    """How fast [m/s] the striker is along the normal in a posture (nq,), at most; ``limit`` (n,) [rad/s]."""
+    """Greatest speed [m/s] of the striker along the normal in a posture (nq,); ``limit`` (n,) [rad/s]."""
     motions, row = _motions(c, striker, normal, *c.split(posture))
     joints = motions[c.base :]
     bounds = np.concatenate([limit, limit])
@@ -127,7 +127,8 @@ class Parting:
 
 
 def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
-    """Whether a point mass [kg] and a target part before its events, at all speeds up to the fastest [m/s].
+    """Detects that a point mass [kg] and a target part before the phases' events, at all speeds up to the
+    fastest.
 
     None: at one of them, they do not.
     """
@@ -217,7 +218,7 @@ def speed_that_leaves(
 
 
 def natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:
-    """How long each phase of the blow of a point mass [kg] of 1 m/s lasts [s].
+    """Duration [s] of each phase of a point mass [kg] that hits at 1 m/s.
 
     It is known from the last programs, which mostly are of the same blow.
     """

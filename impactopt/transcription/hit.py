@@ -107,7 +107,7 @@ class Hit(Contacts):
                 each.add_rows(at + k * b.blocks[-1].n_out)
 
     def renew(self, *, anew: bool) -> None:
-        """As of :meth:`impactopt.transcription.collision.Collision.renew`."""
+        """Renews all collisions (:meth:`impactopt.transcription.collision.Collision.renew`)."""
         self.__dict__.pop("mass", None)
         lasting = [c for c in self.collisions if isinstance(c, Collision)]
         for collision in lasting:
@@ -146,7 +146,7 @@ class Hit(Contacts):
         return self.output(0, self.expected.end[-2], "penetration")
 
     def determined(self) -> list[Determined]:
-        """Of all collisions, and the feed-forward."""
+        """Determined variables of all collisions, and of the feed-forward."""
         parts = [*self.collisions, *self.first]
         return [*(each for part in parts for each in part.determined()), *super().determined()]
 
@@ -166,7 +166,7 @@ class Hit(Contacts):
         return tuple(float(share) for share in found)
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
-        """What plans and strikes say of the contact, for solver variables (n,) and the blocks' outputs."""
+        """Contact data of plans and strikes, for solver variables (n,) and the blocks' outputs."""
         approach = approaches(outputs)
         compression, restitution = self.expected.durations(x)
         scenarios = [

@@ -52,7 +52,7 @@ class InstantImpact:
 
     @property
     def target_state(self) -> Affine:
-        """Of the target, after it."""
+        """State of the target after the impact."""
         return self.blow[0] * (1 / self.mass)
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
@@ -81,13 +81,13 @@ class InstantImpact:
         b.equal("law of the impact", "impact", ["impulse"], start + part["blow"], off)
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
-        """As of :meth:`impactopt.transcription.collision.Collision.link`; no time passes."""
+        """Linking constraints (:meth:`impactopt.transcription.collision.Collision.link`); no time passes."""
         none, still = Affine.zeros(1), Affine.zeros(self._b.ny)
         return self.contact.link(start, (none, none), (still, still), self._rate)
 
     @property
     def state_after(self) -> list[Affine]:
-        """As of :meth:`impactopt.transcription.collision.Collision.state_after`."""
+        """State after contact (:meth:`impactopt.transcription.collision.Collision.state_after`)."""
         state = self.contact.state
         return [state.y, self._rate, state.legs, Affine.constant(1.0)]
 

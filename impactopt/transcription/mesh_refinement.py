@@ -1,4 +1,4 @@
-"""What a plan does between its program's nodes, and the nodes that it takes to keep its limits there, too.
+"""Checks a plan's limits between its program's nodes, and selects the nodes to add.
 
 A program holds torques and the ground's wrench to their limits at its nodes. Between two of them the motion
 is a spline, and what it needs is not: right after a blow, where accelerations are largest, the ZMP can leave

@@ -17,7 +17,7 @@ ALIKE = 3.0  # factor between numbers that are
 
 
 def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
-    """How long [s] each phase of the contact lasts at least; ``natural``: its last one, of a point mass."""
+    """Least duration [s] of each phase of the contact; ``natural``: that of the last phase of a point mass."""
     target, (shortest, longest) = problem.target, problem.contact_duration
     if not shortest:  # no bound: far below what a blow takes, as rows are over these times
         shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
@@ -28,17 +28,19 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
 
 
 def alike(numbers: Array, others: Array) -> bool:
-    """Whether least durations of problems with these numbers (k,) are, as blows take about as long."""
+    """True if problems with these parameters (k,) can share least durations, as their blows take about as
+    long.
+    """
     sizes = np.sort(np.abs([numbers, others]), axis=0)
     return bool(np.all(sizes[1] <= ALIKE * sizes[0]))
 
 
 def switches(law: ContactLaw) -> bool:
-    """Whether compression and restitution are branches of their own."""
+    """True if compression and restitution are different branches of the law."""
     compression, restitution, _ = law.formula()
     return bool(compression != restitution)
 
 
 def pulls_apart(law: ContactLaw) -> bool:
-    """Whether it would pull at bodies that part fast."""
+    """True if the law would pull at bodies that separate fast."""
     return float(law.branch(1e-6, -10.0, False)) < 0

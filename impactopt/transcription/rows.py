@@ -38,12 +38,14 @@ def by_leg(joints: Index) -> list[Index]:
 
 
 def along(labels: Sequence[str], phrase: str) -> list[Measure]:
-    """Of rows in [m] for directions x, y, z, and in [rad] for all else: the labels' last words say which."""
+    """Measures of constraints in [m] for directions x, y, z, else in [rad], told apart by the labels' last
+    words.
+    """
     return [millimetres(phrase) if _straight(name) else degrees(phrase) for name in labels]
 
 
 def rates(labels: Sequence[str]) -> list[Measure]:
-    """As :func:`along`, of rows in [m/s] and [rad/s]."""
+    """Measures of constraints in [m/s] or [rad/s], likewise."""
     return [Measure("m/s" if _straight(name) else "rad/s", 1.0, "off") for name in labels]
 
 
@@ -68,7 +70,7 @@ class Row:
         return _joined(self.term, self.place.name, self.component)
 
     def told(self, x: Array, amount: float) -> tuple[str, str]:
-        """Which row this is at solver variables (n,), and by how much it is violated."""
+        """Name of this constraint and amount of its violation in words, at solver variables (n,)."""
         by = f"by {amount:.3g}" if self.measure is None else self.measure.told(x, amount)
         component = self.component if self.whole is None else self.whole
         return _joined(self.term, self.place.told(x), component), by

@@ -58,7 +58,7 @@ class _Called:
 
 
 class State(NamedTuple):
-    """Of coordinates at contact: v (nv), leg accelerations (nl) while coasting; both by y, ydot, legs."""
+    """State at contact: v (nv), leg accelerations (nl) while coasting; derivatives of both by y, ydot, legs."""
 
     v: Array
     bend: Array
@@ -288,7 +288,7 @@ class Shooting:
 
 
 def _weights(time: Array) -> Array:
-    """Of the trapezoidal rule at these times."""
+    """Weights of the trapezoidal rule at these times."""
     steps = np.diff(time) / 2
     return np.append(steps, 0.0) + np.append(0.0, steps)
 

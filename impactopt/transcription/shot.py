@@ -71,7 +71,7 @@ class Shot:
 
     @property
     def _z(self) -> Affine:
-        """What the shooting is a function of."""
+        """Arguments of the shooting."""
         state = self.contact.state
         return stack([state.y, self.contact.u0[0], state.legs, self.contact.feedforward[0]])
 
@@ -202,7 +202,7 @@ class Shots(Contacts):
         self.scenarios = [Shot(b, contact, self.mass, k, s) for k, s in enumerate(self.hit, start=1)]
 
     def add_rows(self) -> None:
-        """Of all collisions."""
+        """Adds the constraints of all collisions."""
         for shot in self.collisions:
             shot.add_rows()
 
@@ -219,7 +219,7 @@ class Shots(Contacts):
         raise InputError('method "shooting" has no slope of the deepest penetration; take "collocation"')
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
-        """As of `Hit`."""
+        """Contact data of plans and strikes (see `Hit.decode`)."""
         hit, compression, speed = self.expected.decode(x)
         scenarios = []
         for other in self.scenarios:

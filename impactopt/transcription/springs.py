@@ -35,7 +35,7 @@ class SpringPoint(NamedTuple):
 
 
 def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
-    """Of a motion to contact: means over the spline's intervals, and its end.
+    """Spring constraints of a motion to contact: means over the spline's intervals, and its end.
 
     Accelerations of a spline are linear in an interval, those of a spring are not. Where their means are
     right, so are the speeds at the intervals' ends, and with them the blow.
@@ -58,7 +58,9 @@ def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) ->
 
 
 def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
-    """Of a motion to rest: the ends of the spline's intervals. With means it would swing about them."""
+    """Spring constraints of a motion to rest: the ends of the spline's intervals. With means it would
+    oscillate.
+    """
     return [
         SpringPoint(motion.place_at(s), torque, *motion.at(s)[:2], motion.T[0])
         for s, torque in zip(motion.nodes, torques, strict=True)

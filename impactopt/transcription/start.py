@@ -224,7 +224,7 @@ def _of_same_rows(rows: Sequence[Row], known: Sequence[Row], numbers: Array) -> 
 
 
 def _keys(rows: Sequence[Row]) -> Iterator[tuple[tuple[str, str, str], int]]:
-    """What a row is, and how many of that name come before it."""
+    """Name of each constraint, and the number of earlier ones of that name."""
     seen: dict[tuple[str, str, str], int] = {}
     for row in rows:
         name = row.term, row.place.name, row.component
@@ -238,7 +238,7 @@ def _finished(t: ContactProgram, x: Array) -> Array:
 
 
 def _durations(t: Transcription) -> tuple[float, float]:
-    """Of swing and follow-through [s]."""
+    """Durations of swing and follow-through [s]."""
     return float(np.mean(t.problem.swing.duration)), float(np.mean(t.problem.follow.duration))
 
 

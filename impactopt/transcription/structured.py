@@ -100,7 +100,7 @@ class StructuredProgram:
         self._c0, self._Q = float(affine.const.sum()), sp.csc_array(quadratic)
 
     def same_numbers(self, other: StructuredProgram) -> bool:
-        """Whether bounds, constants, weights and parameters are those of another program, to rounding."""
+        """True if bounds, constants, weights and parameters equal those of another program, to rounding."""
         mine, its = self._numbers(), other._numbers()
         return len(mine) == len(its) and all(
             a.shape == b.shape and np.allclose(a, b, rtol=1e-12, atol=1e-12)

@@ -1,4 +1,4 @@
-"""What a solve leaves on disk: `solution.npz` with all numbers, and `summary.json` for a glance.
+"""Files of a result: `solution.npz` with all arrays, and `summary.json` with the main figures.
 
 `solution.npz` stands for itself: it holds the summary and the problem file too. Every file is written beside
 its place and then moved there, so that a reader never sees half of one. When new numbers take the place of
@@ -92,17 +92,17 @@ class Record:
 
     @property
     def completed(self) -> bool:
-        """Whether the planned motion is part of the record."""
+        """True if the planned motion is part of the record."""
         return "reference_time" in self.arrays
 
     @property
     def simulated(self) -> bool:
-        """Whether a re-simulation is part of the record."""
+        """True if a re-simulation is part of the record."""
         return "simulated_time" in self.arrays
 
     @property
     def replayed(self) -> bool:
-        """Whether a replay on free soles is part of the record."""
+        """True if a replay on free soles is part of the record."""
         return "replayed_time" in self.arrays
 
 
@@ -172,7 +172,7 @@ def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:
 
 
 def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
-    """What a record keeps of the robot and of where it stands."""
+    """Arrays of a record that describe the robot and its stance."""
     robot, c = problem.robot, problem.coordinates
     out: dict[str, Any] = {
         "joints": np.array(robot.joint_names),
@@ -202,7 +202,7 @@ def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, A
 
 
 def replay_arrays(replay: Any) -> dict[str, Any]:
-    """What a record keeps of a `Simulation` on free soles: motion and forces, by `replayed_*`."""
+    """Arrays of a record that hold a `Simulation` on free soles: motion and forces, as `replayed_*`."""
     left_out = {"v", "demand", "torque", "gear"}
     kept = {name: value for name, value in _numbers(replay).items() if name not in left_out}
     return {f"replayed_{name}": value for name, value in {**kept, "soles": list(replay.soles)}.items()}

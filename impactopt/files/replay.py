@@ -29,8 +29,8 @@ __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "problem_of", "rep
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Planned:
-    """What there is to replay: a record, its problem, the reference that the servo is to follow, and the one
-    that it goes on with if it hits nothing, where the plan has one; settings of a whole-body controller.
+    """Data of a replay: a record, its problem, the servo's reference and, if the plan has one, the reference
+    that follows a missed blow; settings of a whole-body controller.
     """
 
     record: Record
@@ -55,7 +55,7 @@ class Replay:
 
 
 def has_mujoco() -> bool:
-    """Whether the engine "mujoco" can run."""
+    """True if the engine "mujoco" is installed."""
     return importlib.util.find_spec("mujoco") is not None
 
 

@@ -64,7 +64,7 @@ def _apart(told: list[dict[str, Any]]) -> dict[ApartRow, Held]:
 
 
 def _is_of(t: Transcription, record: Record) -> bool:
-    """Whether a program has the record's variables and rows, and they are met as the record says."""
+    """True if a program has the record's variables and constraints, with the violation that it reports."""
     x, rows = record.arrays["solver_x"], record.arrays["solver_multipliers"]
     if (t.program.n, t.program.m) != (len(x), len(rows)):
         return False

@@ -108,7 +108,7 @@ class SolvedFolder:
         return solution, None
 
     def _leaves_of(self, numbers: Path) -> dict[str, Any]:
-        """Of the problem of a result; of one that cannot be read there are none."""
+        """Values in the problem of a result; none if it cannot be read."""
         if numbers not in self._known:
             self._known[numbers] = {}
             with contextlib.suppress(InputError):
@@ -129,7 +129,7 @@ def _leaves(data: Any, above: tuple[str, ...] = ()) -> dict[str, Any]:
 
 
 def _distance(own: dict[str, Any], other: dict[str, Any]) -> float:
-    """Of two problems; inf if more than numbers differ."""
+    """Distance of two problems; inf if more than numbers differ."""
     if own.keys() != other.keys():
         return np.inf
     squares = 0.0

@@ -156,7 +156,7 @@ class Solution(Solved):
 
     @property
     def contact_elements(self) -> list[int]:
-        """Number of collocation elements in each phase of the contact; none for an impact without duration."""
+        """Number of collocation elements in each phase of the contact; none if it has no duration."""
         if not self.problem.lasts:
             return []
         return [len(phase) for phase in self.elements or contact_elements(self.problem)]

@@ -256,7 +256,7 @@ def clear_strike(
 def _clean_strike(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
-    """Strike without penetration (`clear_strike`); a result that still has some does not count as a solution."""
+    """Strike without penetration (`clear_strike`); a result that still has some is no solution."""
     t, result = clear_strike(budget, margins, t, start)
     if margins is None or not result.status.usable:
         return t, result

@@ -1,4 +1,4 @@
-"""Warning about a plan that is limited by the longest permitted contact, which is no property of the impact."""
+"""Warning about a plan limited by the longest permitted contact, which is no property of the impact."""
 
 from __future__ import annotations
 

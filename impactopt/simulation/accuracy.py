@@ -1,4 +1,4 @@
-"""What an engine's steps leave of a replay's impulse uncertain: the replay once more, with other steps."""
+"""Estimates the error of a replay's impulse from an engine's steps, by a second replay with other steps."""
 
 from __future__ import annotations
 

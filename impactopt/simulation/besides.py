@@ -1,4 +1,4 @@
-"""What touches in a MuJoCo replay beside soles and striker."""
+"""Unintended contacts in a MuJoCo replay: all beside those of soles and striker."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Besides:
         data.mocap_pos[self._mocap] = way
 
     def look(self, data: Any, t: float) -> None:
-        """What touches now, at a time [s]; after a step's forces are known."""
+        """Records the contacts at a time [s]; called once a step's forces are known."""
         if not data.ncon:
             return
         contacts = data.contact

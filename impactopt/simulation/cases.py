@@ -73,7 +73,7 @@ class Case:
     overrides: Mapping[str, ArrayLike] = field(default_factory=dict)
 
     def collide(self, model: CollisionModel, *, require_separation: bool = False) -> Collision:
-        """What a model says of it; a contact may outlast the horizon.
+        """Collision that a model predicts for this case; a contact may outlast the horizon.
 
         Raises
         ------
@@ -213,7 +213,7 @@ class _PostureSearch:
         return np.asarray(margin_in(self.polygon, com[None, :2]) - self.inside)
 
     def from_here(self, d: Array) -> Array:
-        """Where SLSQP goes."""
+        """Solution of SLSQP from this initial guess."""
         rules: list[dict[str, Any]] = [
             {"type": "eq", "fun": self.equalities, "jac": lambda x: _slopes(self.equalities, x)}
         ]
@@ -251,7 +251,7 @@ def _slopes(function: Any, x: Array, by: float = 1e-6) -> Array:
 def errors_against(
     result: Collision, reference: Collision, *, torque_limit: ArrayLike | None = None
 ) -> dict[str, float | None]:
-    """How far a model's collision is from a reference's; None where one of them has no such history.
+    """Errors of a model's collision against a reference; None where one of them lacks the history.
 
     * impulse_error_pct, f_max_error_pct : 100 (result - reference) / reference, so positive where the model
       promises too much. The paper's eq. (24) has the other sign.

@@ -1,6 +1,4 @@
-"""How far the bodies of a replay kept from each other, by exact geometry: apart from the engines, which know
-of none of it or of their own.
-"""
+"""Least clearances between the bodies of a replay, by exact geometry that is independent of the engines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What both engines make of their steps: histories, and how far soles and posture moved."""
+"""Histories that both engines record, and the displacements of soles and posture."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class _Replay(MujocoRobot):
         self.start(self.reference_q[0])
 
     def follow(self, reference: Any) -> None:
-        """What servo and controller follow from now on."""
+        """Sets the reference that servo and controller follow from now on."""
         world, self.followed = self.perturbation, reference
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
         self.reference_q = np.asarray(reference.q)
@@ -208,8 +208,9 @@ class _Replay(MujocoRobot):
         return np.vstack([self.sole_ground(), found])
 
     def fallen(self, t: float) -> str:
-        """Whether the base is far from where the reference has it at a time [s]: a plan may bow deeply
-        itself. A robot that recovers comes through what the reference has after the blow later.
+        """Reason why the robot counts as fallen, "" if it stands: the base is far from the reference's at a
+        time [s], which may bow deeply itself. A robot that recovers reaches the reference's postures after
+        the blow later.
         """
         if not self.floating:
             return ""

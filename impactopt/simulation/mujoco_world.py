@@ -156,7 +156,7 @@ def primitive(mujoco: Any, solid: Any) -> dict[str, Any]:
 
 
 def site_name(number: int) -> str:
-    """Of a striker, the first of which is 1."""
+    """Name of a striker's site; the first striker is 1."""
     return "striker" if number == 1 else f"striker {number}"
 
 

@@ -63,16 +63,16 @@ class _World:
         self.motors, self.delay = Motors(robot), Delay(robot)
 
     def follow(self, reference: Any) -> None:
-        """What the servo follows from now on."""
+        """Sets the reference that the servo follows from now on."""
         self.servo, self.followed = Servo(self.robot, reference), reference
 
     def at_start(self, reference: Any) -> _State:
-        """Where the motion begins: at rest, with motors that give what is asked for."""
+        """State at the motion's start: at rest, with motors that give the demanded torque."""
         travel = self.struck.travel_at_start(reference)
         return self._begin(0.0, np.array(reference.q[0]), np.zeros(self.model.nv), travel)
 
     def at_contact(self, reference: Any) -> _State:
-        """Where contact is planned to begin: as the swing's reference ends."""
+        """State at the planned beginning of contact, where the swing's reference ends."""
         k = int(np.flatnonzero(reference.phase == 0)[-1])
         return self._begin(float(reference.contact_start), np.array(reference.q[k]), reference.v[k], 0.0)
 

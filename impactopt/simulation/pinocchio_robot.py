@@ -72,7 +72,7 @@ class Body(ABC):
         )
 
     def placements(self) -> list[pin.SE3]:
-        """Of the held frames in the world, where it has been last."""
+        """Placements of the constrained frames in the world, at the last evaluation."""
         return [pin.updateFramePlacement(self.model, self.data, i).copy() for i in self.frames]
 
     def places(self) -> Array:

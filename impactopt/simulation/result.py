@@ -1,4 +1,4 @@
-"""What a re-simulation is given and what it gives back: numbers only."""
+"""Inputs and results of a re-simulation: numbers only."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ class Simulation:
 
     @property
     def standing(self) -> bool | None:
-        """Whether the robot stands at the end; None where the engine holds its soles to the ground."""
+        """True if the robot stands at the end; None if the engine constrains its soles to the ground."""
         return None if self.fall is None else not self.fall
 
     def zmp(self) -> Array:
@@ -253,7 +253,7 @@ class Simulation:
         return out
 
     def _cut_numbers(self) -> dict[str, Any]:
-        """Of the joint that was cut longest; None where no motor's line is known, 0 where none was cut."""
+        """Summary of the joint that was cut longest; None if no motor's line is known, 0 if none was cut."""
         if not self.cuts:
             return {
                 "motor_cut_ms": None if self.cuts is None else 0.0,

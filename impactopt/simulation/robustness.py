@@ -104,7 +104,7 @@ def _changed(perturbation: Perturbation, numbers: dict[str, Any]) -> Perturbatio
 
 
 class Row(NamedTuple):
-    """What one replay gave: impulse [N s], largest slip and lift of a sole [m]; nan where it has none."""
+    """Result of one replay: impulse [N s], largest slip and lift of a sole [m]; nan where it has none."""
 
     standing: bool
     reason: str
@@ -161,12 +161,12 @@ class Robustness:
         return float(known.std()) if known.size else float("nan")
 
     def reasons(self) -> dict[str, int]:
-        """How often each kind of reason came, most often first; numbers in it are left out."""
+        """Counts of each kind of reason, most frequent first; numbers in it are left out."""
         kinds = (re.sub(r"(?<= )[-+]?(\d[\d.e+-]*|nan|inf)(?=[ ,;:]|$)", "...", text) for text in self.reason)
         return dict(Counter(kind for kind in kinds if kind).most_common())
 
     def table(self) -> dict[str, Array]:
-        """What was drawn, (n,) by name."""
+        """Drawn parameters, (n,) by name."""
         return {
             name: np.array([getattr(c, name) for c in self.perturbations])
             for name in self.drawn_from.bounds()
@@ -209,7 +209,7 @@ class Robustness:
 
 @dataclass(frozen=True, kw_only=True)
 class Shared:
-    """What every replay needs."""
+    """Data that every replay needs."""
 
     robot: Robot
     reference: Any
@@ -221,7 +221,7 @@ class Shared:
 def _simulate(
     robot: Robot, reference: Any, scene: Scene, *, step: float = STEP, **options: Any
 ) -> Simulation:
-    """As `simulate_mujoco`, with draws' own step, which their steps' error is measured from."""
+    """Simulates a draw with the draws' own step, which the step's error is measured from."""
     return simulate_mujoco(robot, reference, scene, step=step, **options)
 
 

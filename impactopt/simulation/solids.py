@@ -1,4 +1,4 @@
-"""What of the robot and of the world can touch in a replay, and what did."""
+"""Collision geometry of the robot and the world in a replay, and contacts between them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Solid:
 
     @cached_property
     def hull(self) -> Any:
-        """Of its vertices, as coal has it."""
+        """Convex hull of its vertices, for coal."""
         assert self.vertices is not None
         points, facets = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
         points.extend(list(self.vertices))
@@ -80,7 +80,7 @@ class Solids:
         )
 
     def without_target(self) -> Solids:
-        """Where there is none."""
+        """Copy without the target's solids."""
         gone = {k for k, s in enumerate(self.solids) if s.of_target}
         return replace(self, pairs=tuple(p for p in self.pairs if not gone & set(p)))
 
@@ -150,7 +150,7 @@ class Touched:
     force: float | None = None
 
     def summary(self) -> dict[str, Any]:
-        """As in ``summary.json``."""
+        """JSON form, as it stands in ``summary.json``."""
         out = {
             "one": self.one,
             "other": self.other,

@@ -1,4 +1,4 @@
-"""What is hit, as numbers: the contact's force and the target's motion under it."""
+"""Contact law and target dynamics, evaluated numerically for the replay engines."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MOST = 20_000  # places within one step: a contact that needs more is no contact
 
 @dataclass(frozen=True)
 class Push:
-    """What a contact has come to within one step of an engine.
+    """Contact forces and target motion within one step of an engine.
 
     Of each striker (h,): forces [N], their means over the step, and over its first half (halves); peaks [N],
     when their sum is largest; depths [m] in the target, at the end. state, travel [m]: of the target, then;
@@ -101,7 +101,7 @@ class Struck:
         return np.array([float(force(depth, rate, numbers)) if depth > 0 else 0.0 for depth, rate in pairs])
 
     def near(self, depths: Array, speeds: Array, state: Array, step: float) -> bool:
-        """Whether any of them may touch the target within a step [s]."""
+        """True if any of the strikers may touch the target within a step [s]."""
         speed, pairs = self.speed(state), zip(depths.tolist(), speeds.tolist(), strict=True)
         return any(depth + NEAR * step * (abs(rate - speed) + 1.0) > 0 for depth, rate in pairs)
 

@@ -132,5 +132,5 @@ class MotionPhase(ABC):
 
 
 def at_node(parts: list[Index]) -> list[Determined]:
-    """Variables that a node's constraints determine, one after the other; the last of all nodes in one step."""
+    """Variables that a node's constraints determine, in order; the last of all nodes in one step."""
     return [determined(Turn.NODE, part, k) for k, part in enumerate(parts, -len(parts))]

@@ -88,7 +88,7 @@ def add_cone_rows(
 
 
 def _outside_cone(facet: Array, normal: Affine, friction: float) -> Measure:
-    """Measure of a facet (6,) of the cone of corners' forces; ``normal``: the normal force over the weight."""
+    """Measure of a facet (6,) of the cone of corners' forces; ``normal``: normal force over weight."""
     along_sole, tilting = np.hypot(*facet[:2]), np.hypot(*facet[3:5])
     if along_sole < 1e-9 and abs(facet[5]) < 1e-9:
         return Measure("mm", 1e3 / tilting, "outside", normal, 0.05)  # moment over force: the CoP

@@ -17,7 +17,7 @@ ALIKE = 3.0  # factor between numbers that are
 
 
 def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
-    """Least duration [s] of each phase of the contact; ``natural``: that of the last phase of a point mass."""
+    """Least duration [s] of each contact phase; ``natural``: that of a point mass's last phase."""
     target, (shortest, longest) = problem.target, problem.contact_duration
     if not shortest:  # no bound: far below what a blow takes, as rows are over these times
         shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)

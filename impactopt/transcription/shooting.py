@@ -58,7 +58,7 @@ class _Called:
 
 
 class State(NamedTuple):
-    """State at contact: v (nv), leg accelerations (nl) while coasting; derivatives of both by y, ydot, legs."""
+    """State at contact: v (nv), leg accelerations (nl) while coasting; slopes of both by y, ydot, legs."""
 
     v: Array
     bend: Array

@@ -1,4 +1,4 @@
-"""Where a drafted problem hits: ahead of an arm, within its reach, with room to swing."""
+"""Placement of a drafted problem's target: ahead of an arm, within its reach, with room to swing."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def _target_mass(robot: Robot) -> float:
 
 
 def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
-    """What may strike, right or longest first; and all strikers."""
+    """Arms that may strike, right or longest first; and all strikers."""
     model, limbs = drafted.robot.model, drafted.arms
     names = sides(model, [limb.tip for limb in limbs])
     names = [f"{name}_hand" if name in ("left", "right") else name for name in names]
@@ -232,7 +232,7 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
 
 
 def robot_kind(drafted: Drafted) -> str:
-    """What the file is."""
+    """Format of the robot's description."""
     return "MJCF" if drafted.mjcf else "URDF"
 
 
@@ -254,7 +254,7 @@ def _frames(robot: Robot) -> Iterator[str]:
 
 
 def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[str]:
-    """What a user should know before the first plan."""
+    """Notes for the user before the first plan."""
     stands = "on two legs" if drafted.legs else "on a fixed base"
     joints, striker = robot.n - int(robot.hinges.sum()), data["problem"]["striker"]
     yield f"{robot.name}: {joints} joints, {stands}; {striker!r} strikes"
@@ -292,6 +292,6 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
 
 
 def _wide(polygon: list[list[float]]) -> bool:
-    """Whether a sole is longer across than ahead, as no foot is."""
+    """True if a sole is longer across than ahead, as no foot is."""
     length, width = np.ptp(np.array(polygon), axis=0)
     return bool(width > length)

@@ -1,4 +1,4 @@
-"""What a description lacks of its drives: guesses, each of which says that it is one."""
+"""Default drive parameters that a robot description lacks, each marked as a guess."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a bolted arm is strong: blows estimated in many postures, the best of them solved as strikes."""
+"""Strongest postures of a bolted arm: blows estimated in many postures, the best solved as strikes."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _problem(robot: Robot, arm: Arm, blow: Blow, given: Mapping[str, Any]) -> Im
 
 
 def _touches(problem: ImpactProblem, *postures: Array) -> bool:
-    """Whether bodies touch in one of these configurations (nq,), before contact."""
+    """True if bodies touch in one of these configurations (nq,), before contact."""
     none: Array = np.zeros(len(postures))
     at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
     return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)

@@ -1,4 +1,4 @@
-"""What is exported: a plan's motions, the robot's servo, the target, and all that is no history in words."""
+"""Content of an export: a plan's motions, the robot's servo, the target, and metadata in words."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PHASES = ("swing", "contact", "follow-through")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Export:
-    """What all writers get.
+    """Data that all writers get.
 
     planned : the plan, its problem and its references.  joints : names, in the order of all columns.
     order (n,) : where these are in the robot's own arrays.  rate [Hz].
@@ -173,7 +173,7 @@ def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] |
 
 
 def joint_order(robot: Robot, joints: Sequence[str] | None) -> NDArray[np.intp]:
-    """Where the joints of an export are in the robot's arrays.
+    """Indices of an export's joints in the robot's arrays.
 
     Raises
     ------

@@ -22,7 +22,7 @@ Body: Any = section_of(TargetBody)
 
 
 class Target(Section):
-    """What is hit; the keys depend on its kind."""
+    """Target of the impact; the keys depend on its kind."""
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "target_kind"
@@ -38,7 +38,7 @@ class _KnownTarget(Target):
 
 
 class Contact(Section):
-    """What is between hand and target; the keys depend on the law."""
+    """Contact between hand and target; the keys depend on the law."""
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "law"

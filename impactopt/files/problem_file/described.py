@@ -41,12 +41,12 @@ def sections_of(name: str, doc: str, kinds: Mapping[str, type]) -> Any:
 
 
 def one_of(words: Iterable[str]) -> Any:
-    """What pydantic takes for one of these words."""
+    """Type annotation for one of these words."""
     return Literal[tuple(words)]
 
 
 def _value(hint: Any, told: About) -> Any:
-    """What pydantic takes for a field: its annotation without None, with its range."""
+    """Type annotation of a field for pydantic: its own without None, with its range."""
     kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     kind = next(k for k in kinds if k is not type(None))
     if told.by_joint:

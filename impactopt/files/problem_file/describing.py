@@ -1,4 +1,4 @@
-"""What keys and sections are, in words: for comments in files and for the reference."""
+"""Descriptions of keys and sections, for comments in files and for the reference."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["about_section", "comment_at"]
 
 
 def about_section(section: type[BaseModel]) -> str:
-    """What a section is about: its docstring's first sentence."""
+    """Description of a section: its docstring's first sentence."""
     return " ".join((section.__doc__ or "").split("\n\n")[0].split()).rstrip(".")
 
 

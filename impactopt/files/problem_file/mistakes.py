@@ -1,4 +1,4 @@
-"""What is wrong in a TOML file, in words: where, what was meant, and what is allowed."""
+"""Diagnostics of a TOML file: place of a mistake, its probable intention, and permitted values."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def report_mistakes(where: str, lines: Mapping[Place, int], mistakes: Iterable[M
 
 
 def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]:
-    """What pydantic found wrong with a file that `model` describes."""
+    """Mistakes that pydantic found in a file that `model` describes."""
     out, meant = [], set()
     for e in error.errors(include_url=False):
         if e["type"] == "extra_forbidden":

@@ -1,4 +1,4 @@
-"""From a problem file to a problem, in two steps: the text is checked, and then the robot is built."""
+"""Reads a problem file in two steps: the text is checked, and then the robot is built."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ class _Collector:
         ]
 
     def attempt(self, place: tuple[str, ...], make: Callable[[], _T]) -> _T | None:
-        """What `make` gives; None, and a mistake at `place`, if it raises an InputError."""
+        """Result of `make`; None, and a mistake at `place`, if it raises an InputError."""
         try:
             return make()
         except InputError as error:

@@ -137,7 +137,7 @@ def _part(header: str, section: type[BaseModel]) -> str:
 
 
 def _allowed(info: FieldInfo) -> str:
-    """What a key may hold."""
+    """Permitted values of a key."""
     for check in reversed(info.metadata):
         if isinstance(check, (AfterValidator, PlainValidator)) and check.func.__doc__:
             return _sentence(check.func.__doc__)

@@ -1,4 +1,4 @@
-"""From a robot to the section [robot]: what it was made from, and what differs from that."""
+"""Writes a robot as section [robot]: its source, and the differences from that."""
 
 from __future__ import annotations
 

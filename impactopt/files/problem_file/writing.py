@@ -1,4 +1,4 @@
-"""From a problem to its file: what differs from the defaults, with a comment to each key."""
+"""Writes a problem to a file: the differences from the defaults, with a comment to each key."""
 
 from __future__ import annotations
 

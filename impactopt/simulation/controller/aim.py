@@ -1,4 +1,4 @@
-"""What a controller tracks at one instant."""
+"""Reference of a controller at one instant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the controller tracks: the plan's motion, by what it has felt of the blow."""
+"""Reference of the controller: the plan's motion, switched by the impact that the hand senses."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Target:
         return np.concatenate(parts)
 
     def feel(self, t: float, touching: bool) -> None:
-        """What the hand feels at a time [s]."""
+        """Updates the contact state from the hand's sensor at a time [s]."""
         if touching and self.before:
             self.felt = t
         elif not touching and self.struck:
@@ -83,21 +83,21 @@ class Target:
 
     @property
     def before(self) -> bool:
-        """Whether the hand has felt nothing yet."""
+        """True if the hand has sensed no contact yet."""
         return math.isnan(self.felt)
 
     @property
     def bounced(self) -> bool:
-        """Whether the hand was in contact, and is free again."""
+        """True if the hand was in contact, and is free again."""
         return math.isfinite(self.free)
 
     @property
     def struck(self) -> bool:
-        """Whether the hand is in contact, for the first time."""
+        """True if the hand is in contact, for the first time."""
         return math.isfinite(self.felt) and math.isnan(self.free)
 
     def near_blow(self, t: float, window: float) -> bool:
-        """Whether the blow is on, or within a window [s] of it."""
+        """True during the impact and within a window [s] of it."""
         if math.isfinite(self.felt):
             return math.isnan(self.free) or t < self.free + window
         return bool(self.contact[0] - window <= t <= self.contact[1] + window)
@@ -109,7 +109,7 @@ class Target:
         return self.free if math.isfinite(self.free) else self.felt + 2 * (end - start) + PATIENCE
 
     def recovers(self, t: float) -> bool:
-        """Whether the robot recovers from the blow."""
+        """True once the robot recovers from the impact."""
         return self.recovery is not None and bool(t >= self.over + self.recovery.start)
 
     def clock(self, t: float) -> tuple[float, int]:
@@ -122,7 +122,7 @@ class Target:
         return (t, self.last) if t < end + PATIENCE else (t, final)
 
     def at(self, t: float) -> Aim:
-        """What to track at a time [s]."""
+        """Reference at a time [s]."""
         if self.recovery is None or not self.recovers(t):
             return self._planned(*self.clock(t))
         begun = self.over + self.recovery.start

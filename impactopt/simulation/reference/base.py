@@ -1,4 +1,4 @@
-"""What the reference models share: gains, friction, tolerance, and the search for what meets it."""
+"""Base of the reference models: gains, friction, tolerance, and the search for the step that meets it."""
 
 from __future__ import annotations
 

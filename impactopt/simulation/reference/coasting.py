@@ -1,4 +1,4 @@
-"""How a reference that coasts with its soles in place bends: what a plan's servo holds on to in contact."""
+"""Accelerations of a reference that coasts with its soles in place, as a plan's servo keeps it in contact."""
 
 from __future__ import annotations
 

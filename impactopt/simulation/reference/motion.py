@@ -41,7 +41,7 @@ _HAIR, _AHEAD = 1e-12, 1e-6
 
 
 class Instant(NamedTuple):
-    """What a record keeps of an instant. The wrenches are on the held frames, at their `places`."""
+    """Recorded quantities of an instant. The wrenches are on the constrained frames, at their `places`."""
 
     time: float
     force: float
@@ -88,8 +88,9 @@ class Run(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """How large and how fast a contact is: [s], [m/s], [N s], of the target's state; and 1 / mass of hand and
-    target together [1/kg]."""
+    """Scales of a contact: [s], [m/s], [N s], of the target's state; and 1 / mass of hand and target together
+    [1/kg].
+    """
 
     time: float
     speed: float

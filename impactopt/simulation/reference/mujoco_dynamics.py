@@ -137,7 +137,9 @@ class HeldRobot(MujocoRobot):
         self.welds.put(self.data)
 
     def wrenches(self) -> tuple[Array, Array]:
-        """Of the ground on the welded frames (6 a frame), and their places, at the last step's start."""
+        """Wrenches of the ground on the welded frames (6 a frame), and their places, at the last step's
+        start.
+        """
         found, places = self.welds.wrenches(self.data)
         return found.ravel(), places
 

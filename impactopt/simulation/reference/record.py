@@ -1,4 +1,4 @@
-"""From the instants of a collision to its result."""
+"""Assembles a collision's result from its recorded instants."""
 
 from __future__ import annotations
 

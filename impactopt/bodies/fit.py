@@ -170,7 +170,7 @@ def _greedy(covers: NDArray[np.bool_], most: int) -> list[int]:
 
 
 def _depth(hull: ConvexHull, points: Array) -> Array:
-    """How deep (k,) [m] points are in the hull, < 0 outside."""
+    """Depth (k,) [m] of points in the hull, < 0 outside."""
     return np.asarray(-(points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1))
 
 

@@ -44,7 +44,7 @@ def find_mesh(name: str, urdf: Path) -> Path:
 
 
 def _package_folders() -> Iterator[Path]:
-    """Where packages of meshes may be, beside a URDF's own folders."""
+    """Folders that packages of meshes may be in, beside a URDF's own folders."""
     for place in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
         yield from (Path(place), Path(place).parent)  # it holds packages, or it is one
     for place in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):

@@ -1,4 +1,4 @@
-"""What a robot's links are made of, as convex hulls: from its own files, or of its links' inertia."""
+"""Convex hulls of a robot's links, from its own files or from the links' inertia."""
 
 from __future__ import annotations
 

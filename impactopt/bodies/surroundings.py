@@ -1,4 +1,4 @@
-"""What a picture shows of the world: the bodies that a plan keeps off, and how a blow moves them."""
+"""Drawable bodies of the world, which a plan keeps clear of, and their motion under an impact."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Part:
 
 
 def surroundings_of(world: Sequence[WorldBody]) -> list[Part]:
-    """What is drawn of `ImpactProblem.world`: all but the ground, and cores, which are no thing.
+    """Drawable parts of `ImpactProblem.world`: all but the ground, and cores, which are no objects.
 
     A board that lies on two supports is drawn as two halves. Each tips over the inner edge of its support as
     far as the blow has moved the middle, so that it bends a little, and opens when it is broken.

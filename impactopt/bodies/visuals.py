@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes in its URDF or MJCF, or boxes of its links' inertia."""
+"""Visual shapes of a robot: those in its URDF or MJCF, or boxes of its links' inertia."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
 
 
 def _from_mjcf(robot: Robot, mjcf: str) -> list[Visual]:
-    """What is there to be seen of a link; where that is nothing, what collides."""
+    """Visual geoms of each link; its collision geoms if it has none."""
     geoms = geoms_of(robot.model, mjcf)
     seen = {geom.link for geom in geoms if not geom.collides}
     return [
@@ -111,7 +111,7 @@ def _of_tool(robot: Robot, tool: Tool) -> Iterator[Visual]:
 
 
 def _bones_to(robot: Robot, strikers: Iterable[Striker]) -> list[Visual]:
-    """From the frame that each is given in to the striking point, with a ball there."""
+    """Sticks from the frame of each striker to its striking point, with a ball there."""
     model, found = robot.model, []
     for striker in strikers:
         frame = model.frames[model.getFrameId(striker.frame)]

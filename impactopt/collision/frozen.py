@@ -234,7 +234,7 @@ class FrozenDynamics:
 
 
 class _TreeQuantities:
-    """What depends on the robot's tree, each as an SX function of q, v and the normal."""
+    """Quantities that depend on the robot's tree, each as an SX function of q, v and the normal."""
 
     def __init__(self, robot: Robot, held: tuple[str, ...], soles: tuple[str, ...], frame: str) -> None:
         self.robot, self.held, self.soles, self.frame = robot, held, soles, frame

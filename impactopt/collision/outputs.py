@@ -1,4 +1,4 @@
-"""What a collision model can give, each built only when asked for."""
+"""Outputs of a collision model, each built only on request."""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Collision:
-    """What happened from contact to separation. Histories have k entries, at the steps, first at contact,
-    last at separation.
+    """Result of a collision from contact to separation. Histories have k entries, at the steps, first at
+    contact, last at separation.
 
     Attributes
     ----------
@@ -76,7 +76,8 @@ class Collision:
 
     @classmethod
     def from_outputs(cls, found: dict[str, Array], target: Target) -> Collision:
-        """From the arrays of a collision function, without instants that repeat the one before.
+        """Makes a result from the arrays of a collision function, without instants that repeat the one
+        before.
 
         What judges a result, `step_error`, is no part of it.
         """

@@ -1,4 +1,4 @@
-"""How a held robot's striking point can be moved, and what torque lets it move on, compiled for many states.
+"""Striking-point mobility and coasting torques of a constrained robot, compiled for many states.
 
 `impactopt.kinematics.held` has the same for one state, by Pinocchio and least squares; the two are tested
 against each other. That takes some milliseconds a state, which for millions of them would be hours.
@@ -48,7 +48,7 @@ def striking_functions(robot: Robot, *, striker: str, stance: Stance) -> dict[st
 
 
 class _StrikingGraphs:
-    """What depends on the robot's tree in SX, dense algebra in MX, as in `FrozenDynamics`."""
+    """Quantities that depend on the robot's tree in SX, dense algebra in MX, as in `FrozenDynamics`."""
 
     def __init__(self, robot: Robot, held: tuple[str, ...], frame: str) -> None:
         self.rb, self.n, self.base = RigidBody(robot.model), robot.n, robot.nv - robot.n

@@ -1,4 +1,4 @@
-"""What an `impactopt.ImpactProblem` refuses: parts that do not go together."""
+"""Checks by which an `impactopt.ImpactProblem` refuses parts that do not go together."""
 
 from __future__ import annotations
 

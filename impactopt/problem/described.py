@@ -15,7 +15,7 @@ __all__ = ["described"]
 
 
 def described(problem: ImpactProblem) -> dict[str, Any]:
-    """As of `ImpactProblem.describe`."""
+    """Summary of a problem; see `ImpactProblem.describe`."""
     p = problem
     out: dict[str, Any] = {
         "name": p.name,

@@ -1,4 +1,4 @@
-"""What is sound by itself and will not work all the same: found before anything is planned."""
+"""Plausibility checks: valid problems that cannot be solved, found before anything is planned."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DRAWN = 3  # postures that are tried beside the two there are
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """What no solve can mend, first what to mend first: soles of a giant, a start beyond the target, a
+    """Reasons why no solve can succeed, most basic first: soles of a giant, a start beyond the target, a
     point out of balance.
     """
     found = list(giant_soles(problem.robot)) or [_beyond(problem), _out_of_balance(problem)]
@@ -49,8 +49,8 @@ def _beyond(problem: ImpactProblem) -> str:
 
 
 def too_weak(problem: ImpactProblem) -> str:
-    """Whether no wrenches of what is held let the torques hold the robot at rest where it starts, in words;
-    "" if some do. A motion that falls from there at once may be planned all the same.
+    """Message if no wrenches on the constrained frames let the torques hold the robot at rest at its
+    start; "" otherwise. A motion that falls from there at once may be planned all the same.
     """
     robot, c, limit = problem.robot, problem.coordinates, problem.term(TorqueLimit).fraction
     q = problem.start_posture

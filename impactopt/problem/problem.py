@@ -248,7 +248,7 @@ class ImpactProblem:
 
     @property
     def lasts(self) -> bool:
-        """Whether the model of the collision gives the contact a duration."""
+        """True if the model of the collision gives the contact a duration."""
         return self.collision not in INSTANT
 
     @property
@@ -263,12 +263,12 @@ class ImpactProblem:
 
     @property
     def of_drives(self) -> bool:
-        """Whether a term is about motors or gears."""
+        """True if a term is about motors or gears."""
         return any(term.of_drives for term in self.active_terms)
 
     @property
     def first_instant(self) -> bool:
-        """Whether a term looks at the first instant of a contact that has a force at once."""
+        """True if a term needs the first instant of a contact whose force begins with a jump."""
         wanted = self.lasts and any(term.first_instant for term in self.active_terms)
         return wanted and float(self.law.branch(0.0, 1.0, True)) != 0.0
 
@@ -290,7 +290,7 @@ class ImpactProblem:
 
     @cached_property
     def hash(self) -> str:
-        """What this problem is, in 16 hexadecimal digits: see `impactopt.problem.hashing.problem_hash`."""
+        """Hash of this problem, 16 hexadecimal digits: see `impactopt.problem.hashing.problem_hash`."""
         return problem_hash(self)
 
     @cached_property
@@ -350,7 +350,7 @@ class ImpactProblem:
 
     @property
     def keeps_apart(self) -> bool:
-        """Whether any two bodies are not to touch."""
+        """True if any two bodies must not touch."""
         return self.self_collision.enabled or self.keep_out.enabled
 
     @property

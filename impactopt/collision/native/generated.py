@@ -1,4 +1,4 @@
-"""What CasADi writes of the native collision: the robot's tree, and law and target."""
+"""Generated C code of the native collision: the robot's tree, and law and target."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def _side(name: str) -> str:
 
 
 def _face(points: Array, turn: Array) -> Array:
-    """Outward normal (3,) of a foot's largest flat face that looks down; turn (3, 3) : rotation of its joint."""
+    """Outward normal (3,) of a foot's largest flat face that looks down; turn (3, 3) : its joint's."""
     hull = ConvexHull(points)
     corners = points[hull.simplices]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2

@@ -1,4 +1,4 @@
-"""What a plan must respect, as named terms with units, one a file; a problem holds one of each kind at most.
+"""Requirements of a plan as named terms with units, one a file; a problem holds one of each kind at most.
 
 `base` says what a term has. DEFAULT_TERMS hold in every problem, and their rows are in the transcription; the
 others of TERMS bring their own. ON_DEMAND_TERMS hold in every problem too, but a program has their rows only

@@ -1,4 +1,4 @@
-"""What every term has: its name and unit, how its numbers are checked, and where its rows come from."""
+"""Base class of terms: name and unit, checks of parameters, and constraints."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Term(Described):
 
     @property
     def active(self) -> bool:
-        """Whether it is not switched off, as a field ``enabled`` may."""
+        """True unless the term is switched off, as by a field ``enabled``."""
         return bool(getattr(self, "enabled", True))
 
     @property

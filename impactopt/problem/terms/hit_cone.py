@@ -1,4 +1,4 @@
-"""From where it hits, if that is free."""
+"""Cone of free directions of the impact."""
 
 from __future__ import annotations
 

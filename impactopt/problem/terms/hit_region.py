@@ -1,4 +1,4 @@
-"""Where it hits, if that is free."""
+"""Region of free hit points."""
 
 from __future__ import annotations
 

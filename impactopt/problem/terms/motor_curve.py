@@ -1,4 +1,4 @@
-"""How much torque is left of a motor at its speed."""
+"""Torque limit of a motor at its speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How fast torques may change."""
+"""Limit on the rate of torques."""
 
 from __future__ import annotations
 

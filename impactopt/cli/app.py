@@ -80,7 +80,9 @@ def main() -> None:
 
 
 def program() -> typer.Typer:
-    """What `main` runs, for those below that run it too; they get it as the context's `obj`."""
+    """Command-line program that `main` runs, for callers below that run it too; they get it as the
+    context's `obj`.
+    """
     return app
 
 

@@ -63,7 +63,7 @@ def check(
 
 
 def _strength(problem: ImpactProblem) -> str:
-    """What share of the hardest blow nearby this one is, by estimates; "" where that is not known."""
+    """Estimated fraction of the hardest blow nearby that this one reaches; "" if that is not known."""
     from impactopt.problem.strength import best_share
 
     found = best_share(problem)
@@ -75,7 +75,9 @@ def _strength(problem: ImpactProblem) -> str:
 
 
 def _lost_meshes(robot: Robot) -> str:
-    """Which meshes of a robot are nowhere or unreadable, and what that means; "" if all are there."""
+    """Message about a robot's meshes that are missing or unreadable, and the consequences; "" if there are
+    none.
+    """
     from impactopt.bodies.urdf import lost_meshes, urdf_root
 
     root = None if robot.urdf is None else urdf_root(Path(robot.urdf))

@@ -122,7 +122,7 @@ def _live(what: Path, problem: Path | None, port: int | None, open_: bool) -> No
 
 
 def _page(what: Path, problem: Path | None, port: int) -> LiveLook | LiveBlow:
-    """Of a result, or of a problem file's collision."""
+    """Page of a result, or of a problem file's collision."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file
     from impactopt.files.replay import load_planned

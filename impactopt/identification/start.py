@@ -1,4 +1,4 @@
-"""Which numbers of a law are looked for, and where the search for them begins."""
+"""Free parameters of a law, and the initial guess of their fit."""
 
 from __future__ import annotations
 

@@ -53,12 +53,12 @@ class Leg:
 
     @property
     def end(self) -> str:
-        """What rows and variables call what is held."""
+        """Name of the constrained end in constraints and variables."""
         return f"{self.name} {'grip' if self.sole is None else 'sole'}"
 
     @property
     def limb(self) -> str:
-        """What rows call what holds it."""
+        """Name of the constrained limb in constraints."""
         return f"{self.name} {'arm' if self.sole is None else 'leg'}"
 
 
@@ -148,7 +148,7 @@ class StanceCoordinates:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """What is held, by the model's frames: soles first, then hands."""
+        """Constrained frames of the model: soles first, then hands."""
         return tuple(leg.frame for leg in self.legs)
 
     # ------------------------------------------------------------------ symbolic
@@ -309,7 +309,7 @@ class StanceCoordinates:
     # ------------------------------------------------------------------ numeric
     @cached_property
     def closing(self) -> Closing:
-        """What closes the legs, in numbers."""
+        """Numerical solver of the legs' closure."""
         return Closing(self)
 
     def split(self, q_pin: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""What a held robot's striking point weighs, how it can be moved, and what torque lets it move on.
+"""Effective mass, mobility and coasting torque of a constrained robot's striking point.
 
 In numbers for one configuration, by Pinocchio and least squares. For many of them, and for gradients,
 there are compiled graphs, `impactopt.collision.effective_mass` and `impactopt.collision.striking`; tests
@@ -36,7 +36,7 @@ class Held:
 
     @classmethod
     def at(cls, model: pin.Model, q: Array, frames: Sequence[str], striker: str) -> Held:
-        """Of a configuration (nq,), with frames by their names in the model."""
+        """Quantities at a configuration (nq,), with frames by their names in the model."""
         data = model.createData()
         upper = np.triu(pin.crba(model, data, q))
         rows = _jacobians(model, q, [*frames, striker])

@@ -1,4 +1,4 @@
-"""What holds the robot during an impact: its soles, exactly or by the paper's virtual base, or a fixed base.
+"""Stance of the robot in an impact: soles, fixed exactly or by the paper's virtual base, or a fixed base.
 
 The virtual base (paper, eqs. 1-4) adds a mass M_g and an inertia I_g E to each held sole. That equals
 holding the sole by a constraint with the compliance 1/M_g, 1/I_g on the diagonal of its inverse inertia J
@@ -20,7 +20,7 @@ __all__ = ["BothSoles", "FixedBase", "Free", "OneSole", "Stance", "usual_stance"
 
 
 class Stance(ABC):
-    """What holds the robot."""
+    """Base class of stances: frames of the robot that are fixed to the world."""
 
     @abstractmethod
     def soles(self, robot: Robot) -> tuple[Sole, ...]:

@@ -33,7 +33,9 @@ _ENDLESS = np.pi  # [rad] of a joint without limits
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blow:
-    """What came of a posture. q (nq): as drawn; collision: None where there is none, and why says so."""
+    """Collision of a posture. q (nq): as drawn; collision: None if there is none, and why gives the
+    reason.
+    """
 
     q: Array | None = None
     collision: Collision | None = None

@@ -1,4 +1,4 @@
-"""Where everything is at an instant of a motion: between the instants of its track."""
+"""State of a motion at an instant, interpolated between the instants of its track."""
 
 from __future__ import annotations
 

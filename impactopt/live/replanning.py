@@ -1,4 +1,4 @@
-"""From a wish to a plan: bent from the first plan, or solved from the last one."""
+"""Re-plans for a request: by a parametric step from the first plan, or by a solve from the last one."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-3}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Answer:
-    """What came of a wish.
+    """Answer to a request.
 
     solution, track, margins : the plan, its motion, its `Plan.margins`; None where there is none.  seconds :
     it took.  why : there is none, with the worst rows.
@@ -94,7 +94,7 @@ class Replanning:
 
 
 def _reference(plan: Plan) -> Trajectory:
-    """As coarse as a picture may be: it costs as much as some iterations."""
+    """Reference of a plan, coarse enough for a picture: computing it costs as much as some iterations."""
     duration = plan.compression + plan.restitution
     return plan.trajectory(step=float(np.clip(duration / _IN_CONTACT, *_STEPS)), hold=0.2)
 

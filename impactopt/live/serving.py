@@ -110,7 +110,7 @@ def _guarded(token: str) -> Iterator[list[bool]]:
 
 
 def _allowed(request: Any, token: str) -> bool:
-    """Whether a request knows the token, and comes from no page of another origin."""
+    """True if a request has the token, and comes from no page of another origin."""
     first = request.path.partition("?")[0].lstrip("/").partition("/")[0]
     if not secrets.compare_digest(first.encode(), token.encode()):
         return False

@@ -1,4 +1,4 @@
-"""What a live look says of a plan, as Markdown."""
+"""Summary of a plan for the live page, as Markdown."""
 
 from __future__ import annotations
 

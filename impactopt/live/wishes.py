@@ -1,4 +1,4 @@
-"""What a live look can ask for: another hit point, and other numbers of the problem."""
+"""Requests of the live page: another hit point, and other parameters of the problem."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Wish:
     numbers: tuple[tuple[str, float], ...]
 
     def changes(self, problem: ImpactProblem) -> dict[str, Any]:
-        """What is other than in this problem: arguments of `Solution.moved`."""
+        """Differences from this problem: arguments of `Solution.moved`."""
         own = wish_of(problem)
         out: dict[str, Any] = {} if self.point == own.point else {"point": np.array(self.point)}
         return out | dict(sorted(set(self.numbers) - set(own.numbers)))

@@ -1,4 +1,4 @@
-"""What a report plots: for each chart a description and the arrays that it names."""
+"""Charts of a report: for each one a description and the arrays that it names."""
 
 from __future__ import annotations
 

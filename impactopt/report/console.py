@@ -1,4 +1,4 @@
-"""What a person sees in the terminal: progress while a problem is solved, and the results as a table."""
+"""Terminal output: progress while a problem is solved, and the results as a table."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table
 
 
 def verdict_table(verdict: Mapping[str, Any]) -> Table:
-    """What was verified, the worst first; `verdict` as in `impactopt verify --json`."""
+    """Table of a verification, the worst first; `verdict` as in `impactopt verify --json`."""
     kkt = "not computed" if verdict["kkt"] is None else f"KKT residual {verdict['kkt']:.2g}"
     words = "ok" if verdict["ok"] else "not ok"
     table = Table(title=_plain(f"{words}; {kkt}"), title_justify="left")
@@ -204,7 +204,7 @@ def identified_table(found: Mapping[str, Any]) -> Table:
 
 
 def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
-    """What came of each start; `starts` as in a summary."""
+    """Table of the starts' results; `starts` as in a summary."""
     table = Table(title="starts", title_justify="left")
     for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
         table.add_column(name, justify="left" if name in ("start", "status") else "right")
@@ -236,7 +236,7 @@ def _add(table: Table, row: Row) -> None:
 
 
 def told_touches(summary: Mapping[str, Any]) -> str:
-    """What a plan's bodies do to each other, in a sentence; "" where nothing touches anything."""
+    """Sentence about contacts between a plan's bodies; "" if there are none."""
     touches = summary.get("contacts_besides") or ()
     if not touches:
         return ""
@@ -250,13 +250,13 @@ def told_touches(summary: Mapping[str, Any]) -> str:
 
 
 def told_off(summary: Mapping[str, Any]) -> str:
-    """Which bounds of every problem a plan was made without, in a sentence; "" where none is off."""
+    """Sentence about the standard bounds that a plan was made without; "" if all are on."""
     off = summary.get("problem", {}).get("off") or ()
     return f"switched off: {', '.join(off)}" if off else ""
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
-    """What is not met, worst first: a row for each term."""
+    """Table of violations, worst first, one a term."""
     table = Table(title="what is not met, worst first", title_justify="left")
     table.add_column("row", overflow="fold")
     table.add_column("by how much", overflow="fold")

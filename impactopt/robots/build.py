@@ -1,4 +1,4 @@
-"""From files and values by joint to a `pin.Model` and arrays: what `Robot`'s constructors are made of."""
+"""Builds a `pin.Model` and arrays from files and values by joint, for `Robot`'s constructors."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def set_friction(model: pin.Model, viscous: Array, dry: Array) -> None:
 
 
 def frictions(model: pin.Model, joints: Sequence[str]) -> tuple[Actuator, ...]:
-    """Of each joint an `Actuator` of which only the friction is known, the model's."""
+    """Actuators of which only the friction is known, the model's, one a joint."""
     out = []
     for name, viscous, dry in zip(
         joints, *(x[model.nv - len(joints) :] for x in friction(model)), strict=True

@@ -1,4 +1,4 @@
-"""What has to hold of a robot and its configurations; every failure names the thing and the mend."""
+"""Checks of a robot and its configurations; every failure names the thing and the fix."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def hinged(model: pin.Model, soles: Sequence[Sole]) -> pin.Model:
 def with_hinges(
     model: pin.Model, soles: Sequence[Sole], numbers: dict[str, Any], postures: dict[str, Array]
 ) -> tuple[pin.Model, dict[str, Any], dict[str, Array]]:
-    """As `hinged`, with numbers by joint, drives and postures of all joints."""
+    """Model with hinges (`hinged`), and numbers by joint, drives and postures of all joints."""
     whole, torque = hinged(model, soles), hinge_torque(model)
     known: dict[str, dict[str, Any]] = {}
     for sole in soles:

@@ -1,4 +1,4 @@
-"""What a motion asks of gears and motors: torque through the gear, use of the motor's line, power, jumps."""
+"""Gear and motor loads of a motion: torque through the gear, use of the motor's line, power, jumps."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _efforts(robot: Robot, torque: ArrayLike, velocity: ArrayLike) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DriveLoads:
-    """What gears and motors bear at most in a motion, by joint; nan where it is not known, or nothing drives.
+    """Peak loads of gears and motors in a motion, by joint; nan for a joint without data or without a drive.
 
     joints : their names.  gear_limit (n,) : `Robot.gear_limit`.
     gear (n,) : torque through the gear over the torque limit.  motor (n,) : as of `motor_use`.  power (n,)
@@ -66,8 +66,8 @@ class DriveLoads:
     def of(
         cls, robot: Robot, *, gear: ArrayLike, torque: ArrayLike, velocity: ArrayLike, jump: ArrayLike
     ) -> DriveLoads:
-        """From histories: gear [N m] of torque through the gears, torque [N m] of the servos, velocity
-        [rad/s], each (k, n); jump (n,) [rad/s].
+        """Loads from histories: gear [N m] of torque through the gears, torque [N m] of the servos,
+        velocity [rad/s], each (k, n); jump (n,) [rad/s].
         """
         driven = np.where(robot.passive, np.nan, 1.0)
         return cls(
@@ -95,7 +95,7 @@ class DriveLoads:
         return out
 
     def beyond_peak(self) -> str:
-        """Which gears bear more than their momentary peak, in words; "" if none does."""
+        """Message about gears that bear more than their momentary peak; "" if none does."""
         limit, names = self.gear_limit, self.joints
         worst = sorted(np.flatnonzero(self.gear > limit * (1 + 1e-3)), key=lambda k: -self.gear[k] / limit[k])
         if not worst:

@@ -37,12 +37,12 @@ class Compiled:
         self.joint: dict[int, int] = {}
 
     def name(self, kind: str, i: int) -> str:
-        """Of a thing; where it has none its kind and number."""
+        """Name of an object; its kind and number if it has none."""
         found = self.mujoco.mj_id2name(self.mj, getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), i)
         return str(found) if found else f"{kind}{i}"
 
     def off(self, *flags: str) -> bool:
-        """Whether one of these flags of <option><flag> is disabled."""
+        """True if one of these flags of <option><flag> is disabled."""
         bits = (int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{flag.upper()}", 0)) for flag in flags)
         return any(int(self.mj.opt.disableflags) & bit for bit in bits)
 
@@ -51,12 +51,12 @@ class Compiled:
         return [b for b, (joint, _, _) in self.body.items() if b and joint and self.mj.body_mass[b] > 0]
 
     def numbers(self, name: str) -> Array:
-        """Of the compiled model, (count, ...); empty where this MuJoCo has no such numbers."""
+        """Array of the compiled model, (count, ...); empty if this MuJoCo has no such array."""
         return np.asarray(getattr(self.mj, name, np.zeros(0)))
 
 
 def ties_of(c: Compiled) -> Iterator[Tie]:
-    """Of joints and bodies that the robot has."""
+    """Ties between joints and bodies that the robot has."""
     yield from _of_joints(c)
     if not c.off("equality", "constraint"):
         yield from _equalities(c)
@@ -74,7 +74,7 @@ def gravity_of(c: Compiled) -> Array:
 
 
 def notes_of(c: Compiled) -> Iterator[str]:
-    """What was left out, or taken otherwise than MuJoCo takes it."""
+    """Notes on features that were left out, or are treated otherwise than by MuJoCo."""
     mj = c.mj
     shares = _gravcomp(c)
     if len(shares) == 1 and (share := shares.pop()) and not c.off("gravity"):
@@ -179,7 +179,7 @@ def _held_at(c: Compiled, equality: int, joint: int) -> Any:
 
 
 def _body(c: Compiled, equality: int, i: int) -> int:
-    """Of a thing that a loop holds."""
+    """Body of an object that a loop constrains."""
     kinds = c.numbers("eq_objtype")  # MuJoCo 3.2 has bodies only
     is_site = bool(kinds.size) and kinds[equality] == int(c.mujoco.mjtObj.mjOBJ_SITE)
     return int(c.mj.site_bodyid[i]) if is_site else max(i, 0)

@@ -267,7 +267,7 @@ class Tool:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Source:
-    """What a robot was made from, so that a problem file can name it.
+    """Source of a robot, so that a problem file can name it.
 
     Attributes
     ----------

@@ -256,7 +256,7 @@ class Robot:
 
     @cached_property
     def floating(self) -> bool:
-        """Whether the root is a free-flyer."""
+        """True if the root is a free-flyer."""
         return build.is_floating(self.model)
 
     @cached_property

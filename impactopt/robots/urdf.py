@@ -1,4 +1,4 @@
-"""From a URDF to a `pin.Model`, and what else the file says of a robot.
+"""Reads a `pin.Model` and other data of a robot from a URDF.
 
 Pinocchio reads links and joints. It says nothing of <mimic>, of Gazebo's extensions and of <transmission>:
 what of these changes the dynamics becomes a tie or a note of the `Description`.
@@ -190,7 +190,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _text(element: Any) -> str:
-    """What is in an element, or its attribute `link`, in which Gazebo's loops name theirs."""
+    """Text of an element, or its attribute `link`, in which Gazebo's loops name theirs."""
     words = "".join(child.data for child in element.childNodes if child.nodeType == child.TEXT_NODE)
     return str(element.getAttribute("link") or words).strip()
 

@@ -41,7 +41,7 @@ TOO_STIFF = "the contact is too stiff for the steps of its law: {:.1g} of the im
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AlikeCollisions:
-    """What rows share that differ in numbers and hit points only.
+    """Batch of collisions that differ in numbers and hit points only.
 
     file, section : problem and [at_contact], with the values of keys that make the structure.
     model, states, measures : what collides, from where, and what of it is asked for.

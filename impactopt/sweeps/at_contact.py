@@ -1,4 +1,4 @@
-"""What a sweep of collisions says of the state at contact, and of the model that goes on from there."""
+"""State at contact and collision model of a sweep of collisions."""
 
 from __future__ import annotations
 

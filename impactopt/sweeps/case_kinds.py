@@ -1,4 +1,4 @@
-"""What a case is: a whole motion, a strike, or one collision of many; each from its settings to its row."""
+"""Kinds of cases: a whole motion, a strike, or one collision of many; each makes a row from its settings."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ class Collisions:
 
     # ------------------------------------------------------------ rows
     def __call__(self, columns: Mapping[str, Any], *, threads: int | None = None) -> dict[str, NDArray[Any]]:
-        """As `collide_many`; columns (N) of all keys."""
+        """Outputs as of `collide_many`; columns (N) of all keys."""
         count = len(next(iter(columns.values()))) if columns else 1
         out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.outputs}
         out["reason"] = np.full(count, "", dtype=object)
@@ -182,7 +182,7 @@ class Collisions:
         return self._alike[key]
 
     def _body(self, file: ProblemFile) -> ContactStates:
-        """Of a robot on its stance: models share it."""
+        """Contact states of a robot on its stance, which models share."""
         problem, content = file.data["problem"], file.content
         names = [problem.get(name) for name in ("robot", "striker", "start")]
         key = repr([*names, file.data.get("robot"), file.data.get("stance")])

@@ -121,7 +121,9 @@ def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = 
 
 
 def _written(data: Mapping[str, Any]) -> str:
-    """As a file. What varies is written by key paths: its order counts, and TOML has tables last."""
+    """Text of the file. Varied keys are written by key paths: their order counts, and TOML has tables
+    last.
+    """
 
     def with_flat(table: Any, *names: str) -> Any:
         if not isinstance(table, Mapping):  # a mistake, which is told later

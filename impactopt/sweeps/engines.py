@@ -1,4 +1,4 @@
-"""Who does the units of a sweep: processes on this machine."""
+"""Pool of processes on this machine that work on a sweep's units."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRIES = 3  # so many processes may die of a unit; one of them might have been ki
 def on_processes(
     work: Work, units: Iterable[Unit], *, workers: int
 ) -> Generator[tuple[Unit, Found], None, None]:
-    """What units come to, in the order in which they are finished.
+    """Results of units, in the order in which they are finished.
 
     A unit whose process died is tried again, then its rows say so; one that took too long is not.
     """

@@ -1,4 +1,4 @@
-"""What a sweep of collisions can put into its table, and what of the collision each needs."""
+"""Measures that a sweep of collisions can put into its table, and the outputs that each needs."""
 
 from __future__ import annotations
 

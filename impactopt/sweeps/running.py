@@ -34,7 +34,7 @@ UNITS = 64  # at least, where there are cases for them, so that workers end toge
 
 @dataclass(frozen=True, kw_only=True)
 class SweepResult:
-    """What came of a sweep.
+    """Result of a sweep.
 
     cases : of the sweep.  done : rows in the table; failed : of these, without a usable result.  resumed :
     of these, from runs before this one.  seconds : of this run, and rate_per_second : its cases.
@@ -59,7 +59,7 @@ class SweepResult:
     iterations: Mapping[str, float] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """As `impactopt sweep --json` prints it."""
+        """JSON form, as `impactopt sweep --json` prints it."""
         names = ("cases", "done", "failed", "resumed", "seconds", "rate_per_second", "peak_worker_mb")
         out = {**{name: getattr(self, name) for name in names}, "table": str(self.table)}
         return {**out, "iterations": dict(self.iterations)} if self.iterations else out

@@ -57,7 +57,7 @@ def problem_of_result(result: Path) -> ProblemFile:
 
 
 def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
-    """What a result says of its contact, by who says it: ``planned``, ``simulated`` on held soles, and ``free
+    """Contact figures of a result by their source: ``planned``, ``simulated`` on fixed soles, and ``free
     soles``, as far as there are any; keys as of `collide_once`.
     """
     a, told = record.arrays, record.summary
@@ -154,7 +154,7 @@ def _horizon(record: Record, usual: float) -> float:
 
 
 def _saved(file: ProblemFile, section: AtContact, record: Record) -> dict[str, Any]:
-    """What stands beside a collision that is the saved one."""
+    """Saved figures to show beside a collision of the same state."""
     given = section.model_fields_set - {"result", "model", "freezes", "horizon"}
     # of another blow they would mislead
     same = record.problem and parse_problem_file(record.problem, file.path).data == file.data

@@ -37,8 +37,8 @@ _OFF = 1e-6  # [m/s] at 1 m/s, across what can be moved
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posture:
-    """Where rows start from: q (nq,); of a saved result also its velocity v (nv,), torque (n,) [N m] and how
-    its servo's reference bends, the settings of `coasting_reference`.
+    """Posture that rows start from: q (nq,); of a saved result also its velocity v (nv,), torque (n,) [N m]
+    and its servo's reference, the settings of `coasting_reference`.
 
     polygon (k, 2) [m] : support polygon; without corners on a fixed base.
     """
@@ -52,9 +52,9 @@ class Posture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class States:
-    """Of N rows q (N, nq), v (N, nv), torque (N, n) [N m], the striking point's speed along the normal (N)
-    [m/s], the effective mass there (N) [kg], and why a row is impossible, "" where it is not; of a result
-    also the settings `reference` (N, n, k) and `reference_until` (N)."""
+    """States at contact of N rows: q (N, nq), v (N, nv), torque (N, n) [N m], the striking point's speed
+    along the normal (N) [m/s], the effective mass there (N) [kg], and why a row is impossible, "" where it is
+    not; of a result also the settings `reference` (N, n, k) and `reference_until` (N)."""
 
     q: Array
     v: Array
@@ -73,7 +73,7 @@ class States:
         return {"reference": self.reference, "reference_until": self.reference_until}
 
     def some(self, rows: NDArray[np.intp]) -> States:
-        """Of these rows alone."""
+        """States of these rows alone."""
         kept: dict[str, Any] = {name: None if x is None else x[rows] for name, x in vars(self).items()}
         return States(**kept)
 
@@ -95,7 +95,7 @@ class ContactStates:
 
     # ------------------------------------------------------------ postures
     def posture(self, name: str, result: str | None, point: tuple[float, ...]) -> Posture | str:
-        """Of [at_contact] posture or result, and the point (3,) [m] of a reach; or why there is none.
+        """Posture of [at_contact] posture or result, and the point (3,) [m] of a reach; or why there is none.
 
         Raises
         ------
@@ -142,7 +142,7 @@ class ContactStates:
         return Posture(q=q, v=v, torque=torque, bend=bend, polygon=polygon)
 
     def _coordinates(self, q: Array) -> StanceCoordinates:
-        """Of what the stance holds, where it is in a posture (nq,)."""
+        """Coordinates with the stance's frames fixed where they are in a posture (nq,)."""
         robot, stance = self.robot, self.stance
         return StanceCoordinates(robot, stance.soles(robot), q, stance.held_hands(robot))
 

@@ -96,7 +96,7 @@ class VariedKeys:
     def check_values(
         self, grid: Sequence[Axis], rows: Sequence[Axis], over: Mapping[str, Span | Column]
     ) -> None:
-        """What the problem's file would refuse; each value with the first ones of the other keys."""
+        """Checks values by the problem's file; each value with the first ones of the other keys."""
         alone = {axis.key: telling(axis.values) for axis in grid}
         alone |= {
             k: [what.first, what.last] if isinstance(what, Span) else telling(what)
@@ -119,7 +119,7 @@ class VariedKeys:
                 break
 
     def _accepted(self, settings: Mapping[str, Any], key: str) -> bool:
-        """Whether the problem's file takes these values; if not, that is the mistake of one of the keys."""
+        """True if the problem's file takes these values; if not, that is the mistake of one of the keys."""
         try:
             self._base.changed(settings)
         except InputError as error:
@@ -157,14 +157,16 @@ def _span_of(section: SpanSection) -> Span:
 
 
 def telling(values: Column) -> list[Any]:
-    """Of numbers the first, the least and the largest, as ranges are intervals; all values of other kinds."""
+    """Test values: of numbers the first, the least and the largest, as ranges are intervals; else all
+    values.
+    """
     if isinstance(values, np.ndarray):
         return [values[0].item(), values.min().item(), values.max().item()]
     return list(values)
 
 
 def _telling_rows(rows: Sequence[Axis]) -> list[int]:
-    """Which rows of the list to look at, as of `telling`."""
+    """Rows of the list to test, as of `telling`."""
     if not all(isinstance(axis.values, np.ndarray) for axis in rows):
         return list(range(len(rows[0].values)))
     numbers = [np.asarray(axis.values) for axis in rows]

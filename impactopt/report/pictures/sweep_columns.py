@@ -95,7 +95,7 @@ def errors_against(section: Section, data: SweepColumns, values: Array) -> Array
 
 
 def combined(names: Sequence[str], data: SweepColumns) -> tuple[NDArray[np.intp], list[str]]:
-    """Of each row which combination of the columns' values it has, and what these are called."""
+    """Combination of the columns' values in each row, by number, and the combinations' names."""
     if not names:
         return np.zeros(len(data.values(data.section.x)), dtype=np.intp), [""]
     columns = [data.values(name) for name in names]

@@ -298,7 +298,7 @@ class Bodies:
 
     @staticmethod
     def present(body: WorldBody, at: Places) -> NDArray[np.bool_]:
-        """When (k,) a body of the world is there to be touched."""
+        """Mask (k,) of the instants at which a body of the world is present."""
         return np.asarray(at.phase == 0) if body.before else (at.phase != MISSED) | (not body.of_target)
 
     # ------------------------------------------------------------------ exactly

@@ -202,7 +202,7 @@ def _centres(hull: ConvexHull) -> Array:
 
 
 def _spread(points: Array, count: int) -> Array:
-    """At most ``count`` of the points, far from each other."""
+    """Spread of at most ``count`` of the points, far from each other."""
     if len(points) <= count:
         return points
     if len(points) > 20 * count:  # the greedy choice below takes count x points

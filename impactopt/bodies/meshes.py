@@ -55,7 +55,7 @@ def _package_folders() -> Iterator[Path]:
 
 
 def lack_of(name: str, urdf: Path) -> str:
-    """Why a URDF's mesh is no body, as of `find_mesh`; "" if it is one."""
+    """Reason why a URDF's mesh cannot be used (`find_mesh`); "" if it can."""
     try:
         path = find_mesh(name, urdf)
         return _lack(path, path.stat().st_mtime_ns)

@@ -178,7 +178,7 @@ def transform(rotation: Array, translation: Array) -> Any:
 
 
 def distance(one: Any, at_one: Any, two: Any, at_two: Any) -> float:
-    """Between two coal shapes, at these places [m]; below zero: how deep one is in the other."""
+    """Distance of two coal shapes at these places [m]; below zero: depth of the penetration."""
     return float(coal.distance(one, at_one, two, at_two, _REQUEST, coal.DistanceResult()))
 
 

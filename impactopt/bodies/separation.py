@@ -198,8 +198,8 @@ class Separations:
         self._seen = np.full((self.count, self.joints + 3), np.nan)
 
     def write(self, what: int, z: Array, out: Array, factors: Array | None = None) -> None:
-        """To ``out``: values (what = 0), gradients (1), or ``factors`` times the Hessians' lower triangles,
-        column by column (2).
+        """Writes values (what = 0), gradients (1), or ``factors`` times the Hessians' lower triangles, column
+        by column (2), to ``out``.
 
         Derivatives are those of an iterate: directions stay there. Values are of any trial.
         """

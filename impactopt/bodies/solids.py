@@ -22,7 +22,7 @@ class Solid:
     triangles: NDArray[np.intp]
 
     def moved(self, rotation: Array, translation: Array) -> Solid:
-        """In the frame in which it is so placed."""
+        """Copy, rotated and translated."""
         return Solid(vertices=self.vertices @ rotation.T + translation, triangles=self.triangles)
 
 

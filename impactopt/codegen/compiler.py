@@ -73,7 +73,7 @@ def find_compiler() -> Compiler | None:
 
 
 def why_no_compiler() -> str:
-    """Why `find_compiler` has found none, in a few words."""
+    """Reason why `find_compiler` has found none, in a few words."""
     if _forbidden():
         return "IMPACTOPT_NO_COMPILER is set" if os.name == "posix" else "there is none for this system"
     for command in _candidates():

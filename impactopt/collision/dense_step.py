@@ -37,7 +37,7 @@ class Contact:
         self.target = target
 
     def of(self, law: dict[str, float], target: dict[str, float]) -> Law:
-        """With these numbers."""
+        """Law with these parameters."""
         return Law(self, ca.DM(list(law.values())), target)
 
     def call(self, name: str, *given: Any) -> list[Array]:

@@ -148,7 +148,7 @@ def with_jacobian(
 def in_order(
     inputs: Mapping[str, Any], settings: Mapping[str, Any], parameters: Sequence[str]
 ) -> dict[str, Any]:
-    """Those of the inputs that are no settings, and then the parameters in the order they are named in."""
+    """Inputs that are no settings, followed by the parameters in the order they are named in."""
     return {name: x for name, x in inputs.items() if name not in settings} | {
         name: inputs[name] for name in parameters
     }

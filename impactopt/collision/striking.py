@@ -69,7 +69,7 @@ class _StrikingGraphs:
         return self._mobility("least_rates", lambda q: ca.MX(ca.diag(ca.DM(self.ease))))
 
     def _mobility(self, name: str, root: Callable[[Any], Any]) -> Any:
-        """With W of a configuration, and W' W the inverse of what is least."""
+        """Function of the mobility W of a configuration, with W' W the inverse of the least quantity."""
         q, none = ca.MX.sym("q", self.nq), ca.MX.sym("none", 0)
         rows = ca.Function("rows", [self.rb.q], [ca.densify(self.rb.jacobian(self.frame)[:3, :]), self._held])
         J, J_c = rows(q)

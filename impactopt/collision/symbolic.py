@@ -126,7 +126,7 @@ class SymbolicModel(SteppedModel):
         return export(self, whole, parameters, by, every, self._compiled, Path(folder), name)
 
     def _collision(self, outputs: tuple[str, ...], every: int = 1) -> Any:
-        """With all settings as inputs, in C written by hand where there is a compiler."""
+        """Function with all settings as inputs, in handwritten C if there is a compiler."""
         return self._compiled(
             "collision", (*outputs, every), lambda: native_collision(self, outputs, every=every)
         )

@@ -48,7 +48,7 @@ class About:
 
     @property
     def text(self) -> str:
-        """In words, with the unit in brackets."""
+        """Description in words, with the unit in brackets."""
         words, semicolon, rest = self.what.partition(";")
         return f"{words} [{self.unit}]".lstrip() + semicolon + rest if self.unit else self.what
 

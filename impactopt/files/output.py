@@ -165,7 +165,7 @@ def _settled(problem: str, solution: Solution | StrikeSolution) -> str:
 
 
 def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:
-    """That of the solution's record; where nothing else of it is kept, its arrays need not be made."""
+    """Summary of a solution's record; made without the record's arrays, if nothing else of it is kept."""
     return plain(
         solution.summary() if isinstance(solution, StrikeSolution) else _summary(solution, None, None)
     )

@@ -139,7 +139,8 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """With the rows on demand that the record's plan needed, the gains that it chose, and its style's prices.
+    """Problem with the lazy constraints that the record's plan needed, its chosen gains, and its style's
+    prices.
 
     given : the file was, and is not the record's own text.
     """

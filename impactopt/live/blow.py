@@ -86,7 +86,7 @@ class LiveBlow(LivePage):
         self._newest.ask(np.array([float(s.value) for s in (self.speed, *self.joints.values())]))
 
     def run(self) -> None:
-        """Until Ctrl-C."""
+        """Serves the page until Ctrl-C."""
         while True:
             time.sleep(1.0)
 

@@ -100,7 +100,7 @@ def _reference(plan: Plan) -> Trajectory:
 
 
 def why_not(solution: Solution) -> str:
-    """Why a solution is no plan, and its worst rows."""
+    """Reason why a solution is no plan, and its worst constraints."""
     rows = [f"- {row}" for row in solution.violations[:_WORST]]
     time_limit = solution.status is Status.TIME_LIMIT
     told = "no plan was found in time" if time_limit else solution.result.message

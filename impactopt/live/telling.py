@@ -34,5 +34,5 @@ def told_plan(answer: Answer, first: Solution) -> str:
 
 
 def told_failure(answer: Answer) -> str:
-    """Why there is no plan, and that the one before is still drawn."""
+    """Message that there is no plan, with the reason, and that the one before is still drawn."""
     return f"**No plan for this.** {answer.why}\n\nThe one before is shown ({answer.seconds:.2f} s)."

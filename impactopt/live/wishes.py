@@ -49,13 +49,14 @@ class Wish:
 
 
 def wish_of(problem: ImpactProblem) -> Wish:
-    """That for the problem as it is."""
+    """Request that corresponds to the problem as it is."""
     x, y, z = (float(v) for v in problem.point)
     return Wish(point=(x, y, z), numbers=tuple((n.name, n.value) for n in numbers_of(problem)))
 
 
 def numbers_of(problem: ImpactProblem) -> tuple[Number, ...]:
-    """Those that a plan can be bent for: mass of the target, stiffness of the contact, margin of the ZMP.
+    """Parameters that a plan can be adapted to: mass of the target, stiffness of the contact, margin of the
+    ZMP.
 
     A wall has no mass, and an arm that is bolted down no ZMP.
     """

@@ -97,7 +97,7 @@ def _polished(budget: Budget, t: Transcription, first: SolverResult, old: Solver
 
 
 def _first_order(solution: Solution, t: Transcription, bent: Bent) -> SolverResult:
-    """By QPs; where those are not solved, by steps with the active set of the solution."""
+    """First-order plan by QPs; if those are not solved, by steps with the active set of the solution."""
     began = time.perf_counter()
     found = bent.predictor.predict(t.program)
     if found is None:

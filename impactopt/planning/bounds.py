@@ -319,7 +319,7 @@ def changed_or_none(problem: ImpactProblem, **new: object) -> ImpactProblem | No
 
 
 def _outward(value: float, bound: float) -> float:
-    """With some room, in three digits, away from the bound."""
+    """Value with some room, in three digits, away from the bound."""
     up = value > bound
     value += _ROOM * (value - bound) + (1 if up else -1) * 1e-3 * abs(value)
     size = 10.0 ** (np.floor(np.log10(max(abs(value), 1e-12))) - 2)

@@ -58,7 +58,7 @@ class Search:
 
 
 def search(t: Transcription, result: SolverResult, budget: Budget) -> Search:
-    """Why a program has no solution, in about as many iterations as it took to find none.
+    """Searches for the cause of a program's infeasibility, in about as many iterations as its solve took.
 
     result : of the program, where its violation is least.
     """

@@ -274,7 +274,9 @@ class ImpactProblem:
 
     @property
     def abort_after(self) -> float | None:
-        """When the motion is aborted if nothing is hit, after the planned contact [s]; None: never."""
+        """Time after the planned contact at which the motion is aborted if nothing is hit [s]; None:
+        never.
+        """
         return next((s.abort_after for s in self.scenarios if s.abort_after is not None), None)
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
@@ -329,7 +331,7 @@ class ImpactProblem:
 
     @property
     def on_demand(self) -> tuple[Term, ...]:
-        """Those of ON_DEMAND_TERMS that hold: they are not switched off, and about one striker."""
+        """Lazy terms (ON_DEMAND_TERMS) that hold: they are not switched off, and about one striker."""
         terms = tuple(self.term(type(term)) for term in ON_DEMAND_TERMS)
         return tuple(term for term in terms if term.active and self.second is None)
 

@@ -238,7 +238,7 @@ def reference_configurations(model: pin.Model) -> dict[str, Array]:
 
 
 def lowest(model: pin.Model, q: Array, frames: Sequence[str], *, within: float = 0.01) -> list[str]:
-    """Those of the frames that are not higher than the lowest one by more than `within` [m]."""
+    """Frames that are not higher than the lowest one by more than `within` [m]."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     heights = [float(data.oMf[check_frame(model, frame, "place")].translation[2]) for frame in frames]

@@ -168,7 +168,7 @@ class _Replay(MujocoRobot):
 
     # ------------------------------------------------------------------ what a record needs
     def look_at(self, gears: GearWatch, torque: Array, push: Push) -> None:
-        """After a step with torque (n,) [N m] of the servos, under these forces."""
+        """Records gear loads after a step with torque (n,) [N m] of the servos, under these forces."""
         acceleration = self.data.qacc[self.dof]
         gears.look(torque, acceleration)
         if self.yields is not None:
@@ -233,7 +233,7 @@ class _Replay(MujocoRobot):
         return np.arccos(np.clip(self.upright[rows] @ _upright((x, y, z, w)), -1.0, 1.0))
 
     def not_standing(self, simulation: Simulation) -> str:
-        """Why the robot does not stand at the end of its simulation, where it stood; "" if it does."""
+        """Reason why the robot does not stand at the end of its simulation; "" if it does."""
         if not self.floating:
             return ""
         lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))

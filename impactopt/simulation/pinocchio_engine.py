@@ -90,7 +90,7 @@ class _World:
         return self.struck.depths(self.body.hand_places(), s.x)
 
     def rates(self, t: float, s: _State, *, forces: Array | None = None, step: float = 0.0) -> _Rates:
-        """At a state under the forces [N] of its step, or those of the step [s] that begins here."""
+        """Rates of a state under the forces [N] of its step, or those of the step [s] that begins here."""
         body = self.body
         speed = body.look(s.q, s.v)
         speeds, depths = body.rows @ s.v, self.depths(s)

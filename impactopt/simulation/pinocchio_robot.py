@@ -63,7 +63,9 @@ class Body(ABC):
 
     @abstractmethod
     def wrenches(self) -> Array:
-        """On the held frames (frames, 6), at their origins in world axes, of the last acceleration."""
+        """Wrenches on the constrained frames (frames, 6), at their origins in world axes, of the last
+        acceleration.
+        """
 
     def hand_places(self) -> Array:
         """(hands, 3) [m] of the striking points, where they have been last."""

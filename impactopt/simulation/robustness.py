@@ -173,8 +173,8 @@ class Robustness:
         }
 
     def separation(self) -> dict[str, dict[str, float]]:
-        """By parameter, its mean among draws that stand and that do not (of factors: the geometric mean), and
-        how far apart these are in standard deviations of the draws; nan where there are none.
+        """Separation by parameter: its mean among draws that stand and that do not (of factors: the
+        geometric mean), and the difference in standard deviations of the draws; nan where there are none.
         """
         out = {}
         for name, value in self.table().items():
@@ -193,8 +193,8 @@ class Robustness:
         return out
 
     def by_third(self) -> dict[str, list[float]]:
-        """By parameter, the share that stands of draws in the lower, middle and upper third of its range (of
-        factors: of its logarithm): what means hide where both ends fall; nan where there are none.
+        """Fraction that stands of draws in the lower, middle and upper third of each parameter's range (of
+        factors: of its logarithm), which means hide if draws fall at both ends; nan where there are none.
         """
         out = {}
         for name, value in self.table().items():

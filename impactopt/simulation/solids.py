@@ -71,7 +71,7 @@ class Solids:
     floor: float = 0.0
 
     def moved(self, way: Array) -> Solids:
-        """With the target and what holds it somewhere else by ``way`` (3,) [m]."""
+        """Copy with the target and its support moved by ``way`` (3,) [m]."""
         return replace(
             self,
             solids=tuple(
@@ -85,13 +85,13 @@ class Solids:
         return replace(self, pairs=tuple(p for p in self.pairs if not gone & set(p)))
 
     def near(self, model: Any, reference: Any) -> tuple[tuple[int, int], ...]:
-        """Those pairs that can come near when the robot follows a reference: time (k,), q (k, nq)."""
+        """Pairs that can come near when the robot follows a reference: time (k,), q (k, nq)."""
         time = np.asarray(reference.time)
         chosen = np.searchsorted(time, np.arange(time[0], time[-1] + LOOK, LOOK)).clip(0, len(time) - 1)
         return self.near_at(model, np.asarray(reference.q)[chosen])
 
     def links_between(self, model: Any, moves: Array) -> Solids:
-        """With the pairs of links alone that change their distance when velocities move (nv,): all but 0."""
+        """Copy with only the pairs of links whose distance changes when velocities move (nv,) are not 0."""
         moving = {j for j in range(2, model.njoints) if np.any(_own(model.joints[j], moves))}
         paths = [moving.intersection(model.supports[solid.joint]) for solid in self.solids]
         links = [k for k, solid in enumerate(self.solids) if solid.vertices is not None]
@@ -114,7 +114,7 @@ class Solids:
         return out
 
     def near_at(self, model: Any, q: Array) -> tuple[tuple[int, int], ...]:
-        """Those pairs that can come near in configurations q (k, nq)."""
+        """Pairs that can come near in configurations q (k, nq)."""
         data = model.createData()
         balls = [s.ball() for s in self.solids]
         radius = np.array([r for _, r in balls])

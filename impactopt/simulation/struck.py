@@ -170,7 +170,7 @@ class Struck:
         return np.array([float(rate) for rate in self.target.derivative(state, force, self._target)])
 
     def side(self, state: Array, force: float) -> tuple[bool, ...]:
-        """On which side of each of its switches the target is."""
+        """Side of each of its switches that the target is on."""
         return tuple(float(switch) > 0 for switch in self.target.switches(state, force, self._target))
 
     def moved(self, state: Array, force: float, length: float) -> Array:

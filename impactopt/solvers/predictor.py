@@ -86,7 +86,7 @@ class Predictor:
         return np.concatenate([program.g_lower, lower]), np.concatenate([program.g_upper, upper])
 
     def predict(self, program: NonlinearProgram) -> Prediction | None:
-        """For the same program with other numbers; None where a QP's active set is not found.
+        """Prediction for the same program with other parameters; None if a QP's active set is not found.
 
         QP after QP from where the one before led, while rows are off and it helps.
         """

@@ -231,12 +231,12 @@ def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
 
 
 def row_violations(program: NonlinearProgram, g: Vector) -> Vector:
-    """By how much each row is outside its bounds, (m,), >= 0; nan where g is nan."""
+    """Violation of each constraint's bounds, (m,), >= 0; nan where g is nan."""
     return np.maximum(np.maximum(program.g_lower - g, g - program.g_upper), 0.0)
 
 
 def bound_violations(program: NonlinearProgram, x: Vector) -> Vector:
-    """By how much each variable is outside its bounds, (n,), >= 0."""
+    """Violation of each variable's bounds, (n,), >= 0."""
     return np.maximum(np.maximum(program.x_lower - x, x - program.x_upper), 0.0)
 
 

@@ -208,7 +208,7 @@ def _work(chosen: Sweep, store: Store) -> Work:
 
 
 def _units(chosen: Sweep, together: int, finished: set[int]) -> Iterator[Unit]:
-    """Those that are left, in their order."""
+    """Units that are left, in their order."""
     cases = chosen.design.cases
     for index in range(-(-cases // together)):
         if index not in finished:
@@ -246,5 +246,5 @@ def _write(
 
 
 def _cores() -> int:
-    """Those that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

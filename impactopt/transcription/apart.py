@@ -187,7 +187,7 @@ class SeparationBlock(Block):
 
     @classmethod
     def of_separations(cls, name: str, of: Separations, lift: Affine) -> SeparationBlock:
-        """With z of all as one expression."""
+        """Block of separations with the z of all instances as one expression."""
         size = of.joints + 3
         everything = np.arange(size)
         columns, rows = np.triu_indices(size)  # of a lower triangle, column by column

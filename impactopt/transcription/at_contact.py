@@ -328,5 +328,5 @@ class ContactProgram(ABC):
         return {o.name: quantity.evaluate(x) for o, quantity in self.objectives}
 
     def impulse(self, x: Array) -> float:
-        """To the expected target [N s], for solver variables (n,)."""
+        """Impulse to the expected target [N s], for solver variables (n,)."""
         return self.hit.impulse(x)

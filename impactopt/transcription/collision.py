@@ -110,7 +110,7 @@ class Collision(ContactNumbers, Collocated):
 
     @property
     def impulse(self) -> Affine:
-        """To the target [N s]."""
+        """Impulse to the target [N s]."""
         return self.p[self.end[-1]]
 
     @property

@@ -234,7 +234,7 @@ class _Again:
 
 
 def _strained(t: ContactProgram, hit: PlannedCollision, stages: Sequence[CollocationPoint]) -> Array:
-    """In which of the program's elements a gear bears too much, in a collision on elements half as long."""
+    """Elements of the program in which a gear bears too much, in a collision on elements half as long."""
     share = gear_share(t.problem, hit.torque, hit.acceleration)[1:] > 1.0 + GEAR
     elements = sorted({s.members for s in stages})
     out = np.zeros(len(elements) // 2, dtype=bool)

@@ -96,5 +96,5 @@ class Contacts:
         return None
 
     def impulse(self, x: Array) -> float:
-        """To the expected target [N s], for solver variables (n,)."""
+        """Impulse to the expected target [N s], for solver variables (n,)."""
         return float(self.expected.impulse.evaluate(x)[0])

@@ -1,4 +1,4 @@
-"""In which order a solver may eliminate what rows determine, and which rows are whose.
+"""Elimination order of the variables that constraints determine, and the constraints that determine them.
 
 Each part of a program says which of its variables rows determine, and whose `Turn` they are. Two orders hang
 on that: which variables go first, as others follow from them; and who takes rows first, where a row would do
@@ -43,5 +43,5 @@ def determined(turn: Turn, variables: Index, step: int = 0) -> Determined:
 
 
 def by_choice(found: Iterable[Determined]) -> list[Determined]:
-    """In the order in which they take rows: by turn; within one as they come, part by part."""
+    """Determined variables in the order in which they take constraints: by turn, then part by part."""
     return sorted(found, key=lambda each: _FIRST_CHOICE.index(Turn(each.rank[0])))

@@ -86,7 +86,7 @@ class FrozenCollision(Collision):
         self._frozen = [self._freeze(k) for k in range(max(self.freezes, 1))]
 
     def _add_reference(self, count: int) -> None:
-        """At the beginnings of segments, and then where they are frozen, if not at contact."""
+        """Adds reference variables at the beginnings of segments, then at later freezes."""
         count, labels = max(2 * self.freezes, 1), self._b.coordinates.leg_labels
         super()._add_reference(count)
         name = f"{self._named}coasting leg accelerations"
@@ -260,7 +260,9 @@ class FrozenCollision(Collision):
 
     # ------------------------------------------------------------------ rows
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
-        """Those of the freezes come first, as they determine variables that all others have."""
+        """Adds constraints; those of the freezes come first, as they determine variables that all others
+        have.
+        """
         if self._meeting is not None:
             self._meeting.add_rows(at)
         self._moved_rows(*at["moved"])

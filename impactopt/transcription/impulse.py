@@ -47,7 +47,7 @@ class InstantImpact:
 
     @property
     def impulse(self) -> Affine:
-        """To the target [N s]."""
+        """Impulse to the target [N s]."""
         return self.blow[0]
 
     @property

@@ -49,7 +49,7 @@ class JacobianMap:
         self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
 
     def matrix(self) -> sp.csc_array:
-        """For what the blocks' Jacobians were last."""
+        """Jacobian for the blocks' latest values."""
         values = self._linear.copy()
         self._sums.add_to(values, self._entries)
         return _with(self._made, values)
@@ -94,7 +94,7 @@ class HessianMap:
         self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
 
     def matrix(self, sigma: float) -> sp.csc_array:
-        """For what the blocks' Hessians were last."""
+        """Hessian for the blocks' latest values."""
         values: Array = np.multiply(sigma, self._half)
         self._sums.add_to(values, self._entries)
         values = with_transposed(values, self._across)

@@ -78,7 +78,7 @@ def lagrange(places: Sequence[float], at: float) -> Array:
 
 
 def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
-    """Those that a problem asks for, of each phase of its contact; halved if its target has events.
+    """Elements of each phase of a problem's contact; halved if its target has events.
 
     Where an event may come at once, the phase before it is one element. Where something is frozen on the
     way, segments begin with elements; ``shares`` : if the phases' are not those of a point mass.

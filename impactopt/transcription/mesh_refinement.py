@@ -43,7 +43,7 @@ NO_MORE = MoreNodes()
 
 
 def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
-    """Those known, and more in the middle between two nodes where the plan leaves its limits on the way.
+    """Nodes to add: those known, and the middle between two nodes where the plan leaves its limits.
 
     It is looked at every millisecond. That is where a sole gives up more than half of a margin that it has at
     the nodes: of its centre of pressure to its own edges, or of its least normal force; or uses a tenth more

@@ -80,7 +80,7 @@ class MotionPhase(ABC):
         ]
 
     def determined(self) -> list[Determined]:
-        """At each node, one after the other: each leg, and the first sole's wrench."""
+        """Variables determined at each node: each leg, and the first sole's wrench."""
         found = [[*by_leg(self.legs.index(k)), self.w.index(k)[:6]] for k in range(self.w.count)]
         return [each for parts in found for each in at_node(parts)]
 

@@ -87,5 +87,5 @@ def union(first: Index, length: Index | int = 1) -> Index:
 
 @functools.cache
 def _library() -> Any:
-    """In C where there is a compiler; None: sparse products do it."""
+    """C library, if there is a compiler; None: sparse products replace it."""
     return native_library(__package__, "scatter_add")

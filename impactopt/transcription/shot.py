@@ -125,7 +125,7 @@ class Shot:
     # ------------------------------------------------------------------ for terms and objectives
     @property
     def impulse(self) -> Affine:
-        """To the target [N s]."""
+        """Impulse to the target [N s]."""
         return self._impulse[0]
 
     def target_energy(self) -> Affine:

@@ -69,7 +69,7 @@ def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[Sprin
 
 
 def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> None:
-    """At some points: torque = torque at rest - stiffness x turn - damping x rate.
+    """Adds spring constraints at some points: torque = torque at rest - stiffness x turn - damping x rate.
 
     In contact the servo's own law is that of the spring.
 
@@ -100,7 +100,7 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
 
 
 def add_hinges(b: Builder, points: Sequence[tuple[Place, Affine]]) -> None:
-    """At places with these torques over limit (n,): those of soles' hinges are zero.
+    """Adds constraints at places with these torques over limit (n,): those of soles' hinges are zero.
 
     In contact the servo's own law is that: feed-forward and gains are zero.
     """

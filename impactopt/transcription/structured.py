@@ -143,7 +143,7 @@ class StructuredProgram:
         return {b.name: b.value(z).copy() for b, z in zip(self.blocks, self._lifted(x), strict=True)}
 
     def all_outputs(self, x: Array) -> Array:
-        """Those of all blocks one after the other, as rows and lifted variables number them."""
+        """Outputs of all blocks one after the other, as constraints and lifted variables number them."""
         return np.concatenate([b.value(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)])
 
     def objective(self, x: Array) -> float:

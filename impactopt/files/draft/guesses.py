@@ -36,7 +36,7 @@ class Drives:
 
 
 def guess_drives(model: pin.Model, known: Mapping[str, float], carrying: Collection[str] = ()) -> Drives:
-    """For each joint what is missing.
+    """Guesses the missing drive parameters of each joint.
 
     known : torque limits that the model itself has not got.  carrying : joints of legs, with the robot above.
     """
@@ -82,5 +82,5 @@ def _gravity(model: pin.Model) -> list[float]:
 
 
 def _rounded(number: float) -> float:
-    """To two digits."""
+    """Number rounded to two digits."""
     return float(f"{number:.2g}")

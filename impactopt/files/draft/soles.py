@@ -192,7 +192,7 @@ def _polygon(corners: Array) -> Array | None:
 
 
 def _neat(place: Any) -> Any:
-    """Without digits that mean nothing."""
+    """Placement without digits that are rounding errors."""
     turn = np.where(
         np.abs(place.rotation - np.round(place.rotation)) < 1e-6, np.round(place.rotation), place.rotation
     )

@@ -59,8 +59,8 @@ class Export:
 
     @property
     def motions(self) -> dict[str, Motion]:
-        """By the names of their files, as a servo is to follow them: a joint that nothing drives, as a soft
-        grip's, stays where its spring is at rest.
+        """Motions by the names of their files, as a servo is to follow them: a joint that nothing drives,
+        as a soft grip's, stays where its spring is at rest.
         """
         springs = self.robot.passive[self.order]
         of = {"motion": self.motion, **({} if self.missed is None else {"missed": self.missed})}

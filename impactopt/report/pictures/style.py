@@ -101,7 +101,7 @@ class Picture(Figure):
             self.savefig(file, format="png")
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
-        """For notebooks: half as many pixels on the page as in the file, which is sharp on any screen."""
+        """PNG for notebooks: half as many pixels on the page as in the file, which is sharp on any screen."""
         width, height = (int(side * DPI / 2) for side in self.get_size_inches())
         memory = io.BytesIO()
         self.write(memory)

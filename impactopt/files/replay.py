@@ -20,8 +20,8 @@ from impactopt.planning.gears import gear_caution
 from impactopt.planning.on_demand import with_rows
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
-from impactopt.simulation.accuracy import check_steps
 from impactopt.simulation.controller import ControllerSettings, controller_of
+from impactopt.simulation.step_error import check_steps
 from impactopt.transcription.plan import Trajectory
 
 __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "problem_of", "replay"]

@@ -10,7 +10,7 @@ from impactopt.kinematics.directions import across
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Slide
-from impactopt.simulation.struck import FACE
+from impactopt.simulation.target_dynamics import FACE
 from impactopt.transcription.plan import Plan
 
 FAR = 0.15  # [m] across the target's face: a plan that slides so far is told so

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots.loads import DriveLoads
 from impactopt.robots.robot import Robot
+from impactopt.simulation.contact_times import Touches
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.soles import cop_margins, sole_names
-from impactopt.simulation.touch import Touches
 
 Array = NDArray[np.float64]
 

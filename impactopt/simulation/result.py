@@ -13,8 +13,8 @@ from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.robots.loads import DriveLoads
 from impactopt.robots.sole_margins import least_margins
+from impactopt.simulation.collision_geometry import Solids, Touched
 from impactopt.simulation.motors import MotorCut
-from impactopt.simulation.solids import Solids, Touched
 
 Array = NDArray[np.float64]
 PHASES = ("swing", "collision", "follow")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids
 from impactopt.simulation.result import Scene
-from impactopt.simulation.solids import FLOOR, Solid, Solids
 
 
 def scene_of(problem: ImpactProblem) -> Scene:

@@ -22,7 +22,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.second import SecondStriker
 from impactopt.problem.terms import HitCone
 from impactopt.simulation.result import Scene
-from impactopt.simulation.struck import Struck
+from impactopt.simulation.target_dynamics import Struck
 
 Array = NDArray[np.float64]
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.simulation.solids import FLOOR, Solid, Solids
+from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids
 
 __all__ = ["Clearance"]
 

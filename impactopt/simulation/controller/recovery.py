@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
-from impactopt.simulation.controller.aim import Aim
+from impactopt.simulation.controller.setpoint import Aim
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.result import Scene, distance_inside
 

@@ -23,8 +23,8 @@ from impactopt.simulation.mujoco_world import (
 )
 from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.reference.base import ReferenceModel, converge
+from impactopt.simulation.reference.equations_of_motion import Instant, Scales, contact_scales
 from impactopt.simulation.reference.forces import Forces, Phase
-from impactopt.simulation.reference.motion import Instant, Scales, contact_scales
 from impactopt.simulation.reference.record import collision_from
 
 __all__ = ["HeldRobot", "MujocoDynamics", "march"]

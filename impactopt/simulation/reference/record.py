@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.collision.result import Collision
+from impactopt.simulation.reference.equations_of_motion import Instant
 from impactopt.simulation.reference.forces import Forces
-from impactopt.simulation.reference.motion import Instant
 
 __all__ = ["collision_from"]
 

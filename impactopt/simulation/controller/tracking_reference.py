@@ -10,8 +10,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
-from impactopt.simulation.controller.aim import Aim
 from impactopt.simulation.controller.recovery import Recovery
+from impactopt.simulation.controller.setpoint import Aim
 
 __all__ = ["Target"]
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.collision_geometry import Touched
 from impactopt.simulation.result import Simulation
-from impactopt.simulation.solids import Touched
 
 __all__ = ["with_clearance"]
 

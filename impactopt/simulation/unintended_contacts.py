@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.simulation.solids import Solids, Touched
+from impactopt.simulation.collision_geometry import Solids, Touched
 
 Array = NDArray[np.float64]
 

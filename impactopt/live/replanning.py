@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.live.wishes import Wish
+from impactopt.live.requests import Wish
 from impactopt.planning.changes import moved_problem
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution

@@ -19,11 +19,11 @@ from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError, raw_array
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.problem_file.toml import plain_value
-from impactopt.sweeps.alike import AlikeCollisions
 from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model, full_names
+from impactopt.sweeps.collision_batch import AlikeCollisions
 from impactopt.sweeps.collision_keys import role_of, sweep_place
+from impactopt.sweeps.contact_states import ContactStates
 from impactopt.sweeps.measures import chosen
-from impactopt.sweeps.states import ContactStates
 
 __all__ = ["Collisions", "collide_many"]
 

@@ -32,7 +32,7 @@ from impactopt.sweeps.design import Design, Draws, column
 from impactopt.sweeps.figure import Figure
 from impactopt.sweeps.key_paths import flat, put
 from impactopt.sweeps.sections import CaseKind, SweepFile, of_other_kinds
-from impactopt.sweeps.varied import VariedKeys, telling
+from impactopt.sweeps.varied_keys import VariedKeys, telling
 
 __all__ = ["Sweep", "parse_sweep", "read_sweep_file", "sweep_from_data"]
 

@@ -11,7 +11,7 @@ import pytest
 from impactopt import SDC, load_problem
 from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque, striking_velocity
-from impactopt.live.blow import LiveBlow
+from impactopt.live.collision_page import LiveBlow
 
 FILE = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
 LONG = 60.0  # [s]
@@ -60,7 +60,7 @@ def test_where_there_is_no_collision_the_page_says_why(
     def stuck(*_: object, **__: object) -> None:
         raise InputError("the hand cannot move along the normal")
 
-    monkeypatch.setattr("impactopt.live.blow.striking_velocity", stuck)
+    monkeypatch.setattr("impactopt.live.collision_page.striking_velocity", stuck)
     look.speed.value = 3.0
     assert look.wait(LONG)
     assert look.blow.collision is None

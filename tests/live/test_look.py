@@ -33,11 +33,11 @@ from impactopt.errors import InputError
 from impactopt.files.output import load_record, record_of, save_record
 from impactopt.files.replay import problem_of
 from impactopt.files.resume import resumed
-from impactopt.live import look as look_module
-from impactopt.live.look import LiveLook
+from impactopt.live import plan_page as look_module
 from impactopt.live.motion import moment_of
+from impactopt.live.plan_page import LiveLook
 from impactopt.live.replanning import Replanning
-from impactopt.live.wishes import Wish, numbers_of, wish_of
+from impactopt.live.requests import Wish, numbers_of, wish_of
 from impactopt.planning.solution import Solution
 from impactopt.report.tracks import planned_track, tracks_of
 from impactopt.solvers.program import SolverResult, Status

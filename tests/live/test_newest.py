@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from impactopt.live.newest import Newest
+from impactopt.live.latest_request import Newest
 
 LONG = 30.0  # [s] nothing here takes so long
 

@@ -34,8 +34,8 @@ from impactopt.simulation import scene_of, simulate_pinocchio
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 from impactopt.studies.exact import ExactCollision
-from impactopt.sweeps.single import collide_once, problem_of_result
-from impactopt.sweeps.states import ContactStates, Posture
+from impactopt.sweeps.contact_states import ContactStates, Posture
+from impactopt.sweeps.single_collision import collide_once, problem_of_result
 from impactopt.transcription.plan import PlannedCollision
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")

@@ -22,7 +22,7 @@ from impactopt.kinematics.stance import BothSoles, FixedBase
 from impactopt.kinematics.support import margin
 from impactopt.robots.presets import load_robot
 from impactopt.sweeps.collisions import Collisions, collide_many
-from impactopt.sweeps.states import ContactStates, Posture
+from impactopt.sweeps.contact_states import ContactStates, Posture
 
 POINT, NORMAL = [0.7, 0.0, 0.75], np.array([0.0, 0.0, -1.0])
 

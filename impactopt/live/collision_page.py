@@ -17,9 +17,9 @@ from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque, striking_velocity
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.live.drawing import Drawing
+from impactopt.live.latest_request import Newest
 from impactopt.live.motion import Moment
-from impactopt.live.newest import Newest
-from impactopt.live.serving import LOCAL, LivePage, served
+from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["Blow", "LiveBlow"]

@@ -17,10 +17,10 @@ from impactopt.files.output import Record, load_record, plain
 from impactopt.files.problem_file import ProblemFile, parse_problem_file
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.robot import Robot
-from impactopt.sweeps.alike import NOT_ENDED
 from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model
+from impactopt.sweeps.collision_batch import NOT_ENDED
+from impactopt.sweeps.contact_states import ContactStates, States
 from impactopt.sweeps.measures import MEASURES, Blow
-from impactopt.sweeps.states import ContactStates, States
 
 __all__ = ["collide_once", "planned_numbers", "problem_of_result"]
 

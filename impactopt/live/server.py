@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from impactopt.errors import InputError, missing_package
-from impactopt.live.newest import Newest
+from impactopt.live.latest_request import Newest
 
 __all__ = ["LOCAL", "LivePage", "served"]
 

@@ -20,8 +20,8 @@ from impactopt.files.problem_file import ProblemFile
 from impactopt.files.problem_file.toml import Place
 from impactopt.sweeps.at_contact import AtContact
 from impactopt.sweeps.collision_keys import SERVO, setting_of
+from impactopt.sweeps.contact_states import ContactStates, Posture, States
 from impactopt.sweeps.measures import Blow, Measure
-from impactopt.sweeps.states import ContactStates, Posture, States
 
 __all__ = ["AlikeCollisions"]
 

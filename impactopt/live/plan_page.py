@@ -11,12 +11,12 @@ import numpy as np
 
 from impactopt.errors import InputError
 from impactopt.live.drawing import Drawing
+from impactopt.live.latest_request import Newest
 from impactopt.live.motion import moment_of
-from impactopt.live.newest import Newest
 from impactopt.live.replanning import Answer, Replanning
-from impactopt.live.serving import LOCAL, LivePage, served
-from impactopt.live.telling import told_failure, told_plan
-from impactopt.live.wishes import Wish, numbers_of, wish_of
+from impactopt.live.requests import Wish, numbers_of, wish_of
+from impactopt.live.server import LOCAL, LivePage, served
+from impactopt.live.summary import told_failure, told_plan
 from impactopt.planning.solution import Solution
 from impactopt.report.tracks import Track
 

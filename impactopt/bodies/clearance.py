@@ -12,8 +12,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.convex_hulls import Piece
 from impactopt.bodies.fit import Planes
-from impactopt.bodies.pieces import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
 from impactopt.bodies.separation import Placed, Shapes
 from impactopt.bodies.world import BEHIND, WorldBody

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.pieces import Piece
+from impactopt.bodies.convex_hulls import Piece
 
 __all__ = ["distance_to_link", "is_far", "size_of"]
 

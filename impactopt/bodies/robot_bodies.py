@@ -16,8 +16,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.bodies.fit import Planes, Spheres, enclose, fill, surface_points
-from impactopt.bodies.pieces import Piece, pieces_of
 from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot
 

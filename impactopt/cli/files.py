@@ -29,7 +29,7 @@ def check(
     with plain_errors("interrupted", verbose=verbose):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.doubts import hopeless, too_weak
+        from impactopt.problem.feasibility import hopeless, too_weak
         from impactopt.problem.plausibility import doubts
 
         try:

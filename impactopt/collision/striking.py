@@ -1,6 +1,6 @@
 """Striking-point mobility and coasting torques of a constrained robot, compiled for many states.
 
-`impactopt.kinematics.held` has the same for one state, by Pinocchio and least squares; the two are tested
+`impactopt.kinematics.operational_space` has the same for one state, by Pinocchio and least squares; the two are tested
 against each other. That takes some milliseconds a state, which for millions of them would be hours.
 """
 

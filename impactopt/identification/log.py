@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.files import read_archive
 from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, shortened
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.robots.robot import Robot
 
 __all__ = ["FORCE", "SPEED", "TIME", "ImpactLog", "read_log"]

@@ -25,8 +25,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.kinematics.closing import Closing
-from impactopt.kinematics.fixed_order import Index, elimination_order, solve_in_order
+from impactopt.kinematics.leg_closure import Closing
+from impactopt.kinematics.symbolic_elimination import Index, elimination_order, solve_in_order
 from impactopt.robots.checks import LEG, check_arms, check_legs
 from impactopt.robots.hinges import check_held
 from impactopt.robots.rigid_body import RigidBody

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from impactopt.collision import SDC, Collision
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.live.drawing import Drawing
 from impactopt.live.latest_request import Newest

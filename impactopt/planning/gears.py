@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.transcription.mesh_refinement import GEAR
 
 __all__ = ["gear_caution", "gears_beyond"]

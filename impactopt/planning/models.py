@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque
+from impactopt.kinematics.operational_space import holding_torque
 from impactopt.planning.chosen_gains import with_factors_of
 from impactopt.planning.contact_replay import ModelError, PlannedContact
 from impactopt.planning.multistart import carried

@@ -20,7 +20,7 @@ from impactopt.planning.multistart import carried, one_after_the_other, rank_of,
 from impactopt.planning.sliding import slides_beyond
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, Slide, Term
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.plan import Plan, PlannedCollision
 from impactopt.transcription.planned_loads import plan_loads, strike_loads

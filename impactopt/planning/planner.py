@@ -38,7 +38,7 @@ from impactopt.planning.stopping import stopping
 from impactopt.planning.strike import clear_strike
 from impactopt.planning.verdict import lacks_rows, with_reason, with_soles_kept
 from impactopt.planning.window import window_caution
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.apart import ApartRow, Held

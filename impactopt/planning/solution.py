@@ -24,7 +24,7 @@ from impactopt.planning.multistart import Attempt
 from impactopt.planning.on_demand import rows_on_demand
 from impactopt.planning.sliding import slide, slide_caution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_error import ContactError
 from impactopt.transcription.mesh import Elements, Shares, contact_elements

@@ -13,7 +13,7 @@ from impactopt.errors import InputError
 from impactopt.planning.causes import Cause
 from impactopt.planning.multistart import VIOLATED, Budget
 from impactopt.planning.solution import Solution
-from impactopt.problem.doubts import too_weak
+from impactopt.problem.feasibility import too_weak
 from impactopt.robots.sole_margins import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.at_contact import ContactProgram

@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.errors import Mistakes
+from impactopt.robots.attachments import Source, Striker
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.inertias import REPAIRED, check_choice, repair_inertias
-from impactopt.robots.parts import Source, Striker
 
 __all__ = ["Description", "Tie", "between"]
 

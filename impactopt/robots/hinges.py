@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots import build
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import Sole
 from impactopt.robots.checks import check_frame
 from impactopt.robots.joints import hung, mapped
-from impactopt.robots.parts import Sole
 
 __all__ = ["check_held", "check_sole", "hinged", "inside", "with_hinges"]
 

@@ -19,8 +19,8 @@ import pinocchio as pin
 from impactopt.errors import InputError, did_you_mean, missing_package
 from impactopt.robots import arms as _arms
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import Source
 from impactopt.robots.build import joint_names, lock_joints
-from impactopt.robots.parts import Source
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, standin_model
 

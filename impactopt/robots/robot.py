@@ -18,10 +18,10 @@ from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
 from impactopt.robots import urdf as _urdf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
+from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, read_only
 from impactopt.robots.hinges import check_sole, with_hinges
 from impactopt.robots.inertias import GIVEN, REPAIRED, check_inertias
 from impactopt.robots.names import tell_apart
-from impactopt.robots.parts import SoftGrip, Sole, Source, Striker, Tool, read_only
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
 

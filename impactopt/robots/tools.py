@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots import build, checks
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import SoftGrip, Tool
 from impactopt.robots.joints import hung, mapped
-from impactopt.robots.parts import SoftGrip, Tool
 
 __all__ = ["grip_limits", "holding", "holding_softly", "let_go", "with_tool", "without"]
 

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from impactopt.collision import Collision, CollisionModel, effective_mass
 from impactopt.errors import InputError, check_array
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.stance import BothSoles, Stance, usual_stance
 from impactopt.kinematics.support import margin as margin_in
 from impactopt.kinematics.support import support_polygon

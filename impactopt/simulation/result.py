@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.robots.sole_margins import least_margins
 from impactopt.simulation.collision_geometry import Solids, Touched
 from impactopt.simulation.motors import MotorCut

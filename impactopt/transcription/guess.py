@@ -20,7 +20,7 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Nail, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription.layout import Array
 

@@ -12,7 +12,7 @@ from impactopt.collision import SDC, VirtualMass
 from impactopt.collision.freezing import freeze_error, more_often
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.report.console import collision_table
 from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench import freezes as bench

@@ -10,7 +10,7 @@ import pytest
 
 from impactopt import SDC, load_problem
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.live.collision_page import LiveBlow
 
 FILE = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"

@@ -24,7 +24,7 @@ from impactopt import (
     solve,
 )
 from impactopt.planning.stopping import stopping
-from impactopt.problem.doubts import too_weak
+from impactopt.problem.feasibility import too_weak
 
 
 @pytest.fixture(scope="module")

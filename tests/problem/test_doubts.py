@@ -17,7 +17,7 @@ from impactopt.contact.targets import FreeMass
 from impactopt.files.draft.drafting import draft_problem
 from impactopt.kinematics.stance import FixedBase
 from impactopt.kinematics.support import margin, support_polygon
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
 

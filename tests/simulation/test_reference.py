@@ -14,7 +14,7 @@ from support.frozen_cases import Kinematics, robot_named, two_masses, with_heavy
 from impactopt.collision import SDC, Effects, JointFriction
 from impactopt.contact import Board, FreeMass, HuntCrossley, KelvinVoigt, Nail, RigidWall, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque
+from impactopt.kinematics.operational_space import holding_torque
 from impactopt.kinematics.stance import BothSoles, OneSole
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 

@@ -17,7 +17,7 @@ from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.stance import BothSoles, FixedBase
 from impactopt.kinematics.support import margin
 from impactopt.robots.presets import load_robot

@@ -27,10 +27,10 @@ from impactopt.files.problem_file.describing import comment_at
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_writing import sole_data, striker_data
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import far_shapes
+from impactopt.robots.attachments import Sole, Striker
 from impactopt.robots.inertias import REPAIRED
-from impactopt.robots.parts import Sole, Striker
 from impactopt.robots.robot import Robot
 from impactopt.robots.rotors import USUAL_ROTOR
 

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.pieces import Piece
+from impactopt.bodies.convex_hulls import Piece
 from impactopt.robots.build import is_floating
 from impactopt.robots.checks import LEG
 

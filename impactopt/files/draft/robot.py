@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.pieces import Piece, pieces_of
+from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.errors import InputError
 from impactopt.files.draft.guesses import Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock, toes, unshared

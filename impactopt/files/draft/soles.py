@@ -10,12 +10,12 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from impactopt.bodies.pieces import Piece
+from impactopt.bodies.convex_hulls import Piece
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
 from impactopt.files.draft.strikers import first_link
+from impactopt.robots.attachments import Sole
 from impactopt.robots.checks import LEG
-from impactopt.robots.parts import Sole
 
 __all__ = ["find_soles", "sides"]
 

@@ -17,7 +17,7 @@ from impactopt.files.draft.aim import LOWEST, Arm
 from impactopt.kinematics.stance import FixedBase
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.planning.strike import optimize_strike
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import Blow, Strength, drawn_blows
 from impactopt.robots.robot import Robot

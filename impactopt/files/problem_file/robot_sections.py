@@ -26,12 +26,12 @@ from impactopt.files.problem_file.values import (
     Vector,
 )
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.build import add_frame, check_count, lock_joints
 from impactopt.robots.checks import check_legs
 from impactopt.robots.gains import GainFactor, scaled_gains
 from impactopt.robots.hinges import hinged
 from impactopt.robots.mjcf import read_mjcf
-from impactopt.robots.parts import SoftGrip
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 from impactopt.robots.urdf import read_urdf

@@ -42,7 +42,7 @@ from impactopt.files.problem_file.values import (
 from impactopt.kinematics.stance import BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.second import SecondStriker
+from impactopt.problem.second_striker import SecondStriker
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
 

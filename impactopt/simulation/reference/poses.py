@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.world import WorldBody
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
@@ -70,7 +70,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
 
 
 def inverse_mass(problem: ImpactProblem, q: Array) -> Array:
-    """J P J' (3, 3) [1/kg] of the striking point, as of `impactopt.kinematics.held.Held`."""
+    """J P J' (3, 3) [1/kg] of the striking point, as of `impactopt.kinematics.operational_space.Held`."""
     robot = problem.robot
     frames = problem.stance.constraint_frames(robot)
     return Held.at(robot.model, q, frames, robot.striker(problem.striker).model_frame).inverse_mass()

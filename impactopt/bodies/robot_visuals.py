@@ -11,11 +11,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.convex_hulls import ROD, bare_joints, inertia_box, tool_solids
 from impactopt.bodies.mjcf import geoms_of
-from impactopt.bodies.pieces import ROD, bare_joints, inertia_box, tool_solids
 from impactopt.bodies.solids import Solid, cylinder, sphere
 from impactopt.bodies.urdf import numbers, shapes_of, urdf_root
-from impactopt.robots.parts import Tool
+from impactopt.robots.attachments import Tool
 from impactopt.robots.robot import Robot, Striker
 
 __all__ = ["Visual", "visuals_of"]

@@ -143,7 +143,7 @@ def solve(
     with plain_errors(said, verbose=verbose, keeps=True) as console:
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.files.solved import SolvedFolder
+        from impactopt.files.solution_library import SolvedFolder
         from impactopt.planning.planner import solve as plan
         from impactopt.report.console import SolveConsole
 

@@ -1,7 +1,7 @@
 """Metadata of a dataclass's fields: descriptions, units, ranges, keys in a file.
 
 It is said once, in the field's own metadata. The class checks its numbers by it, its docstring lists it, and
-the sections of problem files are made of it (`impactopt.files.problem_file.described`).
+the sections of problem files are made of it (`impactopt.files.problem_file.field_sections`).
 """
 
 from __future__ import annotations

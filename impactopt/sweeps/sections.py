@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from impactopt.files.problem_file.mistakes import Mistake
+from impactopt.files.problem_file.diagnostics import Mistake
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import Positive
 from impactopt.sweeps.figure import Figure

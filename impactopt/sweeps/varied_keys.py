@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile
-from impactopt.files.problem_file.mistakes import Mistake, mistakes_of
+from impactopt.files.problem_file.diagnostics import Mistake, mistakes_of
 from impactopt.files.problem_file.toml import Place
 from impactopt.sweeps.design import Axis, Column, Span, column
 from impactopt.sweeps.sections import SpanSection

@@ -34,7 +34,7 @@ from impactopt.collision import effective_mass
 from impactopt.errors import printable
 from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.files.problem_file.changes import parse_settings
-from impactopt.files.problem_file.mistakes import key_lines
+from impactopt.files.problem_file.diagnostics import key_lines
 from impactopt.files.problem_file.names import problem_file
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.problem.phase import FINEST

@@ -12,7 +12,7 @@ from impactopt.cli.app import app
 from impactopt.errors import InputError
 from impactopt.files.output import NUMBERS
 from impactopt.files.problem_file import ProblemFile, read_problem_file
-from impactopt.files.solved import SolvedFolder
+from impactopt.files.solution_library import SolvedFolder
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.sweeps import sweep_from_data

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
-from impactopt.files.draft.aim import WAYS, Arm, aims, ready
-from impactopt.files.draft.guesses import DOUBT
+from impactopt.files.draft.default_drives import DOUBT
 from impactopt.files.draft.limbs import renumbered
 from impactopt.files.draft.postures import half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_striker
 from impactopt.files.draft.strong import Strong, duration, strongest
-from impactopt.files.problem_file.describing import comment_at
+from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
+from impactopt.files.problem_file.key_docs import comment_at
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_writing import sole_data, striker_data
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml

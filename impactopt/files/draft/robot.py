@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.errors import InputError
-from impactopt.files.draft.guesses import Drives, guess_drives
+from impactopt.files.draft.default_drives import Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints
 from impactopt.robots.checks import LEG

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field, create_model
 
 from impactopt.bodies.shapes import TargetBody
 from impactopt.contact import laws, targets
-from impactopt.files.problem_file.described import one_of, section_of
+from impactopt.files.problem_file.field_sections import one_of, section_of
 from impactopt.files.problem_file.section import Section, optional
 
 _FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # of a file that names none

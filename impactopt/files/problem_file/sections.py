@@ -19,7 +19,7 @@ from pydantic import Field
 from impactopt.bodies.shapes import Ground, Obstacle
 from impactopt.errors import InputError
 from impactopt.files.problem_file.contacts import Contact, Target
-from impactopt.files.problem_file.described import section_of
+from impactopt.files.problem_file.field_sections import section_of
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.solver_sections import SolverSection

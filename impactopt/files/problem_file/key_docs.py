@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from impactopt.files.problem_file.contacts import with_kinds
-from impactopt.files.problem_file.mistakes import section_at
+from impactopt.files.problem_file.diagnostics import section_at
 from impactopt.files.problem_file.sections import File
 from impactopt.files.problem_file.toml import Place
 

@@ -1,4 +1,4 @@
-"""A live look at one collision: sliders for the posture and the speed, with force and ZMP at once."""
+"""Live page of one collision: sliders for the posture and the speed, with force and ZMP at once."""
 
 from __future__ import annotations
 

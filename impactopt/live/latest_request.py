@@ -1,4 +1,4 @@
-"""Work in a thread of its own, for the newest wish alone."""
+"""Answers the latest request alone, in a thread of its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The live look itself: a local page with the planned motion, and controls that make new plans."""
+"""Live page of a plan: the planned motion, and controls that make new plans."""
 
 from __future__ import annotations
 

@@ -257,8 +257,8 @@ def simulate_pinocchio(
     until [s] : it ends, if that is earlier.
     record : steps between recorded instants; every step is recorded in contact.
     missing : there is no target.  missed : the reference of a robot that hits nothing, which it notices at
-        ``missed.contact_end`` (:class:`impactopt.simulation.contact_times.FollowedReference`); default: it does
-        not.
+        ``missed.contact_end`` (:class:`impactopt.simulation.contact_times.FollowedReference`); default: it
+        does not.
 
     Raises
     ------

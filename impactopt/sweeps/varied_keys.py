@@ -1,4 +1,4 @@
-"""The keys that a sweep file varies, read against the problem's file that they are of."""
+"""Varied keys of a sweep file, checked against its problem's file."""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
-"""Spheres that cover a convex hull, and planes that enclose it: what a plan's smooth rows know of bodies.
+"""Spheres that cover a convex hull, and planes that enclose it: what a plan's smooth constraints know of
+bodies.
 
 A point x is at least max_i (n_i . x - h_i) from a body whose support function is h_i in the directions n_i,
-and a sphere that much less its radius. Inside the body that is how deep it is, so that rows show the way out.
+and a sphere that much less its radius. Inside the body that is how deep it is, so that constraints show the
+way out.
 """
 
 from __future__ import annotations

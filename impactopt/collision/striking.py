@@ -1,7 +1,7 @@
 """Striking-point mobility and coasting torques of a constrained robot, compiled for many states.
 
-`impactopt.kinematics.operational_space` has the same for one state, by Pinocchio and least squares; the two
-are tested against each other. That takes some milliseconds a state, which for millions of them would be hours.
+`impactopt.kinematics.operational_space` has the same for one state, by Pinocchio and least squares; they
+are tested against each other. That takes some milliseconds a state, which for millions would be hours.
 """
 
 from __future__ import annotations

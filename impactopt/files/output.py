@@ -74,7 +74,8 @@ class Record:
         with an abort motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines),
         `collision_*` (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*`
         (`Simulation` on free soles, without velocities and torques), `solver_*` (`SolverResult`),
-        `history_*` (its iterations); `program_statement`, names of the program's variables and rows, as JSON.
+        `history_*` (its iterations); `program_statement`, names of the program's variables and constraints,
+        as JSON.
     problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 

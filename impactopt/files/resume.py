@@ -23,7 +23,7 @@ from impactopt.transcription.transcription import Transcription
 
 __all__ = ["resumed"]
 
-_SAME = 1e-6  # of rows: those of a program that is not the record's are off by more
+_SAME = 1e-6  # of constraints: those of a program that is not the record's are off by more
 
 
 def resumed(record: Record, problem: ImpactProblem) -> Solution:

@@ -24,7 +24,7 @@ __all__ = ["Answer", "Replanning"]
 PATIENCE = 20.0  # [s] that each of the two ways may take
 _STEPS = 3e-3, 1e-2  # [s] least and most between instants of the motion that is drawn
 _IN_CONTACT = 6  # instants, if the least step allows it
-_WORST = 5  # rows that are told
+_WORST = 5  # constraints that are told
 # of the solver: the impulse is within a thousandth, in half of the iterations
 _LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-3}
 
@@ -34,7 +34,7 @@ class Answer:
     """Answer to a request.
 
     solution, track, margins : the plan, its motion, its `Plan.margins`; None where there is none.  seconds :
-    it took.  why : there is none, with the worst rows.
+    it took.  why : there is none, with the worst constraints.
     """
 
     solution: Solution | None = None
@@ -85,7 +85,7 @@ class Replanning:
         common: dict[str, Any] = {"callback": stop, "time_limit": self.patience, "options": _LOOSE}
         try:
             bent = self.first.moved(**changes, **common)
-        except InputError:  # its program has other rows, or there is no such problem
+        except InputError:  # its program has other constraints, or there is no such problem
             bent = None
         if bent is not None and (bent.status.usable or stale()):
             return bent

@@ -7,11 +7,11 @@ from impactopt.planning.solution import Solution
 
 __all__ = ["told_failure", "told_plan"]
 
-_WORST = 5  # rows
+_WORST = 5  # constraints
 
 
 def told_plan(answer: Answer, first: Solution) -> str:
-    """A plan's numbers, how it was found, and its worst rows."""
+    """A plan's numbers, how it was found, and its worst constraints."""
     solution = answer.solution
     assert solution is not None
     plan, duration = solution.plan, solution.plan.compression + solution.plan.restitution
@@ -30,7 +30,9 @@ def told_plan(answer: Answer, first: Solution) -> str:
     seconds = first.solve_seconds if solution is first else answer.seconds
     lines.append(f"\n{solution.status.value}: {solution.result.iterations} iterations, {seconds:.2f} s")
     worst = [f"- {row}" for row in solution.violations[:_WORST]]
-    return "\n".join([*lines, *(["\nRows that are not met:", *worst] if worst else ["\nAll rows are met."])])
+    return "\n".join(
+        [*lines, *(["\nViolated constraints:", *worst] if worst else ["\nAll constraints are met."])]
+    )
 
 
 def told_failure(answer: Answer) -> str:

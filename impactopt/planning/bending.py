@@ -27,8 +27,8 @@ from impactopt.transcription.transcription import Transcription
 __all__ = ["moved_solution"]
 
 Array = NDArray[np.float64]
-_FIRST_ORDER = 1e-3  # of rows: a first-order plan that is off by more is none
-_ENOUGH, _CORRECTIONS = 1e-4, 4  # of rows: no more steps; and so many at most beside the first
+_FIRST_ORDER = 1e-3  # of constraints: a first-order plan that is off by more is none
+_ENOUGH, _CORRECTIONS = 1e-4, 4  # of constraints: no more steps; and so many at most beside the first
 _BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near
 # First barriers, and most iterations, from the plan itself. With the smaller one the solver keeps to bounds
 # that hold no more, and takes a third longer. In one of 50 shifts either of them leads nowhere.
@@ -69,7 +69,7 @@ def moved_solution(
     result = _polished(budget, t, first, old)
     t, result = mended(t, result, old.x)
 
-    # new rows are farther off than what a tolerance for small moves makes up for
+    # new constraints are farther off than what a tolerance for small moves makes up for
     given = {name: value for name, value in (options or {}).items() if not name.endswith("_tolerance")}
     exact = replace(budget, options=given)
 
@@ -102,13 +102,14 @@ def _first_order(solution: Solution, t: Transcription, bent: Bent) -> SolverResu
     found = bent.predictor.predict(t.program)
     if found is None:
         return _by_active_set(solution, t, bent)
-    words = f"By {found.steps} QPs of first order: rows are off by {found.violation:.1g} at most."
+    words = f"By {found.steps} QPs of first order: constraints are off by {found.violation:.1g} at most."
     return _result(solution, t, found, words, began)
 
 
 def _by_active_set(solution: Solution, t: Transcription, bent: Bent) -> SolverResult:
     """Newton steps on the changed program's KKT conditions with the solution's own matrix and active set,
-    clipped to bounds: the first is the plan of first order, more of them while rows are off and they help.
+    clipped to bounds: the first is the plan of first order, more of them while constraints are off and they
+    help.
 
     What the solver had left at the solution is not made up for.
     """
@@ -130,7 +131,7 @@ def _by_active_set(solution: Solution, t: Transcription, bent: Bent) -> SolverRe
     unequal, moves = program.g_lower < program.g_upper, program.x_lower < program.x_upper
     gone_y, gone_z = unequal & (system.rows * best.y < 0), moves & (system.bounds * best.z < 0)
     turned = int(gone_y.sum() + gone_z.sum())
-    words = f"By {steps} steps of first order: rows are off by {worst:.1g} at most"
+    words = f"By {steps} steps of first order: constraints are off by {worst:.1g} at most"
     words += f"; {turned} of those that held should not any more." if turned else "."
     y, z = np.where(gone_y, 0.0, best.y), np.where(gone_z, 0.0, best.z)
     return _result(solution, t, Prediction(x=best.x, y=y, z=z, violation=worst, steps=steps), words, began)

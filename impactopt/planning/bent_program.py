@@ -41,7 +41,7 @@ class Bent:
         *,
         anew: bool = True,
     ) -> Transcription:
-        """The solution's program with the numbers of another problem: the same variables and rows.
+        """The solution's program with the numbers of another problem: the same variables and constraints.
 
         Where point, contact law and target alone are others it is good until the next one is asked for.
         anew : as of `ContactProgram.move_to`.
@@ -73,7 +73,7 @@ class Bent:
                 raise InputError("the world has other bodies then: use solve(problem, start=solution)")
             t = t.with_apart(s.apart)
         if (t.program.n, t.program.m) != (len(s.result.x), len(s.result.multipliers)):
-            raise InputError("the program has other rows then: use solve(problem, start=solution)")
+            raise InputError("the program has other constraints then: use solve(problem, start=solution)")
         return t
 
     @cached_property

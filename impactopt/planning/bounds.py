@@ -38,7 +38,7 @@ __all__ = ["MET", "USUAL", "Bound", "Cause", "bounds_of", "changed_or_none"]
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Chosen = Callable[[Row], bool]
-MET = 1e-5  # violation of rows that counts as none here
+MET = 1e-5  # violation of constraints that counts as none here
 USUAL = 1.0  # [s] of a motion
 _NO = np.zeros(0, dtype=np.intp)
 _TIMES = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}
@@ -75,7 +75,7 @@ class Cause:
 class Bound:
     """Bounds of a program that come from one number of its problem.
 
-    chosen : which rows; variables : and whose bounds.  unit : as of a `Relaxation`.
+    chosen : which constraints; variables : and whose bounds.  unit : as of a `Relaxation`.
     told : for variables (n,) that meet all else, the causes that they show.
     """
 
@@ -292,7 +292,7 @@ def _off(t: Transcription, x: Array, chosen: Chosen, *, torques: bool = False) -
 
 
 def _rows(t: Transcription, chosen: Chosen) -> Index:
-    """Numbers of the rows that are chosen, of those that are bounds."""
+    """Numbers of the constraints that are chosen, of those that are bounds."""
     found = np.array([i for i, row in enumerate(t.program.origins) if chosen(row)], dtype=np.intp)
     return found[t.program.g_lower[found] < t.program.g_upper[found]]
 

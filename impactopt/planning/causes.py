@@ -50,7 +50,7 @@ class Search:
     """Result of a search for the bounds that make a problem infeasible.
 
     causes : bounds any one of which would do, the one that moves least first.  met : a program of
-    the problem with rows of all terms on demand, and variables (n,) that meet it; None if none are known.
+    the problem with constraints of all lazy terms, and variables (n,) that meet it; None if none are known.
     """
 
     causes: tuple[Cause, ...] = ()
@@ -76,7 +76,7 @@ class _Relaxing:
     def __init__(self, t: Transcription, result: SolverResult, budget: Budget) -> None:
         self.given, self._budget = t.problem, budget
         self._iterations = max(_LEAST, result.iterations)
-        # a bound that has moved would else break what has no rows yet
+        # a bound that has moved would else break what has no constraints yet
         p = with_rows(t.problem, [snake_case(type(term).__name__) for term in t.problem.on_demand])
         self.t = program_for(t, p, None)
         nothing = np.zeros(t.program.m), np.zeros(t.layout.n)

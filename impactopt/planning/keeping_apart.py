@@ -283,7 +283,9 @@ def _with_more(t: Program, watch: Watch, start: Array | SolverResult) -> tuple[P
 
 
 def _of_names(numbers: Array, old: ContactProgram, new: ContactProgram, other: float) -> Array:
-    """A program's rows' numbers (m,) for one with more constraints between bodies, whose are ``other``."""
+    """A program's constraints' numbers (m,) for one with more constraints between bodies, whose are
+    ``other``.
+    """
     own = len(numbers) - len(old.apart_rows)
     known = dict(zip(old.apart_rows, numbers[own:].tolist(), strict=True))
     return np.append(numbers[:own], [known.get(name, other) for name in new.apart_rows])

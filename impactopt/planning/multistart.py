@@ -34,7 +34,7 @@ Program = TypeVar("Program", bound="ContactProgram")
 Starts = Iterable[tuple[str, Callable[[], Array | SolverResult]]]
 SOLVERS = ("sqp", "ipopt")
 EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
-VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
+VIOLATED = 1e-4  # larger violations are named; an iterate without any is a solution, if not an optimum
 NAMED = 20  # at most
 _PUSH = 1e-6  # into its bounds, of a start that is to stay where it is
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
@@ -223,7 +223,7 @@ def solve_from(
     is one after which no time is left.  began [s] : when work on the problem did.
     work : what is done from a start; None: the program is solved as it is. It may end with another program.
 
-    Of those that meet their rows the one of least objective is best, else the one of least violation.
+    Of those that meet their constraints the one of least objective is best, else the one of least violation.
     """
     built = time.perf_counter()
     found, attempts = list[tuple[Program, SolverResult]](), list[Attempt]()
@@ -270,7 +270,9 @@ def violations_of(t: ContactProgram, x: Array, rows: Array) -> tuple[Violation, 
 
 
 def rank_of(result: SolverResult) -> tuple[bool, float]:
-    """Less is better: those that meet their rows by their objective, then the others by their violation."""
+    """Less is better: those that meet their constraints by their objective, then the others by their
+    violation.
+    """
     met = result.status.usable or result.max_violation <= VIOLATED
     return not met, result.objective if met else result.max_violation
 

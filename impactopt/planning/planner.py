@@ -90,7 +90,7 @@ def solve(
     report : called with a line of text while functions are built.  callback : called with every iteration's
         record; if it returns True, or on Ctrl-C, the solve stops with the best iterate.
 
-    An infeasible problem is a status with named rows, not an exception.
+    An infeasible problem is a status with named constraints, not an exception.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def _planned(
     if isinstance(given, SolverResult) and _meets_rows(t, given):
         budget = budget.near_by()  # the start may be the optimum
     if report is not None:
-        report(f"program of {t.program.n} variables and {t.program.m} rows; {budget.solver} starts")
+        report(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     refining = Refining(budget, margins, apart, report)
     # limbs that are in each other, or gears that break, say nothing of what a start is worth: each is led to
@@ -286,7 +286,7 @@ def _on(refining: Refining, t: Transcription, fields: dict[str, Any]) -> tuple[T
     within, bounded = _bounded(refining, finer, result, (t, old.x), True)
     if within is not finer:
         alone = {key: getattr(bounded, key) - getattr(result, key) for key in EFFORT}
-        rounds.append((within, "rows on demand", replace(bounded, **alone)))
+        rounds.append((within, "lazy constraints", replace(bounded, **alone)))
         finer, result = within, bounded
     if not rounds:
         return t, fields

@@ -147,7 +147,7 @@ class Refining:
         self.blocked, self._known, self._contact = other.blocked, other._known, other._contact
 
     def first(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
-        """The program with its first rows between bodies, and its result."""
+        """The program with its first clearance constraints, and its result."""
         warm = isinstance(start, SolverResult)
         if warm and self.given_rows:
             t = t.with_apart(self.given_rows)
@@ -202,7 +202,7 @@ class Refining:
         penetration; if that fails too, the violated constraints name the obstacle.
         """
         if self.report is not None:
-            self.report("no motion was found from there with rows between bodies: first without them")
+            self.report("no motion was found from there with clearance constraints: first without them")
         last, result = self.judged(*self.rounds(free, self.budget.run(free.program, x0), x0)[:2])
         if result.status.usable:
             return last, one_after_the_other(stuck, result)
@@ -301,7 +301,7 @@ class Refining:
         starts = (first_iterate(finer) if missed else carried(finer, t, old),)
         if violated is not None and finer.layout.n == len(old.x):
             starts = (*starts, old.x, x0)
-        # a contact that is far off breaks the finer program's rows by far
+        # a contact that is far off breaks the finer program's constraints by far
         far = elements is not None and error is not None and abs(error.pct) > AGREED
         name = more_of(
             nodes.total - t.nodes.total, elements, len(violated.rows) if violated is not None else 0

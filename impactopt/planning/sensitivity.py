@@ -24,7 +24,7 @@ _SMALL = 1e-6  # a shadow price that is nothing
 
 @dataclass(frozen=True, kw_only=True)
 class Binding:
-    """A row that a plan is at, and its shadow price: what the objective gains by its bound, per unit.
+    """A constraint that a plan is at, and its shadow price: what the objective gains by its bound, per unit.
 
     row : as messages name it.  price : [objective's unit / unit]; ``unit`` of what the bound is moved by.
     """
@@ -43,7 +43,7 @@ class Sensitivity:
 
     parameter, value : its name and value.  impulse : d impulse / d parameter [N s / unit].
     objective : d (weighted sum of the objectives, less the prices on motion) / d parameter.
-    binding : rows and bounds that the plan is at, dearest first.
+    binding : constraints and bounds that the plan is at, dearest first.
     """
 
     parameter: str

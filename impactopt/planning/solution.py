@@ -44,10 +44,10 @@ class Solved:
     result : the solver's own record, its history included; of the best start.
     build_seconds : time to compile or load functions and to assemble the program.  solve_seconds : time of
         the solver, of all starts.
-    violations : rows that are not met, worst first.
+    violations : constraints that are not met, worst first.
     objectives : value of each of the problem's objectives, by name, in its own unit.
     attempts : result of each start.
-    apart : rows of the program between bodies.
+    apart : constraints of the program between bodies.
     elements, shares : lengths of the collocation elements of the contact's phases, as fractions of them, if
         they are finer than the problem asks for; and the share of each phase in the contact's time, where
         something is frozen during contact. Else ().
@@ -135,7 +135,8 @@ class Solution(Solved):
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
-    statement : names of the program's variables and rows, as `impactopt.transcription.statement` writes them.
+    statement : names of the program's variables and constraints, as `impactopt.transcription.statement`
+    writes them.
     causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
         cheapest first. Each has the ``problem`` with that value. Empty where none is known to.
     window : what is to be said of the time that the contact may last; "" if that costs little.
@@ -217,17 +218,17 @@ class Solution(Solved):
         """The plan bent for another ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` or
         ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
 
-        First come quadratic programs about this plan, which find rows that begin and cease to hold; then the
-        solver goes on from there, with this plan's mesh, and with new rows where bodies come into each other
-        that have none. ``polish=False``: the first alone. They are quick
-        and within a thousandth of the rows where status says "acceptable"; other plans of theirs are none.
-        ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and
+        First come quadratic programs about this plan, which find constraints that begin and cease to hold;
+        then the solver goes on from there, with this plan's mesh, and with new constraints where bodies come
+        into each other that have none. ``polish=False``: the first alone. They are quick
+        and within a thousandth of the constraints where status says "acceptable"; other plans of theirs are
+        none. ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and
         ``time_limit`` are those of `impactopt.solve`.
 
         Raises
         ------
         InputError : this is no solution; nothing is changed, or what target and law do not have; the program
-            has other rows or bodies then.
+            has other constraints or bodies then.
         """
         # by the public name: what solves comes after solutions in the order of imports
         from impactopt import moved_solution

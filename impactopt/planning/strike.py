@@ -45,7 +45,7 @@ from impactopt.transcription.transcription import block_functions
 Array = NDArray[np.float64]
 ROUNDS = 10  # of freezes that come when they are to
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
-# solve that goes on with other rows
+# solve that goes on with other constraints
 BARRIER_ARM, BARRIER_ON = 0.03, 1e-2
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 Work = Callable[[StrikeTranscription, Array | SolverResult], tuple[StrikeTranscription, SolverResult]]
@@ -185,7 +185,7 @@ def _optimized(
         start = (start.result if method == "shooting" else carried_start(t, same, start, start.apart)).x
     given = None if start is None else check_array("start", start, (t.program.n,))
     if report is not None:
-        report(f"program of {t.program.n} variables and {t.program.m} rows; {budget.solver} starts")
+        report(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     work = partial(_clean_strike, budget, margins)
     if method != "shooting":
@@ -212,7 +212,7 @@ def _optimized(
 
 
 def _program_of(solution: StrikeSolution) -> StrikeTranscription:
-    """The program of a solution, without rows between bodies."""
+    """The program of a solution, without clearance constraints."""
     p, elements = solution.problem, solution.elements
     functions = block_functions(p, p.coordinates, None, elements)
     t = StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
@@ -237,8 +237,8 @@ def clear_strike(
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose bodies keep apart; its result has the effort of all.
 
-    start : variables (n,); or a result of this program but for other rows, such as those on demand: then it
-        goes on from there, and begins anew only where that leads nowhere.
+    start : variables (n,); or a result of this program but for other constraints, such as those on demand:
+        then it goes on from there, and begins anew only where that leads nowhere.
     """
     x0 = start.x if isinstance(start, SolverResult) else start
     goes_on = isinstance(start, SolverResult) and len(start.multipliers) == t.program.m

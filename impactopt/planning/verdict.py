@@ -33,15 +33,15 @@ def second_look(
 ) -> SolverResult:
     """The result that IPOPT comes to from the same start, where the SQP gave up, if it says more.
 
-    It scales rows, and restores them by another way, so it rarely fails on the same programs. A limit that
-    the caller has set is an answer, and stays one.
+    It scales constraints, and restores them by another way, so it rarely fails on the same programs. A limit
+    that the caller has set is an answer, and stays one.
     """
     open_end = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
     if budget.solver != "sqp" or not open_end or budget.left == 0:
         return old
     rows = max_violation(program, old.x, program.constraints(old.x))
     if old.status is Status.FAILED and rows <= VIOLATED < old.max_violation:
-        return old  # it has been refused for what is no row
+        return old  # it has been refused for what is no constraint
     if report is not None:
         report("our solver ends without a verdict: IPOPT tries once, from the same start")
     new = replace(budget, solver="ipopt", options=None).run(program, start)

@@ -108,7 +108,7 @@ class ImpactProblem:
     obstacles : bodies in the world that the robot keeps off.
     ground : the floor below a robot on a fixed base; None: there is none. Soles stand on the ground z = 0.
     terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
-        `GearLoad`, whose rows a program gets once a plan without them goes beyond it.
+        `GearLoad`, whose constraints a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
     style : "strongest"; or "natural", with prices on jerk, on the travel of joints, above all of idle ones,
         and on ending away from the start posture (`impactopt.problem.motion_style`).

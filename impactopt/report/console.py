@@ -116,7 +116,7 @@ def verdict_table(verdict: Mapping[str, Any]) -> Table:
     kkt = "not computed" if verdict["kkt"] is None else f"KKT residual {verdict['kkt']:.2g}"
     words = "ok" if verdict["ok"] else "not ok"
     table = Table(title=_plain(f"{words}; {kkt}"), title_justify="left")
-    for name in ("rows", "violation", "where"):
+    for name in ("constraint", "violation", "where"):
         table.add_column(name, justify="right" if name == "violation" else "left")
     for name, row in sorted(verdict["rows"].items(), key=lambda item: -item[1]["violation"]):
         table.add_row(_plain(name), f"{row['violation']:.2g}", _plain(row["where"]))
@@ -257,9 +257,9 @@ def told_off(summary: Mapping[str, Any]) -> str:
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     """Table of violations, worst first, one a term."""
-    table = Table(title="what is not met, worst first", title_justify="left")
-    table.add_column("row", overflow="fold")
-    table.add_column("by how much", overflow="fold")
+    table = Table(title="violations, worst first", title_justify="left")
+    table.add_column("constraint", overflow="fold")
+    table.add_column("violation", overflow="fold")
     for row, by in worst_rows(violations):
         table.add_row(_plain(row), _plain(by))
     return table

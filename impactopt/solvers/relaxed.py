@@ -34,10 +34,12 @@ class Relaxation:
 
 
 class RelaxedProgram:
-    """Minimize the sum of how far bounds move, subject to all of a program's rows; a `NonlinearProgram`.
+    """Minimize the sum of how far bounds move, subject to all of a program's constraints; a
+    `NonlinearProgram`.
 
-    Its variables are the program's (n,), and behind them one for each relaxation, >= 0. Its rows are the
-    program's (m,), and behind them the lower sides of relaxed rows and the bounds of relaxed variables.
+    Its variables are the program's (n,), and behind them one for each relaxation, >= 0. Its constraints are
+    the program's (m,), and behind them the lower sides of relaxed constraints and the bounds of relaxed
+    variables.
 
     x : (n,) somewhere: patterns of derivatives are taken from there, and the size of the objective.
     """
@@ -50,9 +52,8 @@ class RelaxedProgram:
         x_lower, x_upper = program.x_lower.copy(), program.x_upper.copy()
         upper, lower = program.g_upper.copy(), program.g_lower.copy()
         sources, lows, highs = [np.arange(m)], list[Vector](), list[Vector]()
-        coupled: list[
-            tuple[Index, int, float]
-        ] = []  # rows here, their relaxation, and what it weighs in them
+        # constraints, their relaxation, and its coefficient in them
+        coupled: list[tuple[Index, int, float]] = []
         size = m
         for k, relaxed in enumerate(relaxations):
             i, j, unit = relaxed.rows, relaxed.variables, relaxed.unit
@@ -72,7 +73,8 @@ class RelaxedProgram:
                 highs.append(high[bounded])
                 size += count
             lower[i[both]], x_lower[j], x_upper[j] = -np.inf, -np.inf, np.inf
-        self._source = np.concatenate(sources)  # of each row: one of the program's rows, or m + variable
+        # of each constraint: one of the program's, or m + variable
+        self._source = np.concatenate(sources)
         self.n, self.m = n + self._more, size
         self.g_lower, self.g_upper = np.concatenate([lower, *lows]), np.concatenate([upper, *highs])
         self.x_lower = np.concatenate([x_lower, np.zeros(self._more)])

@@ -248,7 +248,7 @@ class Held(NamedTuple):
 def add_apart_rows(
     b: Builder, spots: Sequence[tuple[Place, list[Affine]]], rows: Mapping[ApartRow, Held]
 ) -> list[ApartRow]:
-    """Blocks and rows for these, and their names in the order of the program's rows.
+    """Blocks and constraints for these, and their names in the order of the program's constraints.
 
     spots : places of a program, with coordinates and legs.
     """
@@ -315,7 +315,7 @@ def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_
 
 
 def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[ApartRow, Held]) -> None:
-    """Blocks of these rows with the world's bodies where this problem has them; none is turned."""
+    """Blocks of these constraints with the world's bodies where this problem has them; none is turned."""
     of_name = {block.name: block for block in blocks}
     numbers = {name: block.parameters.copy() for name, block in of_name.items()}
     seen = dict.fromkeys(of_name, 0)

@@ -46,7 +46,7 @@ class BodyState(NamedTuple):
 
 
 class ContactProgram(ABC):
-    """A builder, a hit, and what whoever completes it adds: its parts, and the rows between them.
+    """A builder, a hit, and what whoever completes it adds: its parts, and the clearance constraints.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class ContactProgram(ABC):
     problem, coordinates, robot, functions, y0, legs0 : the builder's.
     angular_momentum : after contact, a group of three, if an objective asks for it.
     objectives : the problem's that it knows, with their quantities.
-    apart_rows : constraints between bodies, in the order of their rows, which are the last.
+    apart_rows : clearance constraints, in the order of their rows, which are the last.
     """
 
     def __init__(self, builder: Builder, hit: Hit) -> None:
@@ -233,7 +233,7 @@ class ContactProgram(ABC):
         )
 
     def with_apart(self: Program, rows: Mapping[ApartRow, Held]) -> Program:
-        """The same program with just these rows between bodies."""
+        """The same program with just these clearance constraints."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
         other.builder = self._bare.copy()

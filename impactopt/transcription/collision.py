@@ -33,7 +33,7 @@ from impactopt.transcription.rows import Measure, Place, along, by_leg, percent,
 
 
 class Collision(ContactNumbers, Collocated):
-    """Variables and rows of the contact with one target.
+    """Variables and constraints of the contact with one target.
 
     contact : what all start from.  stages : collocation points of its phases.
     number : of the program's collisions; 0 that with the expected target.
@@ -169,7 +169,7 @@ class Collision(ContactNumbers, Collocated):
         return [*self.T, self.joined, self.joined_x, self.after]
 
     def _at_stage(self) -> tuple[Group, ...]:
-        """Legs at each collocation point, in the order of their rows."""
+        """Legs at each collocation point, in the order of their constraints."""
         return self.coast_legs, self.coast_rates, self.legs
 
     def loose(self) -> list[Group]:
@@ -197,8 +197,8 @@ class Collision(ContactNumbers, Collocated):
     def determined(self) -> list[Determined]:
         """Variables that each stage's constraints determine, leg by leg, and those of each element.
 
-        An element's travel comes first, by linear rows; last, if there are three phases, the integrals of the
-        first two as one.
+        An element's travel comes first, by linear constraints; last, if there are three phases, the integrals
+        of the first two as one.
         """
         out: list[Determined] = []
         for i in range(len(self.stages)):
@@ -221,7 +221,7 @@ class Collision(ContactNumbers, Collocated):
             out.append(determined(Turn.AFTER, self.after.index(0)))
         return out
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
         """``at``: of each block, the index of the first output of this collision and the outputs a stage."""
         for i, s in enumerate(self.stages):

@@ -39,8 +39,8 @@ __all__ = [
     "typical_state",
 ]
 
-FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
-DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
+FORCE_SCALE = 100.0  # [N] contact forces in the program's constraints
+DEPTH_SCALE = 0.01  # [m] penetration in the program's constraints
 SECOND = ("second law", "second rate", "second penetration", "second separation")  # outputs of `force`
 RESTITUTING = 6  # which parameter of `force` says so
 
@@ -85,7 +85,7 @@ def collision(
     H, J and bias are those at the point, anew at each (steps 1a to 4a of the paper); or those that a freeze
     has stored (1b), with its terms. Then accelerations are linear in torques and forces (3b to 5b), and so
     are those of legs and striker in the frozen Jacobians (6b).
-    The servo (equation 10; 12 as rows) follows a reference that coasts at its velocity at contact:
+    The servo (equation 10; 12 as constraints) follows a reference that coasts at its velocity at contact:
     tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
 
     z = y0, u0 (ydot) at contact; feed-forward over torque limit (n); d1, T1, d, T: y = y0 + T1 d1 + T d;

@@ -172,7 +172,9 @@ class _Again:
         events = np.array([o.term in ends for o in program.origins])
 
         def parts(*, timed: bool) -> tuple[Index, Index]:
-            """Free variables, and the rows that determine them; whether events end phases when they come."""
+            """Free variables, and the constraints that determine them; whether events end phases when they
+            come.
+            """
             times = [] if timed else [g.index(0) for hit in self.hit.collisions for g in hit.T]
             free = np.setdiff1d(np.arange(program.n), np.concatenate([*held, *times]))
             return free, np.flatnonzero(equal & (timed | ~events))
@@ -195,7 +197,7 @@ class _Again:
         return branches, z
 
     def _newton(self, z: Array, free: Index, rows: Index) -> None:
-        """Change the free ones among the variables until these rows are met."""
+        """Change the free ones among the variables until these constraints are met."""
         program = self.program
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # a matrix that is singular is a method that fails

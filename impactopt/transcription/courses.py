@@ -19,7 +19,7 @@ class TorqueCourse(NamedTuple):
     """The torques of a phase.
 
     nodes (k,) : in it, from 0 to 1.  torques : over limit (n,) at each node.  T (1,) : its duration [s].
-    place_at : the place of a node, as rows have it.
+    place_at : the place of a node, as constraints have it.
     """
 
     nodes: Array

@@ -1,8 +1,8 @@
 """Elimination order of the variables that constraints determine, and the constraints that determine them.
 
-Each part of a program says which of its variables rows determine, and whose `Turn` they are. Two orders hang
-on that: which variables go first, as others follow from them; and who takes rows first, where a row would do
-for several.
+Each part of a program says which of its variables constraints determine, and whose `Turn` they are. Two
+orders hang on that: which variables go first, as others follow from them; and who takes constraints first,
+where a constraint would do for several.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ _FIRST_CHOICE = (
     Turn.ELEMENT,
     Turn.FEEDFORWARD,
     Turn.AFTER,
-    Turn.RATE,  # of rows that a collision's legs and motion have left
+    Turn.RATE,  # of constraints that a collision's legs and motion have left
 )
 
 
 def determined(turn: Turn, variables: Index, step: int = 0) -> Determined:
-    """Variables of one system of rows.  step : within a turn, those of a lower one go first."""
+    """Variables of one system of constraints.  step : within a turn, those of a lower one go first."""
     return Determined((turn, step), variables)
 
 

@@ -22,7 +22,7 @@ class FollowThrough(MotionPhase):
     """A clamped cubic spline to rest; it hands back where it starts.
 
     more : nodes beside the ends and middles of its intervals.
-    kind : first word of its variables' names; name : what rows and messages call it.
+    kind : first word of its variables' names; name : what constraints and messages call it.
     """
 
     def __init__(

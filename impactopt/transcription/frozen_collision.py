@@ -7,9 +7,9 @@ rigid-body functions. Beside the robot's coordinates, the legs' rates and the ha
 their own, as frozen Jacobians move them: servo, penetration and force are of these.
 
 With one freeze it is at the state at contact, and the velocities that the bias and dJ/dt v depend on are
-those with which hand and target have met (`v_meet`), by the rows of an impact in which they stay together.
-With N there is one in the middle of each of N segments of the contact's time. Phases share that time as in
-the program's ``shares``; scenarios have the expected target's segments.
+those with which hand and target have met (`v_meet`), by the constraints of an impact in which they stay
+together. With N there is one in the middle of each of N segments of the contact's time. Phases share that
+time as in the program's ``shares``; scenarios have the expected target's segments.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ class _Freeze:
 
 
 class FrozenCollision(Collision):
-    """Variables and rows of the contact with one target. shares : of the hit; the rest as of `Collision`."""
+    """Variables and constraints of the contact with one target. shares : of the hit; the rest as of
+    `Collision`.
+    """
 
     def __init__(
         self,
@@ -258,7 +260,7 @@ class FrozenCollision(Collision):
             out.append(determined(Turn.ELEMENT, self.carried.index(0)))
         return [*([] if self._meeting is None else self._meeting.determined()), *out]
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
         """Adds constraints; those of the freezes come first, as they determine variables that all others
         have.

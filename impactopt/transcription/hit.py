@@ -77,9 +77,9 @@ class Hit(Contacts):
             lasting = [c for c in self.collisions if isinstance(c, Collision)]
             self.first = [FirstInstant(b, contact, c.law, c.suffix) for c in lasting]
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def add_rows(self) -> None:
-        """One block for all collisions, each with its rows."""
+        """One block for all collisions, each with its constraints."""
         b = self._b
         slots: dict[str, list[Any]] = {}
         parameters: dict[str, list[Any]] = {}
@@ -127,7 +127,7 @@ class Hit(Contacts):
     def output(self, collision: int, stage: int, part: str) -> Index:
         """Numbers of outputs of the block ``force``, whose ``part`` they are: at a stage of a collision.
 
-        Once rows are there, and of collisions that last.
+        Once constraints are there, and of collisions that last.
         """
         size = self._b.block("force").n_out
         at = self._at["force"] + (collision * len(self.stages) + stage) * size

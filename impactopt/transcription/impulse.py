@@ -23,7 +23,7 @@ from impactopt.transcription.rows import Measure, Place, percent
 
 
 class InstantImpact:
-    """Variables and rows of an impact in no time; no row of torque or wrench while it lasts.
+    """Variables and constraints of an impact in no time; no constraint of torque or wrench while it lasts.
 
     mass : of a target that hand and robot have met, when they move on together; None: the problem's, which
     parts as its model of the collision says.  named : begin of the variables' names.
@@ -72,7 +72,7 @@ class InstantImpact:
         b, (start, _) = self._b, at["impact"]
         part = b.parts("impact")
         base, joints = start + part["base"], start + part["joints"]
-        units = {"N": "N s", "N m": "N m s"}  # rows are over a tenth of a second of the weight
+        units = {"N": "N s", "N m": "N m s"}  # constraints are over a tenth of a second of the weight
         unbalanced = [Measure(units[m.unit], 0.1 * m.factor, "off") for m in b.limits.unbalanced]
         share = percent("off, of its limit for 0.1 s")
         b.equal("impulse balance", "impact", DIRECTIONS[: b.coordinates.base], base, unbalanced)

@@ -1,4 +1,4 @@
-"""The terms that hold in every problem, as numbers: bounds of variables, scales and units of rows."""
+"""The terms that hold in every problem, as numbers: bounds of variables, scales and units of constraints."""
 
 from __future__ import annotations
 

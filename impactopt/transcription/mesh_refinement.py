@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 STEP = 1e-3  # [s] at which a motion is looked at: as the servo's reference is sampled
 _SHARE, _TORQUE = 0.5, 0.01  # of the room to all torque, and of the limit: what may be given up between nodes
 _FRICTION = 1.1  # of the friction coefficient that a plan may use: what it may use between nodes
-_ROUNDING = 1e-6  # of the weight, by which a cone's rows may be off
+_ROUNDING = 1e-6  # of the weight, by which a cone's constraints may be off
 GEAR = 0.03  # of what a gear may bear: what it may bear more between nodes, or collocation points
 
 

@@ -1,4 +1,4 @@
-"""Phases of a contact: how short they may be, and what of a law needs rows of its own."""
+"""Phases of a contact: how short they may be, and what of a law needs constraints of its own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ALIKE = 3.0  # factor between numbers that are
 def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     """Least duration [s] of each contact phase; ``natural``: that of a point mass's last phase."""
     target, (shortest, longest) = problem.target, problem.contact_duration
-    if not shortest:  # no bound: far below what a blow takes, as rows are over these times
+    if not shortest:  # no bound: far below what a blow takes, as constraints are over these times
         shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
     shares = [SHARE if target.guards else 1.0] * (len(target.phases) - 1) + [1.0]
     if target.at_once:

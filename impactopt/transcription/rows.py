@@ -1,7 +1,7 @@
-"""The rows of a program: what they bound, and how a person reads one that is not met.
+"""The constraints of a program: what they bound, and how a person reads one that is not met.
 
-A row knows its term, its component, its place, whose time is a function of the solution's durations, and the
-measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 % over its limit".
+A constraint knows its term, its component, its place, whose time is a function of the solution's durations,
+and the measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 % over its limit".
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Rows:
     origins: list[Row] = field(default_factory=list)
 
     def copy(self) -> Rows:
-        """The same rows, to which others can be added."""
+        """The same constraints, to which others can be added."""
         return Rows(*(list(getattr(self, f.name)) for f in fields(self)))
 
     def bound(self, k: int, lower: ArrayLike, upper: ArrayLike) -> None:
@@ -100,7 +100,7 @@ class Rows:
             sides[k] = np.broadcast_to(np.asarray(given, dtype=float), sides[k].shape)
 
     def add_each(self, origins: Sequence[Row], *, outputs: Index, lower: float) -> None:
-        """Append rows of these origins:  lower <= out[outputs]."""
+        """Append constraints of these origins:  lower <= out[outputs]."""
         n = len(origins)
         self.outputs.append(np.asarray(outputs, dtype=np.intp))
         self.affine.append(Affine.zeros(n))
@@ -121,9 +121,9 @@ class Rows:
         measure: Measure | Sequence[Measure] | None = None,
         whole: str | None = None,
     ) -> None:
-        """Append ``len(components)`` rows  lower <= out[outputs] + affine <= upper.
+        """Append ``len(components)`` constraints  lower <= out[outputs] + affine <= upper.
 
-        measure : of all, or one a row; place as text: one without a time; whole : of :class:`Row`.
+        measure : of all, or one a constraint; place as text: one without a time; whole : of :class:`Row`.
         Rows that are unbounded on both sides are dropped.
         """
         n = len(components)

@@ -1,7 +1,7 @@
-"""The contact of a strike by shooting: rows and variables of collisions that the SDC predicts.
+"""The contact of a strike by shooting: constraints and variables of collisions that the SDC predicts.
 
 What `Hit` and `Collision` are to a collocated contact. The collision is eliminated: its impulse and what it
-leaves behind are variables that rows determine, its torques and wrenches are rows alone.
+leaves behind are variables that constraints determine, its torques and wrenches are constraints alone.
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ class Shot:
         return stack([state.y, self.contact.u0[0], state.legs, self.contact.feedforward[0]])
 
     def outputs(self, part: str) -> Index:
-        """Numbers of the outputs of this part, once rows are there."""
+        """Numbers of the outputs of this part, once constraints are there."""
         return np.asarray(self._at + self.shooting.parts[part])
 
     def add_rows(self) -> None:
-        """The block, variables that equal its outputs, rows of torque, wrenches and duration."""
+        """The block, variables that equal its outputs, constraints of torque, wrenches and duration."""
         b, c, limits = self._b, self._b.coordinates, self._b.limits
         self._at = sum(block.count * block.n_out for block in b.blocks)
         b.blocks.append(shot_block(self.shooting, self._z))

@@ -149,11 +149,11 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
 
 
 def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
-    """Variables, multipliers of rows and of bounds of a program with more nodes than an old one, or elements,
-    or of another model of the collision that lasts, or with a first instant of contact.
+    """Variables, multipliers of constraints and of bounds of a program with more nodes than an old one, or
+    elements, or of another model of the collision that lasts, or with a first instant of contact.
 
     What is at nodes is between those of the old nodes, and the contact is that of its polynomials;
-    multipliers are those of the same rows and variables.
+    multipliers are those of the same constraints and variables.
     """
     stages = same_places(t.hit.stages, old.hit.stages)
     places = {}
@@ -213,9 +213,9 @@ def _model(t: ContactProgram) -> tuple[str, int]:
 
 
 def _of_same_rows(rows: Sequence[Row], known: Sequence[Row], numbers: Array) -> Array:
-    """The numbers of known rows for these: those of the same name, as often as there are any; else 0.
+    """The numbers of known constraints for these: those of the same name, as often as there are any; else 0.
 
-    Most rows in front are the very same: programs differ by what comes after them.
+    Most constraints in front are the very same: programs differ by what comes after them.
     """
     differ = (k for k, (one, other) in enumerate(zip(rows, known, strict=False)) if one is not other)
     same = next(differ, min(len(rows), len(known)))

@@ -17,7 +17,7 @@ def statement_of(t: Transcription) -> str:
 
     `groups`: name, count and size of the variables, in their order. `rows`: term, place and the number of a
     list of `components`. `more`: nodes beside those of the mesh. `elements`, `guarded`, `shortest`: of the
-    contact, its least durations [s] by collision. `apart`: rows between bodies.
+    contact, its least durations [s] by collision. `apart`: clearance constraints.
     """
     lists: dict[tuple[str, ...], int] = {}
     rows = []

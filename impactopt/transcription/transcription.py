@@ -172,7 +172,7 @@ class Transcription(ContactProgram):
         """Torques over limit of all motions, of a program that has them as variables."""
         return torque_courses(self.builder, self.swing, self.follows, self.torques)
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def _add_motions(self) -> None:
         """One block for the nodes of all motions, and of coasting in contact; and what bounds the splines."""
         b, limits = self.builder, self.builder.limits

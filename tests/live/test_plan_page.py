@@ -77,7 +77,7 @@ def test_a_slider_makes_a_new_plan(look: LiveLook, arm: Solution) -> None:
     assert look.answer.solution.impulse == pytest.approx(wanted.impulse, rel=1e-3)
     assert look.answer.solution.impulse != arm.impulse
     assert f"**{look.answer.solution.impulse:.2f} N s**" in look.told.content
-    assert "All rows are met." in look.told.content
+    assert "All constraints are met." in look.told.content
     assert look.status.content == ""
 
 
@@ -133,7 +133,7 @@ def test_a_plan_of_another_program_is_solved_from_the_last(
     arm: Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(self: Solution, **_: object) -> Solution:
-        raise InputError("the program has other rows then")
+        raise InputError("the program has other constraints then")
 
     monkeypatch.setattr(Solution, "moved", refused)
     wish = wish_of(arm.problem)

@@ -33,7 +33,7 @@ DEEPEST = -1e-6  # [m] what is deeper is a touch
 
 
 class Touch(NamedTuple):
-    """Two bodies in each other: names, from when till when [s], and how deep [m] at most."""
+    """Penetration of two bodies: names, from when till when [s], and how deep [m] at most."""
 
     one: str
     other: str
@@ -91,7 +91,7 @@ class Near:
     """Close pairs: at instant ``at`` (m,), a sphere of the robot and another link or a body of the world.
 
     sphere (m,) : its number.  joint (m,) : that moves it.  other (m,) : joint of the link; or -1 - the index
-    of the world's body.  gap (m,) [m] : between sphere and planes, < 0 if in each other.
+    of the world's body.  gap (m,) [m] : between sphere and planes, < 0 for penetration.
     """
 
     at: Index
@@ -114,7 +114,7 @@ class Near:
 
 
 class Closest(NamedTuple):
-    """Distance [m] of two bodies, < 0 in each other; the points (3,) [m] of both there, in the world; the
+    """Distance [m] of two bodies, < 0 for penetration; the points (3,) [m] of both there, in the world; the
     direction (3,) from the one to the other; and the pieces of the one that may meet the other's there.
     """
 
@@ -376,7 +376,7 @@ class Bodies:
         """The least distance of any pair at any instant, and all that touches.
 
         time (k,) [s] : of the instants.  within [m] : pairs that are farther apart count as `FAR`.
-        Two that are deep in each other are looked at every `EVERY`, so that begin and end are that fine.
+        Deep penetrations are looked at every `EVERY`, so that begin and end are that fine.
         """
         close = self.slack + CLOSE  # of most motions the nearest two are, and then no others matter
         if close < within:

@@ -115,7 +115,7 @@ def fill(hull: ConvexHull, points: Array) -> Spheres:
 def enclose(vertices: Array, normals: Array, radius: float = 0.0) -> Planes:
     """Planes about the hull of vertices (k, 3) [m], inflated by ``radius`` [m], that tell best how far it is.
 
-    normals (m, 3) : of its facets. Directions are taken one by one: that which mends most of what those
+    normals (m, 3) : of its facets. Directions are taken one by one: that which removes most of what those
     before it miss, at points about the body, against all directions together.
     """
     directions = np.concatenate([_rounded(normals), _sphere(SPREAD)])

@@ -1,7 +1,7 @@
 """Signed distances of convex bodies that are smooth everywhere: what a plan's constraints between bodies are.
 
 The separation of two bodies A and B along a unit vector u from B to A is u . t less their supports. Its
-largest value over all u is their distance; where they are in each other it is, near the direction that they
+largest value over all u is their distance; where they penetrate it is, near the direction that they
 came from, how deep they are. With supports max_i a_i . u of vertices it has kinks, where faces are parallel.
 So supports are rounded,
 

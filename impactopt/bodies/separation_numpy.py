@@ -99,7 +99,7 @@ class _Pairs:
         for _ in range(_STEPS):
             step2, gain = self._step(at)
             size = np.linalg.norm(step2, axis=1)
-            # no maximum, as bodies are in each other: along the way that it curves up
+            # no maximum, as bodies penetrate: along the way that it curves up
             curved, axes = np.linalg.eigh(at.bend)
             saddle = going & (size < 1e-9) & (curved[:, 0] < -1e-9)
             up = axes[saddle, :, 0]

@@ -21,9 +21,9 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 def check(
     file: ProblemPath, settings: Settings = None, as_json: AsJson = False, verbose: Verbose = False
 ) -> None:
-    """Say whether a problem file is sound and its target within reach; else every mistake, and its mend.
+    """Say whether a problem file is sound and its target within reach; else every mistake, and its fix.
 
-    What to mend first stands first. With --json {"sound", "file", "hash", "problem", "doubts"}, or {"sound",
+    What to fix first stands first. With --json {"sound", "file", "hash", "problem", "doubts"}, or {"sound",
     "file", "mistakes"}. Exit code: 0 sound, 2 not.
     """
     with plain_errors("interrupted", verbose=verbose):

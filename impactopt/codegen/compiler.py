@@ -79,7 +79,7 @@ def why_no_compiler() -> str:
     for command in _candidates():
         version = _version(command)
         if version and (trouble := _trouble(Compiler(command=command, version=version))):
-            return f"{trouble}; mend it, or what CC names"
+            return f"{trouble}; fix it, or what CC names"
     return "install gcc or clang, or name one in the environment variable CC"
 
 

@@ -107,14 +107,14 @@ def check_course(collision: SteppedModel, result: Collision, error: float) -> No
     """
     length, method = collision.step_length, collision.stepping
     if not result.separated and result.duration < collision.horizon * (1 - 1e-9):
-        mend = (
+        fix = (
             "shorten the horizon, or give a larger tolerance"
             if method == "implicit"
             else "raise the horizon or give a shorter step, both of which make more steps"
         )
         raise InputError(
             f"horizon [s]: the steps are used up by events after {result.duration:.3g} s, before the "
-            f"horizon, {collision.horizon:g} s: joints saturate or slide again and again; {mend}"
+            f"horizon, {collision.horizon:g} s: joints saturate or slide again and again; {fix}"
         )
     if result.duration == 0:
         return

@@ -317,7 +317,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     """
     path = Path(directory)
     path = path if path.name == NUMBERS and not os.path.isdir(path) else path / NUMBERS
-    mend = "solve again with `impactopt solve`"
+    fix = "solve again with `impactopt solve`"
     try:
         with np.load(read_archive(path, LARGEST, MOST_ARRAYS), allow_pickle=False) as file:
             version = int(file["format"])
@@ -334,12 +334,12 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     except InputError:
         raise
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(f"there is no {path}; {mend}") from error
+        raise InputError(f"there is no {path}; {fix}") from error
     except PermissionError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     # what NumPy and zipfile raise for files that are cut, overwritten or of another kind
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, NotImplementedError) as error:
-        raise InputError(f"{path} is damaged ({error}); {mend}") from error
+        raise InputError(f"{path} is damaged ({error}); {fix}") from error
     except (
         zipfile.BadZipFile,
         zlib.error,
@@ -349,6 +349,6 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         RecursionError,
         RuntimeError,
     ) as error:
-        raise InputError(f"{path} is damaged ({error}); {mend}") from error
+        raise InputError(f"{path} is damaged ({error}); {fix}") from error
     place = Path(os.path.normpath(path.parent.resolve() / near)) if near else None
     return Record(summary=summary, problem=problem, arrays=arrays, problem_path=place)

@@ -71,8 +71,8 @@ def served(host: str, port: int) -> tuple[Any, str]:
             pass
     except (OSError, OverflowError) as error:
         taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-        mend = "give another --port, or none" if taken else "give another host or port"
-        raise InputError(f"cannot serve a page at {host}:{port}: {error}; {mend}") from error
+        fix = "give another --port, or none" if taken else "give another host or port"
+        raise InputError(f"cannot serve a page at {host}:{port}: {error}; {fix}") from error
     token = secrets.token_hex(16)
     with _guarded(token) as guards, contextlib.redirect_stdout(io.StringIO()):  # it has a banner
         server = viser.ViserServer(host=host, port=port, label="impactopt", verbose=False)

@@ -62,12 +62,12 @@ def moved_solution(
     margins = Margins(problem) if problem.keeps_apart else None
     refining = Refining(budget, margins, solution.apart, None, mesh=refine)
 
-    def mended(t: Transcription, result: SolverResult, x0: Array) -> tuple[Transcription, SolverResult]:
+    def fixed(t: Transcription, result: SolverResult, x0: Array) -> tuple[Transcription, SolverResult]:
         return refining.judged(*refining.rounds(t, result, x0)[:2])
 
     old = solution.result
     result = _polished(budget, t, first, old)
-    t, result = mended(t, result, old.x)
+    t, result = fixed(t, result, old.x)
 
     # new constraints are farther off than what a tolerance for small moves makes up for
     given = {name: value for name, value in (options or {}).items() if not name.endswith("_tolerance")}
@@ -75,7 +75,7 @@ def moved_solution(
 
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         x0 = start.x if isinstance(start, SolverResult) else start
-        return mended(other, exact.run(other.program, start), x0)
+        return fixed(other, exact.run(other.program, start), x0)
 
     t, result = kept_on_demand(t, result, (t, old), solve, lambda *_: ())
     return _solution(solution, t, result, (built - began, time.perf_counter() - built))

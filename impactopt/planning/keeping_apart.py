@@ -2,7 +2,7 @@
 
 A program begins with those of bodies that are near at its start. Others enter at the iterate at which their
 bodies come near, before these can touch: the solver leaves the program there, gets the one with them, and
-goes on at its barrier. No step goes so far that bodies without a constraint are in each other at its end, or
+goes on at its barrier. No step goes so far that bodies without a constraint penetrate at its end, or
 on another side of each other. So a solution's bodies are on the side of each other that they began on.
 """
 
@@ -35,15 +35,11 @@ NEAR, ENTERS = 0.1, 0.03
 # the same of links with few joints between: they are always near, and can hardly meet
 BETWEEN, NEAR_BETWEEN, ENTERS_BETWEEN = 4, 0.03, 0.015
 OF_START = 0.25  # of how far two bodies are apart at the start: a margin is no more
-SLIP = (
-    2e-3  # [m] that two may come nearer where they are in each other at the start, as distances are rounded
-)
+SLIP = 2e-3  # [m] that two may come nearer where they penetrate at the start, as distances are rounded
 ROUNDED = 2 * np.log(2) * ROUNDING  # [m] by which the rounded distance of two edges is less than theirs
 LEAST = 0.01  # [m] a step brings bodies without a constraint no nearer, nor
 OF_GAP = 0.5  # by more than this part of their distance
-THROUGH = (
-    5e-3  # [m] in each other on the way, bodies that are apart before and after a step are on other sides
-)
+THROUGH = 5e-3  # [m] penetration on the way: bodies that are apart before and after a step are on other sides
 _HALVED = 8  # times at most that a step is
 _TIMES = 25  # that constraints enter in one solve, at most
 
@@ -214,7 +210,7 @@ class Watch:
     def _shapes_at(self, at: Placed, ways: Array, within: float = ENTERS) -> tuple[Placed, Looked]:
         return at, self._shapes.look(at, within, ways, self._margins.wanted)
 
-    # ------------------------------------------------------------------ what is too near
+    # ------------------------------------------------------------------ clearance violations
     def _bare(self, found: Looked, within: Array | float) -> NDArray[np.bool_]:
         """Mask of the pairs found that are nearer than ``within`` [m], a number or (P,), and have no
         constraint.

@@ -301,12 +301,12 @@ def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> S
 
 
 def touching(result: SolverResult, depth: float, names: Iterable[str], what: str) -> SolverResult:
-    """A result whose bodies are so deep [m] in each other: no solution.  names : of the pairs of bodies.
+    """A result whose bodies penetrate by so much [m]: no solution.  names : of the pairs of bodies.
 
     Where nothing else is found it is still told, but goes before no start that is clean.
     """
     pairs = "; ".join(sorted(set(names))[:3])
-    found = f"no {what} was found where they are not"
-    message = f"Bodies are {1e3 * depth:.1f} mm in each other, and {found}: {pairs}."
+    found = f"no {what} was found in which they do not"
+    message = f"Bodies penetrate each other by {1e3 * depth:.1f} mm, and {found}: {pairs}."
     worst = max(result.max_violation, depth, 2 * VIOLATED)
     return replace(result, status=Status.FAILED, max_violation=worst, message=message)

@@ -52,7 +52,7 @@ from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
-_MORE = 2  # starts, where all that were asked for end with bodies in each other
+_MORE = 2  # starts, where all that were asked for end with penetrating bodies
 
 
 def solve(
@@ -166,7 +166,7 @@ def _planned(
         report(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     refining = Refining(budget, margins, apart, report)
-    # limbs that are in each other, or gears that break, say nothing of what a start is worth: each is led to
+    # limbs that penetrate, or gears that break, say nothing of what a start is worth: each is led to
     # its end before they compare
     each = partial(_led, refining, refine and margins is not None)
     of_start = _starts(t, given, which, more, seed, partial(clear_strike, budget, margins), refining)
@@ -315,7 +315,7 @@ def _starts(
 ) -> Starts:
     """Names of the starts, and what makes them; ``hit`` solves a strike.
 
-    A few more than asked for while each ends with bodies in each other: where a motion passes them on the
+    A few more than asked for while each ends with penetrating bodies: where a motion passes them on the
     wrong side, others may not.
     """
     if not isinstance(start, str):

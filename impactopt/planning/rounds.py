@@ -35,7 +35,7 @@ _BARRIER = 1e-4  # where constraints between bodies are new, which the solution 
 _BARRIER_DEEP = 1e-3  # of a finer contact, where the one before is far off
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 _NODE_ROUNDS = 3  # with a finer mesh, at most
-_ROUNDS, _MOST = 12, 40  # of all, and while bodies are in each other: each round brings them nearer to an end
+_ROUNDS, _MOST = 12, 40  # of all, and while bodies penetrate: each round brings them nearer to an end
 _ITERATIONS = 200  # from a solution, where there is another start: it goes on in a few, or hardly at all
 
 
@@ -76,11 +76,11 @@ def more_of(nodes: int, elements: Elements | None, rows: int) -> str:
 class Refining:
     """Refines a program until its solution is valid between the nodes, too.
 
-    Where a solution brings bodies into each other between nodes, leaves its limits there, or has a contact
+    Where a solution has bodies penetrate between nodes, leaves its limits there, or has a contact
     that is too coarse, its program gets more nodes, elements or margins there and is solved again, from where
     it is.
 
-    mesh : whether it may get finer; False: it does where bodies are in each other only.
+    mesh : whether it may get finer; False: it does where bodies penetrate only.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Refining:
         self._near: tuple[Transcription, Array, Violated | None] | None = None
         self._refined = 0  # rounds with a finer mesh
         self._apart: tuple[Transcription, SolverResult] | None = None  # the last whose bodies are not
-        self.blocked = False  # whether it ended with bodies in each other: another start may not
+        self.blocked = False  # whether it ended with penetrating bodies: another start may not
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
         """Discretization error of a program's contact at its solution; the last one is cached."""
@@ -167,7 +167,7 @@ class Refining:
         return self._near[2]
 
     def _looked_at(self, t: Transcription, result: SolverResult, x0: Array) -> SolverResult:
-        """A result without a verdict with that of another solver, from the same start."""
+        """A result without a diagnosis with that of another solver, from the same start."""
         new = second_look(self.budget, t.program, x0, result, self.report)
         return result if new is result else one_after_the_other(result, new)
 
@@ -240,8 +240,8 @@ class Refining:
         return self._apart is not None and self._apart[1] is result
 
     def judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
-        """A result that could not be mended is a solution only if nothing touches anything; else the last one
-        is that was, if any.
+        """Result after a failed repair: a solution only if no bodies touch; else the last one without contact, if
+        there is one.
         """
         if self.margins is None or not result.status.usable or self._is_apart(result):
             return t, self.checked(t, result)

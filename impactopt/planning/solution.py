@@ -173,7 +173,7 @@ class Solution(Solved):
         """Share of the objective that the prices on motion, sole wrenches and the end posture take [%].
 
         They are there for one optimum among motions that hit as hard: ``ImpactProblem.smoothness``,
-        ``wrench_price`` and ``return_price``.  nan where the objectives are worth nothing, or not known.
+        ``wrench_price`` and ``return_price``.  nan where the objectives are zero, or not known.
         """
         if any(o.name not in self.objectives for o in self.problem.objectives):
             return np.nan

@@ -1,9 +1,9 @@
 """Detects clearance violations of a solution and selects the constraints and nodes to add.
 
-At places a program's constraints keep all apart that is near (`keeping_apart`). Where two bodies are too near
-between two places at which they are not, there is to be a node at that instant, which gets constraints as its
-bodies are near there; and where nodes are too dense for another, or in contact, which has none, the places
-beside are asked for more.
+At its nodes a program has constraints on the clearance of near bodies (`keeping_apart`). If two bodies violate
+their clearance between two nodes, a node is added at that instant, which gets constraints as its bodies are
+near there. Where nodes are too dense for another, or in contact, which has none, the required clearance at the
+adjacent nodes is raised.
 """
 
 from __future__ import annotations
@@ -146,7 +146,8 @@ class _Nodes:
 
     def add(self, found: _Between, jumps: bool) -> bool:
         """One at that instant, or as near to it as others are not; two beside it, where bodies jump from one
-        side to the other.  False: the others are too near to each other, or it is in contact, which has none.
+        side to the other.  False: the others are too close to each other, or it is in contact, which has
+        none.
         """
         for phase, places in self._places.items():
             curve, begin, nodes, _ = self._plan.segment(phase, missed=found.missed)

@@ -43,7 +43,7 @@ def second_look(
     if old.status is Status.FAILED and rows <= VIOLATED < old.max_violation:
         return old  # it has been refused for what is no constraint
     if report is not None:
-        report("our solver ends without a verdict: IPOPT tries once, from the same start")
+        report("our solver ends without a diagnosis: IPOPT tries once, from the same start")
     new = replace(budget, solver="ipopt", options=None).run(program, start)
     if new.status is Status.INTERRUPTED or _rank(new) < _rank(old):
         return new
@@ -51,7 +51,7 @@ def second_look(
 
 
 def _rank(result: SolverResult) -> tuple[bool, bool, float]:
-    """Solutions first, then what has a verdict, then what is least violated."""
+    """Solutions first, then what has a diagnosis, then what is least violated."""
     return not result.status.usable, result.status is not Status.INFEASIBLE, result.max_violation
 
 

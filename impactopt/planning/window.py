@@ -33,6 +33,6 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
     share = 100 * min(price / worth, 9.99)
     return (
         f"The contact's {' and '.join(dict.fromkeys(named))} takes all the time that [collision] duration_s "
-        f"leaves it, {1e3 * longest:.3g} ms, and that bound is dear: twice as long is worth {share:.0f} % of "
+        f"leaves it, {1e3 * longest:.3g} ms, and that bound is costly: twice as long gains {share:.0f} % of "
         "the objective, to first order. The contact is softer than that: give it longer."
     )

@@ -242,9 +242,9 @@ def told_touches(summary: Mapping[str, Any]) -> str:
         return ""
     pairs = {(touch["one"], touch["other"]) for touch in touches}
     worst = max(touches, key=lambda touch: float(touch["depth_mm"]))
-    count = f"{len(pairs)} pairs of bodies are" if len(pairs) > 1 else "two bodies are"
+    count = f"{len(pairs)} pairs of bodies penetrate" if len(pairs) > 1 else "two bodies penetrate"
     return (
-        f"{count} in each other, {worst['one']} and {worst['other']} by {worst['depth_mm']:.0f} mm; "
+        f"{count} each other, {worst['one']} and {worst['other']} by {worst['depth_mm']:.0f} mm; "
         "[terms.self_collision] and [terms.keep_out] keep them apart"
     )
 

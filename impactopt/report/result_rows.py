@@ -189,7 +189,7 @@ def worst_rows(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]
             terms.setdefault(str(v["row"]).partition(",")[0], []).append(v)
 
     def more(count: int) -> str:
-        return f" (and {count} more constraint{'s' if count > 1 else ''})" if count else ""
+        return f" (and {count} more)" if count else ""
 
     return [(f"{rows[0]['row']}{more(len(rows) - 1)}", str(rows[0]["by"])) for rows in terms.values()]
 

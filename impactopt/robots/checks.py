@@ -44,8 +44,8 @@ def check_joints(joints: Sequence[str], name: str) -> None:
             raise InputError(f"the name of joint {joint!r} has control characters; take them out")
 
 
-# how a limit is mended in a file of that kind
-_MENDS = {
+# how a limit is fixed in a file of that kind
+_FIXES = {
     "URDF": dict.fromkeys(_LIMITS, "set it in the URDF's <limit>, or "),
     "MJCF": {
         "torque_limit": "set the joint's `actuatorfrcrange` in the MJCF, or ",
@@ -63,7 +63,7 @@ def check_limits(
 
     kind : of the file that they are from, "URDF" or "MJCF", "" for none.
     """
-    mends = _MENDS[kind]
+    fixes = _FIXES[kind]
     found = Mistakes()
     for name, value, unit, option in (
         *((j, x, "N m", "torque_limit") for j, x in zip(joints, torque, strict=True)),
@@ -73,13 +73,13 @@ def check_limits(
         if not 0 < value <= STRONGEST:
             found.found.append(
                 f"joint {name!r} has no usable {option.replace('_', ' ')} ({value:g} {unit}); "
-                f"{mends[option]}give {option}={{{name!r}: ...}}"
+                f"{fixes[option]}give {option}={{{name!r}: ...}}"
             )
     for name, low, high in zip(joints, lower, upper, strict=True):
         if not low < high:
             found.found.append(
                 f"joint {name!r} has no usable position limits (lower {low:g}, upper {high:g} rad); "
-                f"{mends['position_limit']}give position_limit={{{name!r}: (lower, upper)}}"
+                f"{fixes['position_limit']}give position_limit={{{name!r}: (lower, upper)}}"
             )
     found.raise_if_any("the robot")
 

@@ -118,7 +118,7 @@ def _partly_weightless(c: Compiled) -> Iterator[Tie]:
         text=f"bodies {names} have a gravcomp that the others do not have",
         joints=tuple(str(c.model.names[j]) for j in above),
         free=0,
-        mend="give all of them the same",
+        fix="give all of them the same",
     )
 
 
@@ -136,18 +136,18 @@ def _of_joints(c: Compiled) -> Iterator[Tie]:
                 text=f"joint {name!r} has a spring, stiffness {spring:g}, which no plan has",
                 joints=(name,),
                 free=0,
-                mend=_OUT,
+                fix=_OUT,
             )
         bent = c.numbers("dof_dampingpoly")[int(mj.jnt_dofadr[j]) :][:1]
         if bent.any() and not c.off("damper", "passive"):
             text = f"joint {name!r} has damping that is not linear in its speed, which no plan has"
-            yield Tie(text=text, joints=(name,), free=0, mend=_OUT)
+            yield Tie(text=text, joints=(name,), free=0, fix=_OUT)
     for b in c.body:
         first, count = int(mj.body_jntadr[b]), int(mj.body_jntnum[b])
         names = [c.name("joint", j) for j in range(first, first + count) if j in c.joint]
         if len(names) > 1:
             text = f"joints {', '.join(map(repr, names))} move the same body, with no mass between them"
-            yield Tie(text=text, joints=tuple(names), mend="put bodies with mass between them")
+            yield Tie(text=text, joints=tuple(names), fix="put bodies with mass between them")
 
 
 def _equalities(c: Compiled) -> Iterator[Tie]:
@@ -197,7 +197,7 @@ def _loop(c: Compiled, name: str, one: int, other: int) -> Iterator[Tie]:
         )
     ends = (c.body[b][0] for b in (one, other))
     text = f"it closes a loop by the equality {name!r}, and robots here are trees"
-    yield Tie(text=text, joints=between(c.model, *ends), free=0, mend=f"{_OUT}, with the rods that it holds")
+    yield Tie(text=text, joints=between(c.model, *ends), free=0, fix=f"{_OUT}, with the rods that it holds")
 
 
 def _tendons(c: Compiled) -> Iterator[Tie]:
@@ -232,7 +232,7 @@ def _tendons(c: Compiled) -> Iterator[Tie]:
                 "no plan has",
                 joints=joints,
                 free=0,
-                mend=_OUT,
+                fix=_OUT,
             )
 
 

@@ -56,7 +56,7 @@ class Robot:
 
     Raises
     ------
-    InputError : naming the link, joint or frame and the mend: non-physical inertias; limits that are missing,
+    InputError : naming the link, joint or frame and the fix: non-physical inertias; limits that are missing,
         zero or crossed; joints with several degrees of freedom; gains too fast for the inertia they act on;
         postures outside the limits; unknown frames.
     """

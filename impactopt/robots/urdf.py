@@ -100,7 +100,7 @@ def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
         name = gazebo.getAttribute("reference")
         if model.existJointName(name) and any(_numbers(gazebo, "springStiffness")):
             text = f"joint {name!r} has a spring, Gazebo's <springStiffness>, which no plan has"
-            yield Tie(text=text, joints=(name,), free=0, mend="take it out")
+            yield Tie(text=text, joints=(name,), free=0, fix="take it out")
         for loop in _children(gazebo, "joint"):
             ends = [_text(end) for tag in ("parent", "child") for end in _children(loop, tag)]
             frames = [
@@ -113,7 +113,7 @@ def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
                 text = (
                     f"Gazebo's <joint> {loop.getAttribute('name')!r} closes a loop, and robots here are trees"
                 )
-                yield Tie(text=text, joints=between(model, one, other), free=0, mend="take it out")
+                yield Tie(text=text, joints=between(model, one, other), free=0, fix="take it out")
 
 
 def _weightless(root: Any) -> Iterator[str]:

@@ -100,7 +100,7 @@ class Solids:
 
     def apart(self, model: Any, q: Array) -> Array:
         """(k,) [m] between the two links that are nearest to each other in configurations q (k, nq), by their
-        hulls; < 0 in each other, inf where none come near.
+        hulls; < 0 for penetration, inf where none come near.
         """
         near = self.near_at(model, q)
         data, asked, out = model.createData(), coal.DistanceRequest(), np.full(len(q), np.inf)

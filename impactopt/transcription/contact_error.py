@@ -32,7 +32,7 @@ from impactopt.transcription.planned_loads import gear_share
 from impactopt.transcription.rows import Index
 from impactopt.transcription.structured import StructuredProgram
 
-ASKED = 0.5  # [%] of the impulse: the error that is not worth another solve
+ASKED = 0.5  # [%] of the impulse: the error that does not justify another solve
 _MISSED = 0.02  # of the peak force: how far it may be below zero within a phase, or above it at the end
 _TURNED = 1e-3  # of the peak force: what the law's other branch may differ by where it is the right one
 _STEPS, _MET = 8, 1e-7  # of Newton's method, and the residual at which it is done

@@ -86,7 +86,7 @@ def coasted(
 ) -> Iterator[tuple[Array, tuple[Array, Array]]]:
     """Legs of a robot that coasts, at times [s] since y: angles, and rates and accelerations; (nl,) each."""
     for at in elapsed:
-        with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+        with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
             legs = c.solve_legs(y + rates * at, legs)
         _, v, a = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)
         yield legs, (v[c.base + c.dependent], a[c.base + c.dependent])
@@ -168,7 +168,7 @@ def blow(
         ends = _phases(time, rows, target)
         if ends is not None:
             break
-    if ends is None:  # somewhere, where the solver has to mend it
+    if ends is None:  # somewhere, where the solver has to fix it
         ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.guards else [0.0, 0.5, 1.0])
     times = ends[phase] + place * np.diff(ends)[phase]
 

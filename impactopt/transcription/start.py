@@ -110,7 +110,7 @@ def strike_iterate(t: StrikeTranscription, *, speed: float = 1.0, noise: float =
     """Solver variables (n,) of a strike, as of :func:`first_iterate`."""
     hit = reached(t, speed=speed, noise=noise, seed=seed)
     x = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
-    with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+    with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
         hit = replace(hit, legs=t.coordinates.solve_legs(hit.y, hit.legs))
     t.y.write(x, hit.y)
     t.legs.write(x, hit.legs)
@@ -255,7 +255,7 @@ def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
     ):
         legs, all_legs, all_w = t.legs0, [], []
         for y in spline.sample(nodes * spline.duration)[0]:
-            with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+            with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
                 legs = c.solve_legs(y, legs)
             all_legs.append(np.clip(legs, limits.legs_lower, limits.legs_upper))
             all_w.append(static_wrenches(c, y, legs))

@@ -1,4 +1,4 @@
-"""Problem files: what they say reaches the problem; what is wrong in them is named, with the mend."""
+"""Problem files: what they say reaches the problem; what is wrong in them is named, with the fix."""
 
 from __future__ import annotations
 
@@ -548,7 +548,7 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
         ("[target]", "[solver]\ntime_limit_s = 0\n[target]", ["time_limit_s", "> 0"]),
     ],
 )
-def test_a_mistake_is_named_with_the_mend_before_a_robot_is_built(
+def test_a_mistake_is_named_with_the_fix_before_a_robot_is_built(
     tmp_path: Path, old: str, new: str, parts: list[str]
 ) -> None:
     assert old in GOOD

@@ -96,7 +96,7 @@ def test_a_strike_whose_bodies_stay_in_each_other_is_none(
     solved = budget.run(t.program, free)
     monkeypatch.setattr(strikes, "clear_strike", lambda *_: (t, solved))
     _, result = strikes._clean_strike(budget, Margins(t.problem), t, free)
-    assert result.status is Status.FAILED and "mm in each other" in result.message
+    assert result.status is Status.FAILED and "Bodies penetrate each other" in result.message
 
 
 def test_with_rows_on_demand_it_goes_on_from_the_solution_without_them(strike: StrikeTranscription) -> None:

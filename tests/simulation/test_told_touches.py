@@ -1,4 +1,4 @@
-"""What is said of bodies that are in each other."""
+"""Message about penetrating bodies."""
 
 from __future__ import annotations
 
@@ -27,5 +27,5 @@ def test_the_deepest_is_named_and_pairs_are_counted_once() -> None:
         touch("hand", "thigh", 5.0, missed=True),
     ]
     said = told_touches({"contacts_besides": both})
-    assert said.startswith("2 pairs of bodies are in each other, arm and torso by 42 mm")
+    assert said.startswith("2 pairs of bodies penetrate each other, arm and torso by 42 mm")
     assert "two bodies are" in told_touches({"contacts_besides": both[:1]})

@@ -344,8 +344,8 @@ def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, ba
     depth, pairs = deepest(t, x, margins)
     assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}
     budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
-    mended, result = solved_apart(budget, margins, t, free.result)
-    assert result.status is Status.SOLVED and deepest(mended, result.x, margins)[0] <= 0
+    fixed, result = solved_apart(budget, margins, t, free.result)
+    assert result.status is Status.SOLVED and deepest(fixed, result.x, margins)[0] <= 0
 
 
 def test_constraints_enter_before_bodies_can_touch(free: Solution, barred: Solution) -> None:

@@ -39,7 +39,7 @@ _SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 class Mistake:
     """A mistake at a place in the file.
 
-    place : path of keys and indices; the first `sections` of them name the table.  first : it is to be mended
+    place : path of keys and indices; the first `sections` of them name the table.  first : it is to be fixed
     before the others.
     """
 

@@ -1,4 +1,4 @@
-"""The numbers of the whole-body controller, and what its sensors are worth."""
+"""The numbers of the whole-body controller, and the accuracy of its sensors."""
 
 from __future__ import annotations
 

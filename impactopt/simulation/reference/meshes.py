@@ -67,7 +67,7 @@ class Meshes:
         return np.asarray(out)
 
     def touching(self, motion: NDArray[Any]) -> list[tuple[str, str]]:
-        """Names of the pairs that are in each other at any of the configurations (k, nq), each once."""
+        """Names of the pairs that penetrate at any of the configurations (k, nq), each once."""
         (model, geometry), (data, found) = self._read, self._data
         pairs: set[tuple[str, str]] = set()
         for q in map(self._of_urdf, motion):

@@ -25,7 +25,7 @@ class Effects:
     saturation : the torque limits (eq. 12).
     friction : joint friction F (eqs. 5, 6), see `JointFriction`.
     bias : Coriolis, centrifugal and gravity terms c + g (eqs. 5, 6), frozen at contact.
-    jdot : the Jacobians' rates times velocity (eq. 14), of hand and held soles, frozen at contact.
+    jdot : the Jacobians' rates times velocity (eq. 14), of hand and fixed soles, frozen at contact.
     """
 
     stiffness: bool = True

@@ -16,7 +16,7 @@ from impactopt.contact import ContactLaw, Target
 
 __all__ = ["JointSpaceModel", "shape_of"]
 
-_SOON = 1e-9  # [s] in which a target gains the speed that its acceleration is told by
+_SOON = 1e-9  # [s] in which a target gains the speed that shows its acceleration
 
 
 @dataclass(frozen=True, kw_only=True)

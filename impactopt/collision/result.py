@@ -38,10 +38,10 @@ class Collision:
     joint_velocity : (k, n) [rad/s].
     torque, demand : (k, n) [N m] of the servo, and what it would be without saturation. These, the joint
         velocities and all wrenches are None of a point mass, which knows nothing of them.
-    sole_wrench : (k, soles, 6) [N, N m] of the ground on each held sole, world axes, at the sole's frame;
+    sole_wrench : (k, soles, 6) [N, N m] of the ground on each fixed sole, world axes, at the sole's frame;
         in the stance's order of soles. None on a fixed base.
-    hand_wrench : (k, hands, 6) [N, N m] of the world on each held hand, world axes, at its striking point;
-        in the stance's order of hands. None where none is held.
+    hand_wrench : (k, hands, 6) [N, N m] of the world on each supporting hand, world axes, at its striking
+        point; in the stance's order of hands. None where none is held.
     ground_wrench : (k, 6) [N, N m] of the ground on the robot, world axes, about the world's origin; None
         on a fixed base.
     zmp : (k, 2) [m] x and y of the zero-moment point on the ground z = 0; None on a fixed base.

@@ -80,7 +80,7 @@ class SolvedFolder:
     def solve(
         self, problem: ImpactProblem, file: ProblemFile, **options: Any
     ) -> tuple[Solution, Neighbour | None]:
-        """`impactopt.solve` from the nearest solution; without, where there is none or it leads nowhere.
+        """`impactopt.solve` from the nearest solution; without, where there is none or it fails.
 
         options : of `impactopt.solve`, for both.
 

@@ -253,7 +253,7 @@ def _alone(fit: _Fit) -> tuple[Array, tuple[float, float]]:
     return z, touches
 
 
-# ---------------------------------------------------------------- what is told
+# ---------------------------------------------------------------- what is reported
 def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
     """Residuals of force [N], without clipped samples, and of motion [m/s] or [m], all blows."""
     force, motion, begin = [], [], 0

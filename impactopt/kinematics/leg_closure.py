@@ -84,7 +84,7 @@ class Closing:
             yield found
 
     def jacobians(self, q: Array) -> Array:
-        """(6 a sole, nv) of the held soles, each in its own frame, at a pin configuration."""
+        """(6 a sole, nv) of the fixed soles, each in its own frame, at a pin configuration."""
         model, data = self._model, self._data
         pin.computeJointJacobians(model, data, q)
         out = np.zeros((6 * len(self._frames), model.nv))

@@ -1,4 +1,4 @@
-"""Motion on held soles, in stages: numbers that functions are written with and differentiated by.
+"""Motion on fixed soles, in stages: numbers that functions are written with and differentiated by.
 
 A leg's rates and accelerations depend on its angles and the base's motion alone, the base's motion on its own
 coordinates. An expression in all coordinates at once hides that from whoever differentiates it.

@@ -13,10 +13,10 @@ Outcome = TypeVar("Outcome")
 
 
 class Newest(Generic[Wish, Outcome]):
-    """Answers wishes one after the other. One that comes while another is worked on takes its place.
+    """Answers requests one after the other. One that comes while another is worked on takes its place.
 
-    work : from a wish to its outcome. Its second argument says whether a newer wish is there: then it may
-        stop, as nobody will ask for what it returns.
+    work : from a request to its outcome. Its second argument says whether a newer request is there: then it
+        may stop, as nobody will ask for what it returns.
     tell : is given each outcome that is still wished for, or what the work raised, in the same thread.
     """
 
@@ -33,7 +33,7 @@ class Newest(Generic[Wish, Outcome]):
         self._thread.start()
 
     def ask(self, wish: Wish) -> None:
-        """Take this wish in place of all before it."""
+        """Take this request in place of all before it."""
         with self._changed:
             self._wish, self._asked = wish, self._asked + 1
             self._changed.notify_all()
@@ -44,7 +44,7 @@ class Newest(Generic[Wish, Outcome]):
             return self._changed.wait_for(lambda: self._answered == self._asked, timeout)
 
     def close(self, timeout: float | None = None) -> None:
-        """Stop: what is worked on is told no more."""
+        """Stop: what is worked on is reported no more."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

@@ -24,7 +24,7 @@ __all__ = ["Answer", "Replanning"]
 PATIENCE = 20.0  # [s] that each of the two ways may take
 _STEPS = 3e-3, 1e-2  # [s] least and most between instants of the motion that is drawn
 _IN_CONTACT = 6  # instants, if the least step allows it
-_WORST = 5  # constraints that are told
+_WORST = 5  # constraints that are reported
 # of the solver: the impulse is within a thousandth, in half of the iterations
 _LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-3}
 
@@ -45,10 +45,10 @@ class Answer:
 
 
 class Replanning:
-    """Plans for wishes, from a first plan.
+    """Plans for requests, from a first plan.
 
     The first plan is bent (`Solution.moved`): one setting of the sliders then gives one plan, whatever came
-    before. Where that fails, the wish is solved from the last plan that there was, which may be nearer.
+    before. Where that fails, the request is solved from the last plan that there was, which may be nearer.
     """
 
     def __init__(self, first: Solution, *, patience: float = PATIENCE) -> None:

@@ -25,7 +25,7 @@ Page = TypeVar("Page", bound="LivePage")
 
 
 class LivePage:
-    """A page that answers the newest wish of its watcher, until it is closed."""
+    """A page that answers the latest request of its watcher, until it is closed."""
 
     _server: Any
     _newest: Newest[Any, Any]

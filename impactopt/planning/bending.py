@@ -1,4 +1,6 @@
-"""Plans bent for other numbers of their problem: first by the KKT system of the plan, then by the solver."""
+"""Plans bent for other parameters of their problem: first by the KKT system of the plan, then by the
+solver.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ _FIRST_ORDER = 1e-3  # of constraints: a first-order plan that is off by more is
 _ENOUGH, _CORRECTIONS = 1e-4, 4  # of constraints: no more steps; and so many at most beside the first
 _BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near
 # First barriers, and most iterations, from the plan itself. With the smaller one the solver keeps to bounds
-# that hold no more, and takes a third longer. In one of 50 shifts either of them leads nowhere.
+# that hold no more, and takes a third longer. In one of 50 shifts either of them fails.
 _FROM_PLAN = ((1e-3, 150), (1e-5, None))
 
 
@@ -45,7 +47,7 @@ def moved_solution(
     callback: Callback | None = None,
     **changes: Any,
 ) -> Solution:
-    """The plan for a problem with other numbers: `Solution.moved`.
+    """The plan for a problem with other parameters: `Solution.moved`.
 
     changes : as of `impactopt.planning.changes.moved_problem`.
     """

@@ -1,4 +1,4 @@
-"""A solution's program with other numbers, and its KKT system: what bent plans and sensitivities need."""
+"""A solution's program with other parameters, and its KKT system: what bent plans and sensitivities need."""
 
 from __future__ import annotations
 

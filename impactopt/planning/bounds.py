@@ -42,7 +42,7 @@ MET = 1e-5  # violation of constraints that counts as none here
 USUAL = 1.0  # [s] of a motion
 _NO = np.zeros(0, dtype=np.intp)
 _TIMES = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}
-_ROOM = 0.02  # by how much more a value is told than what it takes: there the feasible set is one point
+_ROOM = 0.02  # by how much more a value is reported than what it takes: there the feasible set is one point
 _FAR = 0.1  # [m] between bodies that count as much as a bound's own size
 _PROBES = 6  # of a term's number, at most
 _OF_TERM: dict[str, type[Term]] = {
@@ -312,7 +312,7 @@ def _with(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
 
 
 def changed_or_none(problem: ImpactProblem, **new: object) -> ImpactProblem | None:
-    """A problem with other numbers; None if it may not have them."""
+    """A problem with other parameters; None if it may not have them."""
     with contextlib.suppress(InputError):
         return changed(problem, **new)
     return None

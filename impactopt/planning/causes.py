@@ -40,7 +40,7 @@ _TRIED = 5  # bounds that are tried alone
 _FACTORS = tuple(10.0 ** (sign * k / 2) for k in (1, 2, 3, 4) for sign in (1, -1))  # of stiffness
 _STIFF = 50  # iterations of each: where there is a solution, most are there in half of them
 _BARRIER, _PUSH = 1e-2, 1e-3  # of a program that is nearly met
-_ROUGH = 1e-4  # its tolerance: three digits are told
+_ROUGH = 1e-4  # its tolerance: three digits are reported
 _TRIES = 4  # of a value
 _NONE = 1e-4  # what a relaxation comes to that is none
 

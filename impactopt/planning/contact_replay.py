@@ -32,7 +32,7 @@ AGREED, REFUTED = 1.0, 5.0  # [%] of the impulse: a plan that is off by more is 
 _STEP, _STEPS = 2e-4, 60  # [s] at most; of the planned contact, at least
 _LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that comes back, or goes on, is seen
 _SAMPLED = 1e-3  # [s] of a coasting reference
-_WORTH = 1e-3  # of the planned contact's duration: a gap that is told
+_WORTH = 1e-3  # of the planned contact's duration: a gap that is reported
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +59,8 @@ class ContactReplay:
     the target, by name and unit.  contact [s] : from the first touch to the end of the last.  events [s] :
     since contact, when the target has switched, such as a board that breaks.  partings : how often striker
     and target part and meet again.
-    guards : names of the target's events, in their order.  known [%] : what of `impulse_pct` is told as the
-    error of the model of the collision.
+    guards : names of the target's events, in their order.  known [%] : what of `impulse_pct` is reported as
+    the error of the model of the collision.
     """
 
     planned: float

@@ -1,4 +1,4 @@
-"""Terms that hold by default and get constraints once a plan without them breaks them: what gears bear, how
+"""Terms that hold by default and get constraints once a plan without them breaks them: gear loads, how
 far a blow slides.
 """
 
@@ -61,7 +61,7 @@ def kept_on_demand(
     report: Callable[[str], None] | None = None,
 ) -> tuple[Program, SolverResult]:
     """A program's result if it keeps to the lazy terms; else that of the program with the constraints that it
-    lacks: from there, and where that leads nowhere from the start. It has the effort of all.
+    lacks: from there, and where that fails from the start. It has the effort of all.
 
     first : the program that it came from, and its start.  solve : a program from a start; it keeps bodies
     apart, from the clearance constraints that the program has.  finer : the collisions, if known at more

@@ -13,7 +13,7 @@ from impactopt.problem.terms import Slide
 from impactopt.simulation.target_dynamics import FACE
 from impactopt.transcription.plan import Plan
 
-FAR = 0.15  # [m] across the target's face: a plan that slides so far is told so
+FAR = 0.15  # [m] across the target's face: a plan that slides so far is reported so
 INSTANTS = 9  # of the contact
 MORE = 0.03  # of what it may be: no more than a mesh leaves it
 

@@ -238,7 +238,7 @@ def clear_strike(
     """A strike whose bodies keep apart; its result has the effort of all.
 
     start : variables (n,); or a result of this program but for other constraints, such as those on demand:
-        then it goes on from there, and begins anew only where that leads nowhere.
+        then it goes on from there, and begins anew only where that fails.
     """
     x0 = start.x if isinstance(start, SolverResult) else start
     goes_on = isinstance(start, SolverResult) and len(start.multipliers) == t.program.m

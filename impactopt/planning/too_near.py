@@ -1,9 +1,9 @@
 """Detects clearance violations of a solution and selects the constraints and nodes to add.
 
-At its nodes a program has constraints on the clearance of near bodies (`keeping_apart`). If two bodies violate
-their clearance between two nodes, a node is added at that instant, which gets constraints as its bodies are
-near there. Where nodes are too dense for another, or in contact, which has none, the required clearance at the
-adjacent nodes is raised.
+At its nodes a program has constraints on the clearance of near bodies (`keeping_apart`). If two bodies
+violate their clearance between two nodes, a node is added at that instant, which gets constraints as its
+bodies are near there. Where nodes are too dense for another, or in contact, which has none, the required
+clearance at the adjacent nodes is raised.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def check_apart(kind: str, names: Sequence[str]) -> None:
 def check_at_rest(
     robot: Robot, coordinates: StanceCoordinates, soles: Sequence[str], posture: NDArray[np.float64]
 ) -> None:
-    """InputError if the posture's centre of mass is not above the held soles: it would fall at once."""
+    """InputError if the posture's centre of mass is not above the fixed soles: it would fall at once."""
     polygon = support_polygon(robot, coordinates)
     if not len(polygon):
         return

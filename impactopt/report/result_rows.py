@@ -51,7 +51,7 @@ class Row:
 
 
 def result_columns(summary: Mapping[str, Any]) -> Columns:
-    """The plan, its simulation on held soles, and its replay on free ones, as far as there are any.
+    """The plan, its simulation on fixed soles, and its replay on free ones, as far as there are any.
 
     summary : the content of ``summary.json``.
     """
@@ -104,7 +104,7 @@ def _sole_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     """Margins of each sole by itself, beside what is asked of the plan: of its centre of pressure to its own
     edges in each phase, and its least normal force.
 
-    Good is half of that in a plan and on held soles, and a sole that does not tip on free ones.
+    Good is half of that in a plan and on fixed soles, and a sole that does not tip on free ones.
     """
     asked, force = sources[0].get("sole_cop_margin_asked_mm") or {}, sources[0].get("sole_force_asked_N") or 0
     free = np.array([source.get("engine") == "mujoco" for source in sources])

@@ -95,7 +95,7 @@ class DriveLoads:
         return out
 
     def beyond_peak(self) -> str:
-        """Message about gears that bear more than their momentary peak; "" if none does."""
+        """Message about gears that carry more than their momentary peak; "" if none does."""
         limit, names = self.gear_limit, self.joints
         worst = sorted(np.flatnonzero(self.gear > limit * (1 + 1e-3)), key=lambda k: -self.gear[k] / limit[k])
         if not worst:

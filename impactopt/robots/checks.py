@@ -167,8 +167,8 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
 
 
 def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
-    """InputError with all held soles, (name, frame) each, that are on no leg of their own: its last six
-    joints, which move no other held sole.
+    """InputError with all fixed soles, (name, frame) each, that are on no leg of their own: its last six
+    joints, which move no other fixed sole.
     """
     found, chains = Mistakes(), []
     for name, frame in soles:
@@ -202,7 +202,7 @@ def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
 
 def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]]) -> None:
     """InputError with all hands, (name, frame) each, that hold on with no arm of their own: its last six
-    joints, which move neither a held sole, by its frame, nor another hand.
+    joints, which move neither a fixed sole, by its frame, nor another hand.
     """
     found = Mistakes()
     chains = {frame: robot.limb(frame) for frame in (*soles, *(frame for _, frame in hands))}

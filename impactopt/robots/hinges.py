@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 SHARE = 0.5  # of the foot's mass that goes with the sole
 SPEED = 20.0  # [rad/s]: no bound of a strike
 SINGULAR = 1e-3  # a leg's Jacobian's least singular value [m], at least
-LEVER = 0.1  # [m] by which the weight makes the torque that numbers of a hinge are told in
+LEVER = 0.1  # [m] by which the weight makes the torque that numbers of a hinge are reported in
 
 
 def hinged(model: pin.Model, soles: Sequence[Sole]) -> pin.Model:
@@ -103,7 +103,7 @@ def inside(robot: Any, margin: float) -> tuple[Array, Array]:
 
 
 def hinge_torque(model: pin.Model) -> float:
-    """Torque [N m] in which those of hinges are told: the weight at a lever."""
+    """Torque [N m] in which those of hinges are reported: the weight at a lever."""
     return LEVER * 9.81 * float(sum(body.mass for body in model.inertias))
 
 

@@ -178,7 +178,7 @@ class _Reader(Compiled):
         for a in range(len(mj.actuator_trntype)):
             j = int(mj.actuator_trnid[a, 0])
             if int(mj.actuator_trntype[a]) not in inside:
-                if mj.actuator_trntype[a] != kinds.mjTRN_TENDON:  # a tendon's is told with it
+                if mj.actuator_trntype[a] != kinds.mjTRN_TENDON:  # a tendon's is reported with it
                     self.out.notes.append(f"actuator {self.name('actuator', a)!r}, of no joint, is left out")
                 continue
             if j not in self.joint:

@@ -89,7 +89,7 @@ def _g1_motor(knee: float, idle: float, torque: float, coulomb: float, viscous: 
     """The line of a motor from its torque [N m] up to a speed [rad/s] and the speed without load [rad/s], and
     its friction: measured by Unitree, as in its `unitree_rl_lab` (X1, X2, Y1, Fs, Fd of its actuators).
 
-    What its gears bear is not public.
+    What its gears carry is not public.
     """
     return Actuator(
         stall_torque=torque * idle / (idle - knee),

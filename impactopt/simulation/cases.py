@@ -140,7 +140,7 @@ def posture_of_effective_mass(
     """A configuration (nq,) whose effective mass at the striking point is `mass` [kg], within 1e-6 kg.
 
     The one found nearest to `start` (None: the posture half_sitting) by SLSQP, in the sum of squares of what
-    the joints move [rad], with held soles where they are, joints inside their limits by 0.02 rad, and the
+    the joints move [rad], with fixed soles where they are, joints inside their limits by 0.02 rad, and the
     centre of mass over the soles, `inside` [m] from their edge. Deterministic.
 
     Raises

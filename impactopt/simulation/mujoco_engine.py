@@ -175,12 +175,12 @@ class _Replay(MujocoRobot):
             gears.look(torque, acceleration + (push.forces - push.peaks) @ self.yields[:, self.dof])
 
     def corner_places(self) -> Array:
-        """World places (k, 3) of all held soles' corners."""
+        """World places (k, 3) of all fixed soles' corners."""
         rotations = self.data.xmat[self.corner_body].reshape(-1, 3, 3)
         return self.data.xpos[self.corner_body] + (rotations @ self.corners[:, :, None])[:, :, 0]
 
     def sole_ground(self) -> Array:
-        """(soles, 6) wrench of the floor on each held sole about the world's origin; after the step's forces
+        """(soles, 6) wrench of the floor on each fixed sole about the world's origin; after the step's forces
         are known."""
         out = np.zeros((len(self.held), 6))
         contacts = self.data.contact

@@ -130,7 +130,7 @@ class _World:
         return out
 
     def corners(self) -> Array:
-        """World places (k, 3) of all held soles' corners."""
+        """World places (k, 3) of all fixed soles' corners."""
         places = [
             np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
             for m, c in zip(self.body.placements(), self.scene.corners, strict=False)  # then hands

@@ -1,4 +1,5 @@
-"""The held robot in Pinocchio, with H, J and bias anew at every call: what replays and references move.
+"""The constrained robot in Pinocchio, with H, J and bias anew at every call: what replays and references
+move.
 
 Two ways to the same numbers: the paper's dense system, and Pinocchio's own algorithms along the tree.
 """
@@ -28,7 +29,7 @@ class Body(ABC):
     ----------
     robot : what moves.
     frames : held in all six directions.
-    compliance : (6,) of each held frame, as `Stance.compliance`.
+    compliance : (6,) of each constrained frame, as `Stance.compliance`.
     striker : the striking frame, or several.
     normal : (3,) of the blow.
     """
@@ -78,7 +79,7 @@ class Body(ABC):
         return [pin.updateFramePlacement(self.model, self.data, i).copy() for i in self.frames]
 
     def places(self) -> Array:
-        """(held frames, 3) [m]: their origins in the world, where it has been last."""
+        """(constrained frames, 3) [m]: their origins in the world, where it has been last."""
         return np.array([placement.translation for placement in self.placements()]).reshape(-1, 3)
 
     def _jacobian(self, frame: int) -> Array:

@@ -119,7 +119,7 @@ class Simulation:
     each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
     computed, or nothing was hit.
     gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
-    before.  loads: what gears and motors bear at most.  cuts: joints whose demand the line of their motor
+    before.  loads: what gears and motors carry at most.  cuts: joints whose demand the line of their motor
     has cut, the longest first; None where no motor's line is known.
     grip_force (k, hands) [N]: on each hand that holds on.  impulses (strikers,) [N s]: of each.
     """

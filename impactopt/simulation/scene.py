@@ -9,7 +9,7 @@ from impactopt.simulation.result import Scene
 
 
 def scene_of(problem: ImpactProblem) -> Scene:
-    """Target, contact and held soles of ``problem``."""
+    """Target, contact and fixed soles of ``problem``."""
     p = problem
     return Scene(
         solids=solids_of(p) if p.keeps_apart else Solids(),

@@ -27,7 +27,7 @@ _WEIGHT = 1e6  # of the augmented Lagrangian: a constraint is off by a multiplie
 _WEAK = 1e-4  # multiplier of a constraint that hardly holds
 _PROXIMAL = 1e-2  # curvature more of every variable, so that what hardly matters stays
 _STEPS, _SETS = 5, 20  # QPs, and active sets of each
-_SHORT, _JAMMED = 0.1, 5  # so many line searches that are so short: it gets nowhere
+_SHORT, _JAMMED = 0.1, 5  # so many line searches that are so short: it stalls
 _ENOUGH = 1e-4  # of constraints: no more QPs
 
 

@@ -126,7 +126,7 @@ def _written(data: Mapping[str, Any]) -> str:
     """
 
     def with_flat(table: Any, *names: str) -> Any:
-        if not isinstance(table, Mapping):  # a mistake, which is told later
+        if not isinstance(table, Mapping):  # a mistake, which is reported later
             return table
         tables = {name: table[name] for name in names if isinstance(table.get(name), Mapping)}
         return {**table, **{name: dict(flat(inner)) for name, inner in tables.items()}}

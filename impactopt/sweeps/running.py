@@ -87,7 +87,7 @@ def sweep(
     again : do cases once more that crashed, met an error of ours or ran out of time in an earlier run.
     report : told in words what is going on.  progress : told after every unit; True: both are shown, False:
         not; None: where a person looks, on a terminal or in a notebook, unless `report` is given.
-        Words that nobody is told go to the logger "impactopt".
+        Messages without a receiver go to the logger "impactopt".
 
     A case that fails is a row with its reason. Ctrl-C ends the processes, writes the table of what is
     finished, and is raised.

@@ -91,7 +91,7 @@ def collide_once(
     """One collision of a problem's robot with its target, as plain numbers with units in their names.
 
     at_contact : the state at contact and the model, by the keys of docs/sweeps.md.
-    accuracy : relative, of the impulse: freezing that may have cost more is told.
+    accuracy : relative, of the impulse: freezing that may have cost more is reported.
 
     Returns the measures of docs/sweeps.md; ``target``, what it says after the blow; ``joints``, the largest
     torque demand [N m] and the limit of each, hardest first; or ``reason``, why there is no such collision.

@@ -152,8 +152,8 @@ class ContactProgram(ABC):
         return [*nodes, *self.hit.drives()]
 
     def wrenches(self) -> list[tuple[Place, Affine]]:
-        """Wrenches on soles and held hands (6 each), at the nodes and at collocation points of all contacts
-        that last.
+        """Wrenches on soles and supporting hands (6 each), at the nodes and at collocation points of all
+        contacts that last.
         """
         nodes = [(place, slots[4]) for place, slots in self._node_slots()]
         lasting = [c for c in self.hit.collisions if isinstance(c, Collision)]

@@ -150,7 +150,7 @@ def link() -> BlockExpression:
 
 
 def spring(c: StanceCoordinates, chosen: Joints = ()) -> BlockExpression:
-    """Torques of springs and dampers at joints outside the held legs, less what they bear at rest.
+    """Torques of springs and dampers at joints outside the constrained legs, less what they bear at rest.
 
     z = y, y', T, logarithms of the factors on the gains of the joints of each of ``chosen``;  p = angles at
         rest, stiffness and damping over torque limit (one a joint).

@@ -60,8 +60,8 @@ def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpres
 
     z = y0, u0 (ydot) at contact, T1, T, legs, leg rates [rad/s], of a freeze their accelerations [rad/s^2];
     p = s (place in the phase), 1 in restitution else 0.
-    out = pose error of the held soles [m, rad], twist of the held soles [m/s, rad/s]; of a freeze, what rates
-        and accelerations are off by.
+    out = pose error of the fixed soles [m, rad], twist of the fixed soles [m/s, rad/s]; of a freeze, what
+        rates and accelerations are off by.
     """
     y0, u0 = ca.SX.sym("y0", c.ny), ca.SX.sym("u0", c.ny)
     legs, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("rates", c.nl)
@@ -164,7 +164,7 @@ def _strikers(striker: str, second: str) -> list[str]:
 def _motion(
     c: StanceCoordinates, y: Any, u: Any, legs: Any, ydd: Any, *, jdot: bool = True
 ) -> tuple[Any, Any, list[Stage]]:
-    """v and a (nv) on held soles, and their stages; without dJ/dt v, a as if nothing moved."""
+    """v and a (nv) on fixed soles, and their stages; without dJ/dt v, a as if nothing moved."""
     return motion_in_stages(c, y, legs, u, ydd) if jdot else (*(c.velocity(y, legs, x) for x in (u, ydd)), [])
 
 

@@ -50,7 +50,7 @@ class ContactError:
     coarse : what of it is the elements'; the rest is that phases hold to one branch of the law.
     of_elements : what each element of each phase adds to `coarse` [%].
     missed : whether an event is missed.
-    strained : in which elements of each phase a gear bears more than it may, between the plan's own points.
+    strained : in which elements of each phase a gear carries more than it may, between the plan's own points.
     finer : the collisions as they are on elements half as long, in the program's order: torque and ZMP are
         worst between the plan's own points. Empty if none was found.
     """
@@ -97,8 +97,8 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
 def refined_elements(error: ContactError | None, elements: Elements, asked: float = ASKED) -> Elements | None:
     """Elements for a contact with less error than is asked for [%]; None where it has less, or no more help.
 
-    Those with much of the error are cut, into more parts the more they have, and those in which a gear bears
-    too much; all where an event is missed.
+    Those with much of the error are cut, into more parts the more they have, and those in which a gear
+    carries too much; all where an event is missed.
     """
     strained = error is not None and any(map(any, error.strained))
     if error is None or (abs(error.coarse) <= asked and not error.missed and not strained):
@@ -236,7 +236,7 @@ class _Again:
 
 
 def _strained(t: ContactProgram, hit: PlannedCollision, stages: Sequence[CollocationPoint]) -> Array:
-    """Elements of the program in which a gear bears too much, in a collision on elements half as long."""
+    """Elements of the program in which a gear carries too much, in a collision on elements half as long."""
     share = gear_share(t.problem, hit.torque, hit.acceleration)[1:] > 1.0 + GEAR
     elements = sorted({s.members for s in stages})
     out = np.zeros(len(elements) // 2, dtype=bool)

@@ -58,7 +58,7 @@ class Blow:
 def effective_mass(
     c: StanceCoordinates, strikers: Sequence[str], normal: Array, y: Array, legs: Array, rates: Array
 ) -> tuple[float, float]:
-    """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s].
+    """Mass [kg] of a robot on fixed soles at its striker, along the normal, and the striker's speed [m/s].
 
     Of several strikers: of each, with the others as fast; and their mean speed. One that goes back is met by
     what comes; one that hardly moves counts as slow.

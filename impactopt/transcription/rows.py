@@ -55,7 +55,7 @@ def _straight(label: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A constraint's origin: term, place and component, and how its violation is told.
+    """A constraint's origin: term, place and component, and how its violation is reported.
 
     whole : what the component is a part of, and what messages name in its place; None: the component.
     """

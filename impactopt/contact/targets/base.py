@@ -61,7 +61,7 @@ class Target(Described, ABC):
     def parameters(self) -> dict[str, float]:
         """The target's numbers by name; a collision model takes each as an input named `target_<name>`.
 
-        `type(target)(**numbers)` is the same target with other numbers.
+        `type(target)(**numbers)` is the same target with other parameters.
         """
         return numbers_of(self)
 

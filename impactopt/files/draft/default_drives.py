@@ -18,7 +18,7 @@ SPEED = {True: 3.0, False: 0.3}  # [rad/s], [m/s]
 WEIGHT = 3.0  # torque limit over the largest that gravity asks for
 THIGH = 0.3  # [m] times the robot's weight: what a leg's joint can bear at least
 WEAKEST = {True: 2.0, False: 50.0}  # [N m], [N]
-BELIEVED = {True: 500.0, False: 1e4}  # more than that [N m], [N] is told
+BELIEVED = {True: 500.0, False: 1e4}  # more than that [N m], [N] is reported
 FAST = 60.0  # [rad/s], [m/s]: likewise
 DOUBT = "a GUESS"
 

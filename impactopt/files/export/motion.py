@@ -18,7 +18,7 @@ from impactopt.transcription.plan import Trajectory
 __all__ = ["JUMP", "Base", "Motion", "motion_at", "springs_at_rest"]
 
 Array = NDArray[np.float64]
-JUMP = 1e-6  # [s] by which the later one of two rows at a jump is told later
+JUMP = 1e-6  # [s] by which the later one of two rows at a jump is reported later
 CONTACT = 1  # phase
 
 

@@ -31,7 +31,7 @@ _KINDS = {
     "model_type": "give a section of its own",
     "model_attributes_type": "give a section of its own",
 }
-_MOST, _LONGEST = 100, 1000  # mistakes that are told, and characters of each
+_MOST, _LONGEST = 100, 1000  # mistakes that are reported, and characters of each
 _SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 

@@ -105,7 +105,7 @@ class ReferenceModel(CollisionModel):
 
     @property
     def _held(self) -> tuple[Robot, tuple[str, ...], Array, str]:
-        """Robot, held frames, their compliance, and striking frame."""
+        """Robot, constrained frames, their compliance, and striking frame."""
         robot, held_by = self.robot, self.held_by
         striker = robot.striker(self.striker).model_frame
         return robot, held_by.constraint_frames(robot), held_by.compliance, striker

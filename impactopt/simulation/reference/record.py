@@ -30,7 +30,7 @@ def collision_from(
 ) -> Collision:
     """The result of a collision with that end, and that largest force [N].
 
-    soles : how many of the held frames, the first, are soles.
+    soles : how many of the constrained frames, the first, are soles.
     """
     columns: dict[str, Any] = {
         name: np.array([getattr(i, name) for i in instants]) for name in Instant._fields

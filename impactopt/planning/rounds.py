@@ -240,8 +240,8 @@ class Refining:
         return self._apart is not None and self._apart[1] is result
 
     def judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
-        """Result after a failed repair: a solution only if no bodies touch; else the last one without contact,
-        if there is one.
+        """Result after a failed repair: a solution only if no bodies touch; else the last one without
+        contact, if there is one.
         """
         if self.margins is None or not result.status.usable or self._is_apart(result):
             return t, self.checked(t, result)

@@ -68,6 +68,7 @@ def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
     whole, half = (_slope(bent, number, _STEP * number.typical / k) for k in (1, 2))
     offset, impulse, worth = (_extrapolated(*pair) for pair in zip(whole, half, strict=True))
     n, m = len(x), len(solution.result.multipliers)
+    # implicit function theorem: the KKT matrix times dz/dp is minus the slope of the KKT residual at fixed z
     change = bent.system.step(Offset(dual=offset[:n], rows=offset[n : n + m], variables=offset[n + m :]))
     # impulse and objective may depend on the number at the same motion too
     program = bent.program
@@ -96,6 +97,7 @@ def _slope(bent: Bent, number: Parameter, half: float) -> tuple[Array, Array, Ar
 
 def _extrapolated(whole: Array, half: Array) -> Array:
     """Richardson extrapolation of central differences with a step and its half."""
+    # both errors are even in the step: four times the half's less the whole's leaves those of fourth order
     return (4 * half - whole) / 3
 
 

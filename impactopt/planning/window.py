@@ -26,6 +26,7 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
         for phase, group in zip(t.problem.target.phases, hit.T, strict=True):
             j = group.offset
             if result.x[j] * group.scale[0] >= (1 - _AT) * longest:
+                # multiplier: slope of the objective by the bound; a window twice as long moves it by itself
                 price += max(float(result.bound_multipliers[j]), 0.0) * float(result.x[j])
                 named.append(phase)
     if not named or worth <= 0 or price < _DEAR * worth:

@@ -28,7 +28,7 @@ _SINGULAR = (
     "the active constraints of this solution are linearly dependent: its KKT system is singular; solve the "
     "changed problem from it, with solve(problem, start=solution)"
 )
-_REFINEMENTS = 5
+_REFINEMENTS = 5  # of a solution: they remove the error of what `_ROUNDING` adds to the diagonal
 _LEFT = 1e-8  # of what is given: what a step may leave of the equations
 _SOFT = 1e4  # slack over multiplier: what gives way more is at no bound
 _TINY = 1e-9  # a multiplier that is nothing

@@ -16,9 +16,8 @@ import scipy.sparse as sp
 from impactopt.solvers.program import Determined, Matrix, NonlinearProgram, Vector
 
 Index = npt.NDArray[np.intp]
-_KEEP = (
-    1e-3  # of the program's own objective, over its size: there is one point among many, and a sensible one
-)
+# weight of the program's own objective, over its size: of many points with the least relaxation, it picks one
+_KEEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

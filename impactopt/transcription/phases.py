@@ -43,4 +43,5 @@ def switches(law: ContactLaw) -> bool:
 
 def pulls_apart(law: ContactLaw) -> bool:
     """True if the law would pull at bodies that separate fast."""
+    # hardly any penetration [m], and separation at 10 m/s: a damper without a spring behind it would pull
     return float(law.branch(1e-6, -10.0, False)) < 0

@@ -18,6 +18,7 @@ from impactopt.transcription.rows import Place, percent
 
 __all__ = ["SpringPoint", "add_hinges", "add_springs", "follow_springs", "swing_springs"]
 
+# weights of an interval's begin, middle and end: Simpson's rule, exact for the splines' cubics
 SIMPSON = (1 / 6, 4 / 6, 1 / 6)
 
 

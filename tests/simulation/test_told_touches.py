@@ -28,4 +28,4 @@ def test_the_deepest_is_named_and_pairs_are_counted_once() -> None:
     ]
     said = told_touches({"contacts_besides": both})
     assert said.startswith("2 pairs of bodies penetrate each other, arm and torso by 42 mm")
-    assert "two bodies are" in told_touches({"contacts_besides": both[:1]})
+    assert "two bodies penetrate" in told_touches({"contacts_besides": both[:1]})

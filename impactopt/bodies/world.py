@@ -97,7 +97,7 @@ def _usual(body: TargetBody, target: Target) -> tuple[str, tuple[float, ...]]:
     return "box", BOX
 
 
-def told_body(body: TargetBody, target: Target) -> str:
+def body_message(body: TargetBody, target: Target) -> str:
     """The target's body in words, with its size, and whether that was assumed."""
     if body.shape == "none":
         return "none: nothing keeps off it"

@@ -313,8 +313,8 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     from impactopt.report.console import (
         multistart_table,
         result_table,
-        told_off,
-        told_touches,
+        switched_off_message,
+        touches_message,
         violation_table,
     )
 
@@ -330,7 +330,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         )
     error = summary.get("simulated", {}).get("error")
     beyond = summary.get("gear_caution")
-    cautions = (summary.get("caution"), told_touches(summary), beyond, told_off(summary))
+    cautions = (summary.get("caution"), touches_message(summary), beyond, switched_off_message(summary))
     for text in (summary.get("note"), error, reach.get("error"), *cautions):
         if text:
             console.print(printable(str(text)), markup=False, highlight=False)

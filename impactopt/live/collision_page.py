@@ -17,7 +17,7 @@ from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.live.drawing import Drawing
-from impactopt.live.latest_request import Newest
+from impactopt.live.latest_request import LatestRequest
 from impactopt.live.motion import Moment
 from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.problem.problem import ImpactProblem
@@ -78,12 +78,12 @@ class LiveBlow(LivePage):
         self._drawing.watch(mass, problem.point, problem.normal, float(mass[1]))
         self._controls()
         self.blow = Blow()
-        self._newest = Newest(self._strike, self._told)
+        self._latest = LatestRequest(self._strike, self._told)
         self.changed()
 
     def changed(self) -> None:
         """Collide in the posture and at the speed that the sliders say."""
-        self._newest.ask(np.array([float(s.value) for s in (self.speed, *self.joints.values())]))
+        self._latest.ask(np.array([float(s.value) for s in (self.speed, *self.joints.values())]))
 
     def run(self) -> None:
         """Serves the page until Ctrl-C."""
@@ -107,11 +107,11 @@ class LiveBlow(LivePage):
         for slider in (self.speed, *self.joints.values()):
             slider.on_update(lambda _: self.changed())
 
-    def _strike(self, wish: Array, stale: Callable[[], bool]) -> Blow:
+    def _strike(self, request: Array, stale: Callable[[], bool]) -> Blow:
         began = time.perf_counter()
         p, c = self.problem, self.problem.coordinates
-        speed, y = float(wish[0]), self._y.copy()
-        y[c.base :] = wish[1:]
+        speed, y = float(request[0]), self._y.copy()
+        y[c.base :] = request[1:]
         q = c.join(y, self._legs)
         try:
             v = striking_velocity(p.robot, q, p.striker, p.normal, speed, stance=p.stance)

@@ -6,36 +6,36 @@ import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-__all__ = ["Newest"]
+__all__ = ["LatestRequest"]
 
-Wish = TypeVar("Wish")
+Request = TypeVar("Request")
 Outcome = TypeVar("Outcome")
 
 
-class Newest(Generic[Wish, Outcome]):
+class LatestRequest(Generic[Request, Outcome]):
     """Answers requests one after the other. One that comes while another is worked on takes its place.
 
     work : from a request to its outcome. Its second argument says whether a newer request is there: then it
         may stop, as nobody will ask for what it returns.
-    tell : is given each outcome that is still wished for, or what the work raised, in the same thread.
+    tell : is given each outcome that is still requested, or what the work raised, in the same thread.
     """
 
     def __init__(
         self,
-        work: Callable[[Wish, Callable[[], bool]], Outcome],
-        tell: Callable[[Wish, Outcome | Exception], object],
+        work: Callable[[Request, Callable[[], bool]], Outcome],
+        tell: Callable[[Request, Outcome | Exception], object],
     ) -> None:
         self._work, self._tell = work, tell
         self._changed = threading.Condition()
         self._asked, self._answered, self._closed = 0, 0, False
-        self._wish: Wish
-        self._thread = threading.Thread(target=self._run, name="newest wish", daemon=True)
+        self._request: Request
+        self._thread = threading.Thread(target=self._run, name="newest request", daemon=True)
         self._thread.start()
 
-    def ask(self, wish: Wish) -> None:
+    def ask(self, request: Request) -> None:
         """Take this request in place of all before it."""
         with self._changed:
-            self._wish, self._asked = wish, self._asked + 1
+            self._request, self._asked = request, self._asked + 1
             self._changed.notify_all()
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -56,18 +56,18 @@ class Newest(Generic[Wish, Outcome]):
                 self._changed.wait_for(lambda: self._closed or self._answered != self._asked)
                 if self._closed:
                     return
-                number, wish = self._asked, self._wish
+                number, request = self._asked, self._request
 
             def stale(number: int = number) -> bool:
                 return self._closed or self._asked != number
 
             outcome: Outcome | Exception
             try:
-                outcome = self._work(wish, stale)
+                outcome = self._work(request, stale)
             except Exception as error:
                 outcome = error
             if not stale():
-                self._tell(wish, outcome)
+                self._tell(request, outcome)
             with self._changed:
                 self._answered = number
                 self._changed.notify_all()

@@ -11,12 +11,12 @@ import numpy as np
 
 from impactopt.errors import InputError
 from impactopt.live.drawing import Drawing
-from impactopt.live.latest_request import Newest
+from impactopt.live.latest_request import LatestRequest
 from impactopt.live.motion import moment_of
 from impactopt.live.replanning import Answer, Replanning
-from impactopt.live.requests import Wish, numbers_of, wish_of
+from impactopt.live.requests import PlanRequest, numbers_of, request_of
 from impactopt.live.server import LOCAL, LivePage, served
-from impactopt.live.summary import told_failure, told_plan
+from impactopt.live.summary import failure_message, plan_message
 from impactopt.planning.solution import Solution
 from impactopt.report.tracks import Track
 
@@ -47,9 +47,9 @@ class LiveLook(LivePage):
             raise InputError(
                 f"this plan is no solution ({first.status.value}), so no other can be made of it: solve it"
             )
-        self.first, self.wish = first, wish_of(first.problem)
+        self.first, self.request = first, request_of(first.problem)
         replanning = Replanning(first)
-        self.answer = replanning(self.wish, lambda: False)
+        self.answer = replanning(self.request, lambda: False)
         self._server, self.address = served(host, port)
         self._drawn, self._asking = threading.RLock(), threading.RLock()
         self._drawing = Drawing(self._server, first.problem.robot, first.problem.ground_height)
@@ -58,13 +58,13 @@ class LiveLook(LivePage):
         middle = float(track.places[0, 1:, 1].mean())
         self._drawing.watch(track.mass[0], problem.point, problem.normal, middle)
         self._take(self.answer)
-        self._newest = Newest(replanning, self._told)
+        self._latest = LatestRequest(replanning, self._told)
 
-    def ask(self, wish: Wish) -> None:
+    def ask(self, request: PlanRequest) -> None:
         """Plan for this, in place of what was asked for before."""
-        self.wish = wish
+        self.request = request
         self.status.content = "Planning ..."
-        self._newest.ask(wish)
+        self._latest.ask(request)
 
     def run(self) -> None:
         """Play the motion, until Ctrl-C."""
@@ -117,26 +117,26 @@ class LiveLook(LivePage):
         with self._asking:  # viser calls from several threads
             x, y, z = (float(v) for v in self.hit.position)
             numbers = tuple((name, float(slider.value)) for name, slider in self.sliders.items())
-            wish = Wish(point=(x, y, z), numbers=numbers)
-            if wish != self.wish:
-                self.ask(wish)
+            request = PlanRequest(point=(x, y, z), numbers=numbers)
+            if request != self.request:
+                self.ask(request)
 
     def reset(self) -> None:
         """Put all controls, and with them the plan, back to the first."""
         with self._asking:
-            own = wish_of(self.first.problem)
+            own = request_of(self.first.problem)
             self.ask(own)  # at first, so that no control asks on its way
             for name, value in own.numbers:
                 self.sliders[name].value = value
             self.hit.position = np.array(own.point)
             self.ask(own)
 
-    def _told(self, _: Wish, answer: Answer | Exception) -> None:
+    def _told(self, _: PlanRequest, answer: Answer | Exception) -> None:
         if isinstance(answer, Exception):  # a fault of ours, which must not end the page
             traceback.print_exception(answer)
             answer = Answer(why=f"This is a fault of impactopt: {type(answer).__name__}: {answer}")
         if answer.track is None:
-            self.status.content = told_failure(answer)
+            self.status.content = failure_message(answer)
         else:
             self._take(answer)
 
@@ -151,7 +151,7 @@ class LiveLook(LivePage):
             self.time.max = end
             self._drawing.show(answer.solution.problem, answer.track, answer.solution.plan.polygon)
             self._draw()
-        self.told.content = told_plan(answer, self.first)
+        self.told.content = plan_message(answer, self.first)
         self.status.content = ""
 
     def _draw(self) -> None:

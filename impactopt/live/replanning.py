@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.live.requests import Wish
+from impactopt.live.requests import PlanRequest
 from impactopt.planning.changes import moved_problem
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
@@ -59,10 +59,10 @@ class Replanning:
         ):  # what that needs is made now, and not when the first slider moves
             first.moved(point=first.problem.point, options=_LOOSE)
 
-    def __call__(self, wish: Wish, stale: Callable[[], bool]) -> Answer:
+    def __call__(self, request: PlanRequest, stale: Callable[[], bool]) -> Answer:
         began = time.perf_counter()
         try:
-            solution = self._plan(wish.changes(self.first.problem), stale)
+            solution = self._plan(request.changes(self.first.problem), stale)
             if not solution.status.usable:
                 return Answer(seconds=time.perf_counter() - began, why=why_not(solution))
             reference = _reference(solution.plan)

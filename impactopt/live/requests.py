@@ -11,7 +11,7 @@ import numpy as np
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone
 
-__all__ = ["Number", "Wish", "numbers_of", "wish_of"]
+__all__ = ["Number", "PlanRequest", "numbers_of", "request_of"]
 
 _RANGE = 4.0  # a slider goes from so much below a problem's number to so much above
 _STEPS = 200
@@ -35,7 +35,7 @@ class Number:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wish:
+class PlanRequest:
     """A problem that is asked for. point [m]; numbers : by their names, those that the problem has."""
 
     point: tuple[float, float, float]
@@ -43,15 +43,15 @@ class Wish:
 
     def changes(self, problem: ImpactProblem) -> dict[str, Any]:
         """Differences from this problem: arguments of `Solution.moved`."""
-        own = wish_of(problem)
+        own = request_of(problem)
         out: dict[str, Any] = {} if self.point == own.point else {"point": np.array(self.point)}
         return out | dict(sorted(set(self.numbers) - set(own.numbers)))
 
 
-def wish_of(problem: ImpactProblem) -> Wish:
+def request_of(problem: ImpactProblem) -> PlanRequest:
     """Request that corresponds to the problem as it is."""
     x, y, z = (float(v) for v in problem.point)
-    return Wish(point=(x, y, z), numbers=tuple((n.name, n.value) for n in numbers_of(problem)))
+    return PlanRequest(point=(x, y, z), numbers=tuple((n.name, n.value) for n in numbers_of(problem)))
 
 
 def numbers_of(problem: ImpactProblem) -> tuple[Number, ...]:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from impactopt.errors import InputError, missing_package
-from impactopt.live.latest_request import Newest
+from impactopt.live.latest_request import LatestRequest
 
 __all__ = ["LOCAL", "LivePage", "served"]
 
@@ -28,15 +28,15 @@ class LivePage:
     """A page that answers the latest request of its watcher, until it is closed."""
 
     _server: Any
-    _newest: Newest[Any, Any]
+    _latest: LatestRequest[Any, Any]
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for the newest answer; False after so long [s]."""
-        return self._newest.wait(timeout)
+        return self._latest.wait(timeout)
 
     def close(self) -> None:
         """End all work and the page."""
-        self._newest.close(timeout=1.0)
+        self._latest.close(timeout=1.0)
         with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
             self._server.stop()
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from impactopt.live.replanning import Answer
 from impactopt.planning.solution import Solution
 
-__all__ = ["told_failure", "told_plan"]
+__all__ = ["failure_message", "plan_message"]
 
 _WORST = 5  # constraints
 
 
-def told_plan(answer: Answer, first: Solution) -> str:
+def plan_message(answer: Answer, first: Solution) -> str:
     """A plan's numbers, how it was found, and its worst constraints."""
     solution = answer.solution
     assert solution is not None
@@ -35,6 +35,6 @@ def told_plan(answer: Answer, first: Solution) -> str:
     )
 
 
-def told_failure(answer: Answer) -> str:
+def failure_message(answer: Answer) -> str:
     """Message that there is no plan, with the reason, and that the one before is still drawn."""
     return f"**No plan for this.** {answer.why}\n\nThe one before is shown ({answer.seconds:.2f} s)."

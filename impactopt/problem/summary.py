@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from impactopt.bodies.world import told_body
+from impactopt.bodies.world import body_message
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES
 from impactopt.problem.terms import ON_DEMAND_TERMS
 
@@ -24,7 +24,7 @@ def described(problem: ImpactProblem) -> dict[str, Any]:
         "point_m": p.point.tolist(),
         "normal": p.normal.tolist(),
         "target": repr(p.target),
-        "target_body": told_body(p.body, p.target),
+        "target_body": body_message(p.body, p.target),
         "law": repr(p.law),
         "hash": p.hash,
     }

@@ -38,9 +38,9 @@ __all__ = [
     "replay_table",
     "result_table",
     "strike_table",
-    "told_off",
-    "told_touches",
+    "switched_off_message",
     "torques_table",
+    "touches_message",
     "violation_table",
 ]
 
@@ -235,7 +235,7 @@ def _add(table: Table, row: Row) -> None:
     table.add_row(_plain(row.label), *cells)
 
 
-def told_touches(summary: Mapping[str, Any]) -> str:
+def touches_message(summary: Mapping[str, Any]) -> str:
     """Sentence about contacts between a plan's bodies; "" if there are none."""
     touches = summary.get("contacts_besides") or ()
     if not touches:
@@ -249,7 +249,7 @@ def told_touches(summary: Mapping[str, Any]) -> str:
     )
 
 
-def told_off(summary: Mapping[str, Any]) -> str:
+def switched_off_message(summary: Mapping[str, Any]) -> str:
     """Sentence about the standard bounds that a plan was made without; "" if all are on."""
     off = summary.get("problem", {}).get("off") or ()
     return f"switched off: {', '.join(off)}" if off else ""

@@ -37,7 +37,7 @@ from impactopt.live import plan_page as look_module
 from impactopt.live.motion import moment_of
 from impactopt.live.plan_page import LiveLook
 from impactopt.live.replanning import Replanning
-from impactopt.live.requests import Wish, numbers_of, wish_of
+from impactopt.live.requests import PlanRequest, numbers_of, request_of
 from impactopt.planning.solution import Solution
 from impactopt.report.tracks import planned_track, tracks_of
 from impactopt.solvers.program import SolverResult, Status
@@ -119,10 +119,10 @@ def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
-def test_a_stale_wish_stops_the_solver(arm: Solution) -> None:
+def test_a_stale_request_stops_the_solver(arm: Solution) -> None:
     replanning = Replanning(arm)
-    wish = wish_of(arm.problem)
-    heavy = dataclasses.replace(wish, numbers=(("mass", 3 * arm.problem.target.mass), wish.numbers[1]))
+    request = request_of(arm.problem)
+    heavy = dataclasses.replace(request, numbers=(("mass", 3 * arm.problem.target.mass), request.numbers[1]))
     answer = replanning(heavy, lambda: True)
     assert answer.solution is None
     assert Status.INTERRUPTED.message.split(";")[0] in answer.why
@@ -136,9 +136,9 @@ def test_a_plan_of_another_program_is_solved_from_the_last(
         raise InputError("the program has other constraints then")
 
     monkeypatch.setattr(Solution, "moved", refused)
-    wish = wish_of(arm.problem)
+    request = request_of(arm.problem)
     mass = 1.1 * arm.problem.target.mass
-    answer = Replanning(arm)(dataclasses.replace(wish, numbers=(("mass", mass),)), lambda: False)
+    answer = Replanning(arm)(dataclasses.replace(request, numbers=(("mass", mass),)), lambda: False)
     assert answer.solution is not None
     assert answer.solution.problem.target.mass == mass
 
@@ -154,7 +154,7 @@ def test_the_motion_plays_and_begins_again(look: LiveLook) -> None:
     assert look.time.max == end
 
 
-# ---- wishes and motions
+# ---- requests and motions
 
 
 def test_a_legged_robot_has_a_margin_and_a_wall_no_mass(arm: Solution) -> None:
@@ -165,8 +165,8 @@ def test_a_legged_robot_has_a_margin_and_a_wall_no_mass(arm: Solution) -> None:
     assert [n.name for n in numbers_of(wall)] == ["stiffness", "margin"]
     for number in numbers_of(biped):
         assert number.least < number.value < number.most
-    assert wish_of(biped).changes(biped) == {}
-    other = Wish(point=(0.0, 0.0, 1.0), numbers=(("mass", 3.0), ("margin", 0.01)))
+    assert request_of(biped).changes(biped) == {}
+    other = PlanRequest(point=(0.0, 0.0, 1.0), numbers=(("mass", 3.0), ("margin", 0.01)))
     assert list(other.changes(biped)) == ["point", "margin"]
 
 

@@ -82,7 +82,7 @@ def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, bolted: bool 
         for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
             data[phase]["duration_s"] = duration(robot, way, usual)
         data = _aimed(data, robot, arms[0], iter([strong.point]), strong.normal, folder)
-    said = [*_said(data, drafted, robot), *([_told_strike(strong)] if strong else [])]
+    said = [*_said(data, drafted, robot), *([_strike_message(strong)] if strong else [])]
     return Draft(text=_text(data, drafted, robot), said=tuple(said))
 
 
@@ -92,7 +92,7 @@ def _strong(drafted: Drafted, robot: Robot, arm: Arm, q: Array) -> Strong | None
     return strongest(robot, arm, q, law=SpringDamper(stiffness=STIFFNESS, damping=DAMPING), target=target)
 
 
-def _told_strike(strong: Strong) -> str:
+def _strike_message(strong: Strong) -> str:
     normal = ", ".join(f"{x:g}" for x in strong.normal)
     return (
         f"the drafted blow, along [{normal}], is the hardest of the strikes tried: {strong.impulse:.3g} N s"

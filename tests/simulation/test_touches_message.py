@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from impactopt.report.console import told_touches
+from impactopt.report.console import touches_message
 
 
 def touch(one: str, other: str, depth: float, **more: Any) -> dict[str, Any]:
@@ -13,9 +13,9 @@ def touch(one: str, other: str, depth: float, **more: Any) -> dict[str, Any]:
 
 def test_nothing_is_said_where_nothing_touches() -> None:
     assert (
-        told_touches({"contacts_besides": []})
-        == told_touches({"contacts_besides": None})
-        == told_touches({})
+        touches_message({"contacts_besides": []})
+        == touches_message({"contacts_besides": None})
+        == touches_message({})
         == ""
     )
 
@@ -26,6 +26,6 @@ def test_the_deepest_is_named_and_pairs_are_counted_once() -> None:
         touch("arm", "torso", 41.6),
         touch("hand", "thigh", 5.0, missed=True),
     ]
-    said = told_touches({"contacts_besides": both})
+    said = touches_message({"contacts_besides": both})
     assert said.startswith("2 pairs of bodies penetrate each other, arm and torso by 42 mm")
-    assert "two bodies penetrate" in told_touches({"contacts_besides": both[:1]})
+    assert "two bodies penetrate" in touches_message({"contacts_besides": both[:1]})

@@ -32,7 +32,7 @@ AGREED, REFUTED = 1.0, 5.0  # [%] of the impulse: a plan that is off by more is 
 _STEP, _STEPS = 2e-4, 60  # [s] at most; of the planned contact, at least
 _LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that comes back, or goes on, is seen
 _SAMPLED = 1e-3  # [s] of a coasting reference
-_WORTH = 1e-3  # of the planned contact's duration: a gap that is reported
+_REPORTED_GAP = 1e-3  # of the planned contact's duration: a gap that is reported
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +156,7 @@ def _told(
         outcome=found.outcome,
         contact=found.touches[-1][1] - found.touches[0][0] if found.touches else 0.0,
         events=found.events,
-        partings=sum(gap > _WORTH * duration for gap in gaps),
+        partings=sum(gap > _REPORTED_GAP * duration for gap in gaps),
         guards=problem.target.guards,
         known=known,
     )

@@ -184,7 +184,8 @@ class Watch:
             there = x + length * step
             ways = self._ways.copy()
             found = self._shapes_at(self._placed(there), ways)
-            if not self._too_near(here[1], found[1]) and not self._passes(x, step, length, here, found):
+            clear = not self._violates_clearance(here[1], found[1])
+            if clear and not self._passes(x, step, length, here, found):
                 self._next = there, ways, found
                 break
             length *= 0.5
@@ -218,7 +219,7 @@ class Watch:
         least = np.broadcast_to(within, len(self._shapes))[found.pair]
         return np.asarray(~self._has[found.spot, found.pair] & (found.gap < least))
 
-    def _too_near(self, before: Looked, found: Looked) -> bool:
+    def _violates_clearance(self, before: Looked, found: Looked) -> bool:
         """True if a step has brought bodies without a constraint too close to each other."""
         fell = found.gap < OF_GAP * before.gaps[found.spot, found.pair]
         return bool((fell & self._bare(found, LEAST)).any())

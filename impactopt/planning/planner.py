@@ -168,7 +168,7 @@ def _planned(
     refining = Refining(budget, margins, apart, report)
     # limbs that penetrate, or gears that break, say nothing of what a start is worth: each is led to
     # its end before they compare
-    each = partial(_led, refining, refine and margins is not None)
+    each = partial(_solved_from, refining, refine and margins is not None)
     of_start = _starts(t, given, which, more, seed, partial(clear_strike, budget, margins), refining)
     t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and refine and fields["result"].status.usable:
@@ -235,7 +235,7 @@ def _meets_rows(t: Transcription, start: SolverResult) -> bool:
     return max_violation(t.program, start.x, t.program.constraints(start.x)) <= VIOLATED
 
 
-def _led(
+def _solved_from(
     refining: Refining, to_its_end: bool, t: Transcription, start: Array | SolverResult
 ) -> tuple[Transcription, SolverResult]:
     """Solves from one initial guess, adding the lazy constraints that it needs.  to_its_end : refines it,

@@ -14,7 +14,7 @@ from impactopt.planning.contact_replay import AGREED, REFUTED, ContactReplay, Pl
 from impactopt.planning.keeping_apart import Margins, solved_apart
 from impactopt.planning.models import planned_contact
 from impactopt.planning.multistart import Budget, carried, one_after_the_other, touching, with_effort_of
-from impactopt.planning.too_near import Violated, bodies_too_near
+from impactopt.planning.too_near import Violated, clearance_violations
 from impactopt.planning.verdict import second_look
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.apart import ApartRow, Held
@@ -163,7 +163,7 @@ class Refining:
         if self.margins is None:
             return None
         if self._near is None or self._near[0] is not t or self._near[1] is not x:
-            self._near = t, x, bodies_too_near(t, x, self.margins)
+            self._near = t, x, clearance_violations(t, x, self.margins)
         return self._near[2]
 
     def _looked_at(self, t: Transcription, result: SolverResult, x0: Array) -> SolverResult:
@@ -177,7 +177,7 @@ class Refining:
         free, self.blocked = t, False
         t, result = self.first(free, start)
         if self._stuck(result) and t.apart_rows and self.budget.left != 0:
-            t, result = self._led_out(free, t, result, x0)
+            t, result = self._solved_without_clearance(free, t, result, x0)
         else:
             t, result = self.judged(*self.rounds(t, result, x0)[:2])
         looked = self._looked_at(t, result, x0)
@@ -191,7 +191,7 @@ class Refining:
             return "max_iterations" not in (self.budget.options or {})
         return result.status in _STUCK
 
-    def _led_out(
+    def _solved_without_clearance(
         self, free: Transcription, t: Transcription, stuck: SolverResult, x0: Array
     ) -> tuple[Transcription, SolverResult]:
         """Solves from an initial guess with which the first clearance constraints of a program ``t`` lead
@@ -246,7 +246,7 @@ class Refining:
         if self.margins is None or not result.status.usable or self._is_apart(result):
             return t, self.checked(t, result)
         with contextlib.suppress(InputError):
-            left = bodies_too_near(t, result.x, self.margins, share=1.0)
+            left = clearance_violations(t, result.x, self.margins, share=1.0)
             if left is not None and left.depth > 0:
                 if self._apart is not None:
                     before, clean = self._apart

@@ -66,19 +66,19 @@ def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
     bent = bent_of(solution)
     number, x = parameter_of(solution.problem, parameter), solution.result.x
     whole, half = (_slope(bent, number, _STEP * number.typical / k) for k in (1, 2))
-    offset, impulse, worth = (_extrapolated(*pair) for pair in zip(whole, half, strict=True))
+    offset, impulse, objective = (_extrapolated(*pair) for pair in zip(whole, half, strict=True))
     n, m = len(x), len(solution.result.multipliers)
     # implicit function theorem: the KKT matrix times dz/dp is minus the slope of the KKT residual at fixed z
     change = bent.system.step(Offset(dual=offset[:n], rows=offset[n : n + m], variables=offset[n + m :]))
     # impulse and objective may depend on the number at the same motion too
     program = bent.program
     slope = float(impulse) + _along(program.impulse, x, change.x)
-    dearer = float(worth) + float(program.program.gradient(x) @ change.x)
+    cost_slope = float(objective) + float(program.program.gradient(x) @ change.x)
     return Sensitivity(
         parameter=parameter,
         value=number.value,
         impulse=slope,
-        objective=-dearer,
+        objective=-cost_slope,
         binding=_binding(bent),
     )
 
@@ -91,8 +91,8 @@ def _slope(bent: Bent, number: Parameter, half: float) -> tuple[Array, Array, Ar
         off = bent.system.offset(t.program)
         parts = np.concatenate([getattr(off, name) for name in Offset.PARTS])
         sides.append((parts, np.array(t.impulse(x)), np.array(t.program.objective(x))))
-    parts, impulse, worth = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))
-    return parts, impulse, worth
+    parts, impulse, objective = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))
+    return parts, impulse, objective
 
 
 def _extrapolated(whole: Array, half: Array) -> Array:

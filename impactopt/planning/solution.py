@@ -364,7 +364,7 @@ class Solution(Solved):
         expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),
-            **blow_numbers(plan, expected),
+            **impact_summary(plan, expected),
             "objectives": dict(self.objectives),
             "motion_price_pct": self.motion_price_pct,
             "duration_s": plan.duration,
@@ -401,7 +401,7 @@ class Solution(Solved):
         return out | gear_caution(self.problem, [self.loads, *replayed])
 
 
-def blow_numbers(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
+def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
     """Data of a planned impact for ``summary.json``; one without duration has no force."""
     duration = hit.compression + hit.restitution
     return {

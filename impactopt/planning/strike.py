@@ -30,8 +30,8 @@ from impactopt.planning.multistart import (
 )
 from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
 from impactopt.planning.side_by_side import best_side_by_side, check_workers
-from impactopt.planning.solution import Solved, blow_numbers, versions
-from impactopt.planning.too_near import deepest
+from impactopt.planning.solution import Solved, impact_summary, versions
+from impactopt.planning.too_near import deepest_penetration
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
@@ -74,7 +74,7 @@ class StrikeSolution(Solved):
         angles = self.problem.robot.joint_positions(hit.posture)
         return {
             **self.outcome(),
-            **blow_numbers(hit, hit.collision),
+            **impact_summary(hit, hit.collision),
             "objectives": dict(self.objectives),
             **hit.margins(),
             **loads.summary(),
@@ -260,7 +260,7 @@ def _clean_strike(
     t, result = clear_strike(budget, margins, t, start)
     if margins is None or not result.status.usable:
         return t, result
-    depth, pairs = deepest(t, result.x, margins)
+    depth, pairs = deepest_penetration(t, result.x, margins)
     if depth <= 0:
         return t, result
     names = (" and ".join(margins.bodies.names(pair)) for pair in pairs)

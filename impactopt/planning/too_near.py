@@ -24,7 +24,7 @@ from impactopt.transcription.mesh_refinement import MoreNodes
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["Violated", "bodies_too_near", "deepest"]
+__all__ = ["Violated", "clearance_violations", "deepest_penetration"]
 
 Array = NDArray[np.float64]
 STEP = 8e-3  # [s] at which a plan is looked at
@@ -55,7 +55,9 @@ class _Between(NamedTuple):
     missed: bool
 
 
-def bodies_too_near(t: Transcription, x: Array, margins: Margins, *, share: float = SHARE) -> Violated | None:
+def clearance_violations(
+    t: Transcription, x: Array, margins: Margins, *, share: float = SHARE
+) -> Violated | None:
     """Additions that remove clearance violations at a solution's nodes or between them; None if there are
     none.
 
@@ -86,7 +88,7 @@ def bodies_too_near(t: Transcription, x: Array, margins: Margins, *, share: floa
     return Violated(asked.rows, depth, frozenset(pair for _, pair in worst), nodes.all)
 
 
-def deepest(t: ContactProgram, x: Array, margins: Margins) -> tuple[float, list[Pair]]:
+def deepest_penetration(t: ContactProgram, x: Array, margins: Margins) -> tuple[float, list[Pair]]:
     """Deepest penetration [m] at a program's nodes, < 0 if there is none, and the pairs in contact."""
     touching = list(_near(margins, spots_of(t, x).at, 1.0))
     return max((-apart for _, _, apart in touching), default=-np.inf), [pair for _, pair, _ in touching]

@@ -18,7 +18,7 @@ __all__ = ["verify"]
 
 
 def verify(result: str | os.PathLike[str], *, problem_file: str | os.PathLike[str] | None = None) -> Verdict:
-    """Compute every row, the objective and the KKT residual of a result anew, from its files alone.
+    """Compute every constraint, the objective and the KKT residual of a result anew, from its files alone.
 
     result : a directory that `impactopt solve` wrote, or its `solution.npz`.
     problem_file : instead of the record's own text, such as when its URDF has moved.

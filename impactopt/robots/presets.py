@@ -19,8 +19,8 @@ import pinocchio as pin
 from impactopt.errors import InputError, did_you_mean, missing_package
 from impactopt.robots import arms as _arms
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import Source
 from impactopt.robots.build import joint_names, lock_joints
-from impactopt.robots.parts import Source
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, standin_model
 
@@ -86,7 +86,7 @@ def _g1_motor(knee: float, idle: float, torque: float, coulomb: float, viscous: 
     """The line of a motor from its torque [N m] up to a speed [rad/s] and the speed without load [rad/s], and
     its friction: measured by Unitree, as in its `unitree_rl_lab` (X1, X2, Y1, Fs, Fd of its actuators).
 
-    What its gears bear is not public.
+    What its gears carry is not public.
     """
     return Actuator(
         stall_torque=torque * idle / (idle - knee),

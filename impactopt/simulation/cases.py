@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from impactopt.collision import Collision, CollisionModel, effective_mass
 from impactopt.errors import InputError, check_array
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.stance import BothSoles, Stance, usual_stance
 from impactopt.kinematics.support import margin as margin_in
 from impactopt.kinematics.support import support_polygon
@@ -73,7 +73,7 @@ class Case:
     overrides: Mapping[str, ArrayLike] = field(default_factory=dict)
 
     def collide(self, model: CollisionModel, *, require_separation: bool = False) -> Collision:
-        """What a model says of it; a contact may outlast the horizon.
+        """Collision that a model predicts for this case; a contact may outlast the horizon.
 
         Raises
         ------
@@ -140,7 +140,7 @@ def posture_of_effective_mass(
     """A configuration (nq,) whose effective mass at the striking point is `mass` [kg], within 1e-6 kg.
 
     The one found nearest to `start` (None: the posture half_sitting) by SLSQP, in the sum of squares of what
-    the joints move [rad], with held soles where they are, joints inside their limits by 0.02 rad, and the
+    the joints move [rad], with fixed soles where they are, joints inside their limits by 0.02 rad, and the
     centre of mass over the soles, `inside` [m] from their edge. Deterministic.
 
     Raises
@@ -213,7 +213,7 @@ class _PostureSearch:
         return np.asarray(margin_in(self.polygon, com[None, :2]) - self.inside)
 
     def from_here(self, d: Array) -> Array:
-        """Where SLSQP goes."""
+        """Solution of SLSQP from this initial guess."""
         rules: list[dict[str, Any]] = [
             {"type": "eq", "fun": self.equalities, "jac": lambda x: _slopes(self.equalities, x)}
         ]
@@ -251,7 +251,7 @@ def _slopes(function: Any, x: Array, by: float = 1e-6) -> Array:
 def errors_against(
     result: Collision, reference: Collision, *, torque_limit: ArrayLike | None = None
 ) -> dict[str, float | None]:
-    """How far a model's collision is from a reference's; None where one of them has no such history.
+    """Errors of a model's collision against a reference; None where one of them lacks the history.
 
     * impulse_error_pct, f_max_error_pct : 100 (result - reference) / reference, so positive where the model
       promises too much. The paper's eq. (24) has the other sign.

@@ -1,8 +1,8 @@
 """The collision of a strike by shooting: the SDC from contact to separation, with its tangents.
 
-Its inputs are posture, rates and legs at contact and the feed-forward torque; its outputs what rows and
-objectives are about. The servo's reference coasts with the soles in place: the legs' part of that bends, of
-which the first order is kept, sum of the joint velocities' gains by t.
+Its inputs are posture, rates and legs at contact and the feed-forward torque; its outputs what constraints
+and objectives are about. The servo's reference coasts with the soles in place: the legs' part of that bends,
+of which the first order is kept, sum of the joint velocities' gains by t.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.rows import Index
 
 STEPS = 12  # of the horizon
-INSTANTS = STEPS + 1  # at which rows hold: from the first touch on, whose force may be the largest
+INSTANTS = STEPS + 1  # at which constraints hold: from the first touch on, whose force may be the largest
 FORCE = 100.0  # [N] unit of the peak force among the outputs
 _BEND = 1e-3  # [rad/s^2] of differences by the reference's bend, in which the collision is all but linear
 _HORIZONS = (2e-3, 5e-3, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.4)  # [s]: few, as one is compiled in
@@ -58,7 +58,7 @@ class _Called:
 
 
 class State(NamedTuple):
-    """Of coordinates at contact: v (nv), leg accelerations (nl) while coasting; both by y, ydot, legs."""
+    """State at contact: v (nv), leg accelerations (nl) while coasting; slopes of both by y, ydot, legs."""
 
     v: Array
     bend: Array
@@ -100,7 +100,7 @@ class Shooting:
             stance=problem.stance if problem.robot.floating else None,
             horizon=horizon,
             step=horizon / STEPS,
-            effects=Effects(saturation=False),  # rows keep the torque below its limit
+            effects=Effects(saturation=False),  # constraints keep the torque below its limit
             accuracy=None,
         )
         turned = np.zeros((self.nl, self.nl))
@@ -288,7 +288,7 @@ class Shooting:
 
 
 def _weights(time: Array) -> Array:
-    """Of the trapezoidal rule at these times."""
+    """Weights of the trapezoidal rule at these times."""
     steps = np.diff(time) / 2
     return np.append(steps, 0.0) + np.append(0.0, steps)
 

@@ -1,7 +1,7 @@
-"""The contact of a strike by shooting: rows and variables of collisions that the SDC predicts.
+"""The contact of a strike by shooting: constraints and variables of collisions that the SDC predicts.
 
 What `Hit` and `Collision` are to a collocated contact. The collision is eliminated: its impulse and what it
-leaves behind are variables that rows determine, its torques and wrenches are rows alone.
+leaves behind are variables that constraints determine, its torques and wrenches are constraints alone.
 """
 
 from __future__ import annotations
@@ -71,16 +71,16 @@ class Shot:
 
     @property
     def _z(self) -> Affine:
-        """What the shooting is a function of."""
+        """Arguments of the shooting."""
         state = self.contact.state
         return stack([state.y, self.contact.u0[0], state.legs, self.contact.feedforward[0]])
 
     def outputs(self, part: str) -> Index:
-        """Numbers of the outputs of this part, once rows are there."""
+        """Numbers of the outputs of this part, once constraints are there."""
         return np.asarray(self._at + self.shooting.parts[part])
 
     def add_rows(self) -> None:
-        """The block, variables that equal its outputs, rows of torque, wrenches and duration."""
+        """The block, variables that equal its outputs, constraints of torque, wrenches and duration."""
         b, c, limits = self._b, self._b.coordinates, self._b.limits
         self._at = sum(block.count * block.n_out for block in b.blocks)
         b.blocks.append(shot_block(self.shooting, self._z))
@@ -125,7 +125,7 @@ class Shot:
     # ------------------------------------------------------------------ for terms and objectives
     @property
     def impulse(self) -> Affine:
-        """To the target [N s]."""
+        """Impulse to the target [N s]."""
         return self._impulse[0]
 
     def target_energy(self) -> Affine:
@@ -202,7 +202,7 @@ class Shots(Contacts):
         self.scenarios = [Shot(b, contact, self.mass, k, s) for k, s in enumerate(self.hit, start=1)]
 
     def add_rows(self) -> None:
-        """Of all collisions."""
+        """Adds the constraints of all collisions."""
         for shot in self.collisions:
             shot.add_rows()
 
@@ -219,7 +219,7 @@ class Shots(Contacts):
         raise InputError('method "shooting" has no slope of the deepest penetration; take "collocation"')
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
-        """As of `Hit`."""
+        """Contact data of plans and strikes (see `Hit.decode`)."""
         hit, compression, speed = self.expected.decode(x)
         scenarios = []
         for other in self.scenarios:

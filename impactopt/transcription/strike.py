@@ -106,7 +106,7 @@ class StrikeTranscription(ContactProgram):
         )
 
     def _prices(self) -> Prices:
-        """Of sole wrenches, and of the least accelerations that lead to the state at contact from rest.
+        """Costs of sole wrenches, and of the least accelerations that lead from rest to the state at contact.
 
         A coordinate that has to go the way d to the rate u in the time T accelerates with at least
         integral a^2 dt = 12 d^2/T^3 - 12 d u/T^2 + 4 u^2/T (the cubic).

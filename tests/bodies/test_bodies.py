@@ -21,8 +21,8 @@ from support.small_plans import arm_problem, biped_problem
 
 from impactopt import KeepOut, TargetBody, load_problem
 from impactopt.bodies.clearance import FAR, MISSED, Bodies, Places
+from impactopt.bodies.convex_hulls import convex, inertia_box, pieces_of
 from impactopt.bodies.fit import PLANES, Planes, Spheres, enclose, fill, surface_points
-from impactopt.bodies.pieces import convex, inertia_box, pieces_of
 from impactopt.bodies.robot_bodies import bodies_of, distance
 from impactopt.bodies.shapes import Obstacle, face_axes
 from impactopt.bodies.urdf import lost_meshes, urdf_root

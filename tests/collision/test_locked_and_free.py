@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from impactopt import SDC, BothSoles, FixedBase, Robot, Sole, Striker, arm7
-from impactopt.kinematics.held import striking_velocity
+from impactopt.kinematics.operational_space import striking_velocity
 from impactopt.studies.bench.gains import LAW, ONLY_SERVO, TARGET, impulse_of
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.draft.robot import draft_robot
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.toml import read_toml
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import best_share

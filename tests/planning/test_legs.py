@@ -14,8 +14,8 @@ from impactopt import Solution, coasting_reference, solve
 from impactopt.codegen.compiler import find_compiler
 from impactopt.files.output import record_of
 from impactopt.simulation import scene_of, simulate_mujoco
+from impactopt.simulation.collision_geometry import Solids
 from impactopt.simulation.reference import FullDynamics
-from impactopt.simulation.solids import Solids
 from impactopt.verification.verdict import verify_record
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -19,18 +19,18 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
 from impactopt.robots.robot import Robot
 from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco, solids
+from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.controller.clearance import Clearance
 from impactopt.simulation.controller.cones import cone_of
+from impactopt.simulation.controller.constrained_dynamics import HeldDynamics
 from impactopt.simulation.controller.estimate import StateEstimate
-from impactopt.simulation.controller.held import HeldDynamics
 from impactopt.simulation.controller.quadratic import TorqueQP
 from impactopt.simulation.controller.recovery import Recovery
 from impactopt.simulation.controller.sensors import Sensors
-from impactopt.simulation.controller.target import Target
+from impactopt.simulation.controller.tracking_reference import Target
 from impactopt.simulation.mujoco_engine import _Replay
 from impactopt.simulation.mujoco_world import MujocoOptions
-from impactopt.simulation.solids import Solid, Solids
 
 Array = NDArray[np.float64]
 QUIET = ControllerSettings(noise=0.0)

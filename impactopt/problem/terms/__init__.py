@@ -1,9 +1,10 @@
-"""What a plan must respect, as named terms with units, one a file; a problem holds one of each kind at most.
+"""Requirements of a plan as named terms with units, one a file; a problem holds one of each kind at most.
 
 `base` says what a term has. DEFAULT_TERMS hold in every problem; the constraints of most of them are in the
-transcription, and all other terms bring their own. ON_DEMAND_TERMS hold in every problem too, but a program has their rows only
-if they are given, or once a plan without them has broken them (`impactopt.planning.on_demand`). The rest hold
-where they are given. A new one is a file here, and its lines below.
+transcription, and all other terms bring their own. ON_DEMAND_TERMS hold in every problem too, but a program
+has their constraints only if they are given, or once a plan without them has broken them
+(`impactopt.planning.on_demand`). The rest hold where they are given. A new one is a file here, and its lines
+below.
 """
 
 from impactopt.problem.terms.balance import Balance

@@ -11,7 +11,7 @@ import pinocchio as pin
 from impactopt.collision import SDC, effective_mass
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.kinematics.stance import BothSoles
 from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench.stability_robots import make_robot

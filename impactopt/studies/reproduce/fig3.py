@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impactopt.kinematics.held import striking_velocity
+from impactopt.kinematics.operational_space import striking_velocity
 from impactopt.robots.presets import standin
 from impactopt.studies.bench.costs import HRP2, TOTAL_TIME, cost_aba, cost_full, cost_sdc, iterations
 from impactopt.studies.report import Report, Say, cell, columns_table

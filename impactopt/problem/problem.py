@@ -110,8 +110,8 @@ class ImpactProblem:
     terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
         `GearLoad`, whose constraints a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
-    style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending away
-        from the start posture (`impactopt.problem.motion_style`); or "strongest", with none.
+    style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending
+        away from the start posture (`impactopt.problem.motion_style`); or "strongest", with none.
     motion_price : largest share of the objective that prices on motion may take; those of the style are
         reduced until they take no more.  price_scale : factor on these; 1: a plan chooses it.
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.

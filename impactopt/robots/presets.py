@@ -53,8 +53,8 @@ def talos(**overrides: Any) -> Robot:
     * Soles: 0.20 x 0.12 m about `left_sole_link` and `right_sole_link`, 5 mm inside the 0.21 x 0.13 m box
       that the URDF's simplified variant collides with, as the foot's edges are round (flat part of the mesh:
       0.195 x 0.117 m).
-    * Strikers `right_hand`, `left_hand`: 0.1515 m from the gripper's base along its approach axis (-z), in the
-      middle between the tips of the three fingers, which touch first (`FirstTouch`).
+    * Strikers `right_hand`, `left_hand`: 0.1515 m from the gripper's base along its approach axis (-z), in
+      the middle between the tips of the three fingers, which touch first (`FirstTouch`).
     * Posture `half_sitting`: the SRDF's, but with the ankles' roll at 0, as its 1.7 mrad tilt the soles.
 
     `overrides` go to `Robot.from_urdf`.

@@ -29,9 +29,9 @@ class FirstTouch(Term):
     """The striking link touches the target with its striking point, not with another part before it.
 
     Up to contact no corner of the link's hull is farther than `depth` beyond the target's plane, besides what
-    it sticks out beyond the striking point, and at contact the link's face looks along the normal. The face is
-    the one about the striking point, or the one that `HandOrientation` turns to the target. Links without a
-    body have no such constraints, nor where bodies may pass through the world.
+    it sticks out beyond the striking point, and at contact the link's face looks along the normal. The face
+    is the one about the striking point, or the one that `HandOrientation` turns to the target. Links without
+    a known shape have no such constraints, nor where bodies may pass through the world.
     """
 
     name: ClassVar[str] = "first touch"
@@ -99,7 +99,7 @@ class FirstTouch(Term):
 
 
 def face_of(problem: Any, striker: str) -> StrikerFace | None:
-    """Face of a striker that is to meet the target; None without a body, and where bodies may pass through."""
+    """Face of a striker that is to meet the target; None without a shape, or where bodies may pass."""
     if not problem.keep_out.enabled:
         return None
     turned = problem.extra(HandOrientation) if striker == problem.striker else None

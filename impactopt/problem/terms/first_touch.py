@@ -103,8 +103,8 @@ def face_of(problem: Any, striker: str) -> StrikerFace | None:
     if not problem.keep_out.enabled:
         return None
     turned = problem.extra(HandOrientation) if striker == problem.striker else None
-    known = turned is not None and turned.direction is None
-    return striker_face(problem.robot, striker, np.array(turned.axis) if known else None)
+    axis = np.array(turned.axis) if turned is not None and turned.direction is None else None
+    return striker_face(problem.robot, striker, axis)
 
 
 def late_spots(program: Any) -> list[Any]:

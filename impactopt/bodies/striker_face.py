@@ -35,16 +35,19 @@ class StrikerFace(NamedTuple):
         return float(max(0.0, (self.corners @ self.normal).max()))
 
 
-def striker_face(robot: Robot, striker: str, axis: Array | None = None) -> StrikerFace | None:
-    """The face of one of a robot's strikers; None for a link without a shape that is known.
+def striker_face(
+    robot: Robot, striker: str, axis: Array | None = None, *, assumed: bool = False
+) -> StrikerFace | None:
+    """The face of one of a robot's strikers; None for a link without a known shape.
 
     axis (3,) : its outward unit vector in the striker's frame, if known. Else it is that of the hull's facets
-    next to the striking point; facets count by their areas.
+    next to the striking point; facets count by their areas.  assumed : boxes of links' inertia count too.
     """
     hit = robot.striker(striker)
     model, bodies = robot.model, bodies_of(robot)
     frame = model.frames[model.getFrameId(hit.frame)]
-    pieces = [piece for piece in bodies.of_joint.get(int(frame.parentJoint), ()) if not piece.assumed]
+    every = bodies.of_joint.get(int(frame.parentJoint), ())
+    pieces = [piece for piece in every if assumed or not piece.assumed]
     if not pieces:
         return None
     to_frame = frame.placement.inverse()

@@ -31,7 +31,8 @@ class FirstTouch(Term):
     Up to contact no corner of the link's hull is farther than `depth` beyond the target's plane, besides what
     it sticks out beyond the striking point, and at contact the link's face looks along the normal. The face
     is the one about the striking point, or the one that `HandOrientation` turns to the target. Links without
-    a known shape have no such constraints, nor where bodies may pass through the world.
+    a known shape have such constraints only if this term is given: then it is about boxes of their inertia.
+    There are none where bodies may pass through the world.
     """
 
     name: ClassVar[str] = "first touch"
@@ -104,7 +105,8 @@ def face_of(problem: Any, striker: str) -> StrikerFace | None:
         return None
     turned = problem.extra(HandOrientation) if striker == problem.striker else None
     axis = np.array(turned.axis) if turned is not None and turned.direction is None else None
-    return striker_face(problem.robot, striker, axis)
+    given = problem.extra(FirstTouch) is not None  # of a guessed shape only what is asked for
+    return striker_face(problem.robot, striker, axis, assumed=given)
 
 
 def late_spots(program: Any) -> list[Any]:

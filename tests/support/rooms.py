@@ -31,7 +31,6 @@ ROOMS_IN_ORDER = (
     "identification",
     "report",
     "live",
-    "studies",
     "cli",
     "__main__",
 )

@@ -1,4 +1,4 @@
-"""The command `impactopt verify`: is a result what it says, computed anew by code of its own?"""
+"""The command `impactopt verify`: is a result what it says, computed anew computed anew?"""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def verify(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Compute every row, the objective and the KKT residual of a result anew, trusting nothing of the solver.
+    """Compute every row, the objective and the KKT residual of a result anew, trusting nothing in it.
 
     Exit code: 0 all is as it says, 1 it is not, or part of it could not be computed, 2 bad input.
     """

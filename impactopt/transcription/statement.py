@@ -16,8 +16,8 @@ def statement_of(t: Transcription) -> str:
     """As JSON, for a reader that knows nothing of this package.
 
     `groups`: name, count and size of the variables, in their order. `rows`: term, place and the number of a
-    list of `components`. `more`: nodes beside those of the mesh. `elements`, `guarded`, `shortest`: of the
-    contact, its least durations [s] by collision. `apart`: rows between bodies.
+    list of `components`. `more`: nodes beside those of the mesh. `elements`, `guarded`, `shares`,
+    `shortest`: of the contact, its least durations [s] by collision. `apart`: rows between bodies.
     """
     lists: dict[tuple[str, ...], int] = {}
     rows = []
@@ -34,6 +34,7 @@ def statement_of(t: Transcription) -> str:
             "more": [list(t.nodes.swing), list(t.nodes.follow)],
             "elements": t.hit.elements if collisions else [],
             "guarded": t.hit.guarded,
+            "shares": list(t.hit.shares),
             "shortest": [c.shortest for c in collisions],
             "apart": held,
         }

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from oracle.verdict import verify_record
 
 from benchmarks.kept import Kept
 from benchmarks.planning import DEMO, solved
@@ -29,7 +30,6 @@ from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.doubts import hopeless
 from impactopt.problem.problem import ImpactProblem
-from impactopt.verification.verdict import verify_record
 
 __all__ = ["BASES", "ROWS", "Base", "cleanliness", "draw", "drawn_problem", "row", "run"]
 

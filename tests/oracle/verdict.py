@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
-from impactopt.verification.kkt import Residual, lagrangian_gradient, residual
-from impactopt.verification.program import Claims, Program
-from impactopt.verification.recorded import off_in_record
-from impactopt.verification.variables import Piece, RowName, Variables
+from oracle.kkt import Residual, lagrangian_gradient, residual
+from oracle.program import Claims, Program
+from oracle.recorded import off_in_record
+from oracle.variables import Piece, RowName, Variables
 
 __all__ = ["KKT", "VIOLATION", "Verdict", "claims_of", "verify_record"]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.verification.variables import Piece, Variables
+from oracle.variables import Piece, Variables
 
 __all__ = ["Residual", "lagrangian_gradient", "residual"]
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from impactopt.problem.objectives import Effort
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
-from impactopt.verification.blow import FORCE, Blow
-from impactopt.verification.motions import DIRECTIONS, Way
-from impactopt.verification.robot_motion import RobotMotion
-from impactopt.verification.variables import Piece, Variables
+from oracle.blow import FORCE, Blow
+from oracle.motions import DIRECTIONS, Way
+from oracle.robot_motion import RobotMotion
+from oracle.variables import Piece, Variables
 
 __all__ = ["COASTED", "Drives", "node_torque"]
 
@@ -59,7 +59,7 @@ class Drives:
 
     Attributes
     ----------
-    rows, worth, scales, missing : as of `impactopt.verification.program.Program`.
+    rows, worth, scales, missing : as of `oracle.program.Program`.
     """
 
     def __init__(

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from impactopt.cli.app import app
 from impactopt.files.output import Record, load_record, record_of, save_record
 from impactopt.files.problem_file import load_problem
+from impactopt.files.verify import motion_of_record
 from impactopt.planning.planner import solve
 
 ARM = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
@@ -132,11 +133,11 @@ def emptied(name: str) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        (turned("reference_q", 1e-3), "reference posture"),
-        (turned("reference_angle", 1e-3), "reference angles"),
-        (turned("swing_control", 1e-3), "spline"),
-        (turned("reference_torque", 1.0), "reference torque"),
-        (turned("collision_force", 1e3), "blow"),
+        (turned("reference_q", 1e-3), "reference_q"),
+        (turned("reference_angle", 1e-3), "reference_angle"),
+        (turned("swing_control", 1e-3), "swing_control"),
+        (turned("reference_torque", 1.0), "reference_torque"),
+        (turned("collision_force", 1e3), "collision_force"),
         (turned("solver_x", 1e-3), ""),
         (emptied("solver_multipliers"), "KKT residual"),
         (emptied("solver_bound_multipliers"), "KKT residual"),
@@ -180,10 +181,31 @@ def test_a_result_that_says_nothing_of_its_program(record: Record, tmp_path: Pat
     assert result.exit_code == 2 and "solve again" in result.output
 
 
-def test_what_is_not_known_is_said(record: Record, tmp_path: Path) -> None:
-    """A model that is frozen is not computed here, so nothing is called right that was not looked at."""
+def test_a_result_of_another_program_is_said(record: Record, tmp_path: Path) -> None:
+    """Another model of the collision has other variables: nothing is called right that was not looked at."""
     text = ARM.read_text("utf-8") + '\n[collision]\nmodel = "sdc"\nfreezes = 1\n'
     save_record(dataclasses.replace(record, problem=text), tmp_path)
     found = verified(tmp_path, code=1)
-    assert found["kkt"] is None and "not known to verify: the model 'sdc'" in found["reason"]
+    assert found["kkt"] is None and "its program is not the one" in found["reason"]
     assert load_record(tmp_path).problem == text
+
+
+def test_a_plan_by_a_model_that_is_frozen_on_the_way_is_verified(tmp_path: Path) -> None:
+    text = ARM.read_text("utf-8") + '\n[collision]\nmodel = "sdc"\nfreezes = 2\n'
+    (tmp_path / "frozen.toml").write_text(text, "utf-8")
+    solution = solve(load_problem(tmp_path / "frozen.toml"))
+    assert solution.status.usable
+    save_record(record_of(solution, problem=text, problem_path=ARM), tmp_path / "result")
+    assert verified(tmp_path / "result", code=0)["kkt"] < 1e-5
+
+
+def test_the_motion_is_looked_at_by_pinocchio(record: Record) -> None:
+    problem = load_problem(ARM)
+    arrays = {name: np.array(array) for name, array in record.arrays.items()}
+    good = {name: by for name, by, _ in motion_of_record(problem, arrays)}
+    assert max(good.values()) < 1e-5 and len(good) >= 5
+    for name, word in (("q", "hit point"), ("v", "rates"), ("torque", "equation of motion")):
+        other = dict(arrays)
+        other[f"reference_{name}"] = arrays[f"reference_{name}"] * 1.01 + 1e-3
+        found = {what: by for what, by, _ in motion_of_record(problem, other) if by > 1e-5}
+        assert f"reference: {word}" in found

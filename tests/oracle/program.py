@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.bodies.striker_face import striker_face
 from impactopt.kinematics.support import support_polygon
 from impactopt.kinematics.wrench_cone import inward_edges
 from impactopt.problem.objectives import (
@@ -24,26 +25,38 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     Balance,
+    FirstTouch,
     GearLoad,
     Grip,
+    GroundForce,
     HandOrientation,
     Incidence,
     Slide,
     TargetSpeed,
 )
-from impactopt.verification.apart import apart_pieces
-from impactopt.verification.blow import Blow
-from impactopt.verification.drives import COASTED, Drives, node_torque
-from impactopt.verification.motions import Limits, Way, node_piece, rate_pieces
-from impactopt.verification.robot_motion import RobotMotion
-from impactopt.verification.variables import Piece, Variables
-from impactopt.verification.worth import GONE, orientation_pieces, price_pieces, speed_pieces, worth_pieces
+from oracle.apart import apart_pieces
+from oracle.blow import Blow
+from oracle.drives import COASTED, Drives, node_torque
+from oracle.motions import Limits, Way, node_piece, rate_pieces
+from oracle.robot_motion import RobotMotion
+from oracle.variables import Piece, Variables
+from oracle.worth import GONE, orientation_pieces, price_pieces, speed_pieces, worth_pieces
 
 __all__ = ["Claims", "Program"]
 
 Array = NDArray[np.float64]
+EARLY = 0.12  # [s] before contact: from then on no corner of the striking link is beyond the target's plane
 CLEARANCE, HASTE = 0.02, 0.04  # [m], [m/s] how far the striker keeps off the target's plane
-_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), GearLoad, Grip, HandOrientation, Slide, TargetSpeed)
+_KNOWN_TERMS = (
+    *map(type, DEFAULT_TERMS),
+    FirstTouch,
+    GearLoad,
+    Grip,
+    GroundForce,
+    HandOrientation,
+    Slide,
+    TargetSpeed,
+)
 _KNOWN_OBJECTIVES = (Impulse, TargetEnergy, PeakForce, Penetration, AngularMomentum, Effort)
 
 
@@ -106,6 +119,8 @@ class Program:
         self._touch()
         self._clearance()
         self._slide()
+        self._first_touch()
+        self._ground_force()
         found, strange = apart_pieces(problem, self.robot, self.nodes(), claims.apart)
         self.rows += found
         self.missing += strange
@@ -239,6 +254,59 @@ class Program:
 
         names = ["tangent 1", "tangent 2"]
         self.rows.append(Piece.of(value, [(term.name, "after contact", names, -term.most, term.most)]))
+
+    def _first_touch(self) -> None:
+        """How far the striking link's corners are beyond the target's plane, and where its face looks."""
+        p, term, swing = self.problem, self.problem.extra(FirstTouch), self.ways[0]
+        if term is None or not term.active:
+            return
+        # a target that comes has another plane before contact
+        since = 1.0 if p.target.speed_before() else 1 - EARLY / float(np.mean(p.swing.duration))
+        for k, (striker, point) in enumerate(p.contacts):
+            face = striker_face(p.robot, striker)
+            if face is None:
+                continue
+            names = [f"{striker}, corner {i}" for i in range(len(face.corners))]
+            for s in (float(s) for s in swing.nodes if s >= since):
+                at = swing.at(s)
+
+                def value(
+                    v: Variables, k: int = k, point: Array = point, face: Any = face, at: Any = at
+                ) -> Array:
+                    place, _, turn = self.robot.striking(at(v)[0], np.zeros(self.robot.ny), k)
+                    beyond = (place - point + face.corners @ turn.T) @ p.normal
+                    return np.append(beyond, p.normal @ turn @ face.normal / np.sin(term.angle))
+
+                least = 1 / np.tan(term.angle) if s == swing.nodes[-1] else -np.inf
+                place = swing.place(s)
+                rows: list[Any] = [(term.name, place, names, -np.inf, term.depth)]
+                rows.append((term.name, place, [f"{striker}'s face"], least, np.inf))
+                self.rows.append(Piece.of(value, rows))
+
+    def _ground_force(self) -> None:
+        """Normal forces of the soles over the weight, at the nodes and in contact."""
+        term, robot = self.problem.extra(GroundForce), self.robot
+        soles = [(k, leg.end) for k, (leg, *_) in enumerate(robot.soles) if leg.sole is not None]
+        if term is None or not term.active or not soles:
+            return
+        named = [name for _, name in soles] if len(soles) > 1 else []
+
+        def add(place: str, wrench: Callable[[Variables], Array]) -> None:
+            def value(v: Variables) -> Array:
+                normal = wrench(v)[[6 * k + 2 for k, _ in soles]] / robot.weight
+                return np.array([normal.sum(), *(normal if named else [])])
+
+            rows: list[Any] = [(term.name, place, ["all soles"], term.least, term.most)]
+            rows.append((term.name, place, named, term.sole, np.inf))
+            self.rows.append(Piece.of(value, rows))
+
+        for place, node in self.nodes().items():
+            add(place, lambda v, node=node: node(v)[4])
+        if self._coasting is not None:
+            add(COASTED, lambda v: v.get("coasting sole wrench"))
+        for blow in self.blows:
+            for i in range(len(blow.stages)):
+                add(blow.place(i), lambda v, blow=blow, i=i: blow.get(v, "collision sole wrench", i))
 
     def _clearance(self) -> None:
         for k, (striker, point) in enumerate(self.problem.contacts):

@@ -14,9 +14,9 @@ from impactopt.kinematics.splines import Radau
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
-from impactopt.verification.motions import DIRECTIONS, Limits
-from impactopt.verification.robot_motion import RobotMotion
-from impactopt.verification.variables import Piece, Variables
+from oracle.motions import DIRECTIONS, Limits
+from oracle.robot_motion import RobotMotion
+from oracle.variables import Piece, Variables
 
 __all__ = ["Blow"]
 

@@ -13,9 +13,9 @@ from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.terms import ContactWrenchCone
 from impactopt.robots.sole_margins import SHARE, cop_margin, least_kept
-from impactopt.verification.motions import Way
-from impactopt.verification.program import Program
-from impactopt.verification.variables import Variables
+from oracle.motions import Way
+from oracle.program import Program
+from oracle.variables import Variables
 
 __all__ = ["Off", "off_in_record"]
 

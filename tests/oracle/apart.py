@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
-from impactopt.verification.robot_motion import RobotMotion
-from impactopt.verification.variables import Piece, Variables
+from oracle.robot_motion import RobotMotion
+from oracle.variables import Piece, Variables
 
 __all__ = ["apart_pieces"]
 

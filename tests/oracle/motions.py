@@ -23,8 +23,8 @@ from impactopt.problem.terms import (
 )
 from impactopt.problem.terms.grip import WRENCH
 from impactopt.robots.hinges import inside
-from impactopt.verification.robot_motion import RobotMotion
-from impactopt.verification.variables import Piece, Variables
+from oracle.robot_motion import RobotMotion
+from oracle.variables import Piece, Variables
 
 __all__ = ["Limits", "Way", "node_piece", "rate_pieces"]
 

@@ -19,10 +19,10 @@ from impactopt.problem.objectives import (
 )
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import HandOrientation, TargetSpeed
-from impactopt.verification.blow import DEPTH, Blow
-from impactopt.verification.motions import Way
-from impactopt.verification.robot_motion import RobotMotion
-from impactopt.verification.variables import Piece, Variables
+from oracle.blow import DEPTH, Blow
+from oracle.motions import Way
+from oracle.robot_motion import RobotMotion
+from oracle.variables import Piece, Variables
 
 __all__ = ["GONE", "orientation_pieces", "price_pieces", "speed_pieces", "worth_pieces"]
 

@@ -7,7 +7,7 @@ STAMP  := $(VENV)/.installed
 LEAN   := $(VENV)/.demo
 BROWSER := $(VENV)/.browser
 NEEDED := robots,validate
-EXTRAS := robots,validate,qp,peers,sweep,cluster,mcap,live,docs,notebooks,dev
+EXTRAS := robots,validate,peers,sweep,cluster,mcap,live,docs,notebooks,dev
 ARGS   ?=
 STUDY  := PYTHONPATH=tests $(BIN)/python -m
 # ARGS, where their first word is a name; else a default name before them

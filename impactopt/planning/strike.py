@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -115,7 +114,7 @@ def optimize_strike(
         differ by some percent, and torques by more; `StrikeSolution.model_error` estimates it. The planned
         force is known at a few instants, so its peak may be too low.
     solver, options, time_limit, report, callback : as of :func:`impactopt.solve`. By shooting the solver is
-        the SQP with a QP solver: DAQP if it is installed, else OSQP, unless `options` name one.
+        the SQP with OSQP, unless `options` name another QP solver.
     starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,
         drawn by ``seed``; the best strike is kept. ``StrikeSolution.attempts`` has all.
     workers : processes that these starts are solved on, side by side; then no callback is asked.
@@ -225,8 +224,7 @@ def _of_shooting(solver: str, options: Mapping[str, Any] | None) -> dict[str, An
     """The solver's options for programs without second derivatives."""
     if solver != "sqp":
         raise InputError(f'method "shooting" has no second derivatives: solver is {solver!r}; give "sqp"')
-    quickest = "osqp" if importlib.util.find_spec("daqp") is None else "daqp"
-    own = {"qp_solver": quickest, "hessian": "bfgs", "kkt_tolerance": 1e-4, **(options or {})}
+    own = {"qp_solver": "osqp", "hessian": "bfgs", "kkt_tolerance": 1e-4, **(options or {})}
     if own["qp_solver"] == "interior" or own["hessian"] != "bfgs":
         raise InputError('method "shooting" has no second derivatives: give hessian "bfgs" and a qp_solver')
     return own

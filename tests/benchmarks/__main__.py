@@ -270,7 +270,7 @@ def _solve(
     time_limit: Annotated[float, typer.Option(min=0.1, help="Time limit of one solve, in seconds.")] = 60.0,
     solvers: Annotated[
         list[str] | None,
-        typer.Option("--solver", metavar="NAME", help="One solver, as ipopt or sqp:piqp; may be repeated."),
+        typer.Option("--solver", metavar="NAME", help="One solver, as ipopt or sqp:osqp; may be repeated."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Resume from results/bench/solve.jsonl.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="One start, our default solver and IPOPT.")] = False,

@@ -68,7 +68,7 @@ def _versions() -> dict[str, str]:
     from impactopt.planning.solution import versions
 
     found = versions()
-    for name in ("mujoco", "daqp", "piqp", "unopy", "pounce-solver"):
+    for name in ("mujoco", "unopy", "pounce-solver"):
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     return found

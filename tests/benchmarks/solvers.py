@@ -25,7 +25,7 @@ class Solver:
 
     @property
     def label(self) -> str:
-        """Name and QP solver: "sqp:piqp"."""
+        """Name and QP solver: "sqp:osqp"."""
         return f"{self.name}:{self.qp}" if self.qp else self.name
 
 

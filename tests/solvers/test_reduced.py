@@ -23,7 +23,7 @@ from impactopt.solvers.sqp.reduction import Reduction
 
 WAYS = {
     "osqp": SQPOptions(qp_solver="osqp"),
-    "daqp": SQPOptions(qp_solver="daqp"),
+    "active_set": SQPOptions(qp_solver="active_set"),
     "bfgs": SQPOptions(qp_solver="osqp", hessian="bfgs"),
 }
 

@@ -49,7 +49,7 @@ class Mistakes:
         self.found: list[str] = []
 
     def attempt(self, check: Callable[[], object]) -> bool:
-        """Whether a check passes; what its InputError says is kept."""
+        """True if a check passes; its InputError is kept."""
         try:
             check()
         except InputError as error:
@@ -105,7 +105,7 @@ def printable(text: str) -> str:
 
 
 def has_control(text: str) -> bool:
-    """Whether a text has control characters besides tabs and new lines: no file, name or result may."""
+    """True if a text has control characters besides tabs and new lines: no file, name or result may."""
     return _CONTROL.search(text) is not None
 
 
@@ -167,7 +167,7 @@ def check_array(
 
 
 def raw_array(name: str, value: object) -> NDArray[Any]:
-    """What NumPy makes of a value, of any type; InputError where rows differ in length."""
+    """NumPy array of any type from a value; InputError if its rows differ in length."""
     try:
         return np.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:

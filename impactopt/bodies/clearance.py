@@ -1,4 +1,4 @@
-"""How far all bodies of a scene are apart: fast by spheres and planes, and exactly by their hulls."""
+"""Clearances of all bodies of a scene: fast by spheres and planes, exact by convex hulls."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.convex_hulls import Piece
 from impactopt.bodies.fit import Planes
-from impactopt.bodies.pieces import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
 from impactopt.bodies.separation import Placed, Shapes
 from impactopt.bodies.world import BEHIND, WorldBody
@@ -33,7 +33,7 @@ DEEPEST = -1e-6  # [m] what is deeper is a touch
 
 
 class Touch(NamedTuple):
-    """Two bodies in each other: names, from when till when [s], and how deep [m] at most."""
+    """Penetration of two bodies: names, from when till when [s], and how deep [m] at most."""
 
     one: str
     other: str
@@ -43,8 +43,8 @@ class Touch(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """What a motion's bodies come to: the least distance [m] and when [s], the names of the two, and what
-    touches, deepest first.
+    """Clearance of a motion's bodies: the least distance [m], its time [s], the two bodies, and the
+    contacts, deepest first.
     """
 
     clearance: float
@@ -55,7 +55,7 @@ class Survey(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Places:
-    """Where the bodies are at k instants.
+    """Placements of the bodies at k instants.
 
     rotation (k, joints, 3, 3), translation (k, joints, 3) [m] : of the model's joints.  travel (k,) [m] : of
     the target along its normal.  phase (k,) : 0 before, 1 in, 2 after contact; 3: none.
@@ -68,7 +68,7 @@ class Places:
 
     @classmethod
     def of(cls, robot: Robot, q: Array, travel: Array, phase: Index) -> Places:
-        """Of configurations q (k, nq)."""
+        """Placements for configurations q (k, nq)."""
         model, data = robot.model, robot.model.createData()
         placements = np.zeros((len(q), model.njoints, 4, 4))
         for k, posture in enumerate(q):
@@ -82,16 +82,16 @@ class Places:
 
     @cached_property
     def transforms(self) -> dict[tuple[int, int], Any]:
-        """Of instants and bodies, for exact distances: those that have been asked for."""
+        """Transforms by instant and body, for exact distances: those computed so far."""
         return {}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Near:
-    """What comes near: at instant ``at`` (m,), a sphere of the robot to another link or a body of the world.
+    """Close pairs: at instant ``at`` (m,), a sphere of the robot and another link or a body of the world.
 
     sphere (m,) : its number.  joint (m,) : that moves it.  other (m,) : joint of the link; or -1 - the index
-    of the world's body.  gap (m,) [m] : between sphere and planes, < 0 if in each other.
+    of the world's body.  gap (m,) [m] : between sphere and planes, < 0 for penetration.
     """
 
     at: Index
@@ -101,7 +101,7 @@ class Near:
     gap: Array
 
     def least(self) -> Near:
-        """Of each instant and pair the sphere that is nearest."""
+        """Nearest sphere of each instant and pair."""
         order = np.argsort(self.gap, kind="stable")
         key = np.zeros(len(order), dtype=np.int64)
         for part in (self.at, self.joint, self.other) if len(order) else ():  # one number, in their order
@@ -114,7 +114,7 @@ class Near:
 
 
 class Closest(NamedTuple):
-    """Distance [m] of two bodies, < 0 in each other; the points (3,) [m] of both there, in the world; the
+    """Distance [m] of two bodies, < 0 for penetration; the points (3,) [m] of both there, in the world; the
     direction (3,) from the one to the other; and the pieces of the one that may meet the other's there.
     """
 
@@ -171,11 +171,11 @@ class Bodies:
 
     @cached_property
     def shapes(self) -> Shapes:
-        """Of all pairs that are not to touch, for smooth distances."""
+        """Shapes of all pairs that must not touch, for smooth distances."""
         return Shapes(self.links, self.world, self.pairs, self.world_pairs)
 
     def placed(self, at: Places) -> Placed:
-        """Where these are at k instants, for smooth distances."""
+        """Placements of the shapes at k instants, for smooth distances."""
         k = len(at)
         joints = np.concatenate([at.rotation.reshape(k, -1, 9), at.translation], axis=2)
         world = np.zeros((k, len(self.world), 12))
@@ -187,7 +187,8 @@ class Bodies:
         return Placed(np.ascontiguousarray(joints), world, present)
 
     def _strikes_from_inside(self, joint: int) -> bool:
-        """Whether a link's body surrounds its strikers by more than a target's core is behind the face.
+        """True if a link's body surrounds its strikers by more than the depth of a target's core behind the
+        face.
 
         Such a body, as a box of inertia about a point mass, meets the core however it strikes.
         """
@@ -207,7 +208,7 @@ class Bodies:
 
     @cached_property
     def _about_spheres(self) -> dict[int, tuple[Array, float]]:
-        """Of each joint the centre (3,) and radius [m] of a ball about all its spheres."""
+        """Bounding ball of all spheres of each joint: centre (3,) and radius [m]."""
         links, out = self.links, {}
         for j, own in self._of_joint.items():
             centre = links.balls[j][0]
@@ -217,7 +218,9 @@ class Bodies:
 
     @cached_property
     def directed(self) -> dict[Pair, Pair]:
-        """Of each pair of joints, whose spheres are held against whose planes: of the one they fit best."""
+        """Direction of each pair's check: the joint whose spheres are tested against the other's planes,
+        fitting best.
+        """
         out = self.links.out
         return {(a, b): (a, b) if out[a] <= out[b] else (b, a) for a, b in self.pairs}
 
@@ -238,7 +241,7 @@ class Bodies:
 
     @cached_property
     def _between(self) -> list[int]:
-        """How many joints there are between the two of each pair."""
+        """Number of joints between the two of each pair."""
         up = [set(joints) for joints in self.robot.model.supports]
         return [len(up[a] ^ up[b]) for a, b in self.pairs]
 
@@ -295,7 +298,7 @@ class Bodies:
 
     @staticmethod
     def present(body: WorldBody, at: Places) -> NDArray[np.bool_]:
-        """When (k,) a body of the world is there to be touched."""
+        """Mask (k,) of the instants at which a body of the world is present."""
         return np.asarray(at.phase == 0) if body.before else (at.phase != MISSED) | (not body.of_target)
 
     # ------------------------------------------------------------------ exactly
@@ -312,7 +315,7 @@ class Bodies:
         return distance(one.shape, self._transform(at, k, a), two.shape, self._transform(at, k, b))
 
     def closest(self, at: Places, k: int, pair: Pair) -> Closest:
-        """Where the two of a pair are nearest to each other at instant k, or deepest in each other."""
+        """Closest points of a pair at instant k, or the deepest penetration."""
         a, b = pair
         here, there = self._transform(at, k, a), self._transform(at, k, b)
         pieces = self._pieces(pair)
@@ -332,7 +335,7 @@ class Bodies:
         )
 
     def _pieces(self, pair: Pair) -> Sequence[tuple[Any, Any]]:
-        """Of the two of a pair, those that may meet."""
+        """Convex pieces of a pair that may meet."""
         a, b = pair
         return self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
 
@@ -373,7 +376,7 @@ class Bodies:
         """The least distance of any pair at any instant, and all that touches.
 
         time (k,) [s] : of the instants.  within [m] : pairs that are farther apart count as `FAR`.
-        Two that are deep in each other are looked at every `EVERY`, so that begin and end are that fine.
+        Deep penetrations are looked at every `EVERY`, so that begin and end are that fine.
         """
         close = self.slack + CLOSE  # of most motions the nearest two are, and then no others matter
         if close < within:
@@ -409,11 +412,11 @@ class Bodies:
         return Survey(least, float(time[when]), names, tuple(touches))
 
     def names(self, pair: Pair) -> tuple[str, str]:
-        """What messages call the two."""
+        """Names of the two bodies in messages."""
         a, b = pair
         return self.links.name(a), self.links.name(b) if b >= 0 else self.world[-1 - b].name
 
 
 def _outside(planes: Planes, points: Array) -> Array:
-    """How far (k, m) [m] points (k, m, 3) are from a body at least, < 0 inside."""
+    """Least distance (k, m) [m] of points (k, m, 3) from a body, < 0 inside."""
     return np.asarray((points @ planes.normal.T - planes.offset).max(axis=2))

@@ -1,7 +1,9 @@
-"""Spheres that cover a convex hull, and planes that enclose it: what a plan's smooth rows know of bodies.
+"""Spheres that cover a convex hull, and planes that enclose it: what a plan's smooth constraints know of
+bodies.
 
 A point x is at least max_i (n_i . x - h_i) from a body whose support function is h_i in the directions n_i,
-and a sphere that much less its radius. Inside the body that is how deep it is, so that rows show the way out.
+and a sphere that much less its radius. Inside the body that is how deep it is, so that constraints show the
+way out.
 """
 
 from __future__ import annotations
@@ -113,7 +115,7 @@ def fill(hull: ConvexHull, points: Array) -> Spheres:
 def enclose(vertices: Array, normals: Array, radius: float = 0.0) -> Planes:
     """Planes about the hull of vertices (k, 3) [m], inflated by ``radius`` [m], that tell best how far it is.
 
-    normals (m, 3) : of its facets. Directions are taken one by one: that which mends most of what those
+    normals (m, 3) : of its facets. Directions are taken one by one: that which removes most of what those
     before it miss, at points about the body, against all directions together.
     """
     directions = np.concatenate([_rounded(normals), _sphere(SPREAD)])
@@ -170,7 +172,7 @@ def _greedy(covers: NDArray[np.bool_], most: int) -> list[int]:
 
 
 def _depth(hull: ConvexHull, points: Array) -> Array:
-    """How deep (k,) [m] points are in the hull, < 0 outside."""
+    """Depth (k,) [m] of points in the hull, < 0 outside."""
     return np.asarray(-(points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1))
 
 
@@ -202,7 +204,7 @@ def _centres(hull: ConvexHull) -> Array:
 
 
 def _spread(points: Array, count: int) -> Array:
-    """At most ``count`` of the points, far from each other."""
+    """Spread of at most ``count`` of the points, far from each other."""
     if len(points) <= count:
         return points
     if len(points) > 20 * count:  # the greedy choice below takes count x points

@@ -44,7 +44,7 @@ def find_mesh(name: str, urdf: Path) -> Path:
 
 
 def _package_folders() -> Iterator[Path]:
-    """Where packages of meshes may be, beside a URDF's own folders."""
+    """Folders that packages of meshes may be in, beside a URDF's own folders."""
     for place in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
         yield from (Path(place), Path(place).parent)  # it holds packages, or it is one
     for place in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
@@ -55,7 +55,7 @@ def _package_folders() -> Iterator[Path]:
 
 
 def lack_of(name: str, urdf: Path) -> str:
-    """Why a URDF's mesh is no body, as of `find_mesh`; "" if it is one."""
+    """Reason why a URDF's mesh cannot be used (`find_mesh`); "" if it can."""
     try:
         path = find_mesh(name, urdf)
         return _lack(path, path.stat().st_mtime_ns)

@@ -35,7 +35,7 @@ class Geom:
 
 
 def geoms_of(model: Any, mjcf: str) -> list[Geom]:
-    """Of the bodies that a pin.Model has; planes, height fields and signed distance fields are left out."""
+    """Geoms of a pin.Model's bodies; planes, height fields and signed distance fields are left out."""
     return list(_geoms(model, _compiled(mjcf, Path(mjcf).stat().st_mtime_ns)))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.pieces import Piece
+from impactopt.bodies.convex_hulls import Piece
 
 __all__ = ["distance_to_link", "is_far", "size_of"]
 
@@ -18,7 +18,7 @@ FAR = 0.1  # [m] from all that is known of a link at least, and the shape's own 
 
 
 def is_far(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> bool:
-    """Whether a shape is farther from its link than it is large; beside : all shapes that the joint moves."""
+    """True if a shape is farther from its link than its size; beside : all shapes that the joint moves."""
     return distance_to_link(model, piece, beside) > max(FAR, size_of(piece))
 
 

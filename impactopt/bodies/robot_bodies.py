@@ -16,8 +16,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.bodies.fit import Planes, Spheres, enclose, fill, surface_points
-from impactopt.bodies.pieces import Piece, pieces_of
 from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot
 
@@ -30,7 +30,7 @@ SPACING, LEAST = 1 / 40, 0.003  # of points on a body's surface: of its extent, 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RobotBodies:
-    """What of a robot can touch.
+    """Collision geometry of a robot.
 
     pieces : hulls of links, exact.  source : where they are from, in words.
     joint (c,), centre (c, 3) [m], radius (c,) [m] : spheres that cover them, in the frame of that joint.
@@ -66,7 +66,7 @@ class RobotBodies:
 
     @cached_property
     def balls(self) -> dict[int, tuple[Array, float]]:
-        """Of each joint's pieces the centre (3,) and radius [m] of a sphere about all of them."""
+        """Bounding ball of each joint's pieces: centre (3,) and radius [m]."""
         out = {}
         for j, pieces in self.of_joint.items():
             points = np.concatenate([p.vertices for p in pieces])
@@ -82,7 +82,7 @@ class RobotBodies:
         return {j: max(pieces, key=size).link for j, pieces in self.of_joint.items()}
 
     def name(self, joint: int) -> str:
-        """What messages call the body that a joint moves: its largest link."""
+        """Name of the body that a joint moves, in messages: its largest link."""
         return self._names[joint]
 
     def piece_pairs(
@@ -178,7 +178,7 @@ def transform(rotation: Array, translation: Array) -> Any:
 
 
 def distance(one: Any, at_one: Any, two: Any, at_two: Any) -> float:
-    """Between two coal shapes, at these places [m]; below zero: how deep one is in the other."""
+    """Distance of two coal shapes at these places [m]; below zero: depth of the penetration."""
     return float(coal.distance(one, at_one, two, at_two, _REQUEST, coal.DistanceResult()))
 
 

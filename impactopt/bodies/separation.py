@@ -1,7 +1,7 @@
 """Signed distances of convex bodies that are smooth everywhere: what a plan's constraints between bodies are.
 
 The separation of two bodies A and B along a unit vector u from B to A is u . t less their supports. Its
-largest value over all u is their distance; where they are in each other it is, near the direction that they
+largest value over all u is their distance; where they penetrate it is, near the direction that they
 came from, how deep they are. With supports max_i a_i . u of vertices it has kinks, where faces are parallel.
 So supports are rounded,
 
@@ -48,8 +48,8 @@ _SIDE = 33  # numbers that the C code keeps of a pair
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Where bodies are at K instants: joints (K, J, 12), bodies of the world (K, W, 12), each a rotation by
-    rows and a translation [m]; and whether the latter are there (K, W).
+    """Placements at K instants of joints (K, J, 12) and of bodies of the world (K, W, 12), each a rotation
+    by rows and a translation [m]; and a mask of the bodies that are present (K, W).
     """
 
     joints: Array
@@ -59,8 +59,8 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """How far pairs are apart: gaps (K, P) [m], lower bounds of those that are not near. Those that are: at
-    which instants (m,), and their numbers (m,).
+    """Gaps of pairs (K, P) [m], lower bounds for those that are not near; instants (m,) and pair numbers
+    (m,) of those that are.
     """
 
     gaps: Array
@@ -131,7 +131,7 @@ class Shapes:
         return len(self.pairs)
 
     def look(self, at: Placed, within: float, ways: Array, wanted: NDArray[np.bool_]) -> Looked:
-        """How far the pairs ``wanted`` (P,) are apart, exactly where that is less than ``within`` [m].
+        """Gaps of the pairs ``wanted`` (P,), exact where they are less than ``within`` [m].
 
         ways (K, P, 3) : directions that separate them, zero where none is known; what is looked at moves
         there.
@@ -194,12 +194,12 @@ class Separations:
         return Separations(self._shapes, self.joints, self._pairs, self.numbers.copy(), self.ways.copy())
 
     def forget(self) -> None:
-        """What was found last, as ``numbers`` are others."""
+        """Clears the last result, as ``numbers`` have changed."""
         self._seen = np.full((self.count, self.joints + 3), np.nan)
 
     def write(self, what: int, z: Array, out: Array, factors: Array | None = None) -> None:
-        """To ``out``: values (what = 0), gradients (1), or ``factors`` times the Hessians' lower triangles,
-        column by column (2).
+        """Writes values (what = 0), gradients (1), or ``factors`` times the Hessians' lower triangles, column
+        by column (2), to ``out``.
 
         Derivatives are those of an iterate: directions stay there. Values are of any trial.
         """
@@ -268,7 +268,7 @@ def _chosen(vertices: Array) -> Index:
 
 
 def _corners(half: Array) -> Array:
-    """Of a box; of what is flat or thin as a line, each once."""
+    """Corners of a box; those of a flat or line-like box once each."""
     return np.unique(half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]), axis=0)
 
 

@@ -1,4 +1,4 @@
-"""What native/separation.c does, without a compiler: the same numbers, a hundred times as slowly."""
+"""NumPy version of native/separation.c, for machines without a compiler: same numbers, 100 times slower."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _LONGEST, _STEPS, _TRIES = 0.5, 100, 30  # [rad] a step, and how many of them
 
 
 class _Support(NamedTuple):
-    """Of m bodies in directions: rounded supports (m,), mean (m, 3) and covariance (m, 3, 3) of the points
-    that carry them.
+    """Supports of m bodies in given directions: rounded supports (m,), mean (m, 3) and covariance (m, 3,
+    3) of the points that define them.
     """
 
     height: Array
@@ -28,7 +28,9 @@ class _Support(NamedTuple):
 
 
 class _Side(NamedTuple):
-    """Of m pairs in directions u from the second to the first, in the second's frame; see the C code."""
+    """Separations of m pairs in directions u from the second to the first, in the second's frame; see the
+    C code.
+    """
 
     separation: Array
     slope: Array  # w (m, 3)
@@ -97,7 +99,7 @@ class _Pairs:
         for _ in range(_STEPS):
             step2, gain = self._step(at)
             size = np.linalg.norm(step2, axis=1)
-            # no maximum, as bodies are in each other: along the way that it curves up
+            # no maximum, as bodies penetrate: along the way that it curves up
             curved, axes = np.linalg.eigh(at.bend)
             saddle = going & (size < 1e-9) & (curved[:, 0] < -1e-9)
             up = axes[saddle, :, 0]
@@ -140,7 +142,7 @@ def _mask(numbers: NDArray[np.intp], size: int) -> NDArray[np.bool_]:
 
 
 def _inverse(bend: Array) -> Array:
-    """Of bend made positive definite."""
+    """Inverse of ``bend``, made positive definite."""
     least = np.linalg.eigvalsh(bend)[:, 0]
     return np.linalg.inv(bend + np.maximum(_FLOOR - least, 0.0)[:, None, None] * np.eye(2))
 
@@ -172,7 +174,7 @@ def _chain(n: int, z: Array, numbers: Array) -> tuple[Array, Array, Array, Array
 def write(
     of: Any, points: Array, hulls: Index, what: int, z: Array, out: Array, factors: Array | None
 ) -> None:
-    """As `Separations.write`."""
+    """NumPy version of `Separations.write`."""
     n = of.joints
     turn, shift, axis, origin, turns = _chain(n, z, of.numbers)
     u, at = _Pairs(points, hulls, turn, shift).separate(of.ways)
@@ -218,7 +220,7 @@ def _of_pairs(shapes: Any, at: Any, spot: Index, pair: Index) -> tuple[Array, Ar
 def look(
     shapes: Any, at: Any, within: float, ways: Array, wanted: NDArray[np.bool_], gaps: Array
 ) -> tuple[Index, Index]:
-    """As `Shapes.look`: writes gaps and ways, returns what is near."""
+    """NumPy version of `Shapes.look`: writes gaps and ways, returns the near pairs."""
     spot, pair = (a.ravel() for a in np.indices(gaps.shape))
     other = shapes.pairs[pair, 1]
     there = wanted[pair] & (
@@ -254,7 +256,7 @@ def look(
 def may_meet(
     shapes: Any, one: tuple[Any, Any], two: tuple[Any, Any], wanted: NDArray[np.bool_]
 ) -> tuple[Index, Index]:
-    """As `Shapes.may_meet`."""
+    """NumPy version of `Shapes.may_meet`."""
     before, after = one[1].gaps, two[1].gaps
     spot, pair = np.nonzero(wanted & (before > 0) & (after > 0) & (before + after <= 5.0))
     (turn0, shift0), (turn1, shift1) = (_of_pairs(shapes, p[0], spot, pair) for p in (one, two))

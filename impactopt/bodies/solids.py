@@ -22,7 +22,7 @@ class Solid:
     triangles: NDArray[np.intp]
 
     def moved(self, rotation: Array, translation: Array) -> Solid:
-        """In the frame in which it is so placed."""
+        """Copy, rotated and translated."""
         return Solid(vertices=self.vertices @ rotation.T + translation, triangles=self.triangles)
 
 
@@ -36,7 +36,7 @@ def joined(solids: Sequence[Solid]) -> Solid:
 
 
 def box(sides: ArrayLike) -> Solid:
-    """Of these sides (3,) [m], about the origin."""
+    """Box with these sides (3,) [m], about the origin."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     triangles = [t for a, b, c, d in quads for t in ([a, b, c], [a, c, d])]
@@ -85,7 +85,9 @@ def sphere(radius: float, *, sides: int = 16) -> Solid:
 
 
 def capsule(radius: float, length: float, *, sides: int = 50) -> Solid:
-    """Of this radius about a line of this length along z, whose middle is the origin [m]; sides: 4 k + 2."""
+    """Capsule with this radius about a line of this length along z, whose middle is the origin [m]; sides:
+    4 k + 2.
+    """
     round_ = sphere(radius, sides=sides)  # of an odd number of rows: the middle one becomes the cylinder
     lift = np.sign(round_.vertices[:, 2:]) * [0.0, 0.0, length / 2]
     return Solid(vertices=round_.vertices + lift, triangles=round_.triangles)

@@ -35,21 +35,24 @@ class StrikerFace(NamedTuple):
         return float(max(0.0, (self.corners @ self.normal).max()))
 
 
-def striker_face(robot: Robot, striker: str) -> StrikerFace | None:
-    """The face of one of a robot's strikers; None for a link without a body.
+def striker_face(robot: Robot, striker: str, axis: Array | None = None) -> StrikerFace | None:
+    """The face of one of a robot's strikers; None for a link without a shape that is known.
 
-    The normal is that of the hull's facets next to the striking point; facets count by their areas.
+    axis (3,) : its outward unit vector in the striker's frame, if known. Else it is that of the hull's facets
+    next to the striking point; facets count by their areas.
     """
     hit = robot.striker(striker)
     model, bodies = robot.model, bodies_of(robot)
     frame = model.frames[model.getFrameId(hit.frame)]
-    pieces = bodies.of_joint.get(int(frame.parentJoint), ())
+    pieces = [piece for piece in bodies.of_joint.get(int(frame.parentJoint), ()) if not piece.assumed]
     if not pieces:
         return None
     to_frame = frame.placement.inverse()
     vertices = np.concatenate([p.vertices for p in pieces]) @ to_frame.rotation.T + to_frame.translation
     away = vertices - np.asarray(hit.point)
     hull = ConvexHull(away)
+    if axis is not None:
+        return StrikerFace(np.asarray(axis, dtype=float), _leading(away[hull.vertices], np.asarray(axis)))
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
     nearest = normals[np.argmax(offsets)]  # the facet that the point is least inside of, or farthest outside
     corners = away[hull.simplices]

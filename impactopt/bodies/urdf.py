@@ -64,7 +64,7 @@ def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> I
 
 
 def lost_meshes(model: Any, root: ElementTree.Element, urdf: Path) -> dict[int, dict[str, str]]:
-    """By the joint that moves their link, the names of meshes that are nowhere or unreadable, and why."""
+    """Meshes that are missing or unreadable, with the reason, by the joint that moves their link."""
     lost: dict[int, dict[str, str]] = {}
     for link in root.findall("link"):
         name = link.get("name", "")

@@ -64,7 +64,7 @@ class WorldBody:
 
     @cached_property
     def shape(self) -> Any:
-        """As coal has it."""
+        """Shape for coal."""
         if not self.radius:
             return coal.Box(*(2 * self.half))
         return coal.Capsule(self.radius, 2 * self.half[2]) if self.half[2] > 0 else coal.Sphere(self.radius)
@@ -88,7 +88,7 @@ def ground_body(height: float) -> WorldBody:
 
 
 def _usual(body: TargetBody, target: Target) -> tuple[str, tuple[float, ...]]:
-    """What a target looks like where the problem gives no size: in a word, and its sides [m]."""
+    """Default appearance of a target for which the problem gives no size: its shape, and its sides [m]."""
     if body.shape == "ball":
         return "ball", BOX[:1]
     for kind, usual in USUAL.items():
@@ -97,7 +97,7 @@ def _usual(body: TargetBody, target: Target) -> tuple[str, tuple[float, ...]]:
     return "box", BOX
 
 
-def told_body(body: TargetBody, target: Target) -> str:
+def body_message(body: TargetBody, target: Target) -> str:
     """The target's body in words, with its size, and whether that was assumed."""
     if body.shape == "none":
         return "none: nothing keeps off it"
@@ -107,7 +107,7 @@ def told_body(body: TargetBody, target: Target) -> str:
 
 
 def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array) -> list[WorldBody]:
-    """What is hit: its face's middle is at the point, and it reaches from there along the normal."""
+    """Bodies of a target: its face's middle is at the point, and it extends from there along the normal."""
     rows = face_axes(normal)  # normal, across, up
     axes = np.column_stack([rows[1], rows[2], rows[0]])  # of boxes: across, up, deep
 
@@ -147,7 +147,7 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
 
 
 def _core(box: Any, size: tuple[float, ...]) -> WorldBody:
-    """What is behind the face: a link that strikes is not to come from there."""
+    """Core behind the face, which keeps a striking link from coming through from behind."""
     body: WorldBody = box("target from behind", (size[0], size[1], DEEP), BEHIND, before=True, core=True)
     return body
 

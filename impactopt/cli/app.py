@@ -129,7 +129,7 @@ def solve(
     with plain_errors(said, verbose=verbose, keeps=True) as console:
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.files.solved import SolvedFolder
+        from impactopt.files.solution_library import SolvedFolder
         from impactopt.planning.planner import solve as plan
         from impactopt.report.console import SolveConsole
 
@@ -293,8 +293,8 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     from impactopt.report.console import (
         multistart_table,
         result_table,
-        told_off,
-        told_touches,
+        switched_off_message,
+        touches_message,
         violation_table,
     )
 
@@ -310,7 +310,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         )
     error = summary.get("simulated", {}).get("error")
     beyond = summary.get("gear_caution")
-    cautions = (summary.get("caution"), told_touches(summary), beyond, told_off(summary))
+    cautions = (summary.get("caution"), touches_message(summary), beyond, switched_off_message(summary))
     for text in (summary.get("note"), error, reach.get("error"), *cautions):
         if text:
             console.print(printable(str(text)), markup=False, highlight=False)

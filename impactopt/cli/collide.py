@@ -76,7 +76,7 @@ def collide(
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.report.console import SolveConsole
-        from impactopt.sweeps.single import collide_once, problem_of_result
+        from impactopt.sweeps.single_collision import collide_once, problem_of_result
 
         check_loudness(quiet, verbose)
         if not 0 < accuracy < math.inf:

@@ -21,15 +21,15 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 def check(
     file: ProblemPath, settings: Settings = None, as_json: AsJson = False, verbose: Verbose = False
 ) -> None:
-    """Say whether a problem file is sound and its target within reach; else every mistake, and its mend.
+    """Say whether a problem file is sound and its target within reach; else every mistake, and its fix.
 
-    What to mend first stands first. With --json {"sound", "file", "hash", "problem", "doubts"}, or {"sound",
+    What to fix first stands first. With --json {"sound", "file", "hash", "problem", "doubts"}, or {"sound",
     "file", "mistakes"}. Exit code: 0 sound, 2 not.
     """
     with plain_errors("interrupted", verbose=verbose):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.doubts import hopeless, too_weak
+        from impactopt.problem.feasibility import hopeless, too_weak
         from impactopt.problem.plausibility import doubts
 
         try:
@@ -63,7 +63,7 @@ def check(
 
 
 def _strength(problem: ImpactProblem) -> str:
-    """What share of the hardest blow nearby this one is, by estimates; "" where that is not known."""
+    """Estimated fraction of the hardest blow nearby that this one reaches; "" if that is not known."""
     from impactopt.problem.strength import best_share
 
     found = best_share(problem)
@@ -75,7 +75,9 @@ def _strength(problem: ImpactProblem) -> str:
 
 
 def _lost_meshes(robot: Robot) -> str:
-    """Which meshes of a robot are nowhere or unreadable, and what that means; "" if all are there."""
+    """Message about a robot's meshes that are missing or unreadable, and the consequences; "" if there are
+    none.
+    """
     from impactopt.bodies.urdf import lost_meshes, urdf_root
 
     root = None if robot.urdf is None else urdf_root(Path(robot.urdf))

@@ -13,8 +13,8 @@ from impactopt.cli.options import OtherProblem
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
-    from impactopt.live.blow import LiveBlow
-    from impactopt.live.look import LiveLook
+    from impactopt.live.collision_page import LiveBlow
+    from impactopt.live.plan_page import LiveLook
     from impactopt.report.report import Report
 
 PAGE = "report.html"
@@ -122,13 +122,13 @@ def _live(what: Path, problem: Path | None, port: int | None, open_: bool) -> No
 
 
 def _page(what: Path, problem: Path | None, port: int) -> LiveLook | LiveBlow:
-    """Of a result, or of a problem file's collision."""
+    """Page of a result, or of a problem file's collision."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file
     from impactopt.files.replay import load_planned
     from impactopt.files.resume import resumed
-    from impactopt.live.blow import LiveBlow
-    from impactopt.live.look import LiveLook
+    from impactopt.live.collision_page import LiveBlow
+    from impactopt.live.plan_page import LiveLook
 
     if not _is_robot(what):
         planned = load_planned(what, problem_file=problem)

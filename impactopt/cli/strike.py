@@ -90,11 +90,18 @@ def strike(
         else:
             from rich.console import Console
 
-            from impactopt.report.console import multistart_table, strike_table, told_off, violation_table
+            from impactopt.report.console import (
+                multistart_table,
+                strike_table,
+                switched_off_message,
+                violation_table,
+            )
 
             shown = Console()
             shown.print(strike_table(record.summary))
-            for text in filter(None, (record.summary.get("gear_caution"), told_off(record.summary))):
+            for text in filter(
+                None, (record.summary.get("gear_caution"), switched_off_message(record.summary))
+            ):
                 shown.print(printable(str(text)), highlight=False, markup=False)
             shown.print(multistart_table(record.summary["starts"]))
             if record.summary["violations"]:

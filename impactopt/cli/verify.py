@@ -29,7 +29,8 @@ def verify(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Compute every row, the objective and the KKT residual of a result anew, trusting nothing in it.
+    """Compute every constraint, the objective and the KKT residual of a result anew, trusting nothing of the
+    solver.
 
     Exit code: 0 all is as it says, 1 it is not, or part of it could not be computed, 2 bad input.
     """
@@ -40,7 +41,7 @@ def verify(
 
         check_loudness(quiet, verbose)
         with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
-            progress.say(f"{result}: computing its rows, and their slopes by differences")
+            progress.say(f"{result}: computing its constraints, and their slopes by differences")
             verdict = verified(result, problem_file=problem)
         if as_json:
             typer.echo(json.dumps(plain(verdict.describe()), indent=2))

@@ -73,13 +73,13 @@ def find_compiler() -> Compiler | None:
 
 
 def why_no_compiler() -> str:
-    """Why `find_compiler` has found none, in a few words."""
+    """Reason why `find_compiler` has found none, in a few words."""
     if _forbidden():
         return "IMPACTOPT_NO_COMPILER is set" if os.name == "posix" else "there is none for this system"
     for command in _candidates():
         version = _version(command)
         if version and (trouble := _trouble(Compiler(command=command, version=version))):
-            return f"{trouble}; mend it, or what CC names"
+            return f"{trouble}; fix it, or what CC names"
     return "install gcc or clang, or name one in the environment variable CC"
 
 
@@ -100,7 +100,7 @@ def _candidates() -> list[tuple[str, ...]]:
 
 @functools.cache
 def _trouble(compiler: Compiler) -> str:
-    """What stands against compiling with it, or nothing."""
+    """Reason why a compiler cannot be used, or ""."""
     try:
         with tempfile.TemporaryDirectory(prefix="impactopt-") as scratch:
             source, library = Path(scratch) / "trial.c", Path(scratch) / "trial.so"
@@ -114,7 +114,7 @@ def _trouble(compiler: Compiler) -> str:
 def _compile(
     compiler: Compiler, source: Path, library: Path, level: str, patience: float, *more: Path
 ) -> None:
-    """As `Compiler.run`, in no more than `patience` [s]."""
+    """Compiles (`Compiler.run`) in no more than `patience` [s]."""
     program = shlex.join(compiler.command)
     sources = [str(path) for path in (source, *more)]
     command = [*compiler.command, *level.split(), *_FLAGS, *sources, "-o", str(library), "-lm"]

@@ -1,4 +1,4 @@
-"""Where compiled functions, and numbers that take long to find, are kept on disk."""
+"""Directories on disk for compiled functions, and for cached numbers that take long to compute."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def kept(kind: str, digest: str, make: Callable[[], bytes]) -> bytes:
 
 
 def cache_directory() -> Path:
-    """Where libraries are kept: $IMPACTOPT_CACHE, $XDG_CACHE_HOME/impactopt or ~/.cache/impactopt.
+    """Directory of compiled libraries: $IMPACTOPT_CACHE, $XDG_CACHE_HOME/impactopt or ~/.cache/impactopt.
 
     Who has no home, as users of containers may, has a directory of his own among the temporary ones.
 

@@ -1,4 +1,4 @@
-"""How files are written, whole and through no planted link, and how those that could be anything are read."""
+"""Writes files whole and through no planted link, and reads files that could be anything."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def read_archive(path: str | os.PathLike[str], most: int, arrays: int) -> io.Byt
 
 
 def is_plain_file(path: str | os.PathLike[str]) -> bool:
-    """Whether there is a plain file; of names that no file can have too."""
+    """True if there is a plain file; false for names that no file can have, too."""
     try:
         return stat.S_ISREG(os.stat(path).st_mode)
     except (OSError, ValueError):

@@ -80,7 +80,7 @@ def native_library(package: str, name: str) -> Any:
 
 
 def address(array: npt.NDArray[Any]) -> ctypes.c_void_p:
-    """Of an array's numbers, for C."""
+    """Address of an array's numbers, for C."""
     return ctypes.c_void_p(array.ctypes.data)
 
 

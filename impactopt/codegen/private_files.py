@@ -93,7 +93,7 @@ def locked(path: Path, *, on_wait: Callable[[], None]) -> Iterator[None]:
 
 
 def allows_code(path: Path) -> bool:
-    """Whether libraries can be loaded from a directory: its file system is not mounted noexec."""
+    """True if libraries can be loaded from a directory: its file system is not mounted noexec."""
     return not os.statvfs(path).f_flag & getattr(os, "ST_NOEXEC", 0)
 
 
@@ -130,7 +130,7 @@ def _check(path: Path, status: os.stat_result, is_kind: Callable[[int], bool], k
 
 
 def _is_own_group(group: int) -> bool:
-    """Whether the group is this user's alone, as where every user has a group of the same name."""
+    """True if the group is this user's alone, as where every user has a group of the same name."""
     import grp
     import pwd
 

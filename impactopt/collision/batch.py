@@ -88,7 +88,7 @@ class Batch:
         *,
         threads: int | None = None,
     ) -> dict[str, Array]:
-        """As of `SteppedModel.batch`."""
+        """Outputs of many collisions; see `SteppedModel.batch`."""
         cores = os.cpu_count() or 1 if threads is None else threads
         if not isinstance(cores, int) or cores < 1:
             raise InputError(f"threads: {threads!r}; give a whole number >= 1")
@@ -207,7 +207,7 @@ def _slices(count: int, threads: int) -> Iterator[tuple[int, int]]:
 
 
 def _one_by_one(function: Any, rows: list[Array], found: list[Array]) -> None:
-    """Where there is no compiler."""
+    """Evaluates a batch without a compiler, one collision at a time."""
     shapes = [function.size_in(k) for k in range(function.n_in())]
     for i in range(found[0].shape[0]):
         mine = [x[0 if x.shape[0] == 1 else i] for x in rows]
@@ -246,7 +246,7 @@ def _inputs(
 
 
 def _settings(model: SteppedModel, settings: Mapping[str, Any], count: int) -> dict[str, Array]:
-    """Of each setting its value for all, or one a collision, in its range."""
+    """Values of each setting, for all or one a collision, checked against its range."""
     alone = model.settings.override(
         {
             name: x

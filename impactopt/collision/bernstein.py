@@ -28,7 +28,8 @@ def bernstein_matrix(degree: int) -> Array:
 
 
 def first_negative(b: Array, start: float = 0.0, length: float = 1.0) -> float | None:
-    """Where a polynomial, given by its Bernstein coefficients, falls below zero first; None: nowhere.
+    """First place at which a polynomial, given by its Bernstein coefficients, falls below zero; None if
+    nowhere.
 
     The polynomial lies in its coefficients' convex hull, and has no more roots than they have sign changes
     (Lane and Riesenfeld, BIT 21 (1981) 112-117): parts are halved until that decides.

@@ -1,4 +1,4 @@
-"""What `collide` refuses because its numbers would not be right."""
+"""Checks by which `collide` refuses a collision whose numbers would not be right."""
 
 from __future__ import annotations
 
@@ -63,7 +63,9 @@ def spoiled(frozen: dict[str, Array]) -> Any:
 
 
 def without_contact(impulse: Array, duration: Array, step: Any = 0.0) -> Any:
-    """Whether contacts ended so soon that rounding hides their force, or within one explicit step [s]."""
+    """True for contacts that ended so soon that rounding hides their force, or within one explicit step
+    [s].
+    """
     return (duration > 0) & ((impulse < 0) | (duration <= step))
 
 
@@ -79,12 +81,12 @@ def check_finite(outputs: dict[str, Array], step: float) -> None:
 
 
 def too_large(method: str, error: Array) -> Any:
-    """Whether what Runge-Kutta steps are estimated to have left out of impulses is more than a method may."""
+    """True if the estimated error of Runge-Kutta's impulses is more than the method may have."""
     return ~(error <= ACCURACY[method])
 
 
 def left_out_by_breaking(collision: SteppedModel, impulse: Any, results: Any, force: Any) -> Any:
-    """What Runge-Kutta's steps may leave out where a board breaks within one of them, relative.
+    """Relative error of Runge-Kutta's impulse that a board's break within a step may cause.
 
     Its stages judge whether it has broken: for up to half a step its force is taken for what it is not.
     results (..., k) : of the target.  force [N] : that breaks it.
@@ -94,7 +96,7 @@ def left_out_by_breaking(collision: SteppedModel, impulse: Any, results: Any, fo
 
 
 def breaks(collision: SteppedModel) -> bool:
-    """Whether `left_out_by_breaking` is to be looked at."""
+    """True if `left_out_by_breaking` has to be checked."""
     return collision.stepping == "rk4" and isinstance(collision.target, Board)
 
 
@@ -105,14 +107,14 @@ def check_course(collision: SteppedModel, result: Collision, error: float) -> No
     """
     length, method = collision.step_length, collision.stepping
     if not result.separated and result.duration < collision.horizon * (1 - 1e-9):
-        mend = (
+        fix = (
             "shorten the horizon, or give a larger tolerance"
             if method == "implicit"
             else "raise the horizon or give a shorter step, both of which make more steps"
         )
         raise InputError(
             f"horizon [s]: the steps are used up by events after {result.duration:.3g} s, before the "
-            f"horizon, {collision.horizon:g} s: joints saturate or slide again and again; {mend}"
+            f"horizon, {collision.horizon:g} s: joints saturate or slide again and again; {fix}"
         )
     if result.duration == 0:
         return

@@ -14,7 +14,7 @@ __all__ = ["contact_functions", "law_is_linear", "target_is_linear"]
 
 
 def law_is_linear(law: ContactLaw) -> bool:
-    """Whether both branches are linear, with the law's numbers and with others; a kink bends too."""
+    """True if both branches are linear for all values of the law's parameters; a kink counts as nonlinear."""
     numbers, branches = _law_parts(law)
     slopes = ca.horzcat(*[ca.jacobian(f, x) for f, x in branches])
     found = [_at(numbers, law.parameters, slopes, branches[0][1], k) for k in range(_DRAWS)]
@@ -22,7 +22,7 @@ def law_is_linear(law: ContactLaw) -> bool:
 
 
 def target_is_linear(target: Target) -> bool:
-    """Whether rates, velocity and switches are linear between switches, with other numbers too."""
+    """True if rates, velocity and switches are linear between switches, for all values of the parameters."""
     numbers, (whole, x) = _target_part(target)
     bending = ca.jacobian(ca.vec(ca.jacobian(whole, x)), x)
     if not bending.nnz():

@@ -36,7 +36,7 @@ Loop = Callable[[Any, float, Sequence[Any], bool], tuple[Any, Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """What one freeze has led to, MX.
+    """Result of the segment after one freeze, MX.
 
     Attributes
     ----------
@@ -68,13 +68,13 @@ def relative_to(settings: Mapping[str, Any], time: Any, data: dict[str, Any]) ->
 
 
 def _gained(settings: Mapping[str, Any], time: Any) -> Any:
-    """What the reference's joint velocities (n) [rad/s] have gained by a time [s] since contact."""
+    """Gain of the reference's joint velocities (n) [rad/s] by a time [s] since contact."""
     bend, time = settings["reference"], ca.fmin(time, settings["reference_until"])
     return sum(bend[:, k] * time ** (k + 1) for k in range(bend.shape[1]))
 
 
 def cuts(freezes: int) -> list[float]:
-    """Where segments begin and end, as fractions of the contact's duration (freezes + 1)."""
+    """Ends of the segments, as fractions of the contact's duration (freezes + 1)."""
     return [i / freezes for i in range(freezes + 1)]
 
 

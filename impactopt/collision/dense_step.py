@@ -37,7 +37,7 @@ class Contact:
         self.target = target
 
     def of(self, law: dict[str, float], target: dict[str, float]) -> Law:
-        """With these numbers."""
+        """Law with these parameters."""
         return Law(self, ca.DM(list(law.values())), target)
 
     def call(self, name: str, *given: Any) -> list[Array]:
@@ -71,15 +71,15 @@ class Law:
         return self.force(x, rate, False)[0]
 
     def velocity(self, z: Array) -> float:
-        """Of the target [m/s]."""
+        """Velocity of the target [m/s]."""
         return float(self.contact.target.velocity([*z], self._numbers))
 
     def rates(self, z: Array, force: float) -> Array:
-        """Of the target's state."""
+        """Rates of the target's state."""
         return np.array([float(x) for x in self.contact.target.derivative([*z], force, self._numbers)])
 
     def slopes(self, z: Array, force: float) -> tuple[Array, Array, Array]:
-        """Of the rates by state and force, and of the velocity by state."""
+        """Slopes of the rates by state and force, and of the velocity by state."""
         Z, G, at = self.contact.call("target_slopes", z, force, self._target)
         return Z.reshape(z.size, z.size), G.ravel(), at.ravel()
 
@@ -196,7 +196,9 @@ class Step:
         return _FROM_NODES @ n.reshape(NODES, inputs), False
 
     def _changes(self, terms: Array) -> Array:
-        """Of penetration, rate and target at the nodes (7, 2 + k), by terms of a change of the state."""
+        """Changes of penetration, rate and target at the nodes (7, 2 + k), by terms of a change of the
+        state.
+        """
         rows, at = self.rows, self._slopes[2]
         places = self.at_nodes(terms)
         rate = places @ (rows.speeds[-1] - at @ rows.target)

@@ -148,14 +148,14 @@ def with_jacobian(
 def in_order(
     inputs: Mapping[str, Any], settings: Mapping[str, Any], parameters: Sequence[str]
 ) -> dict[str, Any]:
-    """Those of the inputs that are no settings, and then the parameters in the order they are named in."""
+    """Inputs that are no settings, followed by the parameters in the order they are named in."""
     return {name: x for name, x in inputs.items() if name not in settings} | {
         name: inputs[name] for name in parameters
     }
 
 
 def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> list[Part]:
-    """What gives which derivatives by these inputs; of `separated` they are zero."""
+    """Functions that give each derivative by these inputs; those of `separated` are zero."""
     outputs = tuple(name for name in outputs if name != "separated")
     refrozen, name = model.n_freezes > 0, ""
     carried: tuple[str, ...]
@@ -241,7 +241,7 @@ class _Late(ca.Callback):
         return True
 
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
-        """Of null results nothing is computed."""
+        """Evaluates the outputs; null results are not computed."""
         if self._function is None:
             self._function = self._make()  # type: ignore[no-untyped-call]
         for given, size, room in zip(arg, self._flat_sizes, self._room, strict=True):
@@ -282,7 +282,7 @@ def native_part(
 
 
 def _size(model: SteppedModel, name: str) -> Array:
-    """Of an input's numbers, by which the lengths of differences go."""
+    """Typical size of an input's numbers, which scales the steps of differences."""
     shapes = {"q": (model.robot.nq,), "v": (model.robot.nv,), "feedforward": (model.robot.n,)}
     usual: Array = np.abs(model.settings[name]) if name in model.settings else np.zeros(shapes[name])
     size = np.maximum(usual, least_size(name))
@@ -310,7 +310,7 @@ def _configuration(model: SteppedModel) -> tuple[Any, Any]:
 
 
 def _units(model: Any) -> list[tuple[int, int, slice]]:
-    """Of what has length one in q: begin and end there, and where its velocities are."""
+    """Unit-length parts of q: their ends there, and the slice of their velocities."""
     found = []
     for joint in model.joints:
         if joint.nq == 7:

@@ -1,4 +1,4 @@
-"""What a collision function contains, and what was left out of it because the scene does not need it.
+"""Description of a collision function: its contents, and what the scene allows it to leave out.
 
 All of it is decided when the function is built: what is not in is not computed.
 """
@@ -29,7 +29,7 @@ _EFFECTS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Description:
-    """As text by str(), and as numbers.
+    """Contents of a collision function, as text by str(), and as numbers.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Description:
 def describe(
     collision: SteppedModel, outputs: tuple[str, ...], parameters: tuple[str, ...] = ()
 ) -> Description:
-    """What `SteppedModel.function` is made of for these outputs; see `SteppedModel.describe`."""
+    """Description of `SteppedModel.function` for these outputs; see `SteppedModel.describe`."""
     robot, held_by, settings = collision.robot, collision.held_by, collision.settings
     by = f"{max(held_by.compliance):g} per kg" if any(held_by.compliance) else "exactly"
     effects = [name for name in _EFFECTS if getattr(collision.effects, name)] if collision.n_servos else []

@@ -1,4 +1,4 @@
-"""Which effects the simplified dynamics computation takes into account, and the joints' friction."""
+"""Effects that the simplified dynamics computation takes into account, and the joints' friction."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ __all__ = ["Effects", "JointFriction"]
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:
-    """Which effects a collision model takes into account. The servo's damping (paper, eq. 11) is always
-    there.
+    """Effects that a collision model takes into account. The servo's damping (paper, eq. 11) is always there.
 
     Attributes
     ----------
@@ -26,7 +25,7 @@ class Effects:
     saturation : the torque limits (eq. 12).
     friction : joint friction F (eqs. 5, 6), see `JointFriction`.
     bias : Coriolis, centrifugal and gravity terms c + g (eqs. 5, 6), frozen at contact.
-    jdot : the Jacobians' rates times velocity (eq. 14), of hand and held soles, frozen at contact.
+    jdot : the Jacobians' rates times velocity (eq. 14), of hand and fixed soles, frozen at contact.
     """
 
     stiffness: bool = True

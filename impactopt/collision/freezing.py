@@ -1,4 +1,4 @@
-"""What freezing costs, estimated: the same collision once more, frozen more often.
+"""Estimates the error of freezing by the same collision once more, frozen more often.
 
 With N freezes the error of the impulse falls as 1/N^2 where the robot moves little, and by leaps where a push
 ends or not by a hair. So no constant is a bound of it, but the difference from a collision that is frozen
@@ -35,7 +35,7 @@ def more_often(freezes: int) -> int:
 
 
 def freeze_error(impulse: Array, better: Array, ends: NDArray[Any]) -> Array:
-    """What freezing may have cost of each impulse, relative (N).
+    """Estimated relative error (N) of each impulse that freezing causes.
 
     impulse, better : (N) [N s], and of the collisions frozen more often.  ends : (N) whether those separate;
     where they do not, the error is infinite.

@@ -1,7 +1,7 @@
 """Steps 1b and 2b of the paper: what is computed once, at the moment of contact, and then kept constant.
 
-With H the generalized inertia, J_c the held soles' Jacobians (c rows), Gamma the diagonal compliance of a
-virtual base (zero for exactly held soles) and S the selection of the n joints out of the nv velocities,
+With H the generalized inertia, J_c the fixed soles' Jacobians (c rows), Gamma the diagonal compliance of a
+virtual base (zero for exactly fixed soles) and S the selection of the n joints out of the nv velocities,
 
     P = H^-1 - H^-1 J_c' (J_c H^-1 J_c' + Gamma)^-1 J_c H^-1
 
@@ -138,7 +138,8 @@ class FrozenDynamics:
     # ------------------------------------------------------------ what rounding leaves
     @cached_property
     def pivots(self) -> Any:
-        """(c): what is left of each diagonal entry of the held frames' Delassus matrix in its factorization.
+        """(c): what is left of each diagonal entry of the constrained frames' Delassus matrix in its
+        factorization.
 
         Zero where the frame's direction is held already by those before it: a relative rounding error of
         1e-16 over this is left in all that is computed.
@@ -199,7 +200,7 @@ class FrozenDynamics:
 
     @cached_property
     def sole_positions(self) -> Any:
-        """(3, number of held soles) [m]: origins of the sole frames in the world."""
+        """(3, number of fixed soles) [m]: origins of the sole frames in the world."""
         return self._call("sole_positions")
 
     @cached_property
@@ -234,7 +235,7 @@ class FrozenDynamics:
 
 
 class _TreeQuantities:
-    """What depends on the robot's tree, each as an SX function of q, v and the normal."""
+    """Quantities that depend on the robot's tree, each as an SX function of q, v and the normal."""
 
     def __init__(self, robot: Robot, held: tuple[str, ...], soles: tuple[str, ...], frame: str) -> None:
         self.robot, self.held, self.soles, self.frame = robot, held, soles, frame
@@ -265,7 +266,7 @@ class _TreeQuantities:
 
     @cached_property
     def held_jacobian(self) -> Any:
-        """J_c (c, nv), LOCAL_WORLD_ALIGNED at the held frames."""
+        """J_c (c, nv), LOCAL_WORLD_ALIGNED at the constrained frames."""
         return ca.vertcat(ca.SX(0, self.rb.nv), *[self.rb.jacobian(frame) for frame in self.held])
 
     @cached_property

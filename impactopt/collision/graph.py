@@ -1,4 +1,4 @@
-"""From configuration and velocity at contact to a collision's outputs: the whole graph, and its gradient."""
+"""Expression graph of a collision, from configuration and velocity at contact to its outputs and gradient."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MOST_STEPS = 5000
 def joint_space_model(
     collision: SteppedModel, outputs: tuple[str, ...] = (), *, freezes: int = 0
 ) -> JointSpaceModel:
-    """What the time loop integrates for these outputs."""
+    """Model that the time loop integrates for these outputs."""
     return JointSpaceModel(
         n=collision.n_servos,
         effects=collision.effects,

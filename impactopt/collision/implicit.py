@@ -59,7 +59,7 @@ def polynomials(count: int = STAGES) -> Array:
 
 
 def tables() -> dict[str, Array | float]:
-    """What the kernel needs.
+    """Tables of constants for the kernel.
 
     POWERS (9, 9) : coefficients of the powers of theta of each p_j. AT_ONE (9) : p_j(1).
     HULL (9, 16) : Bernstein coefficients of a sum of w_j p_j are w' HULL, and zeros.

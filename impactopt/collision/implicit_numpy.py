@@ -88,7 +88,7 @@ class _Loop(ca.Callback):
 
 @dataclass
 class _Instant:
-    """What follows from a state."""
+    """Quantities that follow from a state."""
 
     u: Array
     demand: Array
@@ -166,7 +166,7 @@ class _Run:
         return _Instant(u, demand, torque == demand, net, rate, compressing, contact)
 
     def _closing(self, y: Array, depth: float, net: Array) -> bool:
-        """Whether hand and target, which neither approach nor part, are about to approach."""
+        """True if hand and target, which neither approach nor part, are about to approach."""
         slope, parts, z = np.zeros(y.size), self.parts, y[self.parts["target"]]
         slope[parts["torque"]], slope[parts["time"]] = net, 1.0
         force = slope[parts["impulse"]] = max(self.law.force(depth, 0.0, False)[0], 0.0)
@@ -205,7 +205,7 @@ class _Run:
         return speeds, demand
 
     def error_of(self, now: _Instant, s: Step, scale: float, mobility: float) -> float:
-        """What a further term would add, of what is allowed."""
+        """Size of a further term, relative to the tolerance."""
         if not s.found:
             return float("nan")
         impulse = s.terms[:, self.parts["impulse"]].ravel()
@@ -297,7 +297,7 @@ class _Run:
         return min((place for place in places if place is not None and place < end), default=None)
 
     def _separation(self, s: Step) -> float | None:
-        """Where contact ends: by a polynomial, and where the law bends then by the law itself."""
+        """End of contact: by a polynomial, and for a nonlinear law by the law itself."""
         if not self.loop.contact.law_bends:
             return first_negative(s.force @ _HULL)
         depth, depths = s.terms @ self.rows.penetration, s.at_nodes(s.terms @ self.rows.penetration)
@@ -372,7 +372,7 @@ def _matrix(gain: Array | None, n: int) -> Array:
 
 
 def _levels(w: Array, offset: Array, level: Array) -> list[Array]:
-    """What falls below zero where |a joint's series| crosses its level, of those that may."""
+    """Polynomials that fall below zero when a joint's |series| crosses its level, for those that may."""
     b = w.T @ _HULL + offset[:, None]
     within = np.abs(b[:, 0]) <= level
     out = []

@@ -1,4 +1,4 @@
-"""What every model of a collision takes and gives, from the point mass to full dynamics."""
+"""Interface of all collision models, from the point mass to full dynamics."""
 
 from __future__ import annotations
 

@@ -16,12 +16,12 @@ from impactopt.contact import ContactLaw, Target
 
 __all__ = ["JointSpaceModel", "shape_of"]
 
-_SOON = 1e-9  # [s] in which a target gains the speed that its acceleration is told by
+_SOON = 1e-9  # [s] in which a target gains the speed that shows its acceleration
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointSpaceModel:
-    """What happens between hand and target with the robot's frozen dynamics.
+    """Contact dynamics of hand and target with the robot's frozen dynamics.
 
     Its state y holds time integrals since the freeze, so that what is linear in them (momentum, work of
     constraints) is kept exactly by any Runge-Kutta or Taylor method:
@@ -58,7 +58,7 @@ class JointSpaceModel:
     # ------------------------------------------------------------ layout of state and data
     @cached_property
     def layout(self) -> dict[str, slice]:
-        """Where each part of the state lies."""
+        """Slice of each part of the state."""
         sizes = {"time": 1, "penetration": 1, "impulse": 1, "target": self.target.n_states}
         if self.peak:
             sizes["peak"] = 1
@@ -199,7 +199,7 @@ class JointSpaceModel:
         return hand - (self.target.velocity(soon, numbers) - self.target.velocity(state, numbers)) / _SOON
 
     def running(self, y: Any, data: dict[str, Any]) -> Any:
-        """Whether there is still something to integrate, 0 or 1: in contact, and before the end."""
+        """Flag, 0 or 1, that integration goes on: in contact, and before the end."""
         return ca.logic_and(self.phase(y, data)[1], self.part(y, "time") < self._end(data))
 
     def longest(self, y: Any, data: dict[str, Any], length: float) -> Any:

@@ -1,4 +1,4 @@
-"""What a collision model can give, each built only when asked for."""
+"""Outputs of a collision model, each built only on request."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Outputs:
     ----------
     model : the collision in joint space.
     segments : what each freeze has led to.
-    soles, held : number of held soles, and of all that is held, the soles first.
+    soles, held : number of fixed soles, and of all that is held, the soles first.
     v : velocity at contact (nv).
     """
 

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Collision:
-    """What happened from contact to separation. Histories have k entries, at the steps, first at contact,
-    last at separation.
+    """Result of a collision from contact to separation. Histories have k entries, at the steps, first at
+    contact, last at separation.
 
     Attributes
     ----------
@@ -38,10 +38,10 @@ class Collision:
     joint_velocity : (k, n) [rad/s].
     torque, demand : (k, n) [N m] of the servo, and what it would be without saturation. These, the joint
         velocities and all wrenches are None of a point mass, which knows nothing of them.
-    sole_wrench : (k, soles, 6) [N, N m] of the ground on each held sole, world axes, at the sole's frame;
+    sole_wrench : (k, soles, 6) [N, N m] of the ground on each fixed sole, world axes, at the sole's frame;
         in the stance's order of soles. None on a fixed base.
-    hand_wrench : (k, hands, 6) [N, N m] of the world on each held hand, world axes, at its striking point;
-        in the stance's order of hands. None where none is held.
+    hand_wrench : (k, hands, 6) [N, N m] of the world on each supporting hand, world axes, at its striking
+        point; in the stance's order of hands. None where none is held.
     ground_wrench : (k, 6) [N, N m] of the ground on the robot, world axes, about the world's origin; None
         on a fixed base.
     zmp : (k, 2) [m] x and y of the zero-moment point on the ground z = 0; None on a fixed base.
@@ -76,7 +76,8 @@ class Collision:
 
     @classmethod
     def from_outputs(cls, found: dict[str, Array], target: Target) -> Collision:
-        """From the arrays of a collision function, without instants that repeat the one before.
+        """Makes a result from the arrays of a collision function, without instants that repeat the one
+        before.
 
         What judges a result, `step_error`, is no part of it.
         """

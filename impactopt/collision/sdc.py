@@ -22,7 +22,7 @@ __all__ = ["SDC"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SDC(SymbolicModel):
-    """What robot and target do from contact to separation, with H and J frozen.
+    """Simplified dynamics computation: robot and target from contact to separation, with H and J frozen.
 
     Attributes as of `SymbolicModel`, and
 

@@ -1,4 +1,4 @@
-"""How long a step of an explicit method may be, to be stable."""
+"""Longest stable step of an explicit method."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _bound(matrices: Array) -> Array:
 
 
 class Stability:
-    """How long a model's steps may be, with what it takes to freeze it kept."""
+    """Stable step lengths of a model, with its freezing functions cached."""
 
     def __init__(self, collision: SteppedModel) -> None:
         self._collision, self._model = collision, joint_space_model(collision)
@@ -113,7 +113,7 @@ class Stability:
         return slope_function(self._model)
 
     def frozen(self, q: Array, values: dict[str, Array]) -> dict[str, Array]:
-        """What is frozen at q (nq), by name; InputError where rounding spoils it."""
+        """Frozen quantities at q (nq), by name; InputError if rounding spoils them."""
         function = self._freeze
         at_rest = np.zeros(self._collision.robot.nv)
         found = function.call([ca.DM(x) for x in (q, at_rest, values["normal"], np.zeros(2))])

@@ -1,4 +1,4 @@
-"""What a collision model is made of, and how it is stepped: all that its functions and their C depend on."""
+"""Base of the stepped collision models: all that their functions and C code depend on."""
 
 from __future__ import annotations
 

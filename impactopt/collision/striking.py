@@ -1,7 +1,7 @@
-"""How a held robot's striking point can be moved, and what torque lets it move on, compiled for many states.
+"""Striking-point mobility and coasting torques of a constrained robot, compiled for many states.
 
-`impactopt.kinematics.held` has the same for one state, by Pinocchio and least squares; the two are tested
-against each other. That takes some milliseconds a state, which for millions of them would be hours.
+`impactopt.kinematics.operational_space` has the same for one state, by Pinocchio and least squares; they
+are tested against each other. That takes some milliseconds a state, which for millions would be hours.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def striking_functions(robot: Robot, *, striker: str, stance: Stance) -> dict[st
 
 
 class _StrikingGraphs:
-    """What depends on the robot's tree in SX, dense algebra in MX, as in `FrozenDynamics`."""
+    """Quantities that depend on the robot's tree in SX, dense algebra in MX, as in `FrozenDynamics`."""
 
     def __init__(self, robot: Robot, held: tuple[str, ...], frame: str) -> None:
         self.rb, self.n, self.base = RigidBody(robot.model), robot.n, robot.nv - robot.n
@@ -69,7 +69,7 @@ class _StrikingGraphs:
         return self._mobility("least_rates", lambda q: ca.MX(ca.diag(ca.DM(self.ease))))
 
     def _mobility(self, name: str, root: Callable[[Any], Any]) -> Any:
-        """With W of a configuration, and W' W the inverse of what is least."""
+        """Function of the mobility W of a configuration, with W' W the inverse of the least quantity."""
         q, none = ca.MX.sym("q", self.nq), ca.MX.sym("none", 0)
         rows = ca.Function("rows", [self.rb.q], [ca.densify(self.rb.jacobian(self.frame)[:3, :]), self._held])
         J, J_c = rows(q)

@@ -126,7 +126,7 @@ class SymbolicModel(SteppedModel):
         return export(self, whole, parameters, by, every, self._compiled, Path(folder), name)
 
     def _collision(self, outputs: tuple[str, ...], every: int = 1) -> Any:
-        """With all settings as inputs, in C written by hand where there is a compiler."""
+        """Function with all settings as inputs, in handwritten C if there is a compiler."""
         return self._compiled(
             "collision", (*outputs, every), lambda: native_collision(self, outputs, every=every)
         )
@@ -188,8 +188,9 @@ class SymbolicModel(SteppedModel):
     def describe(
         self, outputs: tuple[str, ...] = ("impulse",), *, parameters: tuple[str, ...] = ()
     ) -> Description:
-        """What `function` contains for these outputs, with its instructions, and what was left out and why:
-        text by str(), numbers by `as_dict`."""
+        """Description of `function` for these outputs: its contents with instruction counts, and what was
+        left out and why; text by str(), numbers by `as_dict`.
+        """
         self._check_outputs(outputs, 1)
         return describe(self, tuple(outputs), parameters)
 
@@ -319,7 +320,7 @@ class SymbolicModel(SteppedModel):
         return None
 
     def _caution(self, error: float) -> str:
-        """What is said of an error of the impulse, relative, that comes from freezing."""
+        """Warning about a relative error of the impulse that freezing causes; "" if it is small."""
         return ""
 
     def _freeze_error(
@@ -331,7 +332,7 @@ class SymbolicModel(SteppedModel):
         settings: Mapping[str, Any],
         threads: int | None,
     ) -> NDArray[np.float64]:
-        """What freezing may have cost of each impulse (N) [N s], relative; nan where it is not estimated."""
+        """Estimated relative error of each impulse (N) [N s] by freezing; nan if it is not estimated."""
         if self._more_often is None:
             return np.full(len(impulse), np.nan)
         better = self._more_often.batch(q, v, torque, outputs=("impulse",), threads=threads, **settings)

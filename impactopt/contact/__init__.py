@@ -1,4 +1,4 @@
-"""What is hit and how contact works: laws (force from penetration) and targets (motion from force).
+"""Contact laws (force from penetration) and targets (motion from force).
 
 One class a file, in `laws/` and `targets/`; `factors.py` is for numbers that differ from the expected ones.
 """

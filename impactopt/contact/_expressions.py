@@ -1,4 +1,4 @@
-"""What laws and targets are written with: the same for floats, NumPy arrays and CasADi expressions."""
+"""Functions for laws and targets that work for floats, NumPy arrays and CasADi expressions alike."""
 
 from __future__ import annotations
 

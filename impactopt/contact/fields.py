@@ -1,7 +1,7 @@
-"""What the fields of a dataclass are: in words, their units, their ranges, their keys in a file.
+"""Metadata of a dataclass's fields: descriptions, units, ranges, keys in a file.
 
 It is said once, in the field's own metadata. The class checks its numbers by it, its docstring lists it, and
-the sections of problem files are made of it (`impactopt.files.problem_file.described`).
+the sections of problem files are made of it (`impactopt.files.problem_file.field_sections`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _METADATA = "about"
 
 @dataclass(frozen=True, kw_only=True)
 class About:
-    """What a field is.
+    """Description of a field.
 
     what : in words; its unit is put before the first semicolon.
     unit : such as "N m/s", "" for none.
@@ -48,18 +48,18 @@ class About:
 
     @property
     def text(self) -> str:
-        """In words, with the unit in brackets."""
+        """Description in words, with the unit in brackets."""
         words, semicolon, rest = self.what.partition(";")
         return f"{words} [{self.unit}]".lstrip() + semicolon + rest if self.unit else self.what
 
     @property
     def range(self) -> str:
-        """Of a number: "> 0 and <= 1"; "" for any."""
+        """Range of a number in words: "> 0 and <= 1"; "" for any."""
         bounds = ((">", self.above), (">=", self.least), ("<=", self.most))
         return " and ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
 
     def allows(self, number: float) -> bool:
-        """Whether a number is in the range; NaN never is."""
+        """True if a number is in the range; NaN never is."""
         return not math.isnan(number) and (
             (self.above is None or number > self.above)
             and (self.least is None or number >= self.least)

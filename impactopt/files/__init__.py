@@ -1,1 +1,1 @@
-"""What people read and write: problem files, results and their schema, replays of them."""
+"""Files that people read and write: problem files, results and their schema, replays."""

@@ -1,4 +1,4 @@
-"""Where the files are that come with the package; light, as completion in the shell waits for it.
+"""Locations of the files that come with the package; a light module, as shell completion imports it.
 
 In git they are in `problems/` beside the package; a wheel has them inside it, in `_problems`.
 """

@@ -1,4 +1,4 @@
-"""What a solve leaves on disk: `solution.npz` with all numbers, and `summary.json` for a glance.
+"""Files of a result: `solution.npz` with all arrays, and `summary.json` with the main figures.
 
 `solution.npz` stands for itself: it holds the summary and the problem file too. Every file is written beside
 its place and then moved there, so that a reader never sees half of one. When new numbers take the place of
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from impactopt.codegen.files import read_archive, write_atomically
 from impactopt.errors import InputError
 from impactopt.files.problem_file.changes import change_data
-from impactopt.files.problem_file.describing import comment_at
+from impactopt.files.problem_file.key_docs import comment_at
 from impactopt.files.problem_file.toml import read_toml, write_toml
 from impactopt.files.record_schema import check_arrays, check_summary
 from impactopt.kinematics.support import support_polygon
@@ -74,7 +74,8 @@ class Record:
         with an abort motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines),
         `collision_*` (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*`
         (`Simulation` on free soles, without velocities and torques), `solver_*` (`SolverResult`),
-        `history_*` (its iterations); `program_statement`, names of the program's variables and rows, as JSON.
+        `history_*` (its iterations); `program_statement`, names of the program's variables and constraints,
+        as JSON.
     problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 
@@ -92,17 +93,17 @@ class Record:
 
     @property
     def completed(self) -> bool:
-        """Whether the planned motion is part of the record."""
+        """True if the planned motion is part of the record."""
         return "reference_time" in self.arrays
 
     @property
     def simulated(self) -> bool:
-        """Whether a re-simulation is part of the record."""
+        """True if a re-simulation is part of the record."""
         return "simulated_time" in self.arrays
 
     @property
     def replayed(self) -> bool:
-        """Whether a replay on free soles is part of the record."""
+        """True if a replay on free soles is part of the record."""
         return "replayed_time" in self.arrays
 
 
@@ -165,14 +166,14 @@ def _settled(problem: str, solution: Solution | StrikeSolution) -> str:
 
 
 def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:
-    """That of the solution's record; where nothing else of it is kept, its arrays need not be made."""
+    """Summary of a solution's record; made without the record's arrays, if nothing else of it is kept."""
     return plain(
         solution.summary() if isinstance(solution, StrikeSolution) else _summary(solution, None, None)
     )
 
 
 def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
-    """What a record keeps of the robot and of where it stands."""
+    """Arrays of a record that describe the robot and its stance."""
     robot, c = problem.robot, problem.coordinates
     out: dict[str, Any] = {
         "joints": np.array(robot.joint_names),
@@ -202,7 +203,7 @@ def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, A
 
 
 def replay_arrays(replay: Any) -> dict[str, Any]:
-    """What a record keeps of a `Simulation` on free soles: motion and forces, by `replayed_*`."""
+    """Arrays of a record that hold a `Simulation` on free soles: motion and forces, as `replayed_*`."""
     left_out = {"v", "demand", "torque", "gear"}
     kept = {name: value for name, value in _numbers(replay).items() if name not in left_out}
     return {f"replayed_{name}": value for name, value in {**kept, "soles": list(replay.soles)}.items()}
@@ -316,7 +317,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     """
     path = Path(directory)
     path = path if path.name == NUMBERS and not os.path.isdir(path) else path / NUMBERS
-    mend = "solve again with `impactopt solve`"
+    fix = "solve again with `impactopt solve`"
     try:
         with np.load(read_archive(path, LARGEST, MOST_ARRAYS), allow_pickle=False) as file:
             version = int(file["format"])
@@ -333,12 +334,12 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     except InputError:
         raise
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(f"there is no {path}; {mend}") from error
+        raise InputError(f"there is no {path}; {fix}") from error
     except PermissionError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     # what NumPy and zipfile raise for files that are cut, overwritten or of another kind
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, NotImplementedError) as error:
-        raise InputError(f"{path} is damaged ({error}); {mend}") from error
+        raise InputError(f"{path} is damaged ({error}); {fix}") from error
     except (
         zipfile.BadZipFile,
         zlib.error,
@@ -348,6 +349,6 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         RecursionError,
         RuntimeError,
     ) as error:
-        raise InputError(f"{path} is damaged ({error}); {mend}") from error
+        raise InputError(f"{path} is damaged ({error}); {fix}") from error
     place = Path(os.path.normpath(path.parent.resolve() / near)) if near else None
     return Record(summary=summary, problem=problem, arrays=arrays, problem_path=place)

@@ -1,4 +1,4 @@
-"""What the arrays and the summary of a saved result have to be: names, shapes, kinds of numbers.
+"""Schema of a saved result's arrays and summary: names, shapes, types of numbers.
 
 What is read back from a disk may be damaged, of another version, or made by someone else. What does not keep
 to this is refused as a whole, before anything is drawn or computed from it.

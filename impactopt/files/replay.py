@@ -20,8 +20,8 @@ from impactopt.planning.gears import gear_caution
 from impactopt.planning.on_demand import with_rows
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
-from impactopt.simulation.accuracy import check_steps
 from impactopt.simulation.controller import ControllerSettings, controller_of
+from impactopt.simulation.step_error import check_steps
 from impactopt.transcription.plan import Trajectory
 
 __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "problem_of", "replay"]
@@ -29,8 +29,8 @@ __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "problem_of", "rep
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Planned:
-    """What there is to replay: a record, its problem, the reference that the servo is to follow, and the one
-    that it goes on with if it hits nothing, where the plan has one; settings of a whole-body controller.
+    """Data of a replay: a record, its problem, the servo's reference and, if the plan has one, the reference
+    that follows a missed blow; settings of a whole-body controller.
     """
 
     record: Record
@@ -55,7 +55,7 @@ class Replay:
 
 
 def has_mujoco() -> bool:
-    """Whether the engine "mujoco" can run."""
+    """True if the engine "mujoco" is installed."""
     return importlib.util.find_spec("mujoco") is not None
 
 
@@ -139,7 +139,8 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """With the rows on demand that the record's plan needed, the gains that it chose, and its style's prices.
+    """Problem with the lazy constraints that the record's plan needed, its chosen gains, and its style's
+    prices.
 
     given : the file was, and is not the record's own text.
     """

@@ -1,4 +1,4 @@
-"""Which result a directory keeps: one that is not good goes beside a good one, never in its place."""
+"""Keeps the good result of a directory: a failed one goes beside it, never in its place."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SERIES = "blows.json"
 
 
 def keep_record(record: Record, directory: Path) -> tuple[Path, Path]:
-    """As `save_record`, but one that is not solved leaves a good one in the directory as it is.
+    """Saves a record (`save_record`); one that is not solved leaves a good one in the directory as it is.
 
     It is in the directory's own directory `failed` then, and its summary says so in `set_aside`. A good one
     takes the place of all that there was, a failed one that it makes up for included.
@@ -66,7 +66,7 @@ def keep_series(done: dict[str, Any], directory: Path) -> Path:
 
 
 def set_aside(summary: Mapping[str, Any]) -> str:
-    """What to tell a user of a result that has not taken a good one's place; "" of others."""
+    """Message about a result that has not replaced a good one; "" for others."""
     found = summary.get("set_aside")
     if found is None:
         return ""
@@ -77,7 +77,7 @@ def set_aside(summary: Mapping[str, Any]) -> str:
 
 
 def _place(directory: Path, good: bool, held: bool, summary: dict[str, Any]) -> Path:
-    """Where a result goes; `held`: there is a good one. Its summary says so if that is not the directory."""
+    """Directory for a result; `held`: there is a good one. Its summary notes if that is another directory."""
     if good or not held:
         return directory
     place = directory / FAILED
@@ -86,7 +86,7 @@ def _place(directory: Path, good: bool, held: bool, summary: dict[str, Any]) -> 
 
 
 def _good(status: Any) -> bool:
-    """Whether a record's status is one of a result to keep; one of a newer version's is."""
+    """True if a record's status is that of a result to keep; a newer version's status is."""
     known = [s.value for s in Status if not s.usable]
     return isinstance(status, str) and status not in known
 

@@ -23,7 +23,7 @@ from impactopt.transcription.transcription import Transcription
 
 __all__ = ["program_of_record", "resumed", "solution_of_record"]
 
-_SAME = 1e-6  # of rows: those of a program that is not the record's are off by more
+_SAME = 1e-6  # of constraints: those of a program that is not the record's are off by more
 
 
 def resumed(record: Record, problem: ImpactProblem) -> Solution:
@@ -65,7 +65,7 @@ def _apart(told: list[dict[str, Any]]) -> dict[ApartRow, Held]:
 
 
 def _is_of(t: Transcription, record: Record) -> bool:
-    """Whether a program has the record's variables and rows, and they are met as the record says."""
+    """True if a program has the record's variables and constraints, with the violation that it reports."""
     x, rows = record.arrays["solver_x"], record.arrays["solver_multipliers"]
     if (t.program.n, t.program.m) != (len(x), len(rows)):
         return False

@@ -253,9 +253,9 @@ def _alone(fit: _Fit) -> tuple[Array, tuple[float, float]]:
     return z, touches
 
 
-# ---------------------------------------------------------------- what is told
+# ---------------------------------------------------------------- what is reported
 def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
-    """What is left of force [N], but of clipped samples, and of motion [m/s] or [m], all blows."""
+    """Residuals of force [N], without clipped samples, and of motion [m/s] or [m], all blows."""
     force, motion, begin = [], [], 0
     for blow in fit.blows:
         n = len(blow.time)
@@ -266,7 +266,7 @@ def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
 
 
 def _correlation(fit: _Fit, force: Array) -> float:
-    """Of what is left of the force at neighbouring samples."""
+    """Correlation of the force's residuals at neighbouring samples."""
     ends = np.cumsum([np.sum(~blow.clipped) for blow in fit.blows])[:-1]
     together = sum(float(r[1:] @ r[:-1]) for r in np.split(force, ends))
     return together / max(float(force @ force), 1e-300)
@@ -322,7 +322,7 @@ def _told(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
 
 
 def _standard_errors(jacobian: Array) -> Array:
-    """Of z, with residuals of deviation one; infinite for what the samples say nothing of."""
+    """Standard errors of z, for residuals of deviation one; infinite if the samples do not determine it."""
     _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
     known = s > 1e-10 * s[0]
     out = np.sqrt(np.sum((vt[known] / s[known, None]) ** 2, axis=0))

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.files import read_archive
 from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, shortened
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.robots.robot import Robot
 
 __all__ = ["FORCE", "SPEED", "TIME", "ImpactLog", "read_log"]
@@ -28,7 +28,7 @@ _BEYOND = 2 * np.pi  # [rad] outside its limits, of a joint that is no longer be
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImpactLog:
-    """What was measured of one blow or several, all along the normal of the blow.
+    """Measurements of one blow or several, all along the normal of the blow.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ def _csv(file: Path, name: str) -> dict[str, Array]:
 
 
 def _numbers(cells: list[str]) -> Array:
-    """Of a column; what is no number is NaN, which is refused in columns that are needed."""
+    """Numbers of a column; other text becomes NaN, which is refused in columns that are needed."""
     out = np.empty(len(cells))
     for k, cell in enumerate(cells):
         try:

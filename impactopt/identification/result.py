@@ -1,4 +1,4 @@
-"""What is identified: numbers with intervals, for each law."""
+"""Result of an identification: parameters with intervals, for each law."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Estimate:
 
     @property
     def determined(self) -> bool:
-        """Whether the interval is narrower than the number is large, and leaves out 0."""
+        """True if the interval is narrower than the parameter is large, and excludes 0."""
         return bool(self.high - self.low <= _WIDE * abs(self.value) and self.low * self.high > 0)
 
     def describe(self) -> dict[str, Any]:
@@ -69,7 +69,7 @@ class LawFit:
 
     @property
     def name(self) -> str:
-        """What problem files call the law, or its class."""
+        """Name of the law in problem files, or its class."""
         return self.law.word or type(self.law).__name__
 
     @property
@@ -144,7 +144,7 @@ class Identification:
         return self.fits[0]
 
     def fit(self, law: str | type[ContactLaw]) -> LawFit:
-        """Of one law, by its word in problem files or its class.
+        """Fit of one law, by its word in problem files or its class.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class Identification:
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """What not to believe, in words."""
+        """Warnings about results that are not to be trusted."""
         best, out = self.best, []
         if any(self.clipped):
             out.append(

@@ -1,4 +1,4 @@
-"""Which numbers of a law are looked for, and where the search for them begins."""
+"""Free parameters of a law, and the initial guess of their fit."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def sample_law(kind: type[ContactLaw]) -> ContactLaw:
 
 
 def free_numbers(law: ContactLaw, blow: Blow) -> tuple[Free, ...]:
-    """Those of a law that are looked for, and the mass: of a known law the numbers without a default, such as
-    an exponent has one; of a law of one's own all of them, from the values that they have.
+    """Free parameters of a law, and the mass: of a known law those without a default, which an exponent has;
+    of a custom law all of them, from the values that they have.
 
     Raises
     ------
@@ -104,14 +104,14 @@ def _with(law: ContactLaw, numbers: Mapping[str, float]) -> ContactLaw:
 
 
 def _stiffness(law: ContactLaw, blow: Blow, units: Mapping[str, str]) -> float:
-    """That has the peak force where the hand is deepest."""
+    """Stiffness that gives the peak force where the hand is deepest."""
     deepest, _ = _middle(blow)
     none = {name: 0.0 for name in units if name != "stiffness"}
     return blow.peak / float(_with(law, {**none, "stiffness": 1.0}).force(deepest, 0.0))
 
 
 def _damper(law: ContactLaw, blow: Blow, name: str, stiff: float, units: Mapping[str, str]) -> float:
-    """That adds the peak force half-way in."""
+    """Damping that adds the peak force half-way in."""
     deepest, rate = _middle(blow)
     none = dict.fromkeys(units, 0.0) | {"stiffness": stiff}
     without, one = (_with(law, {**none, name: x}).force(deepest / 2, rate) for x in (0.0, 1.0))

@@ -1,2 +1,3 @@
-"""Where a robot can be: stances, independent coordinates, inverse kinematics, splines, support polygon,
-wrench cone."""
+"""Kinematics of a robot on its stance: independent coordinates, inverse kinematics, splines, support
+polygon, wrench cone.
+"""

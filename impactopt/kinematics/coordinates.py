@@ -25,8 +25,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.kinematics.closing import Closing
-from impactopt.kinematics.fixed_order import Index, elimination_order, solve_in_order
+from impactopt.kinematics.leg_closure import Closing
+from impactopt.kinematics.symbolic_elimination import Index, elimination_order, solve_in_order
 from impactopt.robots.checks import LEG, check_arms, check_legs
 from impactopt.robots.hinges import check_held
 from impactopt.robots.rigid_body import RigidBody
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Leg:
-    """One held sole, or hand, with the last six joints of the chain from the base to it.
+    """One fixed sole, or hand, with the last six joints of the chain from the base to it.
 
     sole : None of a hand.  frame : that is held.  joints : (6,) into the robot's joints.  before : (k,) those
     between base and them.  placement : pin.SE3 of the frame in the world.
@@ -53,12 +53,12 @@ class Leg:
 
     @property
     def end(self) -> str:
-        """What rows and variables call what is held."""
+        """Name of the constrained end in constraints and variables."""
         return f"{self.name} {'grip' if self.sole is None else 'sole'}"
 
     @property
     def limb(self) -> str:
-        """What rows call what holds it."""
+        """Name of the constrained limb in constraints."""
         return f"{self.name} {'arm' if self.sole is None else 'leg'}"
 
 
@@ -67,8 +67,8 @@ class StanceCoordinates:
 
     Attributes
     ----------
-    ny, nl : number of independent coordinates, and of dependent leg joints (6 a held sole or hand).
-    soles, legs, hands : held soles; legs of soles and, after them, of hands; the legs of hands alone.
+    ny, nl : number of independent coordinates, and of dependent leg joints (6 a fixed sole or hand).
+    soles, legs, hands : fixed soles; legs of soles and, after them, of hands; the legs of hands alone.
     independent : (ny - 6 or ny,) indices of the independent joints among the robot's joints.
     undriven : indices in v of what no motor moves but the soles' wrenches: the base, and soles' hinges.
     labels : names of the independent coordinates.
@@ -148,7 +148,7 @@ class StanceCoordinates:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """What is held, by the model's frames: soles first, then hands."""
+        """Constrained frames of the model: soles first, then hands."""
         return tuple(leg.frame for leg in self.legs)
 
     # ------------------------------------------------------------------ symbolic
@@ -194,7 +194,7 @@ class StanceCoordinates:
         return rotation, point, jac[:, -LEG:], twist, acc, jac[:, :-LEG]
 
     def velocity(self, y: Any, legs: Any, rates: Any) -> Any:
-        """Pinocchio velocities v = N(y) ydot (nv, k) that keep the held soles at rest, SX.
+        """Pinocchio velocities v = N(y) ydot (nv, k) that keep the fixed soles at rest, SX.
 
         ``rates`` (ny, k): one ydot a column.
         """
@@ -219,7 +219,7 @@ class StanceCoordinates:
         return ca.horzcat(*[self.embed(base[i], rates[6:, i], parts[:, i]) for i in range(k)])
 
     def motion(self, y: Any, legs: Any, yd: Any, ydd: Any) -> tuple[Any, Any]:
-        """Pinocchio v and a (nv,) that keep the held soles at rest, SX.
+        """Pinocchio v and a (nv,) that keep the fixed soles at rest, SX.
 
         y (ny,), legs (nl,), yd, ydd (ny,): coordinates, dependent joints, rates [1/s] and second rates
         [1/s^2].
@@ -239,7 +239,9 @@ class StanceCoordinates:
         return v, self.embed(a_base, ydd[6:], ca.vertcat(*accs))
 
     def leg_determinants(self, legs: Any) -> Any:
-        """Determinant, up to its sign, of each held leg's Jacobian (a leg), SX; zero at a straight knee."""
+        """Determinant, up to its sign, of each constrained leg's Jacobian (a leg), SX; zero at a straight
+        knee.
+        """
         # what is before a leg's own joints turns its Jacobian as a whole
         nothing, anywhere = ca.SX.zeros(self.rb.nv), ca.SX(self.start)
         out = []
@@ -249,7 +251,7 @@ class StanceCoordinates:
         return ca.vertcat(*out)
 
     def sole_twists(self, y: Any, legs: Any, yd: Any, rates: Any) -> Any:
-        """Twists (6 a held sole) [m/s, rad/s], in the base's own frame, SX.
+        """Twists (6 a fixed sole) [m/s, rad/s], in the base's own frame, SX.
 
         They are for leg rates (nl,) that need not be right.
         """
@@ -269,7 +271,9 @@ class StanceCoordinates:
         return q, self.embed(v, yd[6:], still), self.embed(a, ydd[6:], still)
 
     def closure(self, y: Any, legs: Any) -> Any:
-        """Pose error of the held soles (6 a sole), SX: position [m], rotation vector [rad] to first order."""
+        """Pose error of the fixed soles (6 a sole), SX: position [m], rotation vector [rad] to first
+        order.
+        """
         q = self.configuration(y, legs)
         out = []
         for leg in self.legs:
@@ -309,7 +313,7 @@ class StanceCoordinates:
     # ------------------------------------------------------------------ numeric
     @cached_property
     def closing(self) -> Closing:
-        """What closes the legs, in numbers."""
+        """Numerical solver of the legs' closure."""
         return Closing(self)
 
     def split(self, q_pin: Array) -> tuple[Array, Array]:
@@ -325,14 +329,14 @@ class StanceCoordinates:
         return self.rb.to_pin(np.concatenate([y[: self.base], joints]))
 
     def solve_legs(self, y: Array, guess: Array) -> Array:
-        """Leg joints (nl,) that put every held sole in its place; Newton from ``guess``.
+        """Leg joints (nl,) that put every fixed sole in its place; Newton from ``guess``.
 
         Raises InputError if a sole cannot be reached.
         """
         return self.closing.legs(y, guess)
 
     def sole_jacobians(self, q: Array) -> tuple[Array, list[Any]]:
-        """Jacobians of the held soles, stacked (6 a sole, nv), and their placements, at a pin configuration.
+        """Jacobians of the fixed soles, stacked (6 a sole, nv), and their placements, at a pin configuration.
 
         The Jacobians are in each sole's own frame, the placements in the world.
         """

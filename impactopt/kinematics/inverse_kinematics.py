@@ -1,4 +1,4 @@
-"""Inverse kinematics on held soles: a posture whose striking point is where it should be."""
+"""Inverse kinematics on fixed soles: a posture whose striking point is where it should be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion on held soles, in stages: numbers that functions are written with and differentiated by.
+"""Motion on fixed soles, in stages: numbers that functions are written with and differentiated by.
 
 A leg's rates and accelerations depend on its angles and the base's motion alone, the base's motion on its own
 coordinates. An expression in all coordinates at once hides that from whoever differentiates it.
@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.fixed_order import Index, solve_in_order
+from impactopt.kinematics.symbolic_elimination import Index, solve_in_order
 
 __all__ = ["Stage", "motion_in_stages", "velocity_in_stages"]
 

@@ -1,6 +1,6 @@
-"""What holds the robot during an impact: its soles, exactly or by the paper's virtual base, or a fixed base.
+"""Stance of the robot in an impact: soles, fixed exactly or by the paper's virtual base, or a fixed base.
 
-The virtual base (paper, eqs. 1-4) adds a mass M_g and an inertia I_g E to each held sole. That equals
+The virtual base (paper, eqs. 1-4) adds a mass M_g and an inertia I_g E to each fixed sole. That equals
 holding the sole by a constraint with the compliance 1/M_g, 1/I_g on the diagonal of its inverse inertia J
 H^-1 J^T, without the rounding errors of huge masses in H; M_g to infinity is the exact constraint.
 """
@@ -20,7 +20,7 @@ __all__ = ["BothSoles", "FixedBase", "Free", "OneSole", "Stance", "usual_stance"
 
 
 class Stance(ABC):
-    """What holds the robot."""
+    """Base class of stances: frames of the robot that are fixed to the world."""
 
     @abstractmethod
     def soles(self, robot: Robot) -> tuple[Sole, ...]:
@@ -48,8 +48,8 @@ class Stance(ABC):
 
     @property
     def compliance(self) -> NDArray[np.float64]:
-        """(6,) of each held frame, LOCAL_WORLD_ALIGNED: acceleration it yields by per force [1/kg; 1/(kg
-        m2)]."""
+        """(6,) of each constrained frame, LOCAL_WORLD_ALIGNED: acceleration it yields by per force [1/kg;
+        1/(kg m2)]."""
         return np.zeros(6)
 
 
@@ -59,7 +59,7 @@ class _OnSoles(Stance):
 
     Attributes
     ----------
-    base_mass, base_inertia : M_g [kg] and I_g [kg m2] added to each held sole and hand (paper, eqs. 1, 2);
+    base_mass, base_inertia : M_g [kg] and I_g [kg m2] added to each fixed sole and hand (paper, eqs. 1, 2);
         None: exact.
     hands : names of strikers with which the robot holds on to the world, in all six directions (paper,
         section II-A).

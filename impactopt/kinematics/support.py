@@ -15,7 +15,7 @@ MERGED = 1e-6  # [m] a corner nearer than this to the line of its neighbours is 
 
 
 def support_polygon(robot: Any, coordinates: Any) -> Array:
-    """Convex hull (k, 2) [m] of the held soles' corners on the ground, counter-clockwise, world x and y.
+    """Convex hull (k, 2) [m] of the fixed soles' corners on the ground, counter-clockwise, world x and y.
 
     (0, 2) without soles.
     """

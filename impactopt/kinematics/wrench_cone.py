@@ -45,7 +45,7 @@ def shrink(polygon: ArrayLike, margin: float) -> Array:
 
 
 def _clip(corners: Array, inside: Array) -> Array:
-    """What is left of a convex polygon where its corners' signed distances ``inside`` [m] are negative."""
+    """Part of a convex polygon where the signed distances ``inside`` [m] of its corners are positive."""
     out: list[Array] = []
     for k in range(len(corners)):
         a, b = inside[k - 1], inside[k]

@@ -1,4 +1,4 @@
-"""Where everything is at an instant of a motion: between the instants of its track."""
+"""State of a motion at an instant, interpolated between the instants of its track."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Moment:
 
 
 def moment_of(track: Track, time: float) -> Moment:
-    """At a time [s], held to the track's ends; right of a jump."""
+    """State at a time [s], clipped to the track's ends; right of a jump."""
     at = float(np.clip(time, track.time[0], track.time[-1]))
     after = min(int(np.searchsorted(track.time, at, side="right")), len(track.time) - 1)
     before = max(after - 1, 0)

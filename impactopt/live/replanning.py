@@ -1,4 +1,4 @@
-"""From a wish to a plan: bent from the first plan, or solved from the last one."""
+"""Re-plans for a request: by a parametric step from the first plan, or by a solve from the last one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.live.wishes import Wish
+from impactopt.live.requests import PlanRequest
 from impactopt.planning.changes import moved_problem
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
@@ -24,17 +24,17 @@ __all__ = ["Answer", "Replanning"]
 PATIENCE = 20.0  # [s] that each of the two ways may take
 _STEPS = 3e-3, 1e-2  # [s] least and most between instants of the motion that is drawn
 _IN_CONTACT = 6  # instants, if the least step allows it
-_WORST = 5  # rows that are told
+_WORST = 5  # constraints that are reported
 # of the solver: the impulse is within a thousandth, in half of the iterations
 _LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-3}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Answer:
-    """What came of a wish.
+    """Answer to a request.
 
     solution, track, margins : the plan, its motion, its `Plan.margins`; None where there is none.  seconds :
-    it took.  why : there is none, with the worst rows.
+    it took.  why : there is none, with the worst constraints.
     """
 
     solution: Solution | None = None
@@ -45,10 +45,10 @@ class Answer:
 
 
 class Replanning:
-    """Plans for wishes, from a first plan.
+    """Plans for requests, from a first plan.
 
     The first plan is bent (`Solution.moved`): one setting of the sliders then gives one plan, whatever came
-    before. Where that fails, the wish is solved from the last plan that there was, which may be nearer.
+    before. Where that fails, the request is solved from the last plan that there was, which may be nearer.
     """
 
     def __init__(self, first: Solution, *, patience: float = PATIENCE) -> None:
@@ -59,10 +59,10 @@ class Replanning:
         ):  # what that needs is made now, and not when the first slider moves
             first.moved(point=first.problem.point, options=_LOOSE)
 
-    def __call__(self, wish: Wish, stale: Callable[[], bool]) -> Answer:
+    def __call__(self, request: PlanRequest, stale: Callable[[], bool]) -> Answer:
         began = time.perf_counter()
         try:
-            solution = self._plan(wish.changes(self.first.problem), stale)
+            solution = self._plan(request.changes(self.first.problem), stale)
             if not solution.status.usable:
                 return Answer(seconds=time.perf_counter() - began, why=why_not(solution))
             reference = _reference(solution.plan)
@@ -85,7 +85,7 @@ class Replanning:
         common: dict[str, Any] = {"callback": stop, "time_limit": self.patience, "options": _LOOSE}
         try:
             bent = self.first.moved(**changes, **common)
-        except InputError:  # its program has other rows, or there is no such problem
+        except InputError:  # its program has other constraints, or there is no such problem
             bent = None
         if bent is not None and (bent.status.usable or stale()):
             return bent
@@ -94,13 +94,13 @@ class Replanning:
 
 
 def _reference(plan: Plan) -> Trajectory:
-    """As coarse as a picture may be: it costs as much as some iterations."""
+    """Reference of a plan, coarse enough for a picture: computing it costs as much as some iterations."""
     duration = plan.compression + plan.restitution
     return plan.trajectory(step=float(np.clip(duration / _IN_CONTACT, *_STEPS)), hold=0.2)
 
 
 def why_not(solution: Solution) -> str:
-    """Why a solution is no plan, and its worst rows."""
+    """Reason why a solution is no plan, and its worst constraints."""
     rows = [f"- {row}" for row in solution.violations[:_WORST]]
     time_limit = solution.status is Status.TIME_LIMIT
     told = "no plan was found in time" if time_limit else solution.result.message

@@ -1,1 +1,1 @@
-"""From a problem to a `Solution`: starts, rounds that refine, strikes, series of blows, the baseline."""
+"""Solves an impact problem: initial guesses, mesh refinement, strikes, series of blows, and a baseline."""

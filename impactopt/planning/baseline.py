@@ -1,5 +1,5 @@
-"""What people do without an optimizer: a minimum-jerk reach to the target, as hard as the same limits let it
-be.
+"""Minimum-jerk reach to the target: a baseline without optimization, at the highest speed that the limits
+allow.
 
 From rest to a posture at the hit point (by inverse kinematics) with the striking point moving along the
 normal, and back, each on the minimum-jerk polynomial (Flash and Hogan 1985) in the independent coordinates;
@@ -126,7 +126,7 @@ def _profile(
 
 
 def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) -> bool:
-    """Whether the reach keeps the limits, with no contact, at ``nodes`` instants of each way."""
+    """True if the reach without contact keeps the limits at ``nodes`` instants of each of its two motions."""
     c, r = problem.coordinates, problem.robot
     lower, upper = inside(r, problem.term(PositionLimit).margin)
     legs0 = c.split(problem.start_posture)[1]
@@ -148,7 +148,7 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
 
 
 def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> bool:
-    """Whether some sole wrenches in their cones balance the motion with torques inside the limits (a linear
+    """True if sole wrenches inside their cones balance the motion with torques inside the limits (a linear
     program).
     """
     c, r = problem.coordinates, problem.robot

@@ -1,4 +1,6 @@
-"""Plans bent for other numbers of their problem: first by the KKT system of the plan, then by the solver."""
+"""Plans bent for other parameters of their problem: first by the KKT system of the plan, then by the
+solver.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +29,11 @@ from impactopt.transcription.transcription import Transcription
 __all__ = ["moved_solution"]
 
 Array = NDArray[np.float64]
-_FIRST_ORDER = 1e-3  # of rows: a first-order plan that is off by more is none
-_ENOUGH, _CORRECTIONS = 1e-4, 4  # of rows: no more steps; and so many at most beside the first
+_FIRST_ORDER = 1e-3  # of constraints: a first-order plan that is off by more is none
+_ENOUGH, _CORRECTIONS = 1e-4, 4  # of constraints: no more steps; and so many at most beside the first
 _BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near
 # First barriers, and most iterations, from the plan itself. With the smaller one the solver keeps to bounds
-# that hold no more, and takes a third longer. In one of 50 shifts either of them leads nowhere.
+# that hold no more, and takes a third longer. In one of 50 shifts either of them fails.
 _FROM_PLAN = ((1e-3, 150), (1e-5, None))
 
 
@@ -45,7 +47,7 @@ def moved_solution(
     callback: Callback | None = None,
     **changes: Any,
 ) -> Solution:
-    """The plan for a problem with other numbers: `Solution.moved`.
+    """The plan for a problem with other parameters: `Solution.moved`.
 
     changes : as of `impactopt.planning.changes.moved_problem`.
     """
@@ -62,28 +64,29 @@ def moved_solution(
     margins = Margins(problem) if problem.keeps_apart else None
     refining = Refining(budget, margins, solution.apart, None, mesh=refine)
 
-    def mended(t: Transcription, result: SolverResult, x0: Array) -> tuple[Transcription, SolverResult]:
+    def fixed(t: Transcription, result: SolverResult, x0: Array) -> tuple[Transcription, SolverResult]:
         return refining.judged(*refining.rounds(t, result, x0)[:2])
 
     old = solution.result
     result = _polished(budget, t, first, old)
-    t, result = mended(t, result, old.x)
+    t, result = fixed(t, result, old.x)
 
-    # new rows are farther off than what a tolerance for small moves makes up for
+    # new constraints are farther off than what a tolerance for small moves makes up for
     given = {name: value for name, value in (options or {}).items() if not name.endswith("_tolerance")}
     exact = replace(budget, options=given)
 
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         x0 = start.x if isinstance(start, SolverResult) else start
-        return mended(other, exact.run(other.program, start), x0)
+        return fixed(other, exact.run(other.program, start), x0)
 
     t, result = kept_on_demand(t, result, (t, old), solve, lambda *_: ())
     return _solution(solution, t, result, (built - began, time.perf_counter() - built))
 
 
 def _polished(budget: Budget, t: Transcription, first: SolverResult, old: SolverResult) -> SolverResult:
-    """From the first-order plan where that is near its rows. Else, or where that leads nowhere, from the plan
-    itself, which is a better start then.
+    """Solution of the changed program, started from the first-order step if that nearly satisfies the
+    constraints. Otherwise, or if the solver fails from there, it starts from the old solution, which is the
+    better guess then.
     """
     result = budget.near_by().run(t.program, first, _BARRIER) if first.status.usable else None
     for barrier, most in _FROM_PLAN:
@@ -96,18 +99,19 @@ def _polished(budget: Budget, t: Transcription, first: SolverResult, old: Solver
 
 
 def _first_order(solution: Solution, t: Transcription, bent: Bent) -> SolverResult:
-    """By QPs; where those are not solved, by steps with the active set of the solution."""
+    """First-order plan by QPs; if those are not solved, by steps with the active set of the solution."""
     began = time.perf_counter()
     found = bent.predictor.predict(t.program)
     if found is None:
         return _by_active_set(solution, t, bent)
-    words = f"By {found.steps} QPs of first order: rows are off by {found.violation:.1g} at most."
+    words = f"By {found.steps} QPs of first order: constraints are off by {found.violation:.1g} at most."
     return _result(solution, t, found, words, began)
 
 
 def _by_active_set(solution: Solution, t: Transcription, bent: Bent) -> SolverResult:
     """Newton steps on the changed program's KKT conditions with the solution's own matrix and active set,
-    clipped to bounds: the first is the plan of first order, more of them while rows are off and they help.
+    clipped to bounds: the first is the plan of first order, more of them while constraints are off and they
+    help.
 
     What the solver had left at the solution is not made up for.
     """
@@ -129,7 +133,7 @@ def _by_active_set(solution: Solution, t: Transcription, bent: Bent) -> SolverRe
     unequal, moves = program.g_lower < program.g_upper, program.x_lower < program.x_upper
     gone_y, gone_z = unequal & (system.rows * best.y < 0), moves & (system.bounds * best.z < 0)
     turned = int(gone_y.sum() + gone_z.sum())
-    words = f"By {steps} steps of first order: rows are off by {worst:.1g} at most"
+    words = f"By {steps} steps of first order: constraints are off by {worst:.1g} at most"
     words += f"; {turned} of those that held should not any more." if turned else "."
     y, z = np.where(gone_y, 0.0, best.y), np.where(gone_z, 0.0, best.z)
     return _result(solution, t, Prediction(x=best.x, y=y, z=z, violation=worst, steps=steps), words, began)

@@ -1,4 +1,4 @@
-"""A solution's program with other numbers, and its KKT system: what bent plans and sensitivities need."""
+"""A solution's program with other parameters, and its KKT system: what bent plans and sensitivities need."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Bent:
         *,
         anew: bool = True,
     ) -> Transcription:
-        """The solution's program with the numbers of another problem: the same variables and rows.
+        """The solution's program with the numbers of another problem: the same variables and constraints.
 
         Where point, contact law and target alone are others it is good until the next one is asked for.
         anew : as of `ContactProgram.move_to`.
@@ -73,7 +73,7 @@ class Bent:
                 raise InputError("the world has other bodies then: use solve(problem, start=solution)")
             t = t.with_apart(s.apart)
         if (t.program.n, t.program.m) != (len(s.result.x), len(s.result.multipliers)):
-            raise InputError("the program has other rows then: use solve(problem, start=solution)")
+            raise InputError("the program has other constraints then: use solve(problem, start=solution)")
         return t
 
     @cached_property
@@ -98,7 +98,7 @@ class Bent:
 
 
 def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
-    """Whether programs of the two differ in bounds, constants and parameters only."""
+    """True if the programs of the two problems differ in bounds, constants and parameters only."""
     changing = {"point", "law", "target", "name"}
     pairs = [
         (getattr(problem, f.name), getattr(other, f.name)) for f in fields(problem) if f.name not in changing

@@ -38,11 +38,11 @@ __all__ = ["MET", "USUAL", "Bound", "Cause", "bounds_of", "changed_or_none"]
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Chosen = Callable[[Row], bool]
-MET = 1e-5  # violation of rows that counts as none here
+MET = 1e-5  # violation of constraints that counts as none here
 USUAL = 1.0  # [s] of a motion
 _NO = np.zeros(0, dtype=np.intp)
 _TIMES = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}
-_ROOM = 0.02  # by how much more a value is told than what it takes: there the feasible set is one point
+_ROOM = 0.02  # by how much more a value is reported than what it takes: there the feasible set is one point
 _FAR = 0.1  # [m] between bodies that count as much as a bound's own size
 _PROBES = 6  # of a term's number, at most
 _OF_TERM: dict[str, type[Term]] = {
@@ -75,7 +75,7 @@ class Cause:
 class Bound:
     """Bounds of a program that come from one number of its problem.
 
-    chosen : which rows; variables : and whose bounds.  unit : as of a `Relaxation`.
+    chosen : which constraints; variables : and whose bounds.  unit : as of a `Relaxation`.
     told : for variables (n,) that meet all else, the causes that they show.
     """
 
@@ -87,7 +87,7 @@ class Bound:
     is_time: bool = False
 
     def relaxation(self, t: Transcription) -> Relaxation:
-        """Of a program with the same variables."""
+        """Relaxation of this bound in any program with the same variables."""
         rows = _NO if self.chosen is None else _rows(t, self.chosen)
         return Relaxation(rows, self.variables, self.unit)
 
@@ -98,7 +98,7 @@ def bounds_of(t: Transcription) -> list[Bound]:
 
 
 def _durations(t: Transcription) -> Iterator[Bound]:
-    """Of swing, follow-through and the phases of contact."""
+    """Bounds on the durations of swing, follow-through and the phases of contact."""
     p = t.problem
     found: dict[str, list[int]] = {}
     for name, group in t.layout.groups.items():
@@ -292,7 +292,7 @@ def _off(t: Transcription, x: Array, chosen: Chosen, *, torques: bool = False) -
 
 
 def _rows(t: Transcription, chosen: Chosen) -> Index:
-    """Numbers of the rows that are chosen, of those that are bounds."""
+    """Numbers of the constraints that are chosen, of those that are bounds."""
     found = np.array([i for i, row in enumerate(t.program.origins) if chosen(row)], dtype=np.intp)
     return found[t.program.g_lower[found] < t.program.g_upper[found]]
 
@@ -312,14 +312,14 @@ def _with(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
 
 
 def changed_or_none(problem: ImpactProblem, **new: object) -> ImpactProblem | None:
-    """A problem with other numbers; None if it may not have them."""
+    """A problem with other parameters; None if it may not have them."""
     with contextlib.suppress(InputError):
         return changed(problem, **new)
     return None
 
 
 def _outward(value: float, bound: float) -> float:
-    """With some room, in three digits, away from the bound."""
+    """Value with some room, in three digits, away from the bound."""
     up = value > bound
     value += _ROOM * (value - bound) + (1 if up else -1) * 1e-3 * abs(value)
     size = 10.0 ** (np.floor(np.log10(max(abs(value), 1e-12))) - 2)

@@ -40,17 +40,17 @@ _TRIED = 5  # bounds that are tried alone
 _FACTORS = tuple(10.0 ** (sign * k / 2) for k in (1, 2, 3, 4) for sign in (1, -1))  # of stiffness
 _STIFF = 50  # iterations of each: where there is a solution, most are there in half of them
 _BARRIER, _PUSH = 1e-2, 1e-3  # of a program that is nearly met
-_ROUGH = 1e-4  # its tolerance: three digits are told
+_ROUGH = 1e-4  # its tolerance: three digits are reported
 _TRIES = 4  # of a value
 _NONE = 1e-4  # what a relaxation comes to that is none
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Search:
-    """What came of it.
+    """Result of a search for the bounds that make a problem infeasible.
 
     causes : bounds any one of which would do, the one that moves least first.  met : a program of
-    the problem with rows of all terms on demand, and variables (n,) that meet it; None if none are known.
+    the problem with constraints of all lazy terms, and variables (n,) that meet it; None if none are known.
     """
 
     causes: tuple[Cause, ...] = ()
@@ -58,7 +58,7 @@ class Search:
 
 
 def search(t: Transcription, result: SolverResult, budget: Budget) -> Search:
-    """Why a program has no solution, in about as many iterations as it took to find none.
+    """Searches for the cause of a program's infeasibility, in about as many iterations as its solve took.
 
     result : of the program, where its violation is least.
     """
@@ -76,7 +76,7 @@ class _Relaxing:
     def __init__(self, t: Transcription, result: SolverResult, budget: Budget) -> None:
         self.given, self._budget = t.problem, budget
         self._iterations = max(_LEAST, result.iterations)
-        # a bound that has moved would else break what has no rows yet
+        # a bound that has moved would else break what has no constraints yet
         p = with_rows(t.problem, [snake_case(type(term).__name__) for term in t.problem.on_demand])
         self.t = program_for(t, p, None)
         nothing = np.zeros(t.program.m), np.zeros(t.layout.n)
@@ -117,7 +117,9 @@ class _Relaxing:
         return Search(causes=tuple(causes))
 
     def _common(self) -> tuple[Array, Array] | None:
-        """As `_solved`, of all bounds together."""
+        """A point that meets the program with all bounds relaxed at once, if a start leads to one (see
+        `_solved`).
+        """
         for start in self.starts:
             found = self._solved(self.bounds, start, _ITERATIONS)
             if found is not None:

@@ -1,4 +1,4 @@
-"""A problem with other numbers: those that a plan can be bent for."""
+"""A problem with other parameters: those that a plan can be bent for."""
 
 from __future__ import annotations
 

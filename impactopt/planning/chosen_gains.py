@@ -29,7 +29,7 @@ _AT_BOUND = 1e-3  # of a factor's logarithm
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenGains:
-    """What a plan has chosen of a `GainFactor`.
+    """Servo gains that a plan has chosen for a `GainFactor`.
 
     joints : their names.  factor : on their stiffness; its root is that on their damping.  between : (least,
     largest) that it might be.  stiffness [N m/rad], damping [N m s/rad] : by joint, as chosen.
@@ -43,7 +43,7 @@ class ChosenGains:
 
     @classmethod
     def told(cls, summary: Mapping[str, Any]) -> ChosenGains:
-        """From what its `summary` says."""
+        """Reads the gains back from their `summary`."""
         least, largest = summary["between"]
         return cls(
             joints=tuple(summary["joints"]),
@@ -55,11 +55,11 @@ class ChosenGains:
 
     @property
     def at_bound(self) -> bool:
-        """Whether it might go on if it were let."""
+        """True if the factor is at one of its bounds, so that another bound would change it."""
         return bool(np.abs(np.log(np.array(self.between) / self.factor)).min() < _AT_BOUND)
 
     def summary(self) -> dict[str, Any]:
-        """As in ``summary.json``."""
+        """JSON form, as it stands in ``summary.json``."""
         return {
             "joints": list(self.joints),
             "factor": self.factor,

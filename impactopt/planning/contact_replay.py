@@ -32,12 +32,12 @@ AGREED, REFUTED = 1.0, 5.0  # [%] of the impulse: a plan that is off by more is 
 _STEP, _STEPS = 2e-4, 60  # [s] at most; of the planned contact, at least
 _LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that comes back, or goes on, is seen
 _SAMPLED = 1e-3  # [s] of a coasting reference
-_WORTH = 1e-3  # of the planned contact's duration: a gap that is told
+_REPORTED_GAP = 1e-3  # of the planned contact's duration: a gap that is reported
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
-    """How far a model of the collision is from full dynamics, at a plan's state at contact.
+    """Error of a collision model against full dynamics, at a plan's state at contact.
 
     impulse_pct : [%], positive where it promises too much.  zmp_mm : largest distance; None where one of them
     has no ZMP.
@@ -59,8 +59,8 @@ class ContactReplay:
     the target, by name and unit.  contact [s] : from the first touch to the end of the last.  events [s] :
     since contact, when the target has switched, such as a board that breaks.  partings : how often striker
     and target part and meet again.
-    guards : names of the target's events, in their order.  known [%] : what of `impulse_pct` is told as the
-    error of the model of the collision.
+    guards : names of the target's events, in their order.  known [%] : what of `impulse_pct` is reported as
+    the error of the model of the collision.
     """
 
     planned: float
@@ -86,7 +86,7 @@ class ContactReplay:
         return abs(self.impulse_pct - self.known)
 
     def __str__(self) -> str:
-        """What a plan leaves out."""
+        """Message: how the replayed contact differs from the planned one."""
         off = f"its impulse is {self.impulse:.4g} N s, {self.planned:.4g} N s as planned"
         if self.partings:
             times = "once" if self.partings == 1 else f"{self.partings} times"
@@ -156,7 +156,7 @@ def _told(
         outcome=found.outcome,
         contact=found.touches[-1][1] - found.touches[0][0] if found.touches else 0.0,
         events=found.events,
-        partings=sum(gap > _WORTH * duration for gap in gaps),
+        partings=sum(gap > _REPORTED_GAP * duration for gap in gaps),
         guards=problem.target.guards,
         known=known,
     )

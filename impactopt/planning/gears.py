@@ -1,4 +1,4 @@
-"""What the gears of a plan bear beyond what they may, in words."""
+"""Warnings about gear loads of a plan that exceed the gears' peak torque."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.transcription.mesh_refinement import GEAR
 
 __all__ = ["gear_caution", "gears_beyond"]
@@ -33,7 +33,7 @@ def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: floa
 
 
 def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> dict[str, str]:
-    """What is to be said of gears that bear too much: of a plan that lets them, and of replays of others."""
+    """Warning about overloaded gears, for a plan that permits them or for replays; {} if there are none."""
     loads = [one for one in found if one is not None]
     if problem.gear_load.active:
         text = gears_beyond(problem, loads, more=REPLAYED)

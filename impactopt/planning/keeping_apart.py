@@ -2,7 +2,7 @@
 
 A program begins with those of bodies that are near at its start. Others enter at the iterate at which their
 bodies come near, before these can touch: the solver leaves the program there, gets the one with them, and
-goes on at its barrier. No step goes so far that bodies without a constraint are in each other at its end, or
+goes on at its barrier. No step goes so far that bodies without a constraint penetrate at its end, or
 on another side of each other. So a solution's bodies are on the side of each other that they began on.
 """
 
@@ -35,28 +35,24 @@ NEAR, ENTERS = 0.1, 0.03
 # the same of links with few joints between: they are always near, and can hardly meet
 BETWEEN, NEAR_BETWEEN, ENTERS_BETWEEN = 4, 0.03, 0.015
 OF_START = 0.25  # of how far two bodies are apart at the start: a margin is no more
-SLIP = (
-    2e-3  # [m] that two may come nearer where they are in each other at the start, as distances are rounded
-)
+SLIP = 2e-3  # [m] that two may come nearer where they penetrate at the start, as distances are rounded
 ROUNDED = 2 * np.log(2) * ROUNDING  # [m] by which the rounded distance of two edges is less than theirs
 LEAST = 0.01  # [m] a step brings bodies without a constraint no nearer, nor
 OF_GAP = 0.5  # by more than this part of their distance
-THROUGH = (
-    5e-3  # [m] in each other on the way, bodies that are apart before and after a step are on other sides
-)
+THROUGH = 5e-3  # [m] penetration on the way: bodies that are apart before and after a step are on other sides
 _HALVED = 8  # times at most that a step is
 _TIMES = 25  # that constraints enter in one solve, at most
 
 
 def same_bodies(one: ImpactProblem, other: ImpactProblem) -> bool:
-    """Whether constraints between bodies mean the same in two problems."""
+    """True if clearance constraints mean the same in two problems."""
     if not (one.keeps_apart and other.keeps_apart) or one.robot is not other.robot:
         return False
     return [body.name for body in one.bodies.world] == [body.name for body in other.bodies.world]
 
 
 class Margins:
-    """How far each pair of a problem's bodies is to be apart [m].
+    """Required clearance [m] of each pair of a problem's bodies.
 
     Attributes
     ----------
@@ -93,7 +89,9 @@ class Margins:
         return self.own if pair[1] >= 0 else self.world
 
     def of(self, pair: Pair) -> float:
-        """Of a pair's hulls: the term's, or less where they are near at the start already."""
+        """Required clearance [m] of a pair's hulls: the term's, or less if they are nearer at the start
+        already.
+        """
         if pair not in self._least:
             start = self.bodies.exact(self._start, 0, pair)
             self._least[pair] = min(self.term(pair).margin, max(OF_START * start, 0.0))
@@ -119,7 +117,7 @@ def spots_of(t: ContactProgram, x: Array) -> Spots:
 
 
 class Watch:
-    """Which bodies of a program come near while it is solved, and how far a step may go.
+    """Watches clearances while a program is solved and limits the solver's step where bodies come near.
 
     Attributes
     ----------
@@ -186,7 +184,8 @@ class Watch:
             there = x + length * step
             ways = self._ways.copy()
             found = self._shapes_at(self._placed(there), ways)
-            if not self._too_near(here[1], found[1]) and not self._passes(x, step, length, here, found):
+            clear = not self._violates_clearance(here[1], found[1])
+            if clear and not self._passes(x, step, length, here, found):
                 self._next = there, ways, found
                 break
             length *= 0.5
@@ -212,21 +211,23 @@ class Watch:
     def _shapes_at(self, at: Placed, ways: Array, within: float = ENTERS) -> tuple[Placed, Looked]:
         return at, self._shapes.look(at, within, ways, self._margins.wanted)
 
-    # ------------------------------------------------------------------ what is too near
+    # ------------------------------------------------------------------ clearance violations
     def _bare(self, found: Looked, within: Array | float) -> NDArray[np.bool_]:
-        """Which of those that are near are nearer than this [m], or than (P,), and have no constraint."""
+        """Mask of the pairs found that are nearer than ``within`` [m], a number or (P,), and have no
+        constraint.
+        """
         least = np.broadcast_to(within, len(self._shapes))[found.pair]
         return np.asarray(~self._has[found.spot, found.pair] & (found.gap < least))
 
-    def _too_near(self, before: Looked, found: Looked) -> bool:
-        """Whether a step's end has bodies without a constraint too near."""
+    def _violates_clearance(self, before: Looked, found: Looked) -> bool:
+        """True if a step has brought bodies without a constraint too close to each other."""
         fell = found.gap < OF_GAP * before.gaps[found.spot, found.pair]
         return bool((fell & self._bare(found, LEAST)).any())
 
     def _passes(
         self, x: Array, step: Array, length: float, one: tuple[Placed, Looked], two: tuple[Placed, Looked]
     ) -> bool:
-        """Whether bodies are apart before and after a step, but in each other half way."""
+        """True if bodies are clear before and after a step, but penetrate each other half way."""
         spot, pair = self._shapes.may_meet(one, two, self._margins.wanted)
         if not len(spot):
             return False
@@ -279,7 +280,9 @@ def _with_more(t: Program, watch: Watch, start: Array | SolverResult) -> tuple[P
 
 
 def _of_names(numbers: Array, old: ContactProgram, new: ContactProgram, other: float) -> Array:
-    """A program's rows' numbers (m,) for one with more constraints between bodies, whose are ``other``."""
+    """A program's constraints' numbers (m,) for one with more constraints between bodies, whose are
+    ``other``.
+    """
     own = len(numbers) - len(old.apart_rows)
     known = dict(zip(old.apart_rows, numbers[own:].tolist(), strict=True))
     return np.append(numbers[:own], [known.get(name, other) for name in new.apart_rows])

@@ -1,4 +1,4 @@
-"""From a solution to its program, and from a program's result to what a solution says of it."""
+"""Reconstructs a solution's program, and assembles a `Solution`'s data from a solver's result."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def program_on(
     shares: Shares,
     report: Callable[[str], None] | None = None,
 ) -> Transcription:
-    """A problem's program on a mesh that is known, without rows between bodies."""
+    """A problem's program on a mesh that is known, without clearance constraints."""
     functions = block_functions(problem, problem.coordinates, report, elements)
     return Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
 
 
 def program_of(solution: Solution) -> Transcription:
-    """The program of a solution, without rows between bodies."""
+    """The program of a solution, without clearance constraints."""
     s = solution
     return program_on(s.problem, s.nodes, s.elements, s.shares)
 

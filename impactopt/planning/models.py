@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque
+from impactopt.kinematics.operational_space import holding_torque
 from impactopt.planning.chosen_gains import with_factors_of
 from impactopt.planning.contact_replay import ModelError, PlannedContact
 from impactopt.planning.multistart import carried
@@ -44,7 +44,7 @@ _SHARE, _GUESSED = 0.5, 1.0
 
 
 def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = None) -> ModelError | None:
-    """How far the model of a program's collision is from full dynamics, for solver variables (n,).
+    """Error of a program's collision model against full dynamics, for solver variables (n,).
 
     problem : whose model it is, if not the program's problem's.
     None where nothing is frozen; for an impact with a given restitution; and where a contact has no end.
@@ -67,7 +67,7 @@ def planned_contact(
 
 
 def _error(problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: float) -> ModelError | None:
-    """Of a blow of about this duration [s]."""
+    """Model error for a collision of about this duration [s]."""
     names = ("robot", "striker", "normal", "law", "target", "stance")
     scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
     scene["horizon"] = max(_HORIZON, 4 * duration)
@@ -87,8 +87,8 @@ def _error(problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: 
 def carried_start(
     t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, rows: Any
 ) -> SolverResult:
-    """What a program starts from that has another model of the collision than a solution, or has rows on
-    demand of its own, or gains to choose: that solution.
+    """Maps a solution to the initial guess of a program with another collision model, lazy constraints or
+    gains.
 
     old : makes the solution's program.  rows : between bodies, of the new one.
     """
@@ -134,7 +134,7 @@ def climbed(
 
 
 def good_enough(problem: ImpactProblem, error: ModelError) -> bool:
-    """Whether a problem's "auto" is content with this error."""
+    """True if a model's error is within what the problem's "auto" tolerates."""
     return abs(error.impulse_pct) <= problem.auto_impulse_pct and (error.zmp_mm or 0.0) <= problem.auto_zmp_mm
 
 
@@ -143,7 +143,7 @@ def _silent(_: str) -> None:
 
 
 def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
-    """Whether the first model is not good enough in the posture that a search starts at.
+    """True if the coarsest model is not accurate enough in the posture of the initial guess.
 
     Of a blow half as fast as the joints allow: a fast one moves the robot far while it lasts.
     """

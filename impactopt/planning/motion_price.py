@@ -18,7 +18,10 @@ from impactopt.transcription.transcription import Transcription
 __all__ = ["with_first_scale", "within_price"]
 
 Array = NDArray[np.float64]
-_USUAL, _LEAST = 1.0, 0.02  # [N s] of an initial guess for which prices are as they are; least factor
+_USUAL, _LEAST = (
+    4.0,
+    0.02,
+)  # [N s] of an initial guess (of `punch`) for which prices are as they are; least factor
 _TRIES = 3  # reductions: with lower prices there is more to be priced, so one may not be enough
 _TOLERANCE = 0.02  # of the share: a plan that is within it is not solved again
 _BELOW = 0.9  # of the allowed share is aimed at

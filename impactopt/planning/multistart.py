@@ -34,7 +34,7 @@ Program = TypeVar("Program", bound="ContactProgram")
 Starts = Iterable[tuple[str, Callable[[], Array | SolverResult]]]
 SOLVERS = ("sqp", "ipopt")
 EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
-VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
+VIOLATED = 1e-4  # larger violations are named; an iterate without any is a solution, if not an optimum
 NAMED = 20  # at most
 _PUSH = 1e-6  # into its bounds, of a start that is to stay where it is
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
@@ -42,7 +42,7 @@ SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside t
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """What came of one start.
+    """Result of the solve from one initial guess.
 
     start : its name; impulse [N s]; seconds: of the solver; kept: it is the one that was best.
     """
@@ -57,7 +57,7 @@ class Attempt:
     kept: bool = False
 
     def summary(self) -> dict[str, Any]:
-        """As in ``summary.json``."""
+        """JSON form, as it stands in ``summary.json``."""
         return {
             "start": self.start,
             "status": self.status.value,
@@ -126,7 +126,7 @@ class Budget:
 
     @property
     def interior(self) -> bool:
-        """Whether the solver is the interior-point method."""
+        """True if the solver is the interior-point method."""
         return self.solver == "sqp" and (self.options or {}).get("qp_solver", "interior") == "interior"
 
     @property
@@ -139,7 +139,7 @@ class Budget:
         return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
 
     def _told(self, record: IterationRecord) -> bool:
-        """Whether the solver is to stop after an iteration."""
+        """Reports an iteration to the caller; true if the solver is to stop after it."""
         asked = self.callback is not None and self.callback(record) is True
         return asked or self.stop.asked
 
@@ -223,7 +223,7 @@ def solve_from(
     is one after which no time is left.  began [s] : when work on the problem did.
     work : what is done from a start; None: the program is solved as it is. It may end with another program.
 
-    Of those that meet their rows the one of least objective is best, else the one of least violation.
+    Of those that meet their constraints the one of least objective is best, else the one of least violation.
     """
     built = time.perf_counter()
     found, attempts = list[tuple[Program, SolverResult]](), list[Attempt]()
@@ -252,7 +252,7 @@ def solve_from(
 
 
 def attempt_of(t: ContactProgram, name: str, result: SolverResult) -> Attempt:
-    """What came of a start, or of a round, of that name."""
+    """Result of the solve, or of the refinement round, of that name."""
     return Attempt(
         start=name,
         status=result.status,
@@ -265,12 +265,14 @@ def attempt_of(t: ContactProgram, name: str, result: SolverResult) -> Attempt:
 
 
 def violations_of(t: ContactProgram, x: Array, rows: Array) -> tuple[Violation, ...]:
-    """What is not met at solver variables (n,), whose rows are (m,), worst first."""
+    """Violated constraints at solver variables (n,), worst first; their values are ``rows`` (m,)."""
     return tuple(worst_rows(t.program, x, rows, tolerance=VIOLATED, count=NAMED))
 
 
 def rank_of(result: SolverResult) -> tuple[bool, float]:
-    """Less is better: those that meet their rows by their objective, then the others by their violation."""
+    """Less is better: those that meet their constraints by their objective, then the others by their
+    violation.
+    """
     met = result.status.usable or result.max_violation <= VIOLATED
     return not met, result.objective if met else result.max_violation
 
@@ -299,12 +301,12 @@ def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> S
 
 
 def touching(result: SolverResult, depth: float, names: Iterable[str], what: str) -> SolverResult:
-    """A result whose bodies are so deep [m] in each other: no solution.  names : of the pairs of bodies.
+    """A result whose bodies penetrate by so much [m]: no solution.  names : of the pairs of bodies.
 
     Where nothing else is found it is still told, but goes before no start that is clean.
     """
     pairs = "; ".join(sorted(set(names))[:3])
-    found = f"no {what} was found where they are not"
-    message = f"Bodies are {1e3 * depth:.1f} mm in each other, and {found}: {pairs}."
+    found = f"no {what} was found in which they do not"
+    message = f"Bodies penetrate each other by {1e3 * depth:.1f} mm, and {found}: {pairs}."
     worst = max(result.max_violation, depth, 2 * VIOLATED)
     return replace(result, status=Status.FAILED, max_violation=worst, message=message)

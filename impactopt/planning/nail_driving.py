@@ -27,7 +27,7 @@ class Blow:
 
     @property
     def driven(self) -> float:
-        """What this blow has driven [m]."""
+        """Penetration that this blow has added [m]."""
         target = self.solution.problem.target
         assert isinstance(target, Nail)
         return self.depth - target.depth
@@ -42,7 +42,7 @@ class Series:
 
     @property
     def done(self) -> bool:
-        """Whether the nail is in."""
+        """True if the nail is driven in."""
         return not self.reason
 
     def describe(self) -> dict[str, Any]:

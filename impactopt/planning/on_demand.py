@@ -1,5 +1,5 @@
-"""Terms that hold by default and get rows once a plan without them breaks them: what gears bear, how far a
-blow slides.
+"""Terms that hold by default and get constraints once a plan without them breaks them: gear loads, how
+far a blow slides.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from impactopt.planning.multistart import carried, one_after_the_other, rank_of,
 from impactopt.planning.sliding import slides_beyond
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, Slide, Term
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.plan import Plan, PlannedCollision
 from impactopt.transcription.planned_loads import plan_loads, strike_loads
@@ -37,14 +37,14 @@ _KINDS: dict[str, type[Term]] = {snake_case(type(term).__name__): type(term) for
 
 
 def rows_on_demand(problem: ImpactProblem) -> tuple[str, ...]:
-    """Names, as in files, of the terms on demand whose rows a problem's programs have from the start."""
+    """Names, as in files, of the lazy terms whose constraints a problem's programs have from the start."""
     own = {type(term) for term in problem.active_terms}
     return tuple(name for name, kind in _KINDS.items() if kind in own)
 
 
 def with_rows(problem: ImpactProblem, names: Iterable[str]) -> ImpactProblem:
-    """The same with the rows of these terms on demand from the start; itself if it has them, or has switched
-    them off.
+    """The same with the constraints of these lazy terms from the start; itself if it has them, or has
+    switched them off.
     """
     kinds = [_KINDS[name] for name in names if name in _KINDS and problem.extra(_KINDS[name]) is None]
     if not kinds:
@@ -60,20 +60,20 @@ def kept_on_demand(
     finer: Callable[[Program, Array], tuple[PlannedCollision, ...]],
     report: Callable[[str], None] | None = None,
 ) -> tuple[Program, SolverResult]:
-    """A program's result if it keeps to the terms on demand; else that of the program with the rows that it
-    lacks: from there, and where that leads nowhere from the start. It has the effort of all.
+    """A program's result if it keeps to the lazy terms; else that of the program with the constraints that it
+    lacks: from there, and where that fails from the start. It has the effort of all.
 
     first : the program that it came from, and its start.  solve : a program from a start; it keeps bodies
-    apart, from the rows between them that the program has.  finer : the collisions, if known at more
+    apart, from the clearance constraints that the program has.  finer : the collisions, if known at more
     instants than the program's.
     """
-    for _ in _KINDS:  # rows of one may break another
+    for _ in _KINDS:  # constraints of one may break another
         broken = _broken(t, result, finer) if result.status.usable else {}
         if not broken:
             break
         said = "; ".join(broken.values())
         if report is not None:
-            report(f"{said}: on with rows of {', '.join(_KINDS[name].name for name in broken)}")
+            report(f"{said}: on with constraints of {', '.join(_KINDS[name].name for name in broken)}")
         bounded = with_rows(t.problem, broken)
         warm = program_for(t, bounded, report)
         found, new = solve(warm, carried(warm, t, result))
@@ -84,7 +84,7 @@ def kept_on_demand(
             none = np.zeros(origin.program.m), np.zeros(origin.layout.n)
             again, last = solve(cold, carried_over(cold, origin, x0, *none)[0])
             both = one_after_the_other(new, last)
-            # where neither is a solution, the one that is less off its rows says more
+            # where neither is a solution, the one that is less off its constraints says more
             kept = last.status is not Status.INTERRUPTED and rank_of(new) < rank_of(last)
             found, new = (found, with_effort_of(new, both)) if kept else (again, both)
         if not new.status.usable and new.status is not Status.INTERRUPTED:
@@ -97,7 +97,7 @@ def kept_on_demand(
 def _broken(
     t: Program, result: SolverResult, finer: Callable[[Program, Array], tuple[PlannedCollision, ...]]
 ) -> dict[str, str]:
-    """What is broken of terms on demand that have no rows, by name, in words."""
+    """Violations of lazy terms that have no constraints yet: message by name of the term."""
     problem, has, out = t.problem, rows_on_demand(t.problem), dict[str, str]()
     planned: Plan | PlannedStrike = t.decode(result.x)
     for name, kind in _KINDS.items():
@@ -117,7 +117,7 @@ def _broken(
 def _loads(
     t: Program, planned: Plan | PlannedStrike, finer: tuple[PlannedCollision, ...]
 ) -> list[DriveLoads]:
-    """Of all motions and all collisions."""
+    """Gear and motor loads of all motions and all collisions."""
     hits = finer or [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
     if isinstance(planned, PlannedStrike):
         still = np.zeros(t.robot.nv)
@@ -128,7 +128,7 @@ def _loads(
 
 
 def program_for(t: Program, problem: ImpactProblem, report: Callable[[str], None] | None) -> Program:
-    """The program of another problem on the same mesh, with the same rows between bodies."""
+    """The program of another problem on the same mesh, with the same clearance constraints."""
     elements, c = t.hit.elements if t.hit.guarded else (), problem.coordinates
     functions = block_functions(problem, c, report, elements)
     new: Program

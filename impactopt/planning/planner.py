@@ -38,7 +38,7 @@ from impactopt.planning.stopping import stopping
 from impactopt.planning.strike import clear_strike
 from impactopt.planning.verdict import lacks_rows, with_reason, with_soles_kept
 from impactopt.planning.window import window_caution
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.apart import ApartRow, Held
@@ -52,7 +52,7 @@ from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
-_MORE = 2  # starts, where all that were asked for end with bodies in each other
+_MORE = 2  # starts, where all that were asked for end with penetrating bodies
 
 
 def solve(
@@ -90,7 +90,7 @@ def solve(
     report : called with a line of text while functions are built.  callback : called with every iteration's
         record; if it returns True, or on Ctrl-C, the solve stops with the best iterate.
 
-    An infeasible problem is a status with named rows, not an exception.
+    An infeasible problem is a status with named constraints, not an exception.
 
     Raises
     ------
@@ -163,12 +163,12 @@ def _planned(
     if isinstance(given, SolverResult) and _meets_rows(t, given):
         budget = budget.near_by()  # the start may be the optimum
     if report is not None:
-        report(f"program of {t.program.n} variables and {t.program.m} rows; {budget.solver} starts")
+        report(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     refining = Refining(budget, margins, apart, report)
-    # limbs that are in each other, or gears that break, say nothing of what a start is worth: each is led to
+    # limbs that penetrate, or gears that break, say nothing of what a start is worth: each is led to
     # its end before they compare
-    each = partial(_led, refining, refine and margins is not None)
+    each = partial(_solved_from, refining, refine and margins is not None)
     of_start = _starts(t, given, which, more, seed, partial(clear_strike, budget, margins), refining)
     t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and refine and fields["result"].status.usable:
@@ -198,8 +198,8 @@ def _explained(
     work: Callable[[Transcription, Array], tuple[Transcription, SolverResult]],
     report: Callable[[str], None] | None,
 ) -> tuple[Transcription, dict[str, Any], tuple[Cause, ...]]:
-    """Where there is no solution: the bounds that keep it from being; or a solution from a point that meets
-    them all, if there is such a point.
+    """Diagnosis of a failed solve: the bounds that make it infeasible, or a solution from a feasible point
+    that the diagnosis has found.
 
     A limit that the caller has set is an answer, and stays one.
     """
@@ -235,10 +235,12 @@ def _meets_rows(t: Transcription, start: SolverResult) -> bool:
     return max_violation(t.program, start.x, t.program.constraints(start.x)) <= VIOLATED
 
 
-def _led(
+def _solved_from(
     refining: Refining, to_its_end: bool, t: Transcription, start: Array | SolverResult
 ) -> tuple[Transcription, SolverResult]:
-    """What comes of a start, with the rows on demand that it needs.  to_its_end : round by round."""
+    """Solves from one initial guess, adding the lazy constraints that it needs.  to_its_end : refines it,
+    too.
+    """
     work = refining.solve if to_its_end else refining.first
     found, result = _bounded(refining, *work(t, start), (t, start), to_its_end)
 
@@ -260,7 +262,7 @@ def _bounded(
     first: tuple[Transcription, Array | SolverResult],
     to_its_end: bool,
 ) -> tuple[Transcription, SolverResult]:
-    """As `kept_on_demand`."""
+    """Adds lazy constraints until none is violated (`kept_on_demand`)."""
 
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         own = refining.anew(other)
@@ -284,7 +286,7 @@ def _on(refining: Refining, t: Transcription, fields: dict[str, Any]) -> tuple[T
     within, bounded = _bounded(refining, finer, result, (t, old.x), True)
     if within is not finer:
         alone = {key: getattr(bounded, key) - getattr(result, key) for key in EFFORT}
-        rounds.append((within, "rows on demand", replace(bounded, **alone)))
+        rounds.append((within, "lazy constraints", replace(bounded, **alone)))
         finer, result = within, bounded
     if not rounds:
         return t, fields
@@ -313,7 +315,7 @@ def _starts(
 ) -> Starts:
     """Names of the starts, and what makes them; ``hit`` solves a strike.
 
-    A few more than asked for while each ends with bodies in each other: where a motion passes them on the
+    A few more than asked for while each ends with penetrating bodies: where a motion passes them on the
     wrong side, others may not.
     """
     if not isinstance(start, str):

@@ -1,4 +1,4 @@
-"""From a program's solution to one that is right between its nodes too, round by round."""
+"""Refinement loop: solve, check between nodes, add nodes, elements or clearance constraints, solve again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impactopt.planning.contact_replay import AGREED, REFUTED, ContactReplay, Pl
 from impactopt.planning.keeping_apart import Margins, solved_apart
 from impactopt.planning.models import planned_contact
 from impactopt.planning.multistart import Budget, carried, one_after_the_other, touching, with_effort_of
-from impactopt.planning.too_near import Violated, bodies_too_near
+from impactopt.planning.too_near import Violated, clearance_violations
 from impactopt.planning.verdict import second_look
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.apart import ApartRow, Held
@@ -35,7 +35,7 @@ _BARRIER = 1e-4  # where constraints between bodies are new, which the solution 
 _BARRIER_DEEP = 1e-3  # of a finer contact, where the one before is far off
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 _NODE_ROUNDS = 3  # with a finer mesh, at most
-_ROUNDS, _MOST = 12, 40  # of all, and while bodies are in each other: each round brings them nearer to an end
+_ROUNDS, _MOST = 12, 40  # of all, and while bodies penetrate: each round brings them nearer to an end
 _ITERATIONS = 200  # from a solution, where there is another start: it goes on in a few, or hardly at all
 
 
@@ -61,12 +61,12 @@ class Round:
 
 
 def start_of(finer: Transcription, t: Transcription, x0: Array) -> Array:
-    """What a program started from, for one with more nodes or elements."""
+    """Initial guess of a program, mapped to one with more nodes or elements."""
     return carried_over(finer, t, x0, np.zeros(t.program.m), np.zeros(t.layout.n))[0]
 
 
 def more_of(nodes: int, elements: Elements | None, rows: int) -> str:
-    """What is more in a program, in words."""
+    """Text for the additions to a program."""
     words = [f"{nodes} more node{'s' if nodes > 1 else ''}"] if nodes else []
     words += [f"{sum(map(len, elements))} contact elements"] if elements is not None else []
     words += [f"{rows} constraint{'s' if rows > 1 else ''} between bodies with more margin"] if rows else []
@@ -74,13 +74,13 @@ def more_of(nodes: int, elements: Elements | None, rows: int) -> str:
 
 
 class Refining:
-    """The way from a program's solution to one that is right between its nodes too.
+    """Refines a program until its solution is valid between the nodes, too.
 
-    Where a solution brings bodies into each other between nodes, leaves its limits there, or has a contact
+    Where a solution has bodies penetrate between nodes, leaves its limits there, or has a contact
     that is too coarse, its program gets more nodes, elements or margins there and is solved again, from where
     it is.
 
-    mesh : whether it may get finer; False: it does where bodies are in each other only.
+    mesh : whether it may get finer; False: it does where bodies penetrate only.
     """
 
     def __init__(
@@ -99,10 +99,10 @@ class Refining:
         self._near: tuple[Transcription, Array, Violated | None] | None = None
         self._refined = 0  # rounds with a finer mesh
         self._apart: tuple[Transcription, SolverResult] | None = None  # the last whose bodies are not
-        self.blocked = False  # whether it ended with bodies in each other: another start may not
+        self.blocked = False  # whether it ended with penetrating bodies: another start may not
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
-        """Of a program's contact at its solution; the last one that was asked for is known."""
+        """Discretization error of a program's contact at its solution; the last one is cached."""
         if self._known is None or self._known[0] is not t or self._known[1] is not x:
             self._known = t, x, contact_error(t, x)
         return self._known[2]
@@ -112,8 +112,8 @@ class Refining:
         return Refining(self.budget, self.margins, t.apart_rows, self.report)
 
     def contact(self, t: Transcription, x: Array) -> PlannedContact | None:
-        """Of a program at its solution, with what comes of it in full dynamics; the last one that was asked
-        for is known. None while gains are open, as the robot is another one then.
+        """Planned contact of a program at its solution, with its replay in full dynamics; the last one is
+        cached. None while gains are open, as the robot is another one then.
         """
         if t.problem.gains:
             return None
@@ -130,7 +130,7 @@ class Refining:
         return self._contact[2]
 
     def replay(self, t: Transcription, x: Array) -> ContactReplay | None:
-        """What comes of it."""
+        """Replay of the planned contact in full dynamics."""
         contact = self.contact(t, x)
         return None if contact is None else contact.replay
 
@@ -147,7 +147,7 @@ class Refining:
         self.blocked, self._known, self._contact = other.blocked, other._known, other._contact
 
     def first(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
-        """The program with its first rows between bodies, and its result."""
+        """The program with its first clearance constraints, and its result."""
         warm = isinstance(start, SolverResult)
         if warm and self.given_rows:
             t = t.with_apart(self.given_rows)
@@ -159,15 +159,15 @@ class Refining:
         return t, result
 
     def _violated(self, t: Transcription, x: Array) -> Violated | None:
-        """What a program lacks at its variables; the last that was asked for is known."""
+        """Clearance violations of a program at its variables; the last ones are cached."""
         if self.margins is None:
             return None
         if self._near is None or self._near[0] is not t or self._near[1] is not x:
-            self._near = t, x, bodies_too_near(t, x, self.margins)
+            self._near = t, x, clearance_violations(t, x, self.margins)
         return self._near[2]
 
     def _looked_at(self, t: Transcription, result: SolverResult, x0: Array) -> SolverResult:
-        """A result without a verdict with that of another solver, from the same start."""
+        """A result without a diagnosis with that of another solver, from the same start."""
         new = second_look(self.budget, t.program, x0, result, self.report)
         return result if new is result else one_after_the_other(result, new)
 
@@ -177,7 +177,7 @@ class Refining:
         free, self.blocked = t, False
         t, result = self.first(free, start)
         if self._stuck(result) and t.apart_rows and self.budget.left != 0:
-            t, result = self._led_out(free, t, result, x0)
+            t, result = self._solved_without_clearance(free, t, result, x0)
         else:
             t, result = self.judged(*self.rounds(t, result, x0)[:2])
         looked = self._looked_at(t, result, x0)
@@ -186,22 +186,23 @@ class Refining:
         return self.judged(*self.rounds(t, looked, x0)[:2])
 
     def _stuck(self, result: SolverResult) -> bool:
-        """Whether the solver has ended without a solution, and not at a limit that the caller has set."""
+        """True if the solver has ended without a solution, and not at a limit that the caller has set."""
         if result.status is Status.ITERATION_LIMIT:
             return "max_iterations" not in (self.budget.options or {})
         return result.status in _STUCK
 
-    def _led_out(
+    def _solved_without_clearance(
         self, free: Transcription, t: Transcription, stuck: SolverResult, x0: Array
     ) -> tuple[Transcription, SolverResult]:
-        """What comes of a start that leads nowhere with the first rows between bodies of a program ``t``.
+        """Solves from an initial guess with which the first clearance constraints of a program ``t`` lead
+        nowhere.
 
-        That is where a solver stopped, not that there is no motion: the rows know the bodies as they are at
-        the start. So the motion without them is led out of what it is in; where that fails too, the rows say
-        what is in the way.
+        A solver that stops there does not show that there is no motion: the constraints are linearized for
+        the bodies as they are in the guess. So the motion is first found without them and then moved out of
+        penetration; if that fails too, the violated constraints name the obstacle.
         """
         if self.report is not None:
-            self.report("no motion was found from there with rows between bodies: first without them")
+            self.report("no motion was found from there with clearance constraints: first without them")
         last, result = self.judged(*self.rounds(free, self.budget.run(free.program, x0), x0)[:2])
         if result.status.usable:
             return last, one_after_the_other(stuck, result)
@@ -235,17 +236,17 @@ class Refining:
         return t, result, found
 
     def _is_apart(self, result: SolverResult) -> bool:
-        """Whether a result has been looked at, and nothing touches anything."""
+        """True if a result has been checked and found without contacts between bodies."""
         return self._apart is not None and self._apart[1] is result
 
     def judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
-        """A result that could not be mended is a solution only if nothing touches anything; else the last one
-        is that was, if any.
+        """Result after a failed repair: a solution only if no bodies touch; else the last one without
+        contact, if there is one.
         """
         if self.margins is None or not result.status.usable or self._is_apart(result):
             return t, self.checked(t, result)
         with contextlib.suppress(InputError):
-            left = bodies_too_near(t, result.x, self.margins, share=1.0)
+            left = clearance_violations(t, result.x, self.margins, share=1.0)
             if left is not None and left.depth > 0:
                 if self._apart is not None:
                     before, clean = self._apart
@@ -256,7 +257,7 @@ class Refining:
         return t, self.checked(t, result)
 
     def _next(self, t: Transcription, old: SolverResult, x0: Array) -> Round | None:
-        """What is to be solved next; None if the solution is right."""
+        """Next program to solve; None if the solution is valid."""
         shares, violated = t.hit.shares, None
         elements: Elements | None = None
         error: ContactError | None = None
@@ -300,7 +301,7 @@ class Refining:
         starts = (first_iterate(finer) if missed else carried(finer, t, old),)
         if violated is not None and finer.layout.n == len(old.x):
             starts = (*starts, old.x, x0)
-        # a contact that is far off breaks the finer program's rows by far
+        # a contact that is far off breaks the finer program's constraints by far
         far = elements is not None and error is not None and abs(error.pct) > AGREED
         name = more_of(
             nodes.total - t.nodes.total, elements, len(violated.rows) if violated is not None else 0

@@ -1,4 +1,4 @@
-"""What a number of a problem is worth to a plan, and which rows bind: from the plan's KKT system."""
+"""Parametric sensitivity and active constraints of a plan, from its KKT system."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SMALL = 1e-6  # a shadow price that is nothing
 
 @dataclass(frozen=True, kw_only=True)
 class Binding:
-    """A row that a plan is at, and its shadow price: what the objective gains by its bound, per unit.
+    """A constraint that a plan is at, and its shadow price: what the objective gains by its bound, per unit.
 
     row : as messages name it.  price : [objective's unit / unit]; ``unit`` of what the bound is moved by.
     """
@@ -39,11 +39,11 @@ class Binding:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Sensitivity:
-    """What a number of a problem does to a plan, to first order.
+    """First-order sensitivity of a plan to a parameter of its problem.
 
     parameter, value : its name and value.  impulse : d impulse / d parameter [N s / unit].
     objective : d (weighted sum of the objectives, less the prices on motion) / d parameter.
-    binding : rows and bounds that the plan is at, dearest first.
+    binding : constraints and bounds that the plan is at, dearest first.
     """
 
     parameter: str
@@ -57,7 +57,8 @@ class Sensitivity:
 
 
 def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
-    """How the impulse answers to a number of the problem, and which rows bind: `Solution.sensitivity`.
+    """Sensitivity of impulse and objective to a parameter, and the active constraints:
+    `Solution.sensitivity`.
 
     Derivatives of the program by the parameter are central differences at the solution; the solution's own
     follow from the KKT system.
@@ -65,18 +66,19 @@ def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
     bent = bent_of(solution)
     number, x = parameter_of(solution.problem, parameter), solution.result.x
     whole, half = (_slope(bent, number, _STEP * number.typical / k) for k in (1, 2))
-    offset, impulse, worth = (_extrapolated(*pair) for pair in zip(whole, half, strict=True))
+    offset, impulse, objective = (_extrapolated(*pair) for pair in zip(whole, half, strict=True))
     n, m = len(x), len(solution.result.multipliers)
+    # implicit function theorem: the KKT matrix times dz/dp is minus the slope of the KKT residual at fixed z
     change = bent.system.step(Offset(dual=offset[:n], rows=offset[n : n + m], variables=offset[n + m :]))
     # impulse and objective may depend on the number at the same motion too
     program = bent.program
     slope = float(impulse) + _along(program.impulse, x, change.x)
-    dearer = float(worth) + float(program.program.gradient(x) @ change.x)
+    cost_slope = float(objective) + float(program.program.gradient(x) @ change.x)
     return Sensitivity(
         parameter=parameter,
         value=number.value,
         impulse=slope,
-        objective=-dearer,
+        objective=-cost_slope,
         binding=_binding(bent),
     )
 
@@ -89,12 +91,13 @@ def _slope(bent: Bent, number: Parameter, half: float) -> tuple[Array, Array, Ar
         off = bent.system.offset(t.program)
         parts = np.concatenate([getattr(off, name) for name in Offset.PARTS])
         sides.append((parts, np.array(t.impulse(x)), np.array(t.program.objective(x))))
-    parts, impulse, worth = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))
-    return parts, impulse, worth
+    parts, impulse, objective = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))
+    return parts, impulse, objective
 
 
 def _extrapolated(whole: Array, half: Array) -> Array:
-    """Of differences with a step and its half."""
+    """Richardson extrapolation of central differences with a step and its half."""
+    # both errors are even in the step: four times the half's less the whole's leaves those of fourth order
     return (4 * half - whole) / 3
 
 

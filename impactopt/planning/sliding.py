@@ -1,4 +1,6 @@
-"""How far a blow's striking point slides across the target, which has no friction and a face of some size."""
+"""Slip of the striking point across the target, whose contact is frictionless and whose face has a finite
+size.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +10,10 @@ from impactopt.kinematics.directions import across
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Slide
-from impactopt.simulation.struck import FACE
+from impactopt.simulation.target_dynamics import FACE
 from impactopt.transcription.plan import Plan
 
-FAR = 0.15  # [m] across the target's face: a plan that slides so far is told so
+FAR = 0.15  # [m] across the target's face: a plan that slides so far is reported so
 INSTANTS = 9  # of the contact
 MORE = 0.03  # of what it may be: no more than a mesh leaves it
 
@@ -28,8 +30,8 @@ def slide(problem: ImpactProblem, plan: Plan) -> float:
 
 
 def slides_beyond(term: Slide, plan: Plan) -> str:
-    """How far the striking point is from the hit point as contact ends, in words; "" if that is no more along
-    each tangent than it may be, but for a little.
+    """Message with the striking point's offset from the hit point as contact ends; "" if it is within the
+    limit along each tangent, but for a tolerance.
     """
     problem = plan.problem
     after = plan.closed(plan.through_contact(np.ones(1)))[0]
@@ -42,7 +44,7 @@ def slides_beyond(term: Slide, plan: Plan) -> str:
 
 
 def slide_caution(length: float) -> str:
-    """What is to be said of a slide [m]; "" if it is short."""
+    """Warning about a slide of this length [m]; "" if it is short."""
     if length <= FAR:
         return ""
     return (

@@ -1,4 +1,4 @@
-"""What a solve gives back, and the record that it leaves on disk."""
+"""Result of a solve, and its record on disk."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from impactopt.planning.multistart import Attempt
 from impactopt.planning.on_demand import rows_on_demand
 from impactopt.planning.sliding import slide, slide_caution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_error import ContactError
 from impactopt.transcription.mesh import Elements, Shares, contact_elements
@@ -44,10 +44,10 @@ class Solved:
     result : the solver's own record, its history included; of the best start.
     build_seconds : time to compile or load functions and to assemble the program.  solve_seconds : time of
         the solver, of all starts.
-    violations : rows that are not met, worst first.
+    violations : constraints that are not met, worst first.
     objectives : value of each of the problem's objectives, by name, in its own unit.
     attempts : result of each start.
-    apart : rows of the program between bodies.
+    apart : constraints of the program between bodies.
     elements, shares : lengths of the collocation elements of the contact's phases, as fractions of them, if
         they are finer than the problem asks for; and the share of each phase in the contact's time, where
         something is frozen during contact. Else ().
@@ -91,7 +91,7 @@ class Solved:
 
     @property
     def caution(self) -> str:
-        """What the planned contact leaves out, in words; empty where it is as planned."""
+        """Warning about effects that the planned contact leaves out; empty if the replay agrees with it."""
         replay = self.contact_replay
         return str(replay) if replay is not None and (replay.partings or replay.off > AGREED) else ""
 
@@ -100,7 +100,9 @@ class Solved:
         return self.result.status
 
     def outcome(self) -> dict[str, Any]:
-        """How the solve ended: what ``summary.json`` says even of a plan whose motion cannot be completed."""
+        """Outcome of the solve, as in ``summary.json``; known even of a plan whose motion cannot be
+        completed.
+        """
         return {
             "status": self.status.value,
             "message": self.result.message,
@@ -133,7 +135,8 @@ class Solution(Solved):
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
-    statement : names of the program's variables and rows, as `impactopt.transcription.statement` writes them.
+    statement : names of the program's variables and constraints, as `impactopt.transcription.statement`
+    writes them.
     causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
         cheapest first. Each has the ``problem`` with that value. Empty where none is known to.
     window : what is to be said of the time that the contact may last; "" if that costs little.
@@ -154,7 +157,7 @@ class Solution(Solved):
 
     @property
     def contact_elements(self) -> list[int]:
-        """How many each phase of the contact has; none of an impact without duration."""
+        """Number of collocation elements in each phase of the contact; none if it has no duration."""
         if not self.problem.lasts:
             return []
         return [len(phase) for phase in self.elements or contact_elements(self.problem)]
@@ -170,7 +173,7 @@ class Solution(Solved):
         """Share of the objective that the prices on motion, sole wrenches and the end posture take [%].
 
         They are there for one optimum among motions that hit as hard: ``ImpactProblem.smoothness``,
-        ``wrench_price`` and ``return_price``.  nan where the objectives are worth nothing, or not known.
+        ``wrench_price`` and ``return_price``.  nan where the objectives are zero, or not known.
         """
         if any(o.name not in self.objectives for o in self.problem.objectives):
             return np.nan
@@ -215,17 +218,17 @@ class Solution(Solved):
         """The plan bent for another ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` or
         ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
 
-        First come quadratic programs about this plan, which find rows that begin and cease to hold; then the
-        solver goes on from there, with this plan's mesh, and with new rows where bodies come into each other
-        that have none. ``polish=False``: the first alone. They are quick
-        and within a thousandth of the rows where status says "acceptable"; other plans of theirs are none.
-        ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and
+        First come quadratic programs about this plan, which find constraints that begin and cease to hold;
+        then the solver goes on from there, with this plan's mesh, and with new constraints where bodies come
+        into each other that have none. ``polish=False``: the first alone. They are quick
+        and within a thousandth of the constraints where status says "acceptable"; other plans of theirs are
+        none. ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and
         ``time_limit`` are those of `impactopt.solve`.
 
         Raises
         ------
         InputError : this is no solution; nothing is changed, or what target and law do not have; the program
-            has other rows or bodies then.
+            has other constraints or bodies then.
         """
         # by the public name: what solves comes after solutions in the order of imports
         from impactopt import moved_solution
@@ -234,9 +237,9 @@ class Solution(Solved):
         return found
 
     def sensitivity(self, parameter: str) -> Any:
-        """How impulse and objective answer to a number of the problem, such as ``"target.mass"``,
-        ``"contact.stiffness"``, ``"point.x"`` or ``"terms.torque_limit.fraction"``, and which rows bind, with
-        their shadow prices: a :class:`impactopt.planning.sensitivity.Sensitivity`.
+        """Derivatives of impulse and objective by a parameter of the problem, such as ``"target.mass"``,
+        ``"contact.stiffness"``, ``"point.x"`` or ``"terms.torque_limit.fraction"``, and the active
+        constraints with their shadow prices: a :class:`impactopt.planning.sensitivity.Sensitivity`.
 
         Raises
         ------
@@ -297,9 +300,9 @@ class Solution(Solved):
         return [Path(path) for path in export(self, to, directory, rate=rate, joints=joints)]
 
     def clearance(self) -> dict[str, Any]:
-        """How far bodies are apart in the plan, and what touches what, by exact geometry at 1 ms: the keys
-        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those of a missed blow
-        are among them, and say so.
+        """Clearances and unintended contacts in the plan, by exact geometry at 1 ms: the keys
+        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those after a missed blow
+        are among them, marked as such.
         """
         least, nearest, touches = self._clearance
         return {"clearance_mm": 1e3 * least, "nearest": nearest, "contacts_besides": [{**t} for t in touches]}
@@ -323,7 +326,7 @@ class Solution(Solved):
 
     @cached_property
     def slide(self) -> float:
-        """How far [m] the striking point goes across the target while the contact lasts, as planned."""
+        """Distance [m] that the striking point slides across the target during contact, as planned."""
         return slide(self.problem, self.plan)
 
     @property
@@ -352,7 +355,7 @@ class Solution(Solved):
 
     @cached_property
     def loads(self) -> DriveLoads:
-        """What gears and motors bear at most, as planned with the expected target."""
+        """Peak loads of gears and motors, as planned with the expected target."""
         return motion_loads(self.problem.robot, self.trajectory, self.collision)
 
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
@@ -361,7 +364,7 @@ class Solution(Solved):
         expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),
-            **blow_numbers(plan, expected),
+            **impact_summary(plan, expected),
             "objectives": dict(self.objectives),
             "motion_price_pct": self.motion_price_pct,
             "duration_s": plan.duration,
@@ -398,8 +401,8 @@ class Solution(Solved):
         return out | gear_caution(self.problem, [self.loads, *replayed])
 
 
-def blow_numbers(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
-    """What ``summary.json`` says of a planned blow; one without duration knows no force."""
+def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
+    """Data of a planned impact for ``summary.json``; one without duration has no force."""
     duration = hit.compression + hit.restitution
     return {
         "impulse_Ns": hit.impulse,

@@ -12,7 +12,7 @@ __all__ = ["Stop", "stopping"]
 
 
 class Stop:
-    """Whether the work is to end at its next step.
+    """Flag by which a signal ends the work at its next step.
 
     armed : whether there is something to keep. Until then, and the second time, a signal raises
         KeyboardInterrupt at once.

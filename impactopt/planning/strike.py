@@ -29,8 +29,8 @@ from impactopt.planning.multistart import (
 )
 from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
 from impactopt.planning.side_by_side import best_side_by_side, check_workers
-from impactopt.planning.solution import Solved, blow_numbers, versions
-from impactopt.planning.too_near import deepest
+from impactopt.planning.solution import Solved, impact_summary, versions
+from impactopt.planning.too_near import deepest_penetration
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status
@@ -43,7 +43,7 @@ from impactopt.transcription.transcription import block_functions
 Array = NDArray[np.float64]
 ROUNDS = 10  # of freezes that come when they are to
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
-# solve that goes on with other rows
+# solve that goes on with other constraints
 BARRIER_ARM, BARRIER_ON = 0.03, 1e-2
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 Work = Callable[[StrikeTranscription, Array | SolverResult], tuple[StrikeTranscription, SolverResult]]
@@ -71,7 +71,7 @@ class StrikeSolution(Solved):
         angles = self.problem.robot.joint_positions(hit.posture)
         return {
             **self.outcome(),
-            **blow_numbers(hit, hit.collision),
+            **impact_summary(hit, hit.collision),
             "objectives": dict(self.objectives),
             **hit.margins(),
             **loads.summary(),
@@ -168,7 +168,7 @@ def _optimized(
         start = carried_start(t, same, start, start.apart).x
     given = None if start is None else check_array("start", start, (t.program.n,))
     if report is not None:
-        report(f"program of {t.program.n} variables and {t.program.m} rows; {budget.solver} starts")
+        report(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     work = partial(_bounded_strike, partial(_clean_strike, budget, margins), report)
     t, fields = solve_from(t, _starts(t, given, which, seed), budget, began, work)
@@ -190,7 +190,7 @@ def _optimized(
 
 
 def _program_of(solution: StrikeSolution) -> StrikeTranscription:
-    """The program of a solution, without rows between bodies."""
+    """The program of a solution, without clearance constraints."""
     p, elements = solution.problem, solution.elements
     functions = block_functions(p, p.coordinates, None, elements)
     return StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
@@ -201,8 +201,8 @@ def clear_strike(
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose bodies keep apart; its result has the effort of all.
 
-    start : variables (n,); or a result of this program but for other rows, such as those on demand: then it
-        goes on from there, and begins anew only where that leads nowhere.
+    start : variables (n,); or a result of this program but for other constraints, such as those on demand:
+        then it goes on from there, and begins anew only where that fails.
     """
     x0 = start.x if isinstance(start, SolverResult) else start
     goes_on = isinstance(start, SolverResult) and len(start.multipliers) == t.program.m
@@ -220,11 +220,11 @@ def clear_strike(
 def _clean_strike(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
-    """As `clear_strike`; what still has bodies in each other is no solution."""
+    """Strike without penetration (`clear_strike`); a result that still has some is no solution."""
     t, result = clear_strike(budget, margins, t, start)
     if margins is None or not result.status.usable:
         return t, result
-    depth, pairs = deepest(t, result.x, margins)
+    depth, pairs = deepest_penetration(t, result.x, margins)
     if depth <= 0:
         return t, result
     names = (" and ".join(margins.bodies.names(pair)) for pair in pairs)
@@ -234,7 +234,7 @@ def _clean_strike(
 def _bounded_strike(
     work: Work, report: Callable[[str], None] | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
-    """What comes of a start, with the rows on demand that it needs."""
+    """Solves a strike from one initial guess, adding the lazy constraints that it needs."""
     found, result = work(t, start)
     return kept_on_demand(found, result, (t, start), work, lambda *_: (), report)
 

@@ -1,9 +1,9 @@
-"""Where a solution brings bodies too near to each other between its places, and what it lacks for that.
+"""Detects clearance violations of a solution and selects the constraints and nodes to add.
 
-At places a program's constraints keep all apart that is near (`keeping_apart`). Where two bodies are too near
-between two places at which they are not, there is to be a node at that instant, which gets constraints as its
-bodies are near there; and where nodes are too dense for another, or in contact, which has none, the places
-beside are asked for more.
+At its nodes a program has constraints on the clearance of near bodies (`keeping_apart`). If two bodies
+violate their clearance between two nodes, a node is added at that instant, which gets constraints as its
+bodies are near there. Where nodes are too dense for another, or in contact, which has none, the required
+clearance at the adjacent nodes is raised.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from impactopt.transcription.mesh_refinement import MoreNodes
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["Violated", "bodies_too_near", "deepest"]
+__all__ = ["Violated", "clearance_violations", "deepest_penetration"]
 
 Array = NDArray[np.float64]
 STEP = 8e-3  # [s] at which a plan is looked at
@@ -37,8 +37,8 @@ INNER = 0.2  # of the time between two nodes: another one is not nearer to them
 
 
 class Violated(NamedTuple):
-    """What a solution lacks: constraints in place of its own, how deep [m] bodies are in each other without
-    them, which pairs are too near, and the program's nodes with those that it needs.
+    """Additions that a solution's clearance violations call for: constraints in place of its own, the depth
+    [m] of the penetration without them, the violating pairs, and the program's nodes with those to add.
     """
 
     rows: Rows
@@ -48,15 +48,18 @@ class Violated(NamedTuple):
 
 
 class _Between(NamedTuple):
-    """Where two bodies are nearest between two places: how far apart [m], when [s], on which motion."""
+    """Closest approach of two bodies between two nodes: distance [m], time [s], motion."""
 
     apart: float
     time: float
     missed: bool
 
 
-def bodies_too_near(t: Transcription, x: Array, margins: Margins, *, share: float = SHARE) -> Violated | None:
-    """What keeps apart bodies that are too near, at the nodes of a solution or between them; None: none is.
+def clearance_violations(
+    t: Transcription, x: Array, margins: Margins, *, share: float = SHARE
+) -> Violated | None:
+    """Additions that remove clearance violations at a solution's nodes or between them; None if there are
+    none.
 
     Too near is what gives up more than a ``share`` of its margin by exact geometry.
     """
@@ -85,8 +88,8 @@ def bodies_too_near(t: Transcription, x: Array, margins: Margins, *, share: floa
     return Violated(asked.rows, depth, frozenset(pair for _, pair in worst), nodes.all)
 
 
-def deepest(t: ContactProgram, x: Array, margins: Margins) -> tuple[float, list[Pair]]:
-    """How deep [m] bodies are in each other at a program's places, < 0 if they are not; and which pairs."""
+def deepest_penetration(t: ContactProgram, x: Array, margins: Margins) -> tuple[float, list[Pair]]:
+    """Deepest penetration [m] at a program's nodes, < 0 if there is none, and the pairs in contact."""
     touching = list(_near(margins, spots_of(t, x).at, 1.0))
     return max((-apart for _, _, apart in touching), default=-np.inf), [pair for _, pair, _ in touching]
 
@@ -117,7 +120,7 @@ class _Asked:
         self._gaps = shapes.look(margins.bodies.placed(spots.at), np.inf, ways, margins.wanted).gaps
 
     def more(self, beside: Sequence[int], pair: Pair, apart: float) -> None:
-        """Of two bodies at these places, what is missing between them [m]."""
+        """Raises the required clearance of two bodies at these nodes by what is missing between them [m]."""
         missing, index = min(self._margins.of(pair) - apart, MOST), self._margins.bodies.shapes.index
         for k in beside:
             own = {
@@ -145,7 +148,8 @@ class _Nodes:
 
     def add(self, found: _Between, jumps: bool) -> bool:
         """One at that instant, or as near to it as others are not; two beside it, where bodies jump from one
-        side to the other.  False: the others are too near to each other, or it is in contact, which has none.
+        side to the other.  False: the others are too close to each other, or it is in contact, which has
+        none.
         """
         for phase, places in self._places.items():
             curve, begin, nodes, _ = self._plan.segment(phase, missed=found.missed)

@@ -1,4 +1,4 @@
-"""What a solve that ended without a solution is worth: another solver's word, and why there is none."""
+"""Diagnosis of a failed solve: a second solver's result, and the cause of infeasibility."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impactopt.errors import InputError
 from impactopt.planning.causes import Cause
 from impactopt.planning.multistart import VIOLATED, Budget
 from impactopt.planning.solution import Solution
-from impactopt.problem.doubts import too_weak
+from impactopt.problem.feasibility import too_weak
 from impactopt.robots.sole_margins import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.at_contact import ContactProgram
@@ -33,17 +33,17 @@ def second_look(
 ) -> SolverResult:
     """The result that IPOPT comes to from the same start, where the SQP gave up, if it says more.
 
-    It scales rows, and restores them by another way, so it rarely fails on the same programs. A limit that
-    the caller has set is an answer, and stays one.
+    It scales constraints, and restores them by another way, so it rarely fails on the same programs. A limit
+    that the caller has set is an answer, and stays one.
     """
     open_end = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
     if budget.solver != "sqp" or not open_end or budget.left == 0:
         return old
     rows = max_violation(program, old.x, program.constraints(old.x))
     if old.status is Status.FAILED and rows <= VIOLATED < old.max_violation:
-        return old  # it has been refused for what is no row
+        return old  # it has been refused for what is no constraint
     if report is not None:
-        report("our solver ends without a verdict: IPOPT tries once, from the same start")
+        report("our solver ends without a diagnosis: IPOPT tries once, from the same start")
     new = replace(budget, solver="ipopt", options=None).run(program, start)
     if new.status is Status.INTERRUPTED or _rank(new) < _rank(old):
         return new
@@ -51,12 +51,12 @@ def second_look(
 
 
 def _rank(result: SolverResult) -> tuple[bool, bool, float]:
-    """Solutions first, then what has a verdict, then what is least violated."""
+    """Solutions first, then what has a diagnosis, then what is least violated."""
     return not result.status.usable, result.status is not Status.INFEASIBLE, result.max_violation
 
 
 def lacks_rows(t: ContactProgram, result: SolverResult) -> bool:
-    """Whether a solver has ended by itself, with rows that are not met."""
+    """True if a solver has ended by itself with violated constraints."""
     if result.status not in (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT):
         return False
     return max_violation(t.program, result.x, t.program.constraints(result.x)) > VIOLATED

@@ -1,4 +1,4 @@
-"""What is asked: `ImpactProblem` with its scenarios, terms and objectives.
+"""Problem definition: `ImpactProblem` with its scenarios, terms and objectives.
 
 A new term or objective begins here.
 """

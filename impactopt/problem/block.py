@@ -1,4 +1,6 @@
-"""Nonlinear functions of variables z and numbers p, symbolic: what rows and objectives are written with."""
+"""Nonlinear functions of variables z and numbers p, symbolic: what constraints and objectives are written
+with.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an `impactopt.ImpactProblem` refuses: parts that do not go together."""
+"""Checks by which an `impactopt.ImpactProblem` refuses parts that do not go together."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.kinematics.stance import Free
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.motion_style import STYLES
@@ -64,7 +64,7 @@ def check_apart(kind: str, names: Sequence[str]) -> None:
 def check_at_rest(
     robot: Robot, coordinates: StanceCoordinates, soles: Sequence[str], posture: NDArray[np.float64]
 ) -> None:
-    """InputError if the posture's centre of mass is not above the held soles: it would fall at once."""
+    """InputError if the posture's centre of mass is not above the fixed soles: it would fall at once."""
     polygon = support_polygon(robot, coordinates)
     if not len(polygon):
         return

@@ -12,7 +12,7 @@ __all__ = ["JointMotion", "joint_motion"]
 
 
 class JointMotion(NamedTuple):
-    """Of all joints.
+    """Velocities and accelerations of all joints.
 
     z : what it is a function of, as `ContactProgram.drive_points` has slots for it.  velocity (n) [rad/s],
     acceleration (n) [rad/s^2].  through : of `impactopt.problem.block.make_block`.

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 
-from impactopt.bodies.pieces import pieces_of
+from impactopt.bodies.convex_hulls import pieces_of
 from impactopt.bodies.plausible import distance_to_link, is_far, size_of
 from impactopt.robots.robot import Robot
 from impactopt.robots.rotors import HEAVIEST_ROTOR, LIGHTEST_ROTOR

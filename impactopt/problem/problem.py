@@ -41,13 +41,13 @@ from impactopt.problem.checks import (
     check_stance,
     check_world,
 )
-from impactopt.problem.described import described
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.phase import Phase
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.second import SecondStriker, check_second
+from impactopt.problem.second_striker import SecondStriker, check_second
+from impactopt.problem.summary import described
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -108,10 +108,10 @@ class ImpactProblem:
     obstacles : bodies in the world that the robot keeps off.
     ground : the floor below a robot on a fixed base; None: there is none. Soles stand on the ground z = 0.
     terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
-        `GearLoad`, whose rows a program gets once a plan without them goes beyond it.
+        `GearLoad`, whose constraints a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
-    style : "strongest"; or "natural", with prices on jerk, on the travel of joints, above all of idle ones,
-        and on ending away from the start posture (`impactopt.problem.motion_style`).
+    style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending
+        away from the start posture (`impactopt.problem.motion_style`); or "strongest", with none.
     motion_price : largest share of the objective that prices on motion may take; those of the style are
         reduced until they take no more.  price_scale : factor on these; 1: a plan chooses it.
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
@@ -150,7 +150,7 @@ class ImpactProblem:
     ground: Ground | None = None
     terms: tuple[Term, ...] = ()
     objectives: tuple[Objective, ...] = DEFAULT_OBJECTIVES
-    style: str = "strongest"
+    style: str = "natural"
     motion_price: float = 0.1
     price_scale: float = 1.0
     smoothness: float = 1e-5
@@ -248,7 +248,7 @@ class ImpactProblem:
 
     @property
     def lasts(self) -> bool:
-        """Whether the model of the collision gives the contact a duration."""
+        """True if the model of the collision gives the contact a duration."""
         return self.collision not in INSTANT
 
     @property
@@ -263,18 +263,20 @@ class ImpactProblem:
 
     @property
     def of_drives(self) -> bool:
-        """Whether a term is about motors or gears."""
+        """True if a term is about motors or gears."""
         return any(term.of_drives for term in self.active_terms)
 
     @property
     def first_instant(self) -> bool:
-        """Whether a term looks at the first instant of a contact that has a force at once."""
+        """True if a term needs the first instant of a contact whose force begins with a jump."""
         wanted = self.lasts and any(term.first_instant for term in self.active_terms)
         return wanted and float(self.law.branch(0.0, 1.0, True)) != 0.0
 
     @property
     def abort_after(self) -> float | None:
-        """When the motion is aborted if nothing is hit, after the planned contact [s]; None: never."""
+        """Time after the planned contact at which the motion is aborted if nothing is hit [s]; None:
+        never.
+        """
         return next((s.abort_after for s in self.scenarios if s.abort_after is not None), None)
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
@@ -290,7 +292,7 @@ class ImpactProblem:
 
     @cached_property
     def hash(self) -> str:
-        """What this problem is, in 16 hexadecimal digits: see `impactopt.problem.hashing.problem_hash`."""
+        """Hash of this problem, 16 hexadecimal digits: see `impactopt.problem.hashing.problem_hash`."""
         return problem_hash(self)
 
     @cached_property
@@ -324,12 +326,14 @@ class ImpactProblem:
 
     @property
     def active_terms(self) -> tuple[Term, ...]:
-        """Its own terms that are not switched off."""
-        return tuple(term for term in self.terms if term.active)
+        """Its own terms, and those by default that bring constraints of their own; none that is off."""
+        mine = {type(term) for term in self.terms}
+        own = [t for t in DEFAULT_TERMS if type(t).add_rows is not Term.add_rows and type(t) not in mine]
+        return tuple(term for term in (*self.terms, *own) if term.active)
 
     @property
     def on_demand(self) -> tuple[Term, ...]:
-        """Those of ON_DEMAND_TERMS that hold: they are not switched off, and about one striker."""
+        """Lazy terms (ON_DEMAND_TERMS) that hold: they are not switched off, and about one striker."""
         terms = tuple(self.term(type(term)) for term in ON_DEMAND_TERMS)
         return tuple(term for term in terms if term.active and self.second is None)
 
@@ -350,7 +354,7 @@ class ImpactProblem:
 
     @property
     def keeps_apart(self) -> bool:
-        """Whether any two bodies are not to touch."""
+        """True if any two bodies must not touch."""
         return self.self_collision.enabled or self.keep_out.enabled
 
     @property

@@ -1,4 +1,4 @@
-"""What else may happen at the impact, and has to be survived."""
+"""Scenarios: other outcomes of the impact, which the robot has to survive."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ class Strength:
         return min(float((robot.velocity_limit / size).min()), float(np.sqrt(2.0 * travel * push)))
 
     def _bearable(self, jump: Array, mass: float) -> float:
-        """[m/s] at which gears bear a blow; jump (nv,) : of velocities by an impulse of 1 N s."""
+        """[m/s] at which gears carry a blow; jump (nv,) : of velocities by an impulse of 1 N s."""
         robot = self.robot
         stiffness = float(self.law.force(PRESSED, 0.0)) / PRESSED
         damping = float(self.law.force(PRESSED, 1.0)) - float(self.law.force(PRESSED, 0.0))

@@ -1,4 +1,4 @@
-"""How a row that is not met is told to a reader: its place in the motion, and how far it is off."""
+"""Readable description of a violated constraint: its place in the motion, and the amount."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Expression(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where in the motion a row holds.
+    """Place in the motion at which a constraint holds.
 
     name : in the program, where no other place has it: "swing, 93 %".
     text : to a reader; ``{s}`` and ``{ms}`` stand for the time [s] and [ms].
@@ -45,7 +45,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """How far a violation goes, in words: the amount x ``factor`` in ``unit``, and a ``phrase``.
+    """Amount of a violation in words: the amount x ``factor`` in ``unit``, and a ``phrase``.
 
     over : what the amount is divided by first, such as a sole's normal force; at least ``least``.
     """
@@ -65,15 +65,15 @@ class Measure:
 
 
 def millimetres(phrase: str, *, scale: float = 1.0) -> Measure:
-    """Of rows in ``scale`` [m]."""
+    """Measure of constraints in ``scale`` [m]."""
     return Measure("mm", 1e3 * scale, phrase)
 
 
 def degrees(phrase: str) -> Measure:
-    """Of rows in [rad]."""
+    """Measure of constraints in [rad]."""
     return Measure("deg", float(np.degrees(1)), phrase)
 
 
 def percent(phrase: str, *, of: float = 1.0) -> Measure:
-    """Of rows whose ``of`` is the whole."""
+    """Measure of constraints relative to a whole ``of``."""
     return Measure("%", 100 / of if of > 0 else 100.0, phrase)

@@ -1,4 +1,4 @@
-"""What people read of a result: tables and plain messages on the terminal, pictures, a page for a browser.
+"""Reports of a result: tables and plain messages on the terminal, pictures, a page for a browser.
 
 The terminal's modules (console, result_rows, plain_errors) are light to load, so the page's names are
 imported when they are used.

@@ -1,4 +1,4 @@
-"""What a report plots: for each chart a description and the arrays that it names."""
+"""Charts of a report: for each one a description and the arrays that it names."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def charts_of(record: Record, problem: ImpactProblem | None = None) -> tuple[lis
 
 
 def _bands(record: Record) -> list[list[float]]:
-    """When the plan is in contact, grey in every chart."""
+    """Time span of the planned contact, grey in every chart."""
     return [[float(record.arrays[f"reference_contact_{which}"]) for which in ("start", "end")]]
 
 

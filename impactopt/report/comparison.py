@@ -64,7 +64,7 @@ class Comparison:
     versions: tuple[Difference, ...]
 
     def describe(self) -> dict[str, Any]:
-        """As in `impactopt compare --json`."""
+        """JSON form, as `impactopt compare --json` prints it."""
         results = []
         for name, record in self.records.items():
             row: dict[str, Any] = {"name": name}

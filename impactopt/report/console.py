@@ -1,4 +1,4 @@
-"""What a person sees in the terminal: progress while a problem is solved, and the results as a table."""
+"""Terminal output: progress while a problem is solved, and the results as a table."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ __all__ = [
     "replay_table",
     "result_table",
     "strike_table",
-    "told_off",
-    "told_touches",
+    "switched_off_message",
     "torques_table",
+    "touches_message",
     "violation_table",
 ]
 
@@ -112,11 +112,11 @@ def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table
 
 
 def verdict_table(verdict: Mapping[str, Any]) -> Table:
-    """What was verified, the worst first; `verdict` as in `impactopt verify --json`."""
+    """Table of a verification, the worst first; `verdict` as in `impactopt verify --json`."""
     kkt = "not computed" if verdict["kkt"] is None else f"KKT residual {verdict['kkt']:.2g}"
     words = "ok" if verdict["ok"] else "not ok"
     table = Table(title=_plain(f"{words}; {kkt}"), title_justify="left")
-    for name in ("rows", "violation", "where"):
+    for name in ("constraint", "violation", "where"):
         table.add_column(name, justify="right" if name == "violation" else "left")
     for name, row in sorted(verdict["rows"].items(), key=lambda item: -item[1]["violation"]):
         table.add_row(_plain(name), f"{row['violation']:.2g}", _plain(row["where"]))
@@ -204,7 +204,7 @@ def identified_table(found: Mapping[str, Any]) -> Table:
 
 
 def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
-    """What came of each start; `starts` as in a summary."""
+    """Table of the starts' results; `starts` as in a summary."""
     table = Table(title="starts", title_justify="left")
     for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
         table.add_column(name, justify="left" if name in ("start", "status") else "right")
@@ -235,31 +235,31 @@ def _add(table: Table, row: Row) -> None:
     table.add_row(_plain(row.label), *cells)
 
 
-def told_touches(summary: Mapping[str, Any]) -> str:
-    """What a plan's bodies do to each other, in a sentence; "" where nothing touches anything."""
+def touches_message(summary: Mapping[str, Any]) -> str:
+    """Sentence about contacts between a plan's bodies; "" if there are none."""
     touches = summary.get("contacts_besides") or ()
     if not touches:
         return ""
     pairs = {(touch["one"], touch["other"]) for touch in touches}
     worst = max(touches, key=lambda touch: float(touch["depth_mm"]))
-    count = f"{len(pairs)} pairs of bodies are" if len(pairs) > 1 else "two bodies are"
+    count = f"{len(pairs)} pairs of bodies penetrate" if len(pairs) > 1 else "two bodies penetrate"
     return (
-        f"{count} in each other, {worst['one']} and {worst['other']} by {worst['depth_mm']:.0f} mm; "
+        f"{count} each other, {worst['one']} and {worst['other']} by {worst['depth_mm']:.0f} mm; "
         "[terms.self_collision] and [terms.keep_out] keep them apart"
     )
 
 
-def told_off(summary: Mapping[str, Any]) -> str:
-    """Which bounds of every problem a plan was made without, in a sentence; "" where none is off."""
+def switched_off_message(summary: Mapping[str, Any]) -> str:
+    """Sentence about the standard bounds that a plan was made without; "" if all are on."""
     off = summary.get("problem", {}).get("off") or ()
     return f"switched off: {', '.join(off)}" if off else ""
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
-    """What is not met, worst first: a row for each term."""
-    table = Table(title="what is not met, worst first", title_justify="left")
-    table.add_column("row", overflow="fold")
-    table.add_column("by how much", overflow="fold")
+    """Table of violations, worst first, one a term."""
+    table = Table(title="violations, worst first", title_justify="left")
+    table.add_column("constraint", overflow="fold")
+    table.add_column("violation", overflow="fold")
     for row, by in worst_rows(violations):
         table.add_row(_plain(row), _plain(by))
     return table

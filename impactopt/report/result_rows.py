@@ -44,14 +44,14 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """What is told, with its unit, and a cell for each column."""
+    """Row of a table: a label with its unit, and a cell for each column."""
 
     label: str
     cells: tuple[Cell, ...]
 
 
 def result_columns(summary: Mapping[str, Any]) -> Columns:
-    """The plan, its simulation on held soles, and its replay on free ones, as far as there are any.
+    """The plan, its simulation on fixed soles, and its replay on free ones, as far as there are any.
 
     summary : the content of ``summary.json``.
     """
@@ -104,7 +104,7 @@ def _sole_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     """Margins of each sole by itself, beside what is asked of the plan: of its centre of pressure to its own
     edges in each phase, and its least normal force.
 
-    Good is half of that in a plan and on held soles, and a sole that does not tip on free ones.
+    Good is half of that in a plan and on fixed soles, and a sole that does not tip on free ones.
     """
     asked, force = sources[0].get("sole_cop_margin_asked_mm") or {}, sources[0].get("sole_force_asked_N") or 0
     free = np.array([source.get("engine") == "mujoco" for source in sources])
@@ -125,7 +125,7 @@ def _sole_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
 
 
 def standing(replay: Mapping[str, Any]) -> bool | None:
-    """Whether a replay stands at the end; None where there are no soles: what is bolted cannot fall."""
+    """True if a replay stands at the end; None if there are no soles, as a bolted robot cannot fall."""
     return replay.get("standing") if replay.get("sole_force_N") else None
 
 
@@ -142,7 +142,7 @@ def blow_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
 
 
 def phase_rows(sources: Sequence[Mapping[str, Any]], phases: Iterable[str]) -> Iterator[Row | None]:
-    """What has its own number in each phase."""
+    """Rows with a number of their own in each phase."""
     for label, key, digits, scale, least, most in (
         ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
         ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
@@ -177,7 +177,8 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
 
 
 def worst_rows(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """What is not met, and by how much, worst first: the worst row of each term, and how many more it has.
+    """Violated constraints and amounts, worst first: the worst one of each term, and the number of its
+    others.
 
     violations : as in ``summary.json``. What is off by less than `MINOR` of the worst only follows from it.
     """
@@ -188,13 +189,13 @@ def worst_rows(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]
             terms.setdefault(str(v["row"]).partition(",")[0], []).append(v)
 
     def more(count: int) -> str:
-        return f" (and {count} more row{'s' if count > 1 else ''})" if count else ""
+        return f" (and {count} more)" if count else ""
 
     return [(f"{rows[0]['row']}{more(len(rows) - 1)}", str(rows[0]["by"])) for rows in terms.values()]
 
 
 def target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
-    """What the blows have brought their targets."""
+    """Rows for the impact's effects on the targets."""
     yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
     yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
     yield word_row("the board breaks", [target.get("broken") for target in targets])
@@ -248,7 +249,7 @@ def number_row(
 
 
 def _rounded(value: float, digits: int) -> str:
-    """As text; what rounds to zero has no sign."""
+    """Rounded number as text; a zero has no sign."""
     text = f"{value:.{digits}f}"
     return text.lstrip("-") if float(text) == 0 else text
 
@@ -265,13 +266,13 @@ def word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> R
 
 
 def _of_joints(names: Sequence[Any]) -> Row:
-    """What the numbers above are of, from the left."""
+    """Row with the joints that the numbers above belong to, from the left."""
     different = dict.fromkeys(str(name) for name in names if name)
     return Row(f"  {', '.join(different)}", (Cell(""),) * len(names))
 
 
 def _of_replays(row: Row | None) -> Row | None:
-    """Of a plan there is no such number."""
+    """Row with an empty cell for the plan, which has no such number."""
     return None if row is None else Row(row.label, (Cell(""), *row.cells[1:]))
 
 

@@ -165,7 +165,7 @@ def _world(world: Sequence[WorldBody]) -> str:
 
 
 def _left_out(links: RobotBodies, q: Array, posture: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-    """Why pairs of links may touch, and which those are."""
+    """Reasons why pairs of links may touch, with the pairs."""
     robot = links.robot
     yield "A joint connects them", [(links.name(a), links.name(b)) for a, b in links.connected]
     said = {frozenset(pair) for pair in robot.disable_collisions}

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.bodies.robot_visuals import Visual, visuals_of
+from impactopt.bodies.scene_visuals import surroundings_of
 from impactopt.bodies.solids import Solid, joined, simplified
-from impactopt.bodies.surroundings import surroundings_of
-from impactopt.bodies.visuals import Visual, visuals_of
 from impactopt.bodies.world import WorldBody
 from impactopt.files.output import Record
 from impactopt.problem.problem import ImpactProblem
@@ -54,7 +54,7 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
 
 
 def pack_robot(robot: Robot, arrays: Arrays) -> list[dict[str, Any]]:
-    """What the robot looks like, for the page's header; its triangles are added to `arrays`."""
+    """Robot's solids for the page's header; their triangles are added to `arrays`."""
     return [
         {"joint": body.joint, "colour": body.colour, **pack_solid(f"body{k}", body.solid, arrays)}
         for k, body in enumerate(bodies_drawn(robot))
@@ -81,7 +81,7 @@ def _middle(places: Array) -> float:
 
 
 def bodies_drawn(robot: Robot) -> list[Visual]:
-    """What a robot looks like: a solid for each joint and colour, with few enough triangles in all."""
+    """Solids of a robot, one for each joint and colour, with few enough triangles in all."""
     groups: dict[tuple[int, tuple[float, float, float]], list[Solid]] = {}
     for visual in visuals_of(robot):
         groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)

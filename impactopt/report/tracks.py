@@ -1,4 +1,4 @@
-"""What moves in an animation, at chosen instants: robot, target, force, ZMP and centre of mass."""
+"""Moving objects of an animation at chosen instants: robot, target, force, ZMP and centre of mass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From files and values by joint to a `pin.Model` and arrays: what `Robot`'s constructors are made of."""
+"""Builds a `pin.Model` and arrays from files and values by joint, for `Robot`'s constructors."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import Striker
 from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame
 from impactopt.robots.names import reduced, tell_apart
-from impactopt.robots.parts import Striker
 
 Array = NDArray[np.float64]
 MANY = 100  # soles, strikers or tools
@@ -119,7 +119,7 @@ def set_friction(model: pin.Model, viscous: Array, dry: Array) -> None:
 
 
 def frictions(model: pin.Model, joints: Sequence[str]) -> tuple[Actuator, ...]:
-    """Of each joint an `Actuator` of which only the friction is known, the model's."""
+    """Actuators of which only the friction is known, the model's, one a joint."""
     out = []
     for name, viscous, dry in zip(
         joints, *(x[model.nv - len(joints) :] for x in friction(model)), strict=True
@@ -238,7 +238,7 @@ def reference_configurations(model: pin.Model) -> dict[str, Array]:
 
 
 def lowest(model: pin.Model, q: Array, frames: Sequence[str], *, within: float = 0.01) -> list[str]:
-    """Those of the frames that are not higher than the lowest one by more than `within` [m]."""
+    """Frames that are not higher than the lowest one by more than `within` [m]."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     heights = [float(data.oMf[check_frame(model, frame, "place")].translation[2]) for frame in frames]

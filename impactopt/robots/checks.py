@@ -1,4 +1,4 @@
-"""What has to hold of a robot and its configurations; every failure names the thing and the mend."""
+"""Checks of a robot and its configurations; every failure names the thing and the fix."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def check_joints(joints: Sequence[str], name: str) -> None:
             raise InputError(f"the name of joint {joint!r} has control characters; take them out")
 
 
-# how a limit is mended in a file of that kind
-_MENDS = {
+# how a limit is fixed in a file of that kind
+_FIXES = {
     "URDF": dict.fromkeys(_LIMITS, "set it in the URDF's <limit>, or "),
     "MJCF": {
         "torque_limit": "set the joint's `actuatorfrcrange` in the MJCF, or ",
@@ -63,7 +63,7 @@ def check_limits(
 
     kind : of the file that they are from, "URDF" or "MJCF", "" for none.
     """
-    mends = _MENDS[kind]
+    fixes = _FIXES[kind]
     found = Mistakes()
     for name, value, unit, option in (
         *((j, x, "N m", "torque_limit") for j, x in zip(joints, torque, strict=True)),
@@ -73,13 +73,13 @@ def check_limits(
         if not 0 < value <= STRONGEST:
             found.found.append(
                 f"joint {name!r} has no usable {option.replace('_', ' ')} ({value:g} {unit}); "
-                f"{mends[option]}give {option}={{{name!r}: ...}}"
+                f"{fixes[option]}give {option}={{{name!r}: ...}}"
             )
     for name, low, high in zip(joints, lower, upper, strict=True):
         if not low < high:
             found.found.append(
                 f"joint {name!r} has no usable position limits (lower {low:g}, upper {high:g} rad); "
-                f"{mends['position_limit']}give position_limit={{{name!r}: (lower, upper)}}"
+                f"{fixes['position_limit']}give position_limit={{{name!r}: (lower, upper)}}"
             )
     found.raise_if_any("the robot")
 
@@ -167,8 +167,8 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
 
 
 def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
-    """InputError with all held soles, (name, frame) each, that are on no leg of their own: its last six
-    joints, which move no other held sole.
+    """InputError with all fixed soles, (name, frame) each, that are on no leg of their own: its last six
+    joints, which move no other fixed sole.
     """
     found, chains = Mistakes(), []
     for name, frame in soles:
@@ -202,7 +202,7 @@ def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
 
 def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]]) -> None:
     """InputError with all hands, (name, frame) each, that hold on with no arm of their own: its last six
-    joints, which move neither a held sole, by its frame, nor another hand.
+    joints, which move neither a fixed sole, by its frame, nor another hand.
     """
     found = Mistakes()
     chains = {frame: robot.limb(frame) for frame in (*soles, *(frame for _, frame in hands))}

@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.errors import Mistakes
+from impactopt.robots.attachments import Source, Striker
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.inertias import REPAIRED, check_choice, repair_inertias
-from impactopt.robots.parts import Source, Striker
 
 __all__ = ["Description", "Tie", "between"]
 
@@ -23,7 +23,7 @@ class Tie:
     """Forces or constraints between joints, or on one, that a plan does not have.
 
     joints : by name.  free : how many of them may move all the same; the others have to be locked.
-    text : of a message; begins with the thing and its name.  mend : another one than to lock.
+    text : of a message; begins with the thing and its name.  fix : another one than to lock.
     follower : the joint that a draft locks, "" if none is meant; follows : a polynomial of the other
         joint's angle [rad], the lowest coefficient first, which is the follower's.
     """
@@ -31,7 +31,7 @@ class Tie:
     text: str
     joints: tuple[str, ...]
     free: int = 1
-    mend: str = ""
+    fix: str = ""
     follower: str = ""
     follows: tuple[float, ...] = (0.0,)
 
@@ -41,7 +41,7 @@ class Tie:
         if len(left) <= self.free:
             return ""
         which = "it" if len(left) == 1 else "one of them" if self.free else f"all of {', '.join(left)}"
-        return f"{self.text}; {self.mend and f'{self.mend}, or '}lock {which} (`locked`)"
+        return f"{self.text}; {self.fix and f'{self.fix}, or '}lock {which} (`locked`)"
 
 
 @dataclass(kw_only=True)

@@ -51,7 +51,7 @@ class GainFactor:
         object.__setattr__(self, "factor", (least, largest))
 
     def indices(self, robot: Robot) -> tuple[int, ...]:
-        """Of its joints, in arrays of length n; InputError for what fits none."""
+        """Indices of its joints, in arrays of length n; InputError for a name that fits none."""
         found = {k for name in self.joints for k in fitting(name, robot.joint_names, "gains")}
         return tuple(sorted(found))
 

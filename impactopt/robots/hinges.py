@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots import build
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import Sole
 from impactopt.robots.checks import check_frame
 from impactopt.robots.joints import hung, mapped
-from impactopt.robots.parts import Sole
 
 __all__ = ["check_held", "check_sole", "hinged", "inside", "with_hinges"]
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 SHARE = 0.5  # of the foot's mass that goes with the sole
 SPEED = 20.0  # [rad/s]: no bound of a strike
 SINGULAR = 1e-3  # a leg's Jacobian's least singular value [m], at least
-LEVER = 0.1  # [m] by which the weight makes the torque that numbers of a hinge are told in
+LEVER = 0.1  # [m] by which the weight makes the torque that numbers of a hinge are reported in
 
 
 def hinged(model: pin.Model, soles: Sequence[Sole]) -> pin.Model:
@@ -60,7 +60,7 @@ def hinged(model: pin.Model, soles: Sequence[Sole]) -> pin.Model:
 def with_hinges(
     model: pin.Model, soles: Sequence[Sole], numbers: dict[str, Any], postures: dict[str, Array]
 ) -> tuple[pin.Model, dict[str, Any], dict[str, Array]]:
-    """As `hinged`, with numbers by joint, drives and postures of all joints."""
+    """Model with hinges (`hinged`), and numbers by joint, drives and postures of all joints."""
     whole, torque = hinged(model, soles), hinge_torque(model)
     known: dict[str, dict[str, Any]] = {}
     for sole in soles:
@@ -103,7 +103,7 @@ def inside(robot: Any, margin: float) -> tuple[Array, Array]:
 
 
 def hinge_torque(model: pin.Model) -> float:
-    """Torque [N m] in which those of hinges are told: the weight at a lever."""
+    """Torque [N m] in which those of hinges are reported: the weight at a lever."""
     return LEVER * 9.81 * float(sum(body.mass for body in model.inertias))
 
 

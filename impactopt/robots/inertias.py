@@ -33,7 +33,7 @@ def check_inertias(model: pin.Model) -> None:
 
 
 def _wrong(model: pin.Model, i: int) -> Iterator[str]:
-    """What no matter has, of the body that joint i moves: the first thing."""
+    """First physically impossible property of the body that joint i moves."""
     body = model.inertias[i]
     root = model.joints[i].nq == 7  # a free-flyer, which has no joint in the file
     link = _root(model) if root else f"the link moved by joint {model.names[i]!r}"

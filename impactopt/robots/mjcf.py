@@ -1,4 +1,4 @@
-"""From an MJCF to a `pin.Model` and what else it says of a robot, by MuJoCo's own compiler.
+"""Reads a `pin.Model` and other data of a robot from an MJCF, by MuJoCo's own compiler.
 
 The compiler knows all of the language: defaults, includes, angles, inertias of geoms and meshes. What it has
 compiled is taken over number by number, so both engines have the same robot. Pinocchio's own reader (4.1)
@@ -178,7 +178,7 @@ class _Reader(Compiled):
         for a in range(len(mj.actuator_trntype)):
             j = int(mj.actuator_trnid[a, 0])
             if int(mj.actuator_trntype[a]) not in inside:
-                if mj.actuator_trntype[a] != kinds.mjTRN_TENDON:  # a tendon's is told with it
+                if mj.actuator_trntype[a] != kinds.mjTRN_TENDON:  # a tendon's is reported with it
                     self.out.notes.append(f"actuator {self.name('actuator', a)!r}, of no joint, is left out")
                 continue
             if j not in self.joint:
@@ -217,12 +217,12 @@ class _Reader(Compiled):
                 self._add_to_joint(j, viscous=-viscous)
 
     def _disabled(self, a: int) -> bool:
-        """Whether the actuator's group is."""
+        """True if the actuator's group is disabled."""
         group = int(self.mj.actuator_group[a])
         return 0 <= group < 31 and bool(int(self.mj.opt.disableactuator) >> group & 1)
 
     def _simple(self, a: int) -> bool:
-        """Whether an actuator has a force that is a control, or a servo of position and velocity, at once."""
+        """True if an actuator's force is at once a control, or a servo of position and velocity."""
         mj, m = self.mj, self.mujoco
         return bool(
             mj.actuator_gaintype[a] == m.mjtGain.mjGAIN_FIXED
@@ -275,7 +275,7 @@ def _placement(position: Any, quaternion: Any) -> Any:
 
 
 def _rotation(quaternion: Any) -> Array:
-    """Of a unit quaternion (w, x, y, z)."""
+    """Rotation matrix of a unit quaternion (w, x, y, z)."""
     w, x, y, z = (float(a) for a in quaternion)
     return np.array(pin.Quaternion(w, x, y, z).normalized().matrix())
 

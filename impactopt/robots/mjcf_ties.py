@@ -37,12 +37,12 @@ class Compiled:
         self.joint: dict[int, int] = {}
 
     def name(self, kind: str, i: int) -> str:
-        """Of a thing; where it has none its kind and number."""
+        """Name of an object; its kind and number if it has none."""
         found = self.mujoco.mj_id2name(self.mj, getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), i)
         return str(found) if found else f"{kind}{i}"
 
     def off(self, *flags: str) -> bool:
-        """Whether one of these flags of <option><flag> is disabled."""
+        """True if one of these flags of <option><flag> is disabled."""
         bits = (int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{flag.upper()}", 0)) for flag in flags)
         return any(int(self.mj.opt.disableflags) & bit for bit in bits)
 
@@ -51,12 +51,12 @@ class Compiled:
         return [b for b, (joint, _, _) in self.body.items() if b and joint and self.mj.body_mass[b] > 0]
 
     def numbers(self, name: str) -> Array:
-        """Of the compiled model, (count, ...); empty where this MuJoCo has no such numbers."""
+        """Array of the compiled model, (count, ...); empty if this MuJoCo has no such array."""
         return np.asarray(getattr(self.mj, name, np.zeros(0)))
 
 
 def ties_of(c: Compiled) -> Iterator[Tie]:
-    """Of joints and bodies that the robot has."""
+    """Ties between joints and bodies that the robot has."""
     yield from _of_joints(c)
     if not c.off("equality", "constraint"):
         yield from _equalities(c)
@@ -74,7 +74,7 @@ def gravity_of(c: Compiled) -> Array:
 
 
 def notes_of(c: Compiled) -> Iterator[str]:
-    """What was left out, or taken otherwise than MuJoCo takes it."""
+    """Notes on features that were left out, or are treated otherwise than by MuJoCo."""
     mj = c.mj
     shares = _gravcomp(c)
     if len(shares) == 1 and (share := shares.pop()) and not c.off("gravity"):
@@ -118,7 +118,7 @@ def _partly_weightless(c: Compiled) -> Iterator[Tie]:
         text=f"bodies {names} have a gravcomp that the others do not have",
         joints=tuple(str(c.model.names[j]) for j in above),
         free=0,
-        mend="give all of them the same",
+        fix="give all of them the same",
     )
 
 
@@ -136,18 +136,18 @@ def _of_joints(c: Compiled) -> Iterator[Tie]:
                 text=f"joint {name!r} has a spring, stiffness {spring:g}, which no plan has",
                 joints=(name,),
                 free=0,
-                mend=_OUT,
+                fix=_OUT,
             )
         bent = c.numbers("dof_dampingpoly")[int(mj.jnt_dofadr[j]) :][:1]
         if bent.any() and not c.off("damper", "passive"):
             text = f"joint {name!r} has damping that is not linear in its speed, which no plan has"
-            yield Tie(text=text, joints=(name,), free=0, mend=_OUT)
+            yield Tie(text=text, joints=(name,), free=0, fix=_OUT)
     for b in c.body:
         first, count = int(mj.body_jntadr[b]), int(mj.body_jntnum[b])
         names = [c.name("joint", j) for j in range(first, first + count) if j in c.joint]
         if len(names) > 1:
             text = f"joints {', '.join(map(repr, names))} move the same body, with no mass between them"
-            yield Tie(text=text, joints=tuple(names), mend="put bodies with mass between them")
+            yield Tie(text=text, joints=tuple(names), fix="put bodies with mass between them")
 
 
 def _equalities(c: Compiled) -> Iterator[Tie]:
@@ -179,7 +179,7 @@ def _held_at(c: Compiled, equality: int, joint: int) -> Any:
 
 
 def _body(c: Compiled, equality: int, i: int) -> int:
-    """Of a thing that a loop holds."""
+    """Body of an object that a loop constrains."""
     kinds = c.numbers("eq_objtype")  # MuJoCo 3.2 has bodies only
     is_site = bool(kinds.size) and kinds[equality] == int(c.mujoco.mjtObj.mjOBJ_SITE)
     return int(c.mj.site_bodyid[i]) if is_site else max(i, 0)
@@ -197,7 +197,7 @@ def _loop(c: Compiled, name: str, one: int, other: int) -> Iterator[Tie]:
         )
     ends = (c.body[b][0] for b in (one, other))
     text = f"it closes a loop by the equality {name!r}, and robots here are trees"
-    yield Tie(text=text, joints=between(c.model, *ends), free=0, mend=f"{_OUT}, with the rods that it holds")
+    yield Tie(text=text, joints=between(c.model, *ends), free=0, fix=f"{_OUT}, with the rods that it holds")
 
 
 def _tendons(c: Compiled) -> Iterator[Tie]:
@@ -232,7 +232,7 @@ def _tendons(c: Compiled) -> Iterator[Tie]:
                 "no plan has",
                 joints=joints,
                 free=0,
-                mend=_OUT,
+                fix=_OUT,
             )
 
 

@@ -19,8 +19,8 @@ import pinocchio as pin
 from impactopt.errors import InputError, did_you_mean, missing_package
 from impactopt.robots import arms as _arms
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import Source
 from impactopt.robots.build import joint_names, lock_joints
-from impactopt.robots.parts import Source
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, standin_model
 
@@ -53,10 +53,8 @@ def talos(**overrides: Any) -> Robot:
     * Soles: 0.20 x 0.12 m about `left_sole_link` and `right_sole_link`, 5 mm inside the 0.21 x 0.13 m box
       that the URDF's simplified variant collides with, as the foot's edges are round (flat part of the mesh:
       0.195 x 0.117 m).
-    * Strikers `right_hand`, `left_hand`: 0.125 m from the gripper's base along its approach axis (-z), where
-      the fingers' inner links end; their tips reach 27 mm further but are no part to hit with.
-    * Strikers `right_fingertips`, `left_fingertips`: 0.1515 m along it, in the middle between the three tips,
-      which touch first (`FirstTouch`).
+    * Strikers `right_hand`, `left_hand`: 0.1515 m from the gripper's base along its approach axis (-z), in
+      the middle between the tips of the three fingers, which touch first (`FirstTouch`).
     * Posture `half_sitting`: the SRDF's, but with the ankles' roll at 0, as its 1.7 mrad tilt the soles.
 
     `overrides` go to `Robot.from_urdf`.
@@ -71,8 +69,7 @@ def talos(**overrides: Any) -> Robot:
             for side in ("left", "right")
         ),
         "strikers": tuple(
-            Striker(name=f"{side}_{part}", frame=f"gripper_{side}_base_link", point=np.array([0, 0, -reach]))
-            for part, reach in (("hand", 0.125), ("fingertips", 0.1515))
+            Striker(name=f"{side}_hand", frame=f"gripper_{side}_base_link", point=np.array([0, 0, -0.1515]))
             for side in ("right", "left")
         ),
         "postures": {"half_sitting": {"leg_left_6_joint": 0.0, "leg_right_6_joint": 0.0}},
@@ -89,7 +86,7 @@ def _g1_motor(knee: float, idle: float, torque: float, coulomb: float, viscous: 
     """The line of a motor from its torque [N m] up to a speed [rad/s] and the speed without load [rad/s], and
     its friction: measured by Unitree, as in its `unitree_rl_lab` (X1, X2, Y1, Fs, Fd of its actuators).
 
-    What its gears bear is not public.
+    What its gears carry is not public.
     """
     return Actuator(
         stall_torque=torque * idle / (idle - knee),

@@ -18,10 +18,10 @@ from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
 from impactopt.robots import urdf as _urdf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
+from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, read_only
 from impactopt.robots.hinges import check_sole, with_hinges
 from impactopt.robots.inertias import GIVEN, REPAIRED, check_inertias
 from impactopt.robots.names import tell_apart
-from impactopt.robots.parts import SoftGrip, Sole, Source, Striker, Tool, read_only
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
 
@@ -56,7 +56,7 @@ class Robot:
 
     Raises
     ------
-    InputError : naming the link, joint or frame and the mend: non-physical inertias; limits that are missing,
+    InputError : naming the link, joint or frame and the fix: non-physical inertias; limits that are missing,
         zero or crossed; joints with several degrees of freedom; gains too fast for the inertia they act on;
         postures outside the limits; unknown frames.
     """
@@ -256,7 +256,7 @@ class Robot:
 
     @cached_property
     def floating(self) -> bool:
-        """Whether the root is a free-flyer."""
+        """True if the root is a free-flyer."""
         return build.is_floating(self.model)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What a robot holds: tools that a link holds firmly, or softly by a joint of their own."""
+"""Tools that a robot's link holds firmly, or softly by a joint of their own."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots import build, checks
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import SoftGrip, Tool
 from impactopt.robots.joints import hung, mapped
-from impactopt.robots.parts import SoftGrip, Tool
 
 __all__ = ["grip_limits", "holding", "holding_softly", "let_go", "with_tool", "without"]
 
@@ -22,7 +22,7 @@ GRIP_SPEED = 60.0  # [rad/s] of a tool in a soft grip; no bound of a blow
 
 
 def holding(robot: Any, tool: Tool) -> dict[str, Any]:
-    """What changes of a `Robot` that takes a tool."""
+    """Fields of a `Robot` that change when it takes a tool."""
     if tool.name in robot.strikers:
         raise InputError(f"robot {robot.name!r} has a striker {tool.name!r} already; rename the tool")
     source = robot.source and replace(robot.source, tools=(*robot.source.tools, tool))
@@ -30,7 +30,7 @@ def holding(robot: Any, tool: Tool) -> dict[str, Any]:
 
 
 def holding_softly(robot: Any, name: str, grip: SoftGrip) -> dict[str, Any]:
-    """What changes of a `Robot` that has held its tool of that name firmly."""
+    """Fields of a `Robot` that change when its firmly held tool of that name gets a soft grip."""
     tool = build.pick("tool", name, {tool.name: tool for tool in robot.tools}, robot.name)
     if tool.grip is not None:
         raise InputError(f"robot {robot.name!r} holds {name!r} softly already; give it one grip")

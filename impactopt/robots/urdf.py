@@ -1,4 +1,4 @@
-"""From a URDF to a `pin.Model`, and what else the file says of a robot.
+"""Reads a `pin.Model` and other data of a robot from a URDF.
 
 Pinocchio reads links and joints. It says nothing of <mimic>, of Gazebo's extensions and of <transmission>:
 what of these changes the dynamics becomes a tie or a note of the `Description`.
@@ -100,7 +100,7 @@ def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
         name = gazebo.getAttribute("reference")
         if model.existJointName(name) and any(_numbers(gazebo, "springStiffness")):
             text = f"joint {name!r} has a spring, Gazebo's <springStiffness>, which no plan has"
-            yield Tie(text=text, joints=(name,), free=0, mend="take it out")
+            yield Tie(text=text, joints=(name,), free=0, fix="take it out")
         for loop in _children(gazebo, "joint"):
             ends = [_text(end) for tag in ("parent", "child") for end in _children(loop, tag)]
             frames = [
@@ -113,7 +113,7 @@ def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
                 text = (
                     f"Gazebo's <joint> {loop.getAttribute('name')!r} closes a loop, and robots here are trees"
                 )
-                yield Tie(text=text, joints=between(model, one, other), free=0, mend="take it out")
+                yield Tie(text=text, joints=between(model, one, other), free=0, fix="take it out")
 
 
 def _weightless(root: Any) -> Iterator[str]:
@@ -190,7 +190,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _text(element: Any) -> str:
-    """What is in an element, or its attribute `link`, in which Gazebo's loops name theirs."""
+    """Text of an element, or its attribute `link`, in which Gazebo's loops name theirs."""
     words = "".join(child.data for child in element.childNodes if child.nodeType == child.TEXT_NODE)
     return str(element.getAttribute("link") or words).strip()
 

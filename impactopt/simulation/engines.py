@@ -8,13 +8,13 @@ from typing import Any
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.problem.problem import ImpactProblem
-from impactopt.simulation.accuracy import with_step_error
-from impactopt.simulation.clearing import with_clearance
+from impactopt.simulation.clearance import with_clearance
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.result import Simulation
 from impactopt.simulation.scene import scene_of
+from impactopt.simulation.step_error import with_step_error
 
 ENGINES: dict[str, Callable[..., Simulation]] = {
     "pinocchio": simulate_pinocchio,

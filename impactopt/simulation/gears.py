@@ -1,4 +1,4 @@
-"""What a replay's gears bear, looked at in every step of an engine."""
+"""Gear loads of a replay, evaluated in every step of an engine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What both engines make of their steps: histories, and how far soles and posture moved."""
+"""Histories that both engines record, and the displacements of soles and posture."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.robots.robot import Robot
+from impactopt.simulation.contact_times import Touches
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.soles import cop_margins, sole_names
-from impactopt.simulation.touch import Touches
 
 Array = NDArray[np.float64]
 

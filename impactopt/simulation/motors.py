@@ -18,7 +18,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class MotorCut:
-    """What its motor's line took of a joint's demand: how long [s], at most [N m], and from when on [s]."""
+    """Torque cut from a joint's demand by its motor's line: duration [s], largest cut [N m], first instant
+    [s].
+    """
 
     joint: str
     duration: float
@@ -26,7 +28,7 @@ class MotorCut:
     since: float
 
     def describe(self) -> dict[str, float | str]:
-        """Of ``summary.json``."""
+        """JSON form, as it stands in ``summary.json``."""
         return {
             "joint": self.joint,
             "ms": 1e3 * self.duration,
@@ -36,7 +38,7 @@ class MotorCut:
 
 
 class Motors:
-    """What motors make of a torque that they are asked for; joints of which nothing is known give it.
+    """Torque that motors produce for a demand; joints without motor data produce all of it.
 
     A motor under its full voltage has the torque stall_torque (1 - w / no_load_speed), and braked by it
     -stall_torque (1 + w / no_load_speed): at speed, it can brake harder than it can drive. Friction takes its
@@ -90,7 +92,7 @@ class Motors:
 
 
 class Delay:
-    """What was asked for some time ago, by joint: from reading the joints to setting their torque."""
+    """Delay by joint, from reading the joints to setting their torque."""
 
     def __init__(self, robot: Robot) -> None:
         delay = numbers_of(robot.actuators, "delay")
@@ -107,7 +109,7 @@ class Delay:
         self._kept.append((t, values))
 
     def at(self, t: float, now: Array) -> Array:
-        """What reaches the motors at a time [s] at which `now` (..., n) is asked for.
+        """Demand that reaches the motors at a time [s] at which the present demand is `now` (..., n).
 
         Linear between the instants that are kept; before the first, the same was asked for.
         """
@@ -126,7 +128,7 @@ class Delay:
 
 
 class CutWatch:
-    """Where, and for how long, the line of a motor has cut what was asked for."""
+    """Records the joints, and the durations, in which motor lines have cut the demand."""
 
     def __init__(self, robot: Robot) -> None:
         self._names, n = robot.joint_names, robot.n

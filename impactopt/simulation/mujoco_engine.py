@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.robots.sole_margins import BEARS, weight_of
-from impactopt.simulation.besides import Besides
+from impactopt.simulation.contact_times import FollowedReference, Touches
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
 from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of
@@ -28,8 +28,8 @@ from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
-from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import FollowedReference, Touches
+from impactopt.simulation.target_dynamics import Push, Struck
+from impactopt.simulation.unintended_contacts import Besides
 
 Array = NDArray[np.float64]
 THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after and before each
@@ -87,7 +87,7 @@ class _Replay(MujocoRobot):
         self.start(self.reference_q[0])
 
     def follow(self, reference: Any) -> None:
-        """What servo and controller follow from now on."""
+        """Sets the reference that servo and controller follow from now on."""
         world, self.followed = self.perturbation, reference
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
         self.reference_q = np.asarray(reference.q)
@@ -168,19 +168,19 @@ class _Replay(MujocoRobot):
 
     # ------------------------------------------------------------------ what a record needs
     def look_at(self, gears: GearWatch, torque: Array, push: Push) -> None:
-        """After a step with torque (n,) [N m] of the servos, under these forces."""
+        """Records gear loads after a step with torque (n,) [N m] of the servos, under these forces."""
         acceleration = self.data.qacc[self.dof]
         gears.look(torque, acceleration)
         if self.yields is not None:
             gears.look(torque, acceleration + (push.forces - push.peaks) @ self.yields[:, self.dof])
 
     def corner_places(self) -> Array:
-        """World places (k, 3) of all held soles' corners."""
+        """World places (k, 3) of all fixed soles' corners."""
         rotations = self.data.xmat[self.corner_body].reshape(-1, 3, 3)
         return self.data.xpos[self.corner_body] + (rotations @ self.corners[:, :, None])[:, :, 0]
 
     def sole_ground(self) -> Array:
-        """(soles, 6) wrench of the floor on each held sole about the world's origin; after the step's forces
+        """(soles, 6) wrench of the floor on each fixed sole about the world's origin; after the step's forces
         are known."""
         out = np.zeros((len(self.held), 6))
         contacts = self.data.contact
@@ -208,8 +208,9 @@ class _Replay(MujocoRobot):
         return np.vstack([self.sole_ground(), found])
 
     def fallen(self, t: float) -> str:
-        """Whether the base is far from where the reference has it at a time [s]: a plan may bow deeply
-        itself. A robot that recovers comes through what the reference has after the blow later.
+        """Reason why the robot counts as fallen, "" if it stands: the base is far from the reference's at a
+        time [s], which may bow deeply itself. A robot that recovers reaches the reference's postures after
+        the blow later.
         """
         if not self.floating:
             return ""
@@ -232,7 +233,7 @@ class _Replay(MujocoRobot):
         return np.arccos(np.clip(self.upright[rows] @ _upright((x, y, z, w)), -1.0, 1.0))
 
     def not_standing(self, simulation: Simulation) -> str:
-        """Why the robot does not stand at the end of its simulation, where it stood; "" if it does."""
+        """Reason why the robot does not stand at the end of its simulation; "" if it does."""
         if not self.floating:
             return ""
         lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))
@@ -278,7 +279,7 @@ def simulate_mujoco(
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
     missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
-        :class:`impactopt.simulation.touch.FollowedReference`); default: it does not notice.
+        :class:`impactopt.simulation.contact_times.FollowedReference`); default: it does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 

@@ -37,7 +37,9 @@ class Welds:
             self.world.site_quat[ground] = rotation
 
     def wrenches(self, data: Any) -> tuple[Array, Array]:
-        """Of the world on the frames (frames, 6), world axes, and their places, at the last step's start."""
+        """Wrenches of the world on the frames (frames, 6), world axes, and their places, at the last step's
+        start.
+        """
         d, J = data, self._map
         out, places = np.empty((len(self.frames), 6)), np.empty((len(self.frames), 3))
         if not self.frames:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from impactopt.errors import missing_package
 from impactopt.robots.robot import Robot
+from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
-from impactopt.simulation.solids import FLOOR
 
 Array = NDArray[np.float64]
 # of a weld, MuJoCo's own limits: impedance, and time constant in steps
@@ -156,7 +156,7 @@ def primitive(mujoco: Any, solid: Any) -> dict[str, Any]:
 
 
 def site_name(number: int) -> str:
-    """Of a striker, the first of which is 1."""
+    """Name of a striker's site; the first striker is 1."""
     return "striker" if number == 1 else f"striker {number}"
 
 

@@ -1,4 +1,4 @@
-"""How the world of a replay differs from the one that was planned for."""
+"""Differences between the world of a replay and the planned one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LIGHTEST = 1e-6  # [kg] of a payload that is one: MuJoCo takes no body without i
 
 @dataclass(frozen=True, kw_only=True)
 class Perturbation:
-    """How the world of a replay differs from the plan. By default it does not, and the floor's friction is
+    """Differences of a replay's world from the plan. By default there are none, and the floor's friction is
     0.9.
 
     mass : of the target, as a factor of the planned one.  stiffness, damping : of the contact law, as

@@ -15,14 +15,14 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
+from impactopt.simulation.contact_times import FollowedReference, Touches
 from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of
 from impactopt.simulation.motors import CutWatch, Delay, Motors
 from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
-from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import FollowedReference, Touches
+from impactopt.simulation.target_dynamics import Push, Struck
 
 Array = NDArray[np.float64]
 
@@ -63,16 +63,16 @@ class _World:
         self.motors, self.delay = Motors(robot), Delay(robot)
 
     def follow(self, reference: Any) -> None:
-        """What the servo follows from now on."""
+        """Sets the reference that the servo follows from now on."""
         self.servo, self.followed = Servo(self.robot, reference), reference
 
     def at_start(self, reference: Any) -> _State:
-        """Where the motion begins: at rest, with motors that give what is asked for."""
+        """State at the motion's start: at rest, with motors that give the demanded torque."""
         travel = self.struck.travel_at_start(reference)
         return self._begin(0.0, np.array(reference.q[0]), np.zeros(self.model.nv), travel)
 
     def at_contact(self, reference: Any) -> _State:
-        """Where contact is planned to begin: as the swing's reference ends."""
+        """State at the planned beginning of contact, where the swing's reference ends."""
         k = int(np.flatnonzero(reference.phase == 0)[-1])
         return self._begin(float(reference.contact_start), np.array(reference.q[k]), reference.v[k], 0.0)
 
@@ -90,7 +90,7 @@ class _World:
         return self.struck.depths(self.body.hand_places(), s.x)
 
     def rates(self, t: float, s: _State, *, forces: Array | None = None, step: float = 0.0) -> _Rates:
-        """At a state under the forces [N] of its step, or those of the step [s] that begins here."""
+        """Rates of a state under the forces [N] of its step, or those of the step [s] that begins here."""
         body = self.body
         speed = body.look(s.q, s.v)
         speeds, depths = body.rows @ s.v, self.depths(s)
@@ -130,7 +130,7 @@ class _World:
         return out
 
     def corners(self) -> Array:
-        """World places (k, 3) of all held soles' corners."""
+        """World places (k, 3) of all fixed soles' corners."""
         places = [
             np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
             for m, c in zip(self.body.placements(), self.scene.corners, strict=False)  # then hands
@@ -257,7 +257,8 @@ def simulate_pinocchio(
     until [s] : it ends, if that is earlier.
     record : steps between recorded instants; every step is recorded in contact.
     missing : there is no target.  missed : the reference of a robot that hits nothing, which it notices at
-        ``missed.contact_end`` (:class:`impactopt.simulation.touch.FollowedReference`); default: it does not.
+        ``missed.contact_end`` (:class:`impactopt.simulation.contact_times.FollowedReference`); default: it
+        does not.
 
     Raises
     ------

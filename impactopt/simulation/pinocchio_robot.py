@@ -1,4 +1,5 @@
-"""The held robot in Pinocchio, with H, J and bias anew at every call: what replays and references move.
+"""The constrained robot in Pinocchio, with H, J and bias anew at every call: what replays and references
+move.
 
 Two ways to the same numbers: the paper's dense system, and Pinocchio's own algorithms along the tree.
 """
@@ -28,7 +29,7 @@ class Body(ABC):
     ----------
     robot : what moves.
     frames : held in all six directions.
-    compliance : (6,) of each held frame, as `Stance.compliance`.
+    compliance : (6,) of each constrained frame, as `Stance.compliance`.
     striker : the striking frame, or several.
     normal : (3,) of the blow.
     """
@@ -63,7 +64,9 @@ class Body(ABC):
 
     @abstractmethod
     def wrenches(self) -> Array:
-        """On the held frames (frames, 6), at their origins in world axes, of the last acceleration."""
+        """Wrenches on the constrained frames (frames, 6), at their origins in world axes, of the last
+        acceleration.
+        """
 
     def hand_places(self) -> Array:
         """(hands, 3) [m] of the striking points, where they have been last."""
@@ -72,11 +75,11 @@ class Body(ABC):
         )
 
     def placements(self) -> list[pin.SE3]:
-        """Of the held frames in the world, where it has been last."""
+        """Placements of the constrained frames in the world, at the last evaluation."""
         return [pin.updateFramePlacement(self.model, self.data, i).copy() for i in self.frames]
 
     def places(self) -> Array:
-        """(held frames, 3) [m]: their origins in the world, where it has been last."""
+        """(constrained frames, 3) [m]: their origins in the world, where it has been last."""
         return np.array([placement.translation for placement in self.placements()]).reshape(-1, 3)
 
     def _jacobian(self, frame: int) -> Array:

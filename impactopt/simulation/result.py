@@ -1,4 +1,4 @@
-"""What a re-simulation is given and what it gives back: numbers only."""
+"""Inputs and results of a re-simulation: numbers only."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.robots.sole_margins import least_margins
+from impactopt.simulation.collision_geometry import Solids, Touched
 from impactopt.simulation.motors import MotorCut
-from impactopt.simulation.solids import Solids, Touched
 
 Array = NDArray[np.float64]
 PHASES = ("swing", "collision", "follow")
@@ -119,7 +119,7 @@ class Simulation:
     each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
     computed, or nothing was hit.
     gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
-    before.  loads: what gears and motors bear at most.  cuts: joints whose demand the line of their motor
+    before.  loads: what gears and motors carry at most.  cuts: joints whose demand the line of their motor
     has cut, the longest first; None where no motor's line is known.
     grip_force (k, hands) [N]: on each hand that holds on.  impulses (strikers,) [N s]: of each.
     """
@@ -171,7 +171,7 @@ class Simulation:
 
     @property
     def standing(self) -> bool | None:
-        """Whether the robot stands at the end; None where the engine holds its soles to the ground."""
+        """True if the robot stands at the end; None if the engine constrains its soles to the ground."""
         return None if self.fall is None else not self.fall
 
     def zmp(self) -> Array:
@@ -253,7 +253,7 @@ class Simulation:
         return out
 
     def _cut_numbers(self) -> dict[str, Any]:
-        """Of the joint that was cut longest; None where no motor's line is known, 0 where none was cut."""
+        """Summary of the joint that was cut longest; None if no motor's line is known, 0 if none was cut."""
         if not self.cuts:
             return {
                 "motor_cut_ms": None if self.cuts is None else 0.0,

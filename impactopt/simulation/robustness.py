@@ -17,9 +17,9 @@ from impactopt.errors import InputError, check_array, check_whole, shortened
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation import Perturbation, Scene, Simulation, scene_of, simulate_mujoco
-from impactopt.simulation.accuracy import check_steps, with_step_error
 from impactopt.simulation.controller import ControllerSettings
 from impactopt.simulation.mujoco_world import mujoco_module
+from impactopt.simulation.step_error import check_steps, with_step_error
 from impactopt.simulation.workers import map_on_workers
 
 __all__ = ["PerturbationRanges", "Robustness", "draw_perturbations", "robustness"]
@@ -104,7 +104,7 @@ def _changed(perturbation: Perturbation, numbers: dict[str, Any]) -> Perturbatio
 
 
 class Row(NamedTuple):
-    """What one replay gave: impulse [N s], largest slip and lift of a sole [m]; nan where it has none."""
+    """Result of one replay: impulse [N s], largest slip and lift of a sole [m]; nan where it has none."""
 
     standing: bool
     reason: str
@@ -161,20 +161,20 @@ class Robustness:
         return float(known.std()) if known.size else float("nan")
 
     def reasons(self) -> dict[str, int]:
-        """How often each kind of reason came, most often first; numbers in it are left out."""
+        """Counts of each kind of reason, most frequent first; numbers in it are left out."""
         kinds = (re.sub(r"(?<= )[-+]?(\d[\d.e+-]*|nan|inf)(?=[ ,;:]|$)", "...", text) for text in self.reason)
         return dict(Counter(kind for kind in kinds if kind).most_common())
 
     def table(self) -> dict[str, Array]:
-        """What was drawn, (n,) by name."""
+        """Drawn parameters, (n,) by name."""
         return {
             name: np.array([getattr(c, name) for c in self.perturbations])
             for name in self.drawn_from.bounds()
         }
 
     def separation(self) -> dict[str, dict[str, float]]:
-        """By parameter, its mean among draws that stand and that do not (of factors: the geometric mean), and
-        how far apart these are in standard deviations of the draws; nan where there are none.
+        """Separation by parameter: its mean among draws that stand and that do not (of factors: the
+        geometric mean), and the difference in standard deviations of the draws; nan where there are none.
         """
         out = {}
         for name, value in self.table().items():
@@ -193,8 +193,8 @@ class Robustness:
         return out
 
     def by_third(self) -> dict[str, list[float]]:
-        """By parameter, the share that stands of draws in the lower, middle and upper third of its range (of
-        factors: of its logarithm): what means hide where both ends fall; nan where there are none.
+        """Fraction that stands of draws in the lower, middle and upper third of each parameter's range (of
+        factors: of its logarithm), which means hide if draws fall at both ends; nan where there are none.
         """
         out = {}
         for name, value in self.table().items():
@@ -209,7 +209,7 @@ class Robustness:
 
 @dataclass(frozen=True, kw_only=True)
 class Shared:
-    """What every replay needs."""
+    """Data that every replay needs."""
 
     robot: Robot
     reference: Any
@@ -221,7 +221,7 @@ class Shared:
 def _simulate(
     robot: Robot, reference: Any, scene: Scene, *, step: float = STEP, **options: Any
 ) -> Simulation:
-    """As `simulate_mujoco`, with draws' own step, which their steps' error is measured from."""
+    """Simulates a draw with the draws' own step, which the step's error is measured from."""
     return simulate_mujoco(robot, reference, scene, step=step, **options)
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids
 from impactopt.simulation.result import Scene
-from impactopt.simulation.solids import FLOOR, Solid, Solids
 
 
 def scene_of(problem: ImpactProblem) -> Scene:
-    """Target, contact and held soles of ``problem``."""
+    """Target, contact and fixed soles of ``problem``."""
     p = problem
     return Scene(
         solids=solids_of(p) if p.keeps_apart else Solids(),

@@ -40,7 +40,7 @@ _PR_SET_PDEATHSIG = 1  # of its prctl
 
 @dataclass(frozen=True, kw_only=True)
 class Died:
-    """In place of a result: the exit code of the input's last process (-9: SIGKILL), and how many had it."""
+    """Stand-in for a result: the exit code of the input's last process (-9: SIGKILL), and their number."""
 
     code: int
     tries: int

@@ -1,8 +1,8 @@
 """The KKT system at a solution with its active set: what small changes of a program do to its solution.
 
 Source: Fiacco, "Introduction to sensitivity and stability analysis in nonlinear programming" (1983), ch. 3:
-where active rows are independent, their multipliers are not zero and the second-order condition holds, the
-solution is a smooth function of a parameter, by the implicit function theorem.
+where active constraints are independent, their multipliers are not zero and the second-order condition holds,
+the solution is a smooth function of a parameter, by the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from impactopt.solvers.program import NonlinearProgram, Vector
 __all__ = ["ActiveSystem", "Change", "Offset"]
 
 Side = npt.NDArray[np.int8]
-# off the diagonal of rows: what keeps those that depend on each other from a zero pivot. The first is best
-# where multipliers are large, the other where a row touches nothing
+# on the diagonal of constraints, against zero pivots by dependent ones. The first is best where multipliers
+# are large, the other where a constraint touches nothing
 _ROUNDING = (1e-14, 1e-10)
 _SINGULAR = (
-    "rows that hold at this solution depend on each other: its KKT system is singular; solve the changed "
-    "problem from it, with solve(problem, start=solution)"
+    "the active constraints of this solution are linearly dependent: its KKT system is singular; solve the "
+    "changed problem from it, with solve(problem, start=solution)"
 )
-_REFINEMENTS = 5
+_REFINEMENTS = 5  # of a solution: they remove the error of what `_ROUNDING` adds to the diagonal
 _LEFT = 1e-8  # of what is given: what a step may leave of the equations
 _SOFT = 1e4  # slack over multiplier: what gives way more is at no bound
 _TINY = 1e-9  # a multiplier that is nothing
@@ -36,9 +36,10 @@ _TINY = 1e-9  # a multiplier that is nothing
 
 @dataclass(frozen=True, kw_only=True)
 class Offset:
-    """What a program with other numbers leaves of the KKT conditions of a solution.
+    """Residual of a solution's KKT conditions in a program with other parameters.
 
-    dual (n,) : grad f + J'y + z.  rows (m,) : g minus the bound that each row is at, where it is at one.
+    dual (n,) : grad f + J'y + z.  rows (m,) : g minus the bound that each constraint is at, where it is at
+    one.
     variables (n,) : likewise of x.
     """
 
@@ -49,7 +50,7 @@ class Offset:
     variables: Vector
 
     def less(self, other: Offset) -> Offset:
-        """What is left without another."""
+        """Difference of two residuals."""
         return Offset(
             dual=self.dual - other.dual,
             rows=self.rows - other.rows,
@@ -59,7 +60,7 @@ class Offset:
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """Of variables (n,), multipliers of rows (m,) and of bounds (n,); or their values."""
+    """Values or changes of variables (n,), multipliers of constraints (m,) and multipliers of bounds (n,)."""
 
     x: Vector
     y: Vector
@@ -67,10 +68,10 @@ class Change:
 
 
 class ActiveSystem:
-    """Factored once:  [H A'; A -S] with the rows and bounds A that a solution is at, or near by.
+    """Factored once:  [H A'; A -S] with the constraints and bounds A that a solution is at, or near by.
 
-    S is the slack of an inequality over its multiplier, as of an interior-point method: it lets go of rows
-    that hardly hold, and is nothing for those that do.
+    S is the slack of an inequality over its multiplier, as of an interior-point method: it lets go of
+    constraints that hardly hold, and is nothing for those that do.
 
     Attributes
     ----------
@@ -102,7 +103,7 @@ class ActiveSystem:
         self._factors: dict[float, Any] = {}
 
     def _factor(self, rounding: float) -> Any:
-        """LU of the system, with a little on the diagonal of the rows; kept."""
+        """LU of the system, with a little on the diagonal of the constraints; kept."""
         if rounding not in self._factors:
             n = len(self.x)
             shift = np.concatenate([np.zeros(n), np.full(self._matrix.shape[0] - n, -rounding)])
@@ -114,7 +115,7 @@ class ActiveSystem:
         return self._factors[rounding]
 
     def offset(self, program: NonlinearProgram, at: Change | None = None) -> Offset:
-        """Of a program with other numbers, and the same variables and rows.
+        """KKT residual of a program with other parameters, and the same variables and constraints.
 
         at : variables and multipliers; None: those of the solution.
         """
@@ -132,7 +133,7 @@ class ActiveSystem:
 
         Raises
         ------
-        InputError : rows that the solution is at depend on each other.
+        InputError : the active constraints are linearly dependent.
         """
         given = -np.concatenate([offset.dual, offset.rows[self._rows], offset.variables[self._bounds]])
         for rounding in _ROUNDING:
@@ -155,7 +156,7 @@ class ActiveSystem:
 
 
 def _at(values: Vector, lower: Vector, upper: Vector, multipliers: Vector) -> tuple[Side, Vector]:
-    """Which bound each value is at, or near by; and its slack over its multiplier."""
+    """Bound that each value is at, or near; and its slack over its multiplier."""
     gap = np.abs(np.where(multipliers > 0, upper - values, values - lower))
     size = np.abs(multipliers)
     equal = lower == upper

@@ -41,7 +41,7 @@ IPOPT_DEFAULTS: Mapping[str, Any] = {
     "max_iter": 500,
     "tol": 1e-6,
     "constr_viol_tol": 1e-6,
-    # Our rows are scaled when they are transcribed; IPOPT's own scaling would loosen the large ones only.
+    # Constraints are scaled when they are transcribed; IPOPT's own scaling would loosen the large ones only.
     "nlp_scaling_method": "none",
     # Starts are rough but not far off: a large first barrier would only push them away
     # (half the iterations).

@@ -101,7 +101,7 @@ class Functions:
         iterations: int,
         seconds_qp: float = np.nan,
     ) -> SolverResult:
-        """What came of a solver that these functions were given, measured here: where it ended, or the best
+        """Result of a solver that was given these functions, re-evaluated here: its last point, or the best
         point seen if that is no solution.
 
         since : the clock when it began.  Raises what was raised in the functions.

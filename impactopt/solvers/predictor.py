@@ -1,8 +1,8 @@
-"""What becomes of a program's solution when the program's numbers change: a few quadratic programs.
+"""Predicts a program's solution for changed parameters by a few quadratic programs.
 
-Each has the changed program's rows made linear, and the known solution's Hessian. Its active set is found by
-Newton's method on its augmented Lagrangian, with exact line searches: rows that begin to hold and rows
-that let go are no matter, where a step with the solution's own active set is off.
+Each has the changed program's constraints made linear, and the known solution's Hessian. Its active set is
+found by Newton's method on its augmented Lagrangian, with exact line searches: constraints that begin to hold
+and constraints that let go are no matter, where a step with the solution's own active set is off.
 
 Source: Hermans, Themelis, Patrinos, "QPALM: a Newton-type proximal augmented Lagrangian method for quadratic
 programs", CDC 2019.
@@ -23,18 +23,18 @@ from impactopt.solvers.threads import threads
 __all__ = ["Prediction", "Predictor"]
 
 Sides = npt.NDArray[np.int8]
-_WEIGHT = 1e6  # of the augmented Lagrangian: a row is off by a multiplier's change over it
-_WEAK = 1e-4  # multiplier of a row that hardly holds
+_WEIGHT = 1e6  # of the augmented Lagrangian: a constraint is off by a multiplier's change over it
+_WEAK = 1e-4  # multiplier of a constraint that hardly holds
 _PROXIMAL = 1e-2  # curvature more of every variable, so that what hardly matters stays
 _STEPS, _SETS = 5, 20  # QPs, and active sets of each
-_SHORT, _JAMMED = 0.1, 5  # so many line searches that are so short: it gets nowhere
-_ENOUGH = 1e-4  # of rows: no more QPs
+_SHORT, _JAMMED = 0.1, 5  # so many line searches that are so short: it stalls
+_ENOUGH = 1e-4  # of constraints: no more QPs
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """Variables (n,), multipliers of rows (m,) and bounds (n,), by how much rows or bounds are off at most,
-    and after how many QPs.
+    """Variables (n,), multipliers of rows (m,) and bounds (n,), by how much constraints or bounds are off at
+    most, and after how many QPs.
     """
 
     x: Vector
@@ -48,8 +48,8 @@ class Predictor:
     """Predicts from one solution of a program: x (n,), y (m,) and z (n,) as of
     `impactopt.solvers.program.SolverResult`.
 
-    A solver leaves it with slack at rows that hold, and with small multipliers at those that do not. Both are
-    kept, so that numbers that do not change give back the solution itself.
+    A solver leaves it with slack at constraints that hold, and with small multipliers at those that do not.
+    Both are kept, so that numbers that do not change give back the solution itself.
     """
 
     def __init__(self, program: NonlinearProgram, x: Vector, y: Vector, z: Vector) -> None:
@@ -65,7 +65,8 @@ class Predictor:
             bounded=bounded,
             moves=self._moves,
         )
-        self._free = np.zeros(program.n, dtype=bool)  # variables whose bounds are no rows of the condenser
+        # variables whose bounds are no rows of the condenser
+        self._free = np.zeros(program.n, dtype=bool)
         self._free[self._newton.condenser.free] = bounded[self._newton.condenser.free]
         lower, upper = self._bounds(program)
         self._equal = lower == upper
@@ -78,7 +79,7 @@ class Predictor:
         self._sides = np.sign(own - self._weak).astype(np.int8)
 
     def _bounds(self, program: NonlinearProgram) -> tuple[Vector, Vector]:
-        """Of rows and variables; those that do not move have none."""
+        """Bounds of constraints and variables; infinite for variables that do not move."""
         lower, upper = (
             np.where(self._moves, program.x_lower, -np.inf),
             np.where(self._moves, program.x_upper, np.inf),
@@ -86,9 +87,9 @@ class Predictor:
         return np.concatenate([program.g_lower, lower]), np.concatenate([program.g_upper, upper])
 
     def predict(self, program: NonlinearProgram) -> Prediction | None:
-        """For the same program with other numbers; None where a QP's active set is not found.
+        """Prediction for the same program with other parameters; None if a QP's active set is not found.
 
-        QP after QP from where the one before led, while rows are off and it helps.
+        QP after QP from where the one before led, while constraints are off and it helps.
         """
         found: Prediction | None = None
         x, y, z, sides = self.x, self.y, self.z, self._sides
@@ -112,7 +113,7 @@ class Predictor:
 
 
 class _QP:
-    """Minimize 1/2 d'Hd + q'd with all rows and bounds made linear at x.
+    """Minimize 1/2 d'Hd + q'd with all constraints and bounds made linear at x.
 
     Attributes
     ----------
@@ -142,7 +143,7 @@ class _QP:
         return out
 
     def solve(self, sides: Sides) -> bool:
-        """From an active set (as of `sides`) to that of the solution, or near; whether it gets there."""
+        """Iterates from an active set (as of `sides`) towards the solution's; true if it gets there."""
         rows, short = self._of._inequal, 0
         at = np.zeros(len(rows))
         for k in range(_SETS):
@@ -203,7 +204,7 @@ class _QP:
         return d
 
     def _length(self, step: Vector, at: Vector, along: Vector) -> float:
-        """How far to go along a step for the least augmented Lagrangian, 1 at most."""
+        """Step length that minimizes the augmented Lagrangian along a step, 1 at most."""
         hessian, more = self._of._hessian, _PROXIMAL + self._newton.shift
         linear = float((self._q + hessian @ self.d + more * self.d) @ step)
         square = float(step @ (hessian @ step) + more * (step @ step))
@@ -216,7 +217,7 @@ class _QP:
         return float(brentq(slope, 0.0, 1.0, xtol=1e-6))
 
     def multipliers(self) -> tuple[Vector, Vector]:
-        """Of rows (m,) and bounds (n,), as of the last active set."""
+        """Multipliers of constraints (m,) and bounds (n,), as of the last active set."""
         found = self._y + self._constant
         y, z = found[: self._m], found[self._m :].copy()
         held = ~self._of._moves

@@ -1,4 +1,4 @@
-"""What a nonlinear program is to our solvers, and what a solver gives back.
+"""Interface of nonlinear programs and of solver results.
 
 The border between the symbolic and the numeric half of the package: everything below it is NumPy and SciPy.
 """
@@ -20,10 +20,10 @@ Matrix = Any  # scipy.sparse.csc_array; SciPy ships no types
 
 
 class Determined(NamedTuple):
-    """Variables, by number, that equality rows of their own determine; those of lower rank go first.
+    """Variables, by number, that equality constraints of their own determine; those of lower rank go first.
 
-    A program may have a sequence ``determined`` of them. Where rows would do for several, what stands first
-    there takes those that stand first.
+    A program may have a sequence ``determined`` of them. Where constraints would do for several, what stands
+    first there takes those that stand first.
     """
 
     rank: tuple[int, ...]
@@ -40,7 +40,7 @@ class NonlinearProgram(Protocol):
 
     Attributes
     ----------
-    n, m : number of variables and of rows.
+    n, m : number of variables and of constraints.
     x_lower, x_upper : bounds of the variables (n,).
     g_lower, g_upper : bounds of the rows (m,).
     """
@@ -73,20 +73,22 @@ class NonlinearProgram(Protocol):
         ...
 
     def row_name(self, i: int) -> str:
-        """What row i of g is to the reader: "torque limit, swing, node 7, arm_right_4_joint"."""
+        """Readable name of constraint i: "torque limit, swing, node 7, arm_right_4_joint"."""
         ...
 
     def variable_name(self, j: int) -> str:
-        """What entry j of x is to the reader."""
+        """Readable name of variable j."""
         ...
 
 
 @runtime_checkable
 class SpokenProgram(NonlinearProgram, Protocol):
-    """A program that tells its violated rows as a person reads them."""
+    """A program that tells its violated constraints as a person reads them."""
 
     def row_group(self, i: int) -> tuple[str, str]:
-        """Term and place of row i: of the rows of a term at a place one message stands for all."""
+        """Term and place of constraint i: of the constraints of a term at a place one message stands for
+        all.
+        """
         ...
 
     def describe_violation(self, i: int, x: Vector, amount: float) -> tuple[str, str]:
@@ -96,7 +98,9 @@ class SpokenProgram(NonlinearProgram, Protocol):
 
 @dataclass(frozen=True)
 class Violation:
-    """What is not met: as a person reads it, how far it is off, and the amount in the row's own unit."""
+    """Violated constraint or bound: its name, the violation in words, and the amount in the constraint's own
+    unit.
+    """
 
     what: str
     by: str
@@ -106,11 +110,11 @@ class Violation:
         return f"{self.what}: {self.by}"
 
 
-MINOR = 0.01  # of the worst row's violation: what a message leaves out
+MINOR = 0.01  # of the worst constraint's violation: what a message leaves out
 
 
 class Status(enum.Enum):
-    """How a solver ended."""
+    """Status that a solver ended with."""
 
     SOLVED = "solved"
     ACCEPTABLE = "acceptable"
@@ -127,7 +131,7 @@ class Status(enum.Enum):
 
     @property
     def usable(self) -> bool:
-        """Whether the iterate meets the solver's tolerances, or nearly so (SOLVED, ACCEPTABLE)."""
+        """True if the iterate meets the solver's tolerances, or nearly so (SOLVED, ACCEPTABLE)."""
         return self in (Status.SOLVED, Status.ACCEPTABLE)
 
 
@@ -136,7 +140,7 @@ _MESSAGES = {
     Status.ACCEPTABLE: "Solved to an acceptable level: near a local optimum, not within the tolerances.",
     Status.ITERATION_LIMIT: "Stopped at the iteration limit; the best iterate so far is returned.",
     Status.TIME_LIMIT: "Stopped at the time limit; the best iterate so far is returned.",
-    Status.INFEASIBLE: "Infeasible: no point near by meets all rows; the least violation is returned.",
+    Status.INFEASIBLE: "Infeasible: no point near by meets all constraints; the least violation is returned.",
     Status.INTERRUPTED: "Interrupted; the best iterate so far is returned.",
     Status.FAILED: "The solver gave up; the best iterate so far is returned.",
 }
@@ -150,7 +154,7 @@ class IterationRecord:
     ----------
     iteration : number, from 0 (the start).
     objective : f(x).
-    max_violation : largest violation of a row or a bound, in the units of the rows.
+    max_violation : largest violation of a constraint or a bound, in the units of the constraints.
     kkt : scaled stationarity (see `stationarity`); nan where the solver does not know it.
     step : largest absolute entry of the step that led here.
     seconds : time since the start of the solve [s].
@@ -184,9 +188,9 @@ class SolverResult:
     iterations : number of iterations.
     seconds : wall time; seconds_functions: of that in the program's functions; seconds_qp: of that in the QP
         solver.
-    max_violation : largest violation of a row or a bound, in the units of the rows.
+    max_violation : largest violation of a constraint or a bound, in the units of the constraints.
     kkt : scaled stationarity (see `stationarity`).
-    message : a sentence, with the rows that cannot be met by name where there are any.
+    message : a sentence, with the constraints that cannot be met by name where there are any.
     history : one record an iteration.
     """
 
@@ -210,7 +214,7 @@ def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
 
     Raises
     ------
-    InputError : wrong shapes, NaN, crossing bounds; the message names the row or variable.
+    InputError : wrong shapes, NaN, crossing bounds; the message names the constraint or variable.
     """
     n, m = program.n, program.m
     sides = (("x", n, program.variable_name), ("g", m, program.row_name))
@@ -229,17 +233,17 @@ def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
 
 
 def row_violations(program: NonlinearProgram, g: Vector) -> Vector:
-    """By how much each row is outside its bounds, (m,), >= 0; nan where g is nan."""
+    """Violation of each constraint's bounds, (m,), >= 0; nan where g is nan."""
     return np.maximum(np.maximum(program.g_lower - g, g - program.g_upper), 0.0)
 
 
 def bound_violations(program: NonlinearProgram, x: Vector) -> Vector:
-    """By how much each variable is outside its bounds, (n,), >= 0."""
+    """Violation of each variable's bounds, (n,), >= 0."""
     return np.maximum(np.maximum(program.x_lower - x, x - program.x_upper), 0.0)
 
 
 def max_violation(program: NonlinearProgram, x: Vector, g: Vector) -> float:
-    """Largest violation of a row or a bound at x with g = g(x); inf if any is nan."""
+    """Largest violation of a constraint or a bound at x with g = g(x); inf if any is nan."""
     rows, bounds = row_violations(program, g), bound_violations(program, x)
     worst = max(float(np.max(rows, initial=0.0)), float(np.max(bounds, initial=0.0)))
     finite = not (np.isnan(rows).any() or np.isnan(bounds).any())
@@ -278,7 +282,7 @@ def complementarity(
 def is_stationary_violation(
     program: NonlinearProgram, x: Vector, g: Vector, jacobian: Matrix, tolerance: float = 1e-3
 ) -> bool:
-    """Whether no small step lessens the violation 1/2 |v|^2 of the rows: a locally infeasible point.
+    """True if no small step reduces the violation 1/2 |v|^2 of the constraints: a locally infeasible point.
 
     True if the gradient J' v, without the part that only the variables' bounds hold, is small beside |J||v|.
     """
@@ -300,9 +304,9 @@ def worst_rows(
     count: int = 5,
     once_a_term: bool = False,
 ) -> list[Violation]:
-    """What is violated by more than the tolerance, largest first.
+    """Violations beyond the tolerance, largest first.
 
-    Of a term's rows at a place the worst one only; ``once_a_term``: of all its rows.
+    Only the worst one of each term's constraints at a node; ``once_a_term``: of all its constraints.
     """
     violations = np.concatenate([row_violations(program, g), bound_violations(program, x)])
     violations = np.where(np.isnan(violations), np.inf, violations)
@@ -328,7 +332,7 @@ def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, 
     rows = worst_rows(program, x, g, tolerance=tolerance, once_a_term=True)
     if not rows:
         return status.message
-    # rows are of order one, so what is off by so much less only follows from the others
+    # constraints are of order one, so what is off by so much less only follows from the others
     rows = [violation for violation in rows if violation.amount >= MINOR * rows[0].amount]
     listed = "; ".join(str(violation) for violation in rows)
     heading = "Rows that cannot be met" if status is Status.INFEASIBLE else "Rows not met"
@@ -336,12 +340,14 @@ def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, 
         np.sum(~(row_violations(program, g) <= tolerance))
         + np.sum(~(bound_violations(program, x) <= tolerance))
     )
-    tail = f"; {more} rows in all" if more > len(rows) else ""
+    tail = f"; {more} constraints in all" if more > len(rows) else ""
     return f"{status.message} {heading}: {listed}{tail}."
 
 
 class BestIterate:
-    """Keeps the best point a solver has seen: least violation; among points that meet the rows, least f."""
+    """Keeps the best point a solver has seen: least violation; among points that meet the constraints, least
+    f.
+    """
 
     def __init__(self, program: NonlinearProgram, tolerance: float):
         self._program, self._tolerance = program, tolerance

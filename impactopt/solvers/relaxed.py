@@ -16,9 +16,8 @@ import scipy.sparse as sp
 from impactopt.solvers.program import Determined, Matrix, NonlinearProgram, Vector
 
 Index = npt.NDArray[np.intp]
-_KEEP = (
-    1e-3  # of the program's own objective, over its size: there is one point among many, and a sensible one
-)
+# weight of the program's own objective, over its size: of many points with the least relaxation, it picks one
+_KEEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +33,12 @@ class Relaxation:
 
 
 class RelaxedProgram:
-    """Minimize the sum of how far bounds move, subject to all of a program's rows; a `NonlinearProgram`.
+    """Minimize the sum of how far bounds move, subject to all of a program's constraints; a
+    `NonlinearProgram`.
 
-    Its variables are the program's (n,), and behind them one for each relaxation, >= 0. Its rows are the
-    program's (m,), and behind them the lower sides of relaxed rows and the bounds of relaxed variables.
+    Its variables are the program's (n,), and behind them one for each relaxation, >= 0. Its constraints are
+    the program's (m,), and behind them the lower sides of relaxed constraints and the bounds of relaxed
+    variables.
 
     x : (n,) somewhere: patterns of derivatives are taken from there, and the size of the objective.
     """
@@ -50,9 +51,8 @@ class RelaxedProgram:
         x_lower, x_upper = program.x_lower.copy(), program.x_upper.copy()
         upper, lower = program.g_upper.copy(), program.g_lower.copy()
         sources, lows, highs = [np.arange(m)], list[Vector](), list[Vector]()
-        coupled: list[
-            tuple[Index, int, float]
-        ] = []  # rows here, their relaxation, and what it weighs in them
+        # constraints, their relaxation, and its coefficient in them
+        coupled: list[tuple[Index, int, float]] = []
         size = m
         for k, relaxed in enumerate(relaxations):
             i, j, unit = relaxed.rows, relaxed.variables, relaxed.unit
@@ -72,7 +72,8 @@ class RelaxedProgram:
                 highs.append(high[bounded])
                 size += count
             lower[i[both]], x_lower[j], x_upper[j] = -np.inf, -np.inf, np.inf
-        self._source = np.concatenate(sources)  # of each row: one of the program's rows, or m + variable
+        # of each constraint: one of the program's, or m + variable
+        self._source = np.concatenate(sources)
         self.n, self.m = n + self._more, size
         self.g_lower, self.g_upper = np.concatenate([lower, *lows]), np.concatenate([upper, *highs])
         self.x_lower = np.concatenate([x_lower, np.zeros(self._more)])
@@ -84,7 +85,7 @@ class RelaxedProgram:
         self._number_entries(program.jacobian(x))
 
     def _number_entries(self, jacobian: Matrix) -> None:
-        """Where the Jacobian's entries come from: the program's, a one, or the coupling's weights."""
+        """Sources of the Jacobian's entries: the program's entries, a one, or the coupling's weights."""
         n, own = self._program.n, jacobian.nnz
         theirs = sp.csc_array(
             (np.arange(1, own + 1), jacobian.indices, jacobian.indptr), shape=jacobian.shape
@@ -100,7 +101,7 @@ class RelaxedProgram:
         self._indices, self._indptr = (a.astype(np.int32) for a in (numbered.indices, numbered.indptr))
 
     def sizes(self, x: Vector) -> Vector:
-        """How far each relaxation's bounds have moved, in its unit; x : of this program."""
+        """Relaxation of each group of bounds, in its unit; x : variables of this program."""
         return np.asarray(x[self._program.n :])
 
     def start(self, x: Vector, room: float) -> Vector:

@@ -9,5 +9,5 @@ from threadpoolctl import ThreadpoolController
 
 @cache
 def threads() -> ThreadpoolController:
-    """Of the libraries that are loaded: to look for them takes as long as a QP."""
+    """Controller of the loaded libraries' thread pools; cached, as finding them takes as long as a QP."""
     return ThreadpoolController()

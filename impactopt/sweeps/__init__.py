@@ -1,13 +1,13 @@
 """Sweeps: many cases of one problem, done by many workers, and none of them lost.
 
-* definition.py   sweep files: sections.py, varied.py; design.py: grids, lists and draws
-* units.py        what goes to a worker, and what comes back
-* case_kinds.py   from a case's settings to its row; evaluate.py: on a worker; watchdog.py: in time
-* collisions.py   rows of collisions in compiled code: at_contact.py, collision_keys.py, states.py, scene.py,
-                  measures.py
-* engines.py      processes that do the units; cluster.py: Dask workers that do
+* definition.py   sweep files: sections.py, varied_keys.py; design.py: grids, lists and draws
+* units.py        inputs and results of a worker
+* case_kinds.py   from a case's settings to its row; evaluate.py: on a worker; watchdog.py: time limits
+* collisions.py   batches of collisions in compiled code: collision_batch.py, at_contact.py,
+                  collision_keys.py, contact_states.py, scene.py, measures.py
+* local_pool.py   pool of processes on this machine; cluster.py: Dask workers
 * journal.py      finished units on disk; store.py: the directory; table.py: the result
-* progress.py     how far a sweep is
+* progress.py     progress of a sweep
 * running.py      all of it together
 """
 

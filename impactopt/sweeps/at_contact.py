@@ -1,4 +1,4 @@
-"""What a sweep of collisions says of the state at contact, and of the model that goes on from there."""
+"""State at contact and collision model of a sweep of collisions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError
 from impactopt.collision import CollisionModel
 from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
-from impactopt.files.problem_file.mistakes import mistakes_of, report_mistakes
+from impactopt.files.problem_file.diagnostics import mistakes_of, report_mistakes
 from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import File
 from impactopt.files.problem_file.values import Positive

@@ -1,4 +1,4 @@
-"""What a case is: a whole motion, a strike, or one collision of many; each from its settings to its row."""
+"""Kinds of cases: a whole motion, a strike, or one collision of many; each makes a row from its settings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from impactopt.files.output import Record, plain, record_of, record_of_strike, summary_of
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
-from impactopt.files.solved import SolvedFolder
+from impactopt.files.solution_library import SolvedFolder
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import StrikeSolution, optimize_strike

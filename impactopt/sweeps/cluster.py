@@ -66,7 +66,7 @@ async def _greet(address: str) -> None:
 def on_cluster(
     work: Work, units: Iterable[Unit], client: Any, tell: Callable[[str], None]
 ) -> Generator[tuple[Unit, Found], None, None]:
-    """What units come to, in the order in which they are finished.
+    """Results of units on a cluster, in the order in which they are finished.
 
     client : a `distributed.Client`. A unit whose worker dies is given to another one by the scheduler, as
         often as `distributed.scheduler.allowed-failures` says; then its rows say so. Workers come and go.
@@ -108,7 +108,7 @@ def on_cluster(
 
 
 class _Pool:
-    """How many threads the workers have now."""
+    """Number of threads that the workers have at present."""
 
     def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
         self._client, self._next, self._threads = client, 0.0, 1

@@ -1,4 +1,4 @@
-"""Which keys a sweep of collisions can vary, and what each of them is to a collision."""
+"""Keys that a sweep of collisions can vary, and the role of each in a collision."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _STATE = (("at_contact", "speed_m_s"), ("at_contact", "joints_rad"))
 
 
 def sweep_place(data: Mapping[str, Any], key: str) -> Place:
-    """Where a key path is: in the problem file's data, or in [at_contact]; units may be left out.
+    """Place of a key path in the problem file's data, or in [at_contact]; units may be left out.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def sweep_place(data: Mapping[str, Any], key: str) -> Place:
 
 
 def role_of(place: Place) -> Role:
-    """What a key at this place is to a collision; InputError if it is nothing."""
+    """Role of a key at this place in a collision; InputError if it has none."""
     table, *rest = place
     if table in _KINDS:
         return "structure" if rest == [_KINDS[str(table)]] else "number"

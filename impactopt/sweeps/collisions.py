@@ -19,11 +19,11 @@ from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError, raw_array
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.problem_file.toml import plain_value
-from impactopt.sweeps.alike import AlikeCollisions
 from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model, full_names
+from impactopt.sweeps.collision_batch import AlikeCollisions
 from impactopt.sweeps.collision_keys import role_of, sweep_place
+from impactopt.sweeps.contact_states import ContactStates
 from impactopt.sweeps.measures import chosen
-from impactopt.sweeps.states import ContactStates
 
 __all__ = ["Collisions", "collide_many"]
 
@@ -141,7 +141,7 @@ class Collisions:
 
     # ------------------------------------------------------------ rows
     def __call__(self, columns: Mapping[str, Any], *, threads: int | None = None) -> dict[str, NDArray[Any]]:
-        """As `collide_many`; columns (N) of all keys."""
+        """Outputs as of `collide_many`; columns (N) of all keys."""
         count = len(next(iter(columns.values()))) if columns else 1
         out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.outputs}
         out["reason"] = np.full(count, "", dtype=object)
@@ -182,7 +182,7 @@ class Collisions:
         return self._alike[key]
 
     def _body(self, file: ProblemFile) -> ContactStates:
-        """Of a robot on its stance: models share it."""
+        """Contact states of a robot on its stance, which models share."""
         problem, content = file.data["problem"], file.content
         names = [problem.get(name) for name in ("robot", "striker", "start")]
         key = repr([*names, file.data.get("robot"), file.data.get("stance")])

@@ -1,4 +1,4 @@
-"""How a sweep tells a person how far it is: a live bar on a terminal, else a line now and then."""
+"""Progress of a sweep on the console: a live bar on a terminal, else a line now and then."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class SweepConsole:
             self._console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
     def progress(self, now: SweepProgress) -> None:
-        """How far it is."""
+        """Updates the bar's text."""
         text = f"{now.rate:.3g} a second, {words_for_time(now.remaining)} left"
         if now.failed:
             text += f", {now.failed} failed"
@@ -72,7 +72,7 @@ class SweepConsole:
 
 @contextlib.contextmanager
 def told(report: Say | None, progress: Progress | bool | None) -> Iterator[tuple[Say, Progress]]:
-    """Who is told in words, and of the progress; arguments as of :func:`impactopt.sweep`."""
+    """Receivers of messages and of the progress; arguments as of :func:`impactopt.sweep`."""
     console = None
     if progress is True or (progress is None and report is None):
         console = _console(always=progress is True)

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from impactopt.codegen.files import is_plain_file, read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
-from impactopt.files.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
+from impactopt.files.problem_file.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.files.problem_file.names import problem_file, sweep_file
 from impactopt.files.problem_file.toml import (
     LONGEST_TEXT,
@@ -32,7 +32,7 @@ from impactopt.sweeps.design import Design, Draws, column
 from impactopt.sweeps.figure import Figure
 from impactopt.sweeps.key_paths import flat, put
 from impactopt.sweeps.sections import CaseKind, SweepFile, of_other_kinds
-from impactopt.sweeps.varied import VariedKeys, telling
+from impactopt.sweeps.varied_keys import VariedKeys, telling
 
 __all__ = ["Sweep", "parse_sweep", "read_sweep_file", "sweep_from_data"]
 
@@ -121,10 +121,12 @@ def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = 
 
 
 def _written(data: Mapping[str, Any]) -> str:
-    """As a file. What varies is written by key paths: its order counts, and TOML has tables last."""
+    """Text of the file. Varied keys are written by key paths: their order counts, and TOML has tables
+    last.
+    """
 
     def with_flat(table: Any, *names: str) -> Any:
-        if not isinstance(table, Mapping):  # a mistake, which is told later
+        if not isinstance(table, Mapping):  # a mistake, which is reported later
             return table
         tables = {name: table[name] for name in names if isinstance(table.get(name), Mapping)}
         return {**table, **{name: dict(flat(inner)) for name, inner in tables.items()}}

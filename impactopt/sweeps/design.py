@@ -1,4 +1,4 @@
-"""Which values the cases of a sweep have: grids, lists and draws, and every combination of the three.
+"""Design of a sweep: the cases' values by grids, lists and draws, and every combination of the three.
 
 Cases are never written out all at once: a million of them are a formula and the draws.
 """

@@ -24,7 +24,7 @@ Texts = Annotated[dict[str, str], BeforeValidator(lambda table: dict(flat(table)
 
 
 class Figure(Section):
-    """What a sweep's picture shows; names are the sweep's keys, and columns of its table."""
+    """Picture of a sweep; names are the sweep's keys, and columns of its table."""
 
     drawn_as: Literal["heatmap", "lines", "scatter"] = required("what is drawn", "kind")
     x: str = required("column on the horizontal axis")

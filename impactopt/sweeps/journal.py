@@ -54,7 +54,7 @@ class Journal:
         try:
             with open(path, "rb", opener=_made) as file:  # no link, pipe or directory
                 head = file.read(len(MAGIC))
-            # SQLite takes a few bytes for an empty file; after a kill it may have its head to mend
+            # SQLite takes a few bytes for an empty file; after a kill it may have its head to fix
             if head not in (b"", MAGIC) and not path.with_name(f"{path.name}-journal").exists():
                 raise InputError(f"{path} is no journal of a sweep; move it away, or give another --out")
             self._file = sqlite3.connect(path, isolation_level=None)  # each statement is a transaction

@@ -1,4 +1,4 @@
-"""What a sweep of collisions can put into its table, and what of the collision each needs."""
+"""Measures that a sweep of collisions can put into its table, and the outputs that each needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.support import margin, zmp
-from impactopt.sweeps.states import States
+from impactopt.sweeps.contact_states import States
 
 __all__ = ["MEASURES", "Blow", "Measure", "chosen"]
 

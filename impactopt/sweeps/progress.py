@@ -1,4 +1,4 @@
-"""What a sweep has come to so far: how many, how fast, the best, and how long it will take."""
+"""Progress of a sweep: cases done, rate, best result, and remaining time."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class ProgressCounter:
         return time.perf_counter() - self._began
 
     def begin(self) -> None:
-        """What has come so far is from runs before; this one begins now."""
+        """Begins this run; cases counted so far are of earlier runs."""
         self.resumed, self._began = self.done, time.perf_counter()
         self._recent = deque([(self._began, self.done)])
 
@@ -96,7 +96,7 @@ class ProgressCounter:
         return {name: float(np.mean(found)) for name, found in sorted(self._iterations.items())}
 
     def progress(self) -> SweepProgress:
-        """How it stands now."""
+        """Present progress."""
         now = time.perf_counter()
         while len(self._recent) > 2 and now - self._recent[0][0] > OF_LATE:
             self._recent.popleft()

@@ -16,8 +16,8 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.cluster import connected, on_cluster
 from impactopt.sweeps.console import told
 from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
-from impactopt.sweeps.engines import on_processes
 from impactopt.sweeps.evaluate import evaluate
+from impactopt.sweeps.local_pool import on_processes
 from impactopt.sweeps.progress import ProgressCounter, SweepProgress
 from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
@@ -34,7 +34,7 @@ UNITS = 64  # at least, where there are cases for them, so that workers end toge
 
 @dataclass(frozen=True, kw_only=True)
 class SweepResult:
-    """What came of a sweep.
+    """Result of a sweep.
 
     cases : of the sweep.  done : rows in the table; failed : of these, without a usable result.  resumed :
     of these, from runs before this one.  seconds : of this run, and rate_per_second : its cases.
@@ -59,7 +59,7 @@ class SweepResult:
     iterations: Mapping[str, float] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """As `impactopt sweep --json` prints it."""
+        """JSON form, as `impactopt sweep --json` prints it."""
         names = ("cases", "done", "failed", "resumed", "seconds", "rate_per_second", "peak_worker_mb")
         out = {**{name: getattr(self, name) for name in names}, "table": str(self.table)}
         return {**out, "iterations": dict(self.iterations)} if self.iterations else out
@@ -87,7 +87,7 @@ def sweep(
     again : do cases once more that crashed, met an error of ours or ran out of time in an earlier run.
     report : told in words what is going on.  progress : told after every unit; True: both are shown, False:
         not; None: where a person looks, on a terminal or in a notebook, unless `report` is given.
-        Words that nobody is told go to the logger "impactopt".
+        Messages without a receiver go to the logger "impactopt".
 
     A case that fails is a row with its reason. Ctrl-C ends the processes, writes the table of what is
     finished, and is raised.
@@ -208,7 +208,7 @@ def _work(chosen: Sweep, store: Store) -> Work:
 
 
 def _units(chosen: Sweep, together: int, finished: set[int]) -> Iterator[Unit]:
-    """Those that are left, in their order."""
+    """Units that are left, in their order."""
     cases = chosen.design.cases
     for index in range(-(-cases // together)):
         if index not in finished:
@@ -246,5 +246,5 @@ def _write(
 
 
 def _cores() -> int:
-    """Those that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

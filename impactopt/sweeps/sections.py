@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from impactopt.files.problem_file.mistakes import Mistake
+from impactopt.files.problem_file.diagnostics import Mistake
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import Positive
 from impactopt.sweeps.figure import Figure
@@ -19,7 +19,7 @@ Seed = Annotated[int, Field(ge=0)]
 
 
 class SweepSection(Section):
-    """What a case is, and of which problem."""
+    """Kind of case, and its problem."""
 
     problem: str = required("a problem's name, or a file beside this one")
     name: str = Field(default="", description="what reports call the sweep")
@@ -81,7 +81,7 @@ class SweepFile(Section):
 
 
 def of_other_kinds(content: SweepFile) -> list[Mistake]:
-    """What the file says and the sweep's kind of case has no use for."""
+    """Settings in the file that the sweep's kind of case has no use for."""
     given, found = content.sweep, list[Mistake]()
     collisions = given.case_kind == "collision"
     for name in sorted(given.model_fields_set):

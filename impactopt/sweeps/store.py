@@ -135,7 +135,7 @@ def _lock(path: Path) -> int:
 
 
 def _changes(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """What is different, in words; what only one of them has too."""
+    """Differences in words; settings that only one of them has included."""
     before, after = (
         {**_flat(of.get("sweep", {})), **_flat(of.get("problem", {}), "problem file: ")}
         for of in (there, now)

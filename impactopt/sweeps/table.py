@@ -152,7 +152,7 @@ def merge_kinds(kinds: dict[str, str], columns: Columns) -> None:
 
 
 def _kind(values: Sequence[Any] | NDArray[Any]) -> str:
-    """What values are; "" for nothing but None."""
+    """Type of values; "" for nothing but None."""
     if isinstance(values, np.ndarray) and values.dtype.kind in "fiub":
         return {"f": "float", "b": "bool"}.get(values.dtype.kind, "int")
     names = {bool: "bool", int: "int", float: "float", str: "text"}

@@ -22,7 +22,7 @@ Columns = Mapping[str, Sequence[Any] | NDArray[Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What all units of a sweep share.
+    """Data that all units of a sweep share.
 
     data, path : of the problem's file with the sweep's [set].  folder : of the sweep's file.
     case_kind, seed, start, starts, time_limit [s], trajectories, at_contact, outputs : as of `Sweep`.
@@ -59,7 +59,7 @@ class Unit:
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What a unit came to: columns of `count` values each, and whole results by case, where they are kept.
+    """Result of a unit: columns of `count` values each, and whole results by case, where they are kept.
 
     Every row has a `status`, and a `reason` where it has no usable result, else "".
     peak_mb : the most memory that the worker has had so far [MB].

@@ -1,4 +1,4 @@
-"""From a problem to a nonlinear program (variables, rows, blocks), and from its solution back to a `Plan`.
+"""Transcribes a problem to a nonlinear program, and its solution back to a `Plan`.
 
 * transcription.py, strike.py    the programs of a whole motion and of the blow alone: which parts they have
 * swing.py, follow.py, hit.py    parts; builder.py: what each of them takes

@@ -31,7 +31,7 @@ TOO_NEAR = millimetres("too near")
 
 @dataclass(frozen=True)
 class Chain:
-    """How to get from a body's frame to another's, joint by joint.
+    """Kinematic chain between the frames of two bodies, joint by joint.
 
     columns (n,) : the joints' places among base coordinates and joints (nv), with their ``signs``.
     turns (n,) : 1 for a joint that turns, 0 for one that slides.  places : n + 1 placements between them
@@ -81,7 +81,7 @@ def _placement(m: Any) -> Array:
 
 
 def _places(c: StanceCoordinates) -> list[int]:
-    """Of each base coordinate and joint (nv): where it is in y and, behind them, legs."""
+    """Index of each base coordinate and joint (nv) in y followed by legs."""
     out = [*range(c.base)] + [0] * c.robot.n
     for k, j in enumerate(c.independent):
         out[c.base + int(j)] = c.base + k
@@ -91,7 +91,7 @@ def _places(c: StanceCoordinates) -> list[int]:
 
 
 def chain_between(model: Any, one: int, other: int) -> Chain:
-    """From the frame of joint ``one`` to that of joint ``other``; 0: the world."""
+    """Chain between the frames of joints ``one`` and ``other``; 0: the world."""
     up_one, up_other = list(model.supports[one]), list(model.supports[other])
     shared = max(j for j in up_one if j in up_other)
     if other == 0:
@@ -170,7 +170,7 @@ class SeparationPart:
         return self._of.count * self._width
 
     def write_to(self, numbers: Array) -> None:
-        """From now on calls write to these (size,)."""
+        """Sets the array (size,) that later calls write to."""
         self.output = numbers.reshape(self._of.count, self._width)
 
     def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
@@ -187,7 +187,7 @@ class SeparationBlock(Block):
 
     @classmethod
     def of_separations(cls, name: str, of: Separations, lift: Affine) -> SeparationBlock:
-        """With z of all as one expression."""
+        """Block of separations with the z of all instances as one expression."""
         size = of.joints + 3
         everything = np.arange(size)
         columns, rows = np.triu_indices(size)  # of a lower triangle, column by column
@@ -221,7 +221,7 @@ class SeparationBlock(Block):
 
 
 class ApartRow(NamedTuple):
-    """What one constraint keeps apart at one place: its name.
+    """Key of a clearance constraint: node and pair of convex pieces.
 
     place : of the program.  joint : of the link.  other : joint of the other link; or -1 - the index of a
     body of the world.  number : of the two pieces among those of these two bodies.
@@ -234,7 +234,7 @@ class ApartRow(NamedTuple):
 
 
 class Held(NamedTuple):
-    """How a constraint keeps them apart.
+    """Separating direction and distance of a clearance constraint.
 
     way (3) : direction from the other to the one in the other's frame, near which they are apart.
     reach [m] : how far.  travel [m] : of the target, if the other moves with it.
@@ -248,7 +248,7 @@ class Held(NamedTuple):
 def add_apart_rows(
     b: Builder, spots: Sequence[tuple[Place, list[Affine]]], rows: Mapping[ApartRow, Held]
 ) -> list[ApartRow]:
-    """Blocks and rows for these, and their names in the order of the program's rows.
+    """Blocks and constraints for these, and their names in the order of the program's constraints.
 
     spots : places of a program, with coordinates and legs.
     """
@@ -315,7 +315,7 @@ def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_
 
 
 def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[ApartRow, Held]) -> None:
-    """Blocks of these rows with the world's bodies where this problem has them; none is turned."""
+    """Blocks of these constraints with the world's bodies where this problem has them; none is turned."""
     of_name = {block.name: block for block in blocks}
     numbers = {name: block.parameters.copy() for name, block in of_name.items()}
     seen = dict.fromkeys(of_name, 0)
@@ -333,7 +333,7 @@ def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[Ap
 
 
 class _Known(NamedTuple):
-    """What all constraints of two bodies share."""
+    """Data that all constraints of a pair of bodies share."""
 
     chain: Chain
     pattern: tuple[Index, Index, Array]

@@ -38,7 +38,7 @@ Numbers = npt.NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Arranged:
-    """What is left of a function when registers are places.
+    """Table of instructions of a function whose registers are numbered memory places.
 
     words : of each run, its kind (an operation's in CasADi, or one of those above), how many operations, and
     of each the places that it reads and the one that it writes.
@@ -54,8 +54,8 @@ class Arranged:
 
 
 def arranged(function: ca.Function, known: Mapping[int, int]) -> Arranged | None:
-    """Of an SX function of known kinds of operations, each with the number of its operands; None of another,
-    or without a compiler.
+    """Instruction table of an SX function of known operations, each with its number of operands; None for
+    another function, or without a compiler.
     """
     library = None if find_compiler() is None else _library()
     if library is None:
@@ -120,7 +120,7 @@ def _pairs(of: Callable[[int], Sequence[int]], count: Numbers) -> tuple[Numbers,
 
 
 def _starts(count: int, size: Callable[[int], int]) -> Numbers:
-    """Where the numbers of each begin."""
+    """Offsets at which each input's or output's numbers begin."""
     return np.cumsum([0, *(size(i) for i in range(count))], dtype=np.int32)
 
 

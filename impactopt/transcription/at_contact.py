@@ -34,8 +34,8 @@ Program = TypeVar("Program", bound="ContactProgram")
 
 
 class BodyState(NamedTuple):
-    """Where the robot is at a place: phase (0 before contact, 2 after it, 3 after one that met nothing), the
-    place's name, time [s] since the start, and configuration (nq,).
+    """Configuration of the robot at a node: phase (0 before contact, 2 after it, 3 after a missed one), the
+    node's name, time [s] since the start, and configuration (nq,).
     """
 
     phase: int
@@ -45,7 +45,7 @@ class BodyState(NamedTuple):
 
 
 class ContactProgram(ABC):
-    """A builder, a hit, and what whoever completes it adds: its parts, and the rows between them.
+    """A builder, a hit, and what whoever completes it adds: its parts, and the clearance constraints.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class ContactProgram(ABC):
     problem, coordinates, robot, functions, y0, legs0 : the builder's.
     angular_momentum : after contact, a group of three, if an objective asks for it.
     objectives : the problem's that it knows, with their quantities.
-    apart_rows : constraints between bodies, in the order of their rows, which are the last.
+    apart_rows : clearance constraints, in the order of their rows, which are the last.
     """
 
     def __init__(self, builder: Builder, hit: Hit) -> None:
@@ -147,8 +147,8 @@ class ContactProgram(ABC):
         return [*nodes, *self.hit.drives()]
 
     def wrenches(self) -> list[tuple[Place, Affine]]:
-        """Wrenches on soles and held hands (6 each), at the nodes and at collocation points of all contacts
-        that last.
+        """Wrenches on soles and supporting hands (6 each), at the nodes and at collocation points of all
+        contacts that last.
         """
         nodes = [(place, slots[4]) for place, slots in self._node_slots()]
         lasting = [c for c in self.hit.collisions if isinstance(c, Collision)]
@@ -163,7 +163,7 @@ class ContactProgram(ABC):
         return self.hit.first_instants()
 
     def contact_ends(self) -> list[ContactEnd]:
-        """What all contacts begin and end with."""
+        """States at the beginning and the end of all contacts."""
         return self.hit.contact_ends()
 
     def deepest_penetration(self) -> Affine:
@@ -198,7 +198,7 @@ class ContactProgram(ABC):
         if self.builder.robot.hinges.any():
             add_hinges(self.builder, [(place, torque) for place, torque, _ in self._nodes()])
         for term in terms:
-            if type(term).add_rows is not Term.add_rows and term.active:  # those of others are there
+            if type(term).add_rows is not Term.add_rows:  # those of others are there
                 term.add_rows(self)
         self.objectives = quantities(self, objectives)
         self._worth = assemble(self.layout, self.objectives, self._prices())
@@ -223,7 +223,7 @@ class ContactProgram(ABC):
         )
 
     def with_apart(self: Program, rows: Mapping[ApartRow, Held]) -> Program:
-        """The same program with just these rows between bodies."""
+        """The same program with just these clearance constraints."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
         other.builder = self._bare.copy()
@@ -269,7 +269,7 @@ class ContactProgram(ABC):
     # ------------------------------------------------------------------ what completes it
     @abstractmethod
     def _determined(self) -> list[Determined]:
-        """What rows determine, of all parts."""
+        """Variables that linear or block constraints determine, of all parts."""
 
     @abstractmethod
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
@@ -280,12 +280,12 @@ class ContactProgram(ABC):
         """The same without torques, which not every program has as variables."""
 
     def _spring_points(self) -> list[SpringPoint]:
-        """Where springs of joints are held to their law."""
+        """Points where springs of joints obey their law."""
         return [SpringPoint(place, torque, y, y1, T) for place, torque, (y, y1, _, _, _, T) in self._nodes()]
 
     @abstractmethod
     def _prices(self) -> Prices:
-        """What makes the optimum unique."""
+        """Small quadratic costs that make the optimum unique."""
 
     @abstractmethod
     def swing_spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
@@ -297,11 +297,11 @@ class ContactProgram(ABC):
 
     @abstractmethod
     def body_states(self, x: Array) -> list[BodyState]:
-        """Where bodies are at all places of `swing_spots` and `follow_spots`, for solver variables (n,)."""
+        """Configurations at all nodes of `swing_spots` and `follow_spots`, for solver variables (n,)."""
 
     @abstractmethod
     def travel(self, x: Array, time: Array) -> Array:
-        """How far (k,) [m] the target has gone at these times [s] since the start."""
+        """Travel (k,) [m] of the target at these times [s] since the start."""
 
     @abstractmethod
     def decode(self, x: Array) -> Any:
@@ -314,9 +314,9 @@ class ContactProgram(ABC):
         return self.coordinates.join(y.evaluate(x), legs.evaluate(x))
 
     def achieved(self, x: Array) -> dict[str, float]:
-        """What the objectives' quantities come to, by their names, for solver variables (n,)."""
+        """Values of the objectives' quantities by name, for solver variables (n,)."""
         return {o.name: quantity.evaluate(x) for o, quantity in self.objectives}
 
     def impulse(self, x: Array) -> float:
-        """To the expected target [N s], for solver variables (n,)."""
+        """Impulse to the expected target [N s], for solver variables (n,)."""
         return self.hit.impulse(x)

@@ -56,7 +56,7 @@ class BatchedFunction:
         return self._shape[0] * self._shape[1]
 
     def write_to(self, numbers: Array) -> None:
-        """From now on calls write to these (size,)."""
+        """Sets the array (size,) that later calls write to."""
         self._all = numbers.reshape(self._shape)
         self.output = self._all[: self.count]
         for part, buffer, _ in self._parts if numbers.size else ():
@@ -160,7 +160,7 @@ class Block:
     def of_lift(
         cls, name: str, functions: dict[str, Any], lift: Affine, count: int, parameters: ArrayLike
     ) -> Block:
-        """As :meth:`make`, of all instances' z (count * n_in) as one expression."""
+        """Makes the block (:meth:`make`) with the z of all instances (count * n_in) as one expression."""
         f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
         n_in, n_out = f.size1_in(0), f.size1_out(0)
         p = np.broadcast_to(np.asarray(parameters, dtype=float), (count, f.size1_in(1)))

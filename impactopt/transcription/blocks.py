@@ -150,7 +150,7 @@ def link() -> BlockExpression:
 
 
 def spring(c: StanceCoordinates, chosen: Joints = ()) -> BlockExpression:
-    """Torques of springs and dampers at joints outside the held legs, less what they bear at rest.
+    """Torques of springs and dampers at joints outside the constrained legs, less what they bear at rest.
 
     z = y, y', T, logarithms of the factors on the gains of the joints of each of ``chosen``;  p = angles at
         rest, stiffness and damping over torque limit (one a joint).
@@ -166,7 +166,7 @@ def spring(c: StanceCoordinates, chosen: Joints = ()) -> BlockExpression:
 
 
 def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
-    """What is left after the impact.
+    """Balance after the impact: capture point, vertical speed and angular momentum.
 
     The capture point [m], the vertical speed of the CoM [m/s], the angular momentum [N m s].
     z = y, y', legs, T;  p = the support polygon's edges (inward normal, offset: 3 an edge).  out = distance

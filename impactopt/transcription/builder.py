@@ -1,4 +1,4 @@
-"""What the parts of a program are built with: variables, blocks and rows, and the limits that all keep."""
+"""Builder that the parts of a program share: variables, blocks and constraints, and the common limits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Builder:
     functions : the compiled blocks by name.
     ny, nl, nw : number of coordinates, of legs' joints, of sole wrenches' components.
     y0 (ny,), legs0 (nl,) : the start posture.
-    layout, rows, blocks : variables, rows and functions so far.
+    layout, rows, blocks : variables, constraints and functions so far.
     lifted : variables of :meth:`lift`, with the numbers of the outputs that they equal.
     followers : what :meth:`follow` was given.
     """
@@ -45,14 +45,14 @@ class Builder:
         self.followers: list[Callable[[Builder], None]] = []
 
     def copy(self) -> Builder:
-        """The same program so far, to which other blocks and rows can be added; no variables."""
+        """The same program so far, to which other blocks and constraints can be added; no variables."""
         other = copy.copy(self)
         other.blocks, other.rows = [block.copy() for block in self.blocks], self.rows.copy()
         return other
 
     def follow(self, take: Callable[[Builder], None]) -> None:
-        """Have numbers follow the problem: ``take`` writes them to the blocks, rows or bounds of a builder,
-        this one or a copy, that has another problem.
+        """Have numbers follow the problem: ``take`` writes them to the blocks, constraints or bounds of a
+        builder, this one or a copy, that has another problem.
         """
         self.followers.append(take)
 
@@ -87,9 +87,10 @@ class Builder:
         lower: ArrayLike = -np.inf,
         upper: ArrayLike = np.inf,
     ) -> Group:
-        """One vector of variables that equals outputs of blocks, so that rows and objective can take it.
+        """One vector of variables that equals outputs of blocks, so that constraints and objective can take
+        it.
 
-        term, place, measure : of the rows that say so; the term is the variables' name if not given.
+        term, place, measure : of the constraints that say so; the term is the variables' name if not given.
         scale, lower, upper : of the variables.
         """
         size = len(outputs)

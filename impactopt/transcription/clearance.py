@@ -105,7 +105,9 @@ def _follow(b: Builder, number: int, start: int, aparts: list[float], *, planes:
 
 
 def _nearest(b: Builder, number: int) -> float:
-    """How near [m] behind the target's plane a striking point may stay: as near as it starts, at least."""
+    """Least distance [m] of a striking point behind the target's plane: at most the distance that it starts
+    at.
+    """
     p, (striker, point) = b.problem, b.problem.contacts[number]
     at = striking_point(p.robot, striker, p.start_posture)
     return min(CLEARANCE, max(float(p.normal @ (point - at)), 0.0))

@@ -33,7 +33,7 @@ from impactopt.transcription.rows import Measure, Place, along, by_leg, percent,
 
 
 class Collision(ContactNumbers, Collocated):
-    """Variables and rows of the contact with one target.
+    """Variables and constraints of the contact with one target.
 
     contact : what all start from.  stages : collocation points of its phases.
     number : of the program's collisions; 0 that with the expected target.
@@ -110,12 +110,12 @@ class Collision(ContactNumbers, Collocated):
 
     @property
     def impulse(self) -> Affine:
-        """To the target [N s]."""
+        """Impulse to the target [N s]."""
         return self.p[self.end[-1]]
 
     @property
     def target_state(self) -> Affine:
-        """Of the target, at separation."""
+        """State of the target at separation."""
         return self.state[self.end[-1]]
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
@@ -161,19 +161,19 @@ class Collision(ContactNumbers, Collocated):
         return [(self.d, self.u)]
 
     def states(self) -> tuple[Group, ...]:
-        """What has a slope, and a value at contact, beside the rates of `integrated`."""
+        """Variables with a slope, and a value at contact, beside the rates of `integrated`."""
         return self.state, self.xt, self.p
 
     def held_over(self) -> list[Group]:
-        """What finer elements do not change."""
+        """Variables that finer elements do not change."""
         return [*self.T, self.joined, self.joined_x, self.after]
 
     def _at_stage(self) -> tuple[Group, ...]:
-        """Legs at each collocation point, in the order of their rows."""
+        """Legs at each collocation point, in the order of their constraints."""
         return self.coast_legs, self.coast_rates, self.legs
 
     def loose(self) -> list[Group]:
-        """What has a value at each collocation point, and none that is known at contact."""
+        """Variables with a value at each collocation point, and no known value at contact."""
         return [self.coast_legs, self.coast_rates, self.legs, self.f, self.w]
 
     def _gains(self) -> tuple[Array, Array]:
@@ -195,10 +195,10 @@ class Collision(ContactNumbers, Collocated):
         return self.stages[i].phase == len(self.end) - 1
 
     def determined(self) -> list[Determined]:
-        """Of each stage, leg by leg; and element by element what its rows determine.
+        """Variables that each stage's constraints determine, leg by leg, and those of each element.
 
-        An element's travel comes first, by linear rows; last, if there are three phases, the integrals of the
-        first two as one.
+        An element's travel comes first, by linear constraints; last, if there are three phases, the integrals
+        of the first two as one.
         """
         out: list[Determined] = []
         for i in range(len(self.stages)):
@@ -221,7 +221,7 @@ class Collision(ContactNumbers, Collocated):
             out.append(determined(Turn.AFTER, self.after.index(0)))
         return out
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
         """``at``: of each block, the index of the first output of this collision and the outputs a stage."""
         for i, s in enumerate(self.stages):
@@ -359,7 +359,7 @@ class Collision(ContactNumbers, Collocated):
             self.w.write(x, self.contact.state.w.evaluate(x))
 
     def guess_model(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """What a model of the collision has for itself: here the legs of the reference."""
+        """Initial guess of a collision model's own variables: here the legs of the reference."""
         if not legs.size:
             return
         elapsed = np.ravel([self._time(s.phase, s.place).evaluate(x) for s in self.stages])

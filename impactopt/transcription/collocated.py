@@ -1,4 +1,4 @@
-"""What is known of a contact at collocation points: values, slopes, and what they come to phase by phase."""
+"""Values and slopes of the contact at collocation points, and their integrals phase by phase."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Collocated:
         return time, self._so_far(self.d, self.joined, phase), self._so_far(self.xt, self.joined_x, phase)
 
     def _so_far(self, integral: Group, joined: Group, phase: int) -> Affine:
-        """What an integral has come to in the phases before one, over their time."""
+        """Integral over the phases before one, divided by their time."""
         if phase == 0:
             return Affine.zeros(integral.size)
         return integral[self.end[0]] if phase == 1 else joined[0]
@@ -108,12 +108,12 @@ class Collocated:
             b.rows.add(components=b.robot.joint_names, outputs=outputs, **common)
 
     def drives(self) -> list[DrivePoint]:
-        """Of each stage, once rows are there, if a term is about drives."""
+        """Drives at each stage; known once constraints are added, if a term is about drives."""
         pairs = zip(self.stages, self.torques, strict=True)
         return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
 
     def wrenches(self) -> list[tuple[Place, Affine]]:
-        """Of each stage, on soles and held hands."""
+        """Wrenches on soles and supporting hands at each stage."""
         return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
 
     def _motion(self, i: int) -> list[Affine]:

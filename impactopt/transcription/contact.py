@@ -1,4 +1,4 @@
-"""What all collisions of a program start from: the state at contact, and what the robot goes on with."""
+"""State at contact that all collisions of a program start from, and the servo reference that continues."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class ContactState(NamedTuple):
 
 
 class Coasting(NamedTuple):
-    """What the robot goes on with: the torques over limit of the feed-forward (n), the rate (ny) ydot, and
-    the logarithms of the factors on its gains, one for each of the problem's `gains`.
+    """Reference during contact: the feed-forward torques over limit (n), the rate (ny) ydot, and the
+    logarithms of the factors on the servo's gains, one for each of the problem's `gains`.
     """
 
     feedforward: Group

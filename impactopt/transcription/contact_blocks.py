@@ -39,19 +39,19 @@ __all__ = [
     "typical_state",
 ]
 
-FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
-DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
+FORCE_SCALE = 100.0  # [N] contact forces in the program's constraints
+DEPTH_SCALE = 0.01  # [m] penetration in the program's constraints
 SECOND = ("second law", "second rate", "second penetration", "second separation")  # outputs of `force`
 RESTITUTING = 6  # which parameter of `force` says so
 
 
 def base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
-    """Of base rows: the weight [N], and with the lever [m] of moments."""
+    """Scale of the base's equations: the weight [N], and for moments the weight times the lever [m]."""
     return ca.vertcat(*[weight] * 3, *[weight * lever] * 3) if c.base else ca.SX(0, 1)
 
 
 def leg_part(c: StanceCoordinates, v: Any) -> Any:
-    """Of the held legs' joints (nl), out of (nv)."""
+    """Entries of the constrained legs' joints (nl), out of (nv)."""
     return ca.vertcat(*[v[c.base + int(j)] for j in c.dependent])
 
 
@@ -60,8 +60,8 @@ def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpres
 
     z = y0, u0 (ydot) at contact, T1, T, legs, leg rates [rad/s], of a freeze their accelerations [rad/s^2];
     p = s (place in the phase), 1 in restitution else 0.
-    out = pose error of the held soles [m, rad], twist of the held soles [m/s, rad/s]; of a freeze, what rates
-        and accelerations are off by.
+    out = pose error of the fixed soles [m, rad], twist of the fixed soles [m/s, rad/s]; of a freeze, what
+        rates and accelerations are off by.
     """
     y0, u0 = ca.SX.sym("y0", c.ny), ca.SX.sym("u0", c.ny)
     legs, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("rates", c.nl)
@@ -85,7 +85,7 @@ def collision(
     H, J and bias are those at the point, anew at each (steps 1a to 4a of the paper); or those that a freeze
     has stored (1b), with its terms. Then accelerations are linear in torques and forces (3b to 5b), and so
     are those of legs and striker in the frozen Jacobians (6b).
-    The servo (equation 10; 12 as rows) follows a reference that coasts at its velocity at contact:
+    The servo (equation 10; 12 as constraints) follows a reference that coasts at its velocity at contact:
     tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
 
     z = y0, u0 (ydot) at contact; feed-forward over torque limit (n); d1, T1, d, T: y = y0 + T1 d1 + T d;
@@ -164,7 +164,7 @@ def _strikers(striker: str, second: str) -> list[str]:
 def _motion(
     c: StanceCoordinates, y: Any, u: Any, legs: Any, ydd: Any, *, jdot: bool = True
 ) -> tuple[Any, Any, list[Stage]]:
-    """v and a (nv) on held soles, and their stages; without dJ/dt v, a as if nothing moved."""
+    """v and a (nv) on fixed soles, and their stages; without dJ/dt v, a as if nothing moved."""
     return motion_in_stages(c, y, legs, u, ydd) if jdot else (*(c.velocity(y, legs, x) for x in (u, ydd)), [])
 
 
@@ -265,7 +265,7 @@ def force(
 
 
 def moved(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """Where the robot is in contact, to freeze there anew, and how fast its hand moves.
+    """Position of the robot in contact, for a new freeze there, and its hand's speed along the normal.
 
     z = y0, d1, T1, d, T, u as in :func:`collision`;  p = normal (3).  out = y; speed along the normal [m/s].
     """
@@ -278,7 +278,8 @@ def moved(c: StanceCoordinates, striker: str) -> BlockExpression:
 
 
 def carried(c: StanceCoordinates) -> BlockExpression:
-    """What soles bear beside the forces of a model without bias: weight, Coriolis and centrifugal forces.
+    """Base load of the soles beside the forces of a model without bias: weight, Coriolis and centrifugal
+    forces.
 
     z = y, legs, u at contact; wrenches (6 a sole);  p = weight [N], lever [m].  out = base rows.
     """

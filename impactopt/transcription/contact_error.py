@@ -1,4 +1,4 @@
-"""How far a planned contact is from the one that its equations have, and the elements that bring it nearer.
+"""Estimates the discretization error of a planned contact, and selects the elements that reduce it.
 
 The contact is integrated once more from the plan's state at contact, by the same equations on elements half
 as long, over the same time, and by the contact law with its switches in place of one branch a phase. What
@@ -32,7 +32,7 @@ from impactopt.transcription.planned_loads import gear_share
 from impactopt.transcription.rows import Index
 from impactopt.transcription.structured import StructuredProgram
 
-ASKED = 0.5  # [%] of the impulse: the error that is not worth another solve
+ASKED = 0.5  # [%] of the impulse: the error that does not justify another solve
 _MISSED = 0.02  # of the peak force: how far it may be below zero within a phase, or above it at the end
 _TURNED = 1e-3  # of the peak force: what the law's other branch may differ by where it is the right one
 _STEPS, _MET = 8, 1e-7  # of Newton's method, and the residual at which it is done
@@ -44,13 +44,13 @@ _MOST = 16  # elements of a phase
 
 @dataclass(frozen=True, kw_only=True)
 class ContactError:
-    """Of a plan's contact, the worst of those with its targets.
+    """Error of a plan's contact, the worst over its targets.
 
     pct : error of the impulse [%]; inf where an event is missed, or no contact was found.
     coarse : what of it is the elements'; the rest is that phases hold to one branch of the law.
     of_elements : what each element of each phase adds to `coarse` [%].
     missed : whether an event is missed.
-    strained : in which elements of each phase a gear bears more than it may, between the plan's own points.
+    strained : in which elements of each phase a gear carries more than it may, between the plan's own points.
     finer : the collisions as they are on elements half as long, in the program's order: torque and ZMP are
         worst between the plan's own points. Empty if none was found.
     """
@@ -97,8 +97,8 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
 def refined_elements(error: ContactError | None, elements: Elements, asked: float = ASKED) -> Elements | None:
     """Elements for a contact with less error than is asked for [%]; None where it has less, or no more help.
 
-    Those with much of the error are cut, into more parts the more they have, and those in which a gear bears
-    too much; all where an event is missed.
+    Those with much of the error are cut, into more parts the more they have, and those in which a gear
+    carries too much; all where an event is missed.
     """
     strained = error is not None and any(map(any, error.strained))
     if error is None or (abs(error.coarse) <= asked and not error.missed and not strained):
@@ -172,7 +172,9 @@ class _Again:
         events = np.array([o.term in ends for o in program.origins])
 
         def parts(*, timed: bool) -> tuple[Index, Index]:
-            """Free variables, and the rows that determine them; whether events end phases when they come."""
+            """Free variables, and the constraints that determine them; whether events end phases when they
+            come.
+            """
             times = [] if timed else [g.index(0) for hit in self.hit.collisions for g in hit.T]
             free = np.setdiff1d(np.arange(program.n), np.concatenate([*held, *times]))
             return free, np.flatnonzero(equal & (timed | ~events))
@@ -195,7 +197,7 @@ class _Again:
         return branches, z
 
     def _newton(self, z: Array, free: Index, rows: Index) -> None:
-        """Change the free ones among the variables until these rows are met."""
+        """Change the free ones among the variables until these constraints are met."""
         program = self.program
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # a matrix that is singular is a method that fails
@@ -234,7 +236,7 @@ class _Again:
 
 
 def _strained(t: ContactProgram, hit: PlannedCollision, stages: Sequence[CollocationPoint]) -> Array:
-    """In which of the program's elements a gear bears too much, in a collision on elements half as long."""
+    """Elements of the program in which a gear carries too much, in a collision on elements half as long."""
     share = gear_share(t.problem, hit.torque, hit.acceleration)[1:] > 1.0 + GEAR
     elements = sorted({s.members for s in stages})
     out = np.zeros(len(elements) // 2, dtype=bool)
@@ -244,12 +246,12 @@ def _strained(t: ContactProgram, hit: PlannedCollision, stages: Sequence[Colloca
 
 
 def _scale(old: Collision, x: Array) -> float:
-    """From impulses [N s] to [%] of that of a plan (n,)."""
+    """Factor of impulses [N s] to [%] of the impulse of a plan (n,)."""
     return 100 / max(abs(float(old.p.read(x)[-1, 0])), 1e-9)
 
 
 def _grown(new: Collision, old: Collision, z: Array, x: Array) -> Array:
-    """What each element adds to the error of the impulse [%]: (elements,)."""
+    """Contribution of each element to the error of the impulse [%]: (elements,)."""
     planned, found = old.p.read(x)[:, 0], new.p.read(z)[:, 0]
     ends = [
         float(found[i] - planned[k])

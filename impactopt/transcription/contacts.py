@@ -1,4 +1,4 @@
-"""What a program asks of the contact with all targets, by whichever method it is predicted."""
+"""Interface of the contact transcriptions (collocated, frozen, shooting, impulsive)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Contacts:
 
     @cached_property
     def mass(self) -> float:
-        """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
+        """Effective mass [kg] of the robot at its striker, where inverse kinematics reaches the target."""
         return mass_at_contact(self._b.problem)
 
     def add_feedforward_rows(self, torque: Index) -> None:
@@ -72,15 +72,17 @@ class Contacts:
         return [determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
 
     def drives(self) -> list[DrivePoint]:
-        """What the drives do in contact, as far as it is known: of an impact without duration, nothing."""
+        """Drives in contact, as far as they are known; none for an impact without duration."""
         return []
 
     def first_instants(self) -> list[tuple[Place, Index]]:
-        """Where accelerations jump, with the numbers of the outputs that rotors take off the gears' load."""
+        """Instants at which accelerations jump, with the indices of the outputs that rotors subtract from
+        gear loads.
+        """
         return []
 
     def contact_ends(self) -> list[ContactEnd]:
-        """Of all contacts."""
+        """States at the beginning and the end of all contacts."""
         return [collision.contact_end() for collision in self.collisions]
 
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
@@ -94,5 +96,5 @@ class Contacts:
         return None
 
     def impulse(self, x: Array) -> float:
-        """To the expected target [N s], for solver variables (n,)."""
+        """Impulse to the expected target [N s], for solver variables (n,)."""
         return float(self.expected.impulse.evaluate(x)[0])

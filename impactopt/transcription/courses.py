@@ -19,7 +19,7 @@ class TorqueCourse(NamedTuple):
     """The torques of a phase.
 
     nodes (k,) : in it, from 0 to 1.  torques : over limit (n,) at each node.  T (1,) : its duration [s].
-    place_at : the place of a node, as rows have it.
+    place_at : the place of a node, as constraints have it.
     """
 
     nodes: Array
@@ -31,7 +31,7 @@ class TorqueCourse(NamedTuple):
 def torque_courses(
     b: Builder, swing: MotionPhase, follows: Sequence[MotionPhase], torques: Sequence[Affine]
 ) -> list[TorqueCourse]:
-    """Of the swing from its start on, where the torque is given, and of each motion to rest.
+    """Torque profiles of the swing, whose initial torque is given, and of each motion to rest.
 
     torques : over limit, at the nodes of all of these, one motion after the other.
     """

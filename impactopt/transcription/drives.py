@@ -1,4 +1,4 @@
-"""Where a program knows what joints and their drives do: at nodes, in contact, and at its ends."""
+"""Points at which a program knows the state of joints and drives: nodes, contact and its ends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from impactopt.transcription.rows import Place
 
 
 class DrivePoint(NamedTuple):
-    """What the drives do at a place.
+    """State of the drives at a node.
 
     torque (n,) : of the servos, over limit.  slots : z of `impactopt.problem.joint_motion.joint_motion`.
     """

@@ -1,8 +1,8 @@
-"""In which order a solver may eliminate what rows determine, and which rows are whose.
+"""Elimination order of the variables that constraints determine, and the constraints that determine them.
 
-Each part of a program says which of its variables rows determine, and whose `Turn` they are. Two orders hang
-on that: which variables go first, as others follow from them; and who takes rows first, where a row would do
-for several.
+Each part of a program says which of its variables constraints determine, and whose `Turn` they are. Two
+orders hang on that: which variables go first, as others follow from them; and who takes constraints first,
+where a constraint would do for several.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from impactopt.transcription.rows import Index
 
 
 class Turn(IntEnum):
-    """Of variables that rows determine; those of a lower turn are eliminated first."""
+    """Order of elimination of determined variables; lower ones are eliminated first."""
 
     NODE = 0  # legs at a node, and the first sole's wrench
     LIFTED = 1  # what equals outputs of blocks
@@ -33,15 +33,15 @@ _FIRST_CHOICE = (
     Turn.ELEMENT,
     Turn.FEEDFORWARD,
     Turn.AFTER,
-    Turn.RATE,  # of rows that a collision's legs and motion have left
+    Turn.RATE,  # of constraints that a collision's legs and motion have left
 )
 
 
 def determined(turn: Turn, variables: Index, step: int = 0) -> Determined:
-    """Variables of one system of rows.  step : within a turn, those of a lower one go first."""
+    """Variables of one system of constraints.  step : within a turn, those of a lower one go first."""
     return Determined((turn, step), variables)
 
 
 def by_choice(found: Iterable[Determined]) -> list[Determined]:
-    """In the order in which they take rows: by turn; within one as they come, part by part."""
+    """Determined variables in the order in which they take constraints: by turn, then part by part."""
     return sorted(found, key=lambda each: _FIRST_CHOICE.index(Turn(each.rank[0])))

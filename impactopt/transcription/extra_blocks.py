@@ -86,7 +86,7 @@ def _extra(block: BlockExpression | BlockRecipe, problem: ImpactProblem, element
 
 
 def key_of(block: BlockExpression) -> tuple[Any, ...]:
-    """What a block computes, as a short text: a user's own has no name to be known by."""
+    """Hash of a block's expression, which identifies it, as a user's own block has no name."""
     stages = [stage.symbols for stage in block.through], [stage.expression for stage in block.through]
     graph = ca.Function("block", [block.z, block.p, *stages[0]], [block.out, *stages[1]])
     return hashlib.sha256(graph.serialize().encode()).hexdigest(), block.lanes

@@ -28,7 +28,7 @@ def carry_contact(new: Collision, old: Collision, into: Array, x: Array) -> None
     for integral, rate in new.integrated():
         u = rate.read(into)
         d = np.zeros_like(u)
-        for i, s in enumerate(new.stages):  # by their rows, which are linear
+        for i, s in enumerate(new.stages):  # by their constraints, which are linear
             d[i] = s.quadrature @ u[list(s.members)] + (0.0 if s.new_phase else d[s.previous])
         integral.write(into, d)
     for mine, its in zip(new.held_over(), old.held_over(), strict=True):

@@ -23,7 +23,7 @@ TYPICAL = 100.0  # [rad/s^2]
 
 
 class FirstInstant:
-    """Variables and rows of it.
+    """Variables and constraints of it.
 
     law : numbers of the contact law.  suffix : of the names of its place and variables.
     """
@@ -60,7 +60,7 @@ class FirstInstant:
 
     @property
     def rotors(self) -> Index:
-        """Numbers of the outputs that are the rotors' part of the gears' load, once rows are there."""
+        """Numbers of the outputs that are the rotors' part of the gears' load, once constraints are there."""
         return np.asarray(self._rotors)
 
     def determined(self) -> list[Determined]:

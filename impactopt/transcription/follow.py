@@ -1,4 +1,4 @@
-"""From the state that the contact leaves behind to rest: variables and rows of a follow-through.
+"""Variables and constraints of a follow-through, from the state after contact to rest.
 
 There is one after the expected blow and, where a problem asks for it, one for a blow that met nothing.
 """
@@ -22,7 +22,7 @@ class FollowThrough(MotionPhase):
     """A clamped cubic spline to rest; it hands back where it starts.
 
     more : nodes beside the ends and middles of its intervals.
-    kind : first word of its variables' names; name : what rows and messages call it.
+    kind : first word of its variables' names; name : what constraints and messages call it.
     """
 
     def __init__(
@@ -64,8 +64,8 @@ class FollowThrough(MotionPhase):
 
 
 class AbortMotion(FollowThrough):
-    """The way to rest of a robot that has hit nothing, and coasts for ``after`` [s] from contact on until it
-    knows. It has one node more, where coasting ends, under a sole wrench of its own.
+    """Motion to rest of a robot that has hit nothing, and coasts for ``after`` [s] from contact on until it
+    detects that. It has one more node, at the end of coasting, with a sole wrench of its own.
     """
 
     def __init__(self, b: Builder, more: tuple[float, ...] = (), *, after: float) -> None:

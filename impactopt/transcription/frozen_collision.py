@@ -7,9 +7,9 @@ rigid-body functions. Beside the robot's coordinates, the legs' rates and the ha
 their own, as frozen Jacobians move them: servo, penetration and force are of these.
 
 With one freeze it is at the state at contact, and the velocities that the bias and dJ/dt v depend on are
-those with which hand and target have met (`v_meet`), by the rows of an impact in which they stay together.
-With N there is one in the middle of each of N segments of the contact's time. Phases share that time as in
-the program's ``shares``; scenarios have the expected target's segments.
+those with which hand and target have met (`v_meet`), by the constraints of an impact in which they stay
+together. With N there is one in the middle of each of N segments of the contact's time. Phases share that
+time as in the program's ``shares``; scenarios have the expected target's segments.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from impactopt.transcription.rows import Measure, Place, along, by_leg, rates
 
 @dataclass(frozen=True)
 class _Freeze:
-    """Where something is frozen: in which phase, at which place in it; coordinates, rates, legs."""
+    """Point at which the dynamics is frozen: phase, place in it; coordinates, rates, legs."""
 
     phase: int
     place: float
@@ -46,7 +46,9 @@ class _Freeze:
 
 
 class FrozenCollision(Collision):
-    """Variables and rows of the contact with one target. shares : of the hit; the rest as of `Collision`."""
+    """Variables and constraints of the contact with one target. shares : of the hit; the rest as of
+    `Collision`.
+    """
 
     def __init__(
         self,
@@ -86,7 +88,7 @@ class FrozenCollision(Collision):
         self._frozen = [self._freeze(k) for k in range(max(self.freezes, 1))]
 
     def _add_reference(self, count: int) -> None:
-        """At the beginnings of segments, and then where they are frozen, if not at contact."""
+        """Adds reference variables at the beginnings of segments, then at later freezes."""
         count, labels = max(2 * self.freezes, 1), self._b.coordinates.leg_labels
         super()._add_reference(count)
         name = f"{self._named}coasting leg accelerations"
@@ -189,7 +191,7 @@ class FrozenCollision(Collision):
         return [*own, at.y, at.u, at.legs, *more]
 
     def _hand_slope(self, i: int) -> Affine:
-        """Of its speed along the normal, which is that of the robot at the beginning of a segment."""
+        """Slope of the hand's speed along the normal, which starts each segment at the robot's speed."""
         s, k = self.stages[i], self._segments[i]
         first = s.previous < 0 or self._segments[s.previous] != k
         slope = self.speed[s.members[0]] * 0.0
@@ -258,9 +260,11 @@ class FrozenCollision(Collision):
             out.append(determined(Turn.ELEMENT, self.carried.index(0)))
         return [*([] if self._meeting is None else self._meeting.determined()), *out]
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
-        """Those of the freezes come first, as they determine variables that all others have."""
+        """Adds constraints; those of the freezes come first, as they determine variables that all others
+        have.
+        """
         if self._meeting is not None:
             self._meeting.add_rows(at)
         self._moved_rows(*at["moved"])
@@ -359,6 +363,6 @@ class FrozenCollision(Collision):
             group.write(x, legs)
 
     def _speed(self, y: Array, rates: Array, legs: Array) -> float:
-        """Of the hand along the normal [m/s]."""
+        """Speed of the hand along the normal [m/s]."""
         p = self._b.problem
         return effective_mass(self._b.coordinates, p.strikers, p.normal, y, legs, rates)[1]

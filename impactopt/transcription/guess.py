@@ -1,4 +1,4 @@
-"""Where the search for a contact starts: a point mass in the robot's place meets the target.
+"""Initial guess of a contact: a point mass in place of the robot meets the target.
 
 The law and the target are the true ones, switches and all, integrated by SciPy.
 """
@@ -20,7 +20,7 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Nail, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription.layout import Array
 
@@ -58,7 +58,7 @@ class Blow:
 def effective_mass(
     c: StanceCoordinates, strikers: Sequence[str], normal: Array, y: Array, legs: Array, rates: Array
 ) -> tuple[float, float]:
-    """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s].
+    """Mass [kg] of a robot on fixed soles at its striker, along the normal, and the striker's speed [m/s].
 
     Of several strikers: of each, with the others as fast; and their mean speed. One that goes back is met by
     what comes; one that hardly moves counts as slow.
@@ -75,7 +75,7 @@ def effective_mass(
 
 
 def mass_at_contact(problem: ImpactProblem) -> float:
-    """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
+    """Effective mass [kg] of the robot at its striker, where inverse kinematics reaches the target."""
     c = problem.coordinates
     y, legs = c.split(problem.contact_posture)
     return effective_mass(c, problem.strikers, problem.normal, y, legs, np.zeros(c.ny))[0]
@@ -86,7 +86,7 @@ def coasted(
 ) -> Iterator[tuple[Array, tuple[Array, Array]]]:
     """Legs of a robot that coasts, at times [s] since y: angles, and rates and accelerations; (nl,) each."""
     for at in elapsed:
-        with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+        with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
             legs = c.solve_legs(y + rates * at, legs)
         _, v, a = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)
         yield legs, (v[c.base + c.dependent], a[c.base + c.dependent])
@@ -104,7 +104,7 @@ def _motions(c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: 
 
 
 def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, limit: Array) -> float:
-    """How fast [m/s] the striker is along the normal in a posture (nq,), at most; ``limit`` (n,) [rad/s]."""
+    """Greatest speed [m/s] of the striker along the normal in a posture (nq,); ``limit`` (n,) [rad/s]."""
     motions, row = _motions(c, striker, normal, *c.split(posture))
     joints = motions[c.base :]
     bounds = np.concatenate([limit, limit])
@@ -127,7 +127,8 @@ class Parting:
 
 
 def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
-    """Whether a point mass [kg] and a target part before its events, at all speeds up to the fastest [m/s].
+    """Detects that a point mass [kg] and a target part before the phases' events, at all speeds up to the
+    fastest.
 
     None: at one of them, they do not.
     """
@@ -167,7 +168,7 @@ def blow(
         ends = _phases(time, rows, target)
         if ends is not None:
             break
-    if ends is None:  # somewhere, where the solver has to mend it
+    if ends is None:  # somewhere, where the solver has to fix it
         ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.guards else [0.0, 0.5, 1.0])
     times = ends[phase] + place * np.diff(ends)[phase]
 
@@ -217,7 +218,7 @@ def speed_that_leaves(
 
 
 def natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:
-    """How long each phase of the blow of a point mass [kg] of 1 m/s lasts [s].
+    """Duration [s] of each phase of a point mass [kg] that hits at 1 m/s.
 
     It is known from the last programs, which mostly are of the same blow.
     """

@@ -77,9 +77,9 @@ class Hit(Contacts):
             lasting = [c for c in self.collisions if isinstance(c, Collision)]
             self.first = [FirstInstant(b, contact, c.law, c.suffix) for c in lasting]
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def add_rows(self) -> None:
-        """One block for all collisions, each with its rows."""
+        """One block for all collisions, each with its constraints."""
         b = self._b
         slots: dict[str, list[Any]] = {}
         parameters: dict[str, list[Any]] = {}
@@ -107,7 +107,7 @@ class Hit(Contacts):
                 each.add_rows(at + k * b.blocks[-1].n_out)
 
     def renew(self, *, anew: bool) -> None:
-        """As of :meth:`impactopt.transcription.collision.Collision.renew`."""
+        """Renews all collisions (:meth:`impactopt.transcription.collision.Collision.renew`)."""
         self.__dict__.pop("mass", None)
         lasting = [c for c in self.collisions if isinstance(c, Collision)]
         for collision in lasting:
@@ -127,7 +127,7 @@ class Hit(Contacts):
     def output(self, collision: int, stage: int, part: str) -> Index:
         """Numbers of outputs of the block ``force``, whose ``part`` they are: at a stage of a collision.
 
-        Once rows are there, and of collisions that last.
+        Once constraints are there, and of collisions that last.
         """
         size = self._b.block("force").n_out
         at = self._at["force"] + (collision * len(self.stages) + stage) * size
@@ -146,7 +146,7 @@ class Hit(Contacts):
         return self.output(0, self.expected.end[-2], "penetration")
 
     def determined(self) -> list[Determined]:
-        """Of all collisions, and the feed-forward."""
+        """Determined variables of all collisions, and of the feed-forward."""
         parts = [*self.collisions, *self.first]
         return [*(each for part in parts for each in part.determined()), *super().determined()]
 
@@ -166,7 +166,7 @@ class Hit(Contacts):
         return tuple(float(share) for share in found)
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
-        """What plans and strikes say of the contact, for solver variables (n,) and the blocks' outputs."""
+        """Contact data of plans and strikes, for solver variables (n,) and the blocks' outputs."""
         approach = approaches(outputs)
         compression, restitution = self.expected.durations(x)
         scenarios = [

@@ -23,7 +23,7 @@ from impactopt.transcription.rows import Measure, Place, percent
 
 
 class InstantImpact:
-    """Variables and rows of an impact in no time; no row of torque or wrench while it lasts.
+    """Variables and constraints of an impact in no time; no constraint of torque or wrench while it lasts.
 
     mass : of a target that hand and robot have met, when they move on together; None: the problem's, which
     parts as its model of the collision says.  named : begin of the variables' names.
@@ -47,12 +47,12 @@ class InstantImpact:
 
     @property
     def impulse(self) -> Affine:
-        """To the target [N s]."""
+        """Impulse to the target [N s]."""
         return self.blow[0]
 
     @property
     def target_state(self) -> Affine:
-        """Of the target, after it."""
+        """State of the target after the impact."""
         return self.blow[0] * (1 / self.mass)
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
@@ -72,7 +72,7 @@ class InstantImpact:
         b, (start, _) = self._b, at["impact"]
         part = b.parts("impact")
         base, joints = start + part["base"], start + part["joints"]
-        units = {"N": "N s", "N m": "N m s"}  # rows are over a tenth of a second of the weight
+        units = {"N": "N s", "N m": "N m s"}  # constraints are over a tenth of a second of the weight
         unbalanced = [Measure(units[m.unit], 0.1 * m.factor, "off") for m in b.limits.unbalanced]
         share = percent("off, of its limit for 0.1 s")
         b.equal("impulse balance", "impact", DIRECTIONS[: b.coordinates.base], base, unbalanced)
@@ -81,13 +81,13 @@ class InstantImpact:
         b.equal("law of the impact", "impact", ["impulse"], start + part["blow"], off)
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
-        """As of :meth:`impactopt.transcription.collision.Collision.link`; no time passes."""
+        """Linking constraints (:meth:`impactopt.transcription.collision.Collision.link`); no time passes."""
         none, still = Affine.zeros(1), Affine.zeros(self._b.ny)
         return self.contact.link(start, (none, none), (still, still), self._rate)
 
     @property
     def state_after(self) -> list[Affine]:
-        """As of :meth:`impactopt.transcription.collision.Collision.state_after`."""
+        """State after contact (:meth:`impactopt.transcription.collision.Collision.state_after`)."""
         state = self.contact.state
         return [state.y, self._rate, state.legs, Affine.constant(1.0)]
 

@@ -1,4 +1,4 @@
-"""The terms that hold in every problem, as numbers: bounds of variables, scales and units of rows."""
+"""The terms that hold in every problem, as numbers: bounds of variables, scales and units of constraints."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Limits:
     ----------
     torque, velocity, position, cone, balance, incidence, extension : the problem's terms.
     weight : of the robot [N].  units : of base rows, weight [N] and lever [m].  unbalanced : how their
-        violation is told.
+        violation is reported.
     wrench_scale (6 a sole) : of sole wrenches [N, N m].
     y_lower, y_upper (ny,), legs_lower, legs_upper (nl,) : of the coordinates and the legs.
     rate_limit (n,) : of the joints [rad/s].

@@ -1,4 +1,4 @@
-"""Where the numbers of a program's blocks belong in its Jacobian and in its Hessian.
+"""Sparsity maps: positions of the blocks' derivatives in a program's Jacobian and Hessian.
 
 Blocks take z = S x + c, so the nonzeros of both matrices are sums of multiples of the blocks' own nonzeros,
 with factors that never change. They are added up in runs: a block's variables that stand side by side are
@@ -22,7 +22,7 @@ from impactopt.transcription.scatter_add import Runs, count_up, union, with_tran
 
 
 class JacobianMap:
-    """From the blocks' Jacobians to that of the rows g = out[...] + A x."""
+    """Map of the blocks' Jacobians to that of the constraints g = out[...] + A x."""
 
     def __init__(self, blocks: Sequence[Block], lift: sp.csr_array, row_of: Index, linear: sp.csr_array):
         """lift : S, of the inputs of all blocks.  row_of : each output's row; -1: none.  linear : A."""
@@ -49,14 +49,14 @@ class JacobianMap:
         self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
 
     def matrix(self) -> sp.csc_array:
-        """For what the blocks' Jacobians were last."""
+        """Jacobian for the blocks' latest values."""
         values = self._linear.copy()
         self._sums.add_to(values, self._entries)
         return _with(self._made, values)
 
 
 class HessianMap:
-    """From the lower triangles of the blocks' Hessians to the Hessian of sigma x'Qx/2 + multipliers . out.
+    """Map of the lower triangles of the blocks' Hessians to the Hessian of sigma x'Qx/2 + multipliers . out.
 
     An entry off the diagonal of z stands for the one across it, too, and so does what it is a part of in x.
     So entries are added up on one side, those of the diagonal halved, and the whole is that and its
@@ -94,7 +94,7 @@ class HessianMap:
         self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
 
     def matrix(self, sigma: float) -> sp.csc_array:
-        """For what the blocks' Hessians were last."""
+        """Hessian for the blocks' latest values."""
         values: Array = np.multiply(sigma, self._half)
         self._sums.add_to(values, self._entries)
         values = with_transposed(values, self._across)
@@ -118,7 +118,7 @@ def _with(matrix: sp.csc_array, values: Array) -> sp.csc_array:
 
 
 def _terms(lift: sp.csr_array, z: Index) -> tuple[Index, Index, Array]:
-    """Of these inputs every term: the position in z, the variable, and its coefficient."""
+    """Terms of these inputs: the position in z, the variable, and its coefficient."""
     count = lift.indptr[z + 1] - lift.indptr[z]
     owner = np.repeat(np.arange(len(z)), count)
     at = lift.indptr[z][owner] + count_up(count)
@@ -126,7 +126,7 @@ def _terms(lift: sp.csr_array, z: Index) -> tuple[Index, Index, Array]:
 
 
 def _alike(lift: sp.csr_array) -> npt.NDArray[np.bool_]:
-    """Which inputs have the coefficients of the input before, each of the next variable."""
+    """Mask of the inputs that have the coefficients of the input before, each of the next variable."""
     count = np.diff(lift.indptr)
     owner = np.repeat(np.arange(count.size), count)
     out = np.append(False, count[1:] == count[:-1])[: count.size]
@@ -138,7 +138,7 @@ def _alike(lift: sp.csr_array) -> npt.NDArray[np.bool_]:
 
 
 def _runs(shape: tuple[int, ...], follows: npt.NDArray[np.bool_]) -> tuple[Index, Index]:
-    """Where runs of entries begin, and their lengths.
+    """Beginnings and lengths of the runs of entries.
 
     shape : instances and entries of each; follows : which of the entries after the first goes on.
     """

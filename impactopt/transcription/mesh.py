@@ -1,4 +1,4 @@
-"""Where a program has its nodes: breaks of the splines, collocation points of the contact phases."""
+"""Mesh of a program: breaks of the splines, collocation points of the contact phases."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def lagrange(places: Sequence[float], at: float) -> Array:
 
 
 def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
-    """Those that a problem asks for, of each phase of its contact; halved if its target has events.
+    """Elements of each phase of a problem's contact; halved if its target has events.
 
     Where an event may come at once, the phase before it is one element. Where something is frozen on the
     way, segments begin with elements; ``shares`` : if the phases' are not those of a point mass.
@@ -101,7 +101,7 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
 
 
 def guessed_shares(problem: ImpactProblem) -> Shares:
-    """Of the contact's time that each phase lasts, as a point mass meets the target."""
+    """Fraction of the contact's time that each phase lasts, as a point mass meets the target."""
     durations = natural_durations(problem.law, problem.target, mass_at_contact(problem))
     return tuple(float(share) for share in durations / durations.sum())
 
@@ -114,7 +114,7 @@ def place_of(fraction: float, shares: Shares) -> tuple[int, float]:
 
 
 def segment_of(phase: int, begin: float, end: float, shares: Shares, freezes: int) -> int:
-    """Which of the segments between freezes an element is of, that begins and ends at these places."""
+    """Index of the segment between freezes that an element with these ends belongs to."""
     before = float(np.cumsum([0.0, *shares])[phase])
     middle = before + shares[phase] * (begin + end) / 2
     return min(int(middle * freezes), freezes - 1)
@@ -139,7 +139,7 @@ def contact_mesh(problem: ImpactProblem, elements: Elements | None = None) -> li
 
 
 def percentage(s: float, more: Collection[float]) -> str:
-    """What a place on [0, 1] is called; one of ``more`` with more digits, as others are near it."""
+    """Name of a place on [0, 1]; one of ``more`` has more digits, as others are near it."""
     return f"{100 * s:.2f} %" if s in more else f"{100 * s:.0f} %"
 
 

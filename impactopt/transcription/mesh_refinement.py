@@ -1,4 +1,4 @@
-"""What a plan does between its program's nodes, and the nodes that it takes to keep its limits there, too.
+"""Checks a plan's limits between its program's nodes, and selects the nodes to add.
 
 A program holds torques and the ground's wrench to their limits at its nodes. Between two of them the motion
 is a spline, and what it needs is not: right after a blow, where accelerations are largest, the ZMP can leave
@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 STEP = 1e-3  # [s] at which a motion is looked at: as the servo's reference is sampled
 _SHARE, _TORQUE = 0.5, 0.01  # of the room to all torque, and of the limit: what may be given up between nodes
 _FRICTION = 1.1  # of the friction coefficient that a plan may use: what it may use between nodes
-_ROUNDING = 1e-6  # of the weight, by which a cone's rows may be off
-GEAR = 0.03  # of what a gear may bear: what it may bear more between nodes, or collocation points
+_ROUNDING = 1e-6  # of the weight, by which a cone's constraints may be off
+GEAR = 0.03  # of what a gear may bear: what it may carry more between nodes, or collocation points
 
 
 class MoreNodes(NamedTuple):
@@ -43,12 +43,12 @@ NO_MORE = MoreNodes()
 
 
 def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
-    """Those known, and more in the middle between two nodes where the plan leaves its limits on the way.
+    """Nodes to add: those known, and the middle between two nodes where the plan leaves its limits.
 
     It is looked at every millisecond. That is where a sole gives up more than half of a margin that it has at
     the nodes: of its centre of pressure to its own edges, or of its least normal force; or uses a tenth more
     friction than it may; where torques give up half of the room to all that the motors have; where a joint of
-    a held leg is faster than it may be; and where a gear bears 3 % more than it may.
+    a constrained leg is faster than it may be; and where a gear carries 3 % more than it may.
     """
     start = plan.coordinates.split(plan.problem.start_posture)[1]
     swing, legs = _middles_outside(plan, 0, start)

@@ -18,12 +18,12 @@ from impactopt.transcription.rows import Index, Measure, Place, by_leg
 
 
 class MotionPhase(ABC):
-    """Takes a builder; hands back places, slots of blocks, and what rows determine.
+    """Takes a builder; hands back places, slots of blocks, and what constraints determine.
 
     Attributes
     ----------
-    name : what rows and messages call it.  phase : what the problem asks of it.
-    breaks : of the spline, from 0 to 1.  nodes (k,) : where legs and sole wrenches are, and rows hold.
+    name : what constraints and messages call it.  phase : what the problem asks of it.
+    breaks : of the spline, from 0 to 1.  nodes (k,) : where legs and sole wrenches are, and constraints hold.
     more : which of these are beside the ends and middles of the spline's intervals.
     c, legs, w, T : variables: control points, legs and sole wrenches at the nodes, duration [s].
     """
@@ -52,7 +52,7 @@ class MotionPhase(ABC):
 
     def at(self, s: float) -> tuple[Affine, Affine, Affine]:
         """y, y', y'' at s."""
-        if s not in self._at:  # rows, prices and places ask for the same few
+        if s not in self._at:  # constraints, prices and places ask for the same few
             y, yd, ydd = (
                 add([self.control(int(j)) * row[0, j] for j in np.flatnonzero(row[0])])
                 for row in basis(self.breaks, s)
@@ -80,11 +80,11 @@ class MotionPhase(ABC):
         ]
 
     def determined(self) -> list[Determined]:
-        """At each node, one after the other: each leg, and the first sole's wrench."""
+        """Variables determined at each node: each leg, and the first sole's wrench."""
         found = [[*by_leg(self.legs.index(k)), self.w.index(k)[:6]] for k in range(self.w.count)]
         return [each for parts in found for each in at_node(parts)]
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def _add_rate_rows(self, b: Builder, js: range) -> None:
         """Velocity control points within the limit; multiplied by T they are linear."""
         c, velocity = b.coordinates, b.limits.velocity
@@ -132,5 +132,5 @@ class MotionPhase(ABC):
 
 
 def at_node(parts: list[Index]) -> list[Determined]:
-    """What rows of a node determine, one after the other; the last of all nodes go at one step."""
+    """Variables that a node's constraints determine, in order; the last of all nodes in one step."""
     return [determined(Turn.NODE, part, k) for k, part in enumerate(parts, -len(parts))]

@@ -16,10 +16,10 @@ from impactopt.transcription.rows import Index, Measure, Place, along, percent
 def add_nodes(
     b: Builder, instances: list[list[Affine]], places: Sequence[Place | str], *, closed: int = 0
 ) -> list[Index]:
-    """Nodes of the block ``node`` with their rows, but for those of torque; the torques' outputs.
+    """Nodes of the block ``node`` with their constraints, but for those of torque; the torques' outputs.
 
     instances : y, y', y'', legs, sole wrench, T of each.  closed : so many of the last have the posture
-    of another, whose rows close their legs.
+    of another, whose constraints close their legs.
     """
     c, part = b.coordinates, b.parts("node")
     limits, rates = b.robot.torque_limit, b.robot.velocity_limit[c.dependent]
@@ -88,7 +88,7 @@ def add_cone_rows(
 
 
 def _outside_cone(facet: Array, normal: Affine, friction: float) -> Measure:
-    """Of a facet (6,) of the cone of corners' forces; ``normal``: the normal force over the weight."""
+    """Measure of a facet (6,) of the cone of corners' forces; ``normal``: normal force over weight."""
     along_sole, tilting = np.hypot(*facet[:2]), np.hypot(*facet[3:5])
     if along_sole < 1e-9 and abs(facet[5]) < 1e-9:
         return Measure("mm", 1e3 / tilting, "outside", normal, 0.05)  # moment over force: the CoP

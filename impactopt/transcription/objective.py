@@ -1,4 +1,4 @@
-"""What a program minimizes: minus the weighted sum of the problem's objectives, plus small prices.
+"""Objective of a program: minus the weighted sum of the problem's objectives, plus small regularizing costs.
 
 Every objective is affine or quadratic in the variables. What is neither is an output of a block first, with a
 variable that equals it (:meth:`impactopt.transcription.builder.Builder.lift`); only what a problem asks for
@@ -25,7 +25,7 @@ from impactopt.transcription.motion_phase import MotionPhase
 
 @dataclass(frozen=True)
 class Quantity:
-    """What an objective weighs: an affine expression plus the squares of a group of variables."""
+    """Quantity that an objective weighs: an affine expression plus the squares of a group of variables."""
 
     affine: Affine
     squares: Group | None = None

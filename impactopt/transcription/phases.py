@@ -1,4 +1,4 @@
-"""Phases of a contact: how short they may be, and what of a law needs rows of its own."""
+"""Phases of a contact: how short they may be, and what of a law needs constraints of its own."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ ALIKE = 3.0  # factor between numbers that are
 
 
 def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
-    """How long [s] each phase of the contact lasts at least; ``natural``: its last one, of a point mass."""
+    """Least duration [s] of each contact phase; ``natural``: that of a point mass's last phase."""
     target, (shortest, longest) = problem.target, problem.contact_duration
-    if not shortest:  # no bound: far below what a blow takes, as rows are over these times
+    if not shortest:  # no bound: far below what a blow takes, as constraints are over these times
         shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
     shares = [SHARE if target.guards else 1.0] * (len(target.phases) - 1) + [1.0]
     if target.at_once:
@@ -28,17 +28,20 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
 
 
 def alike(numbers: Array, others: Array) -> bool:
-    """Whether least durations of problems with these numbers (k,) are, as blows take about as long."""
+    """True if problems with these parameters (k,) can share least durations, as their blows take about as
+    long.
+    """
     sizes = np.sort(np.abs([numbers, others]), axis=0)
     return bool(np.all(sizes[1] <= ALIKE * sizes[0]))
 
 
 def switches(law: ContactLaw) -> bool:
-    """Whether compression and restitution are branches of their own."""
+    """True if compression and restitution are different branches of the law."""
     compression, restitution, _ = law.formula()
     return bool(compression != restitution)
 
 
 def pulls_apart(law: ContactLaw) -> bool:
-    """Whether it would pull at bodies that part fast."""
+    """True if the law would pull at bodies that separate fast."""
+    # hardly any penetration [m], and separation at 10 m/s: a damper without a spring behind it would pull
     return float(law.branch(1e-6, -10.0, False)) < 0

@@ -31,7 +31,7 @@ def sampled(start: float, end: float, step: float) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """What the servo is given: nothing else of the plan reaches a simulation.
+    """Reference trajectory of the servo, the only part of a plan that reaches a simulation.
 
     time (k,) [s], ascending, an instant twice where the reference jumps; phase (k,): 0 swing, 1 collision, 2
     follow-through; q (k, nq) pin configurations; v (k, nv) pin velocities; a (k, nv); torque (k, n)
@@ -56,7 +56,7 @@ class Trajectory:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Where bodies are at k instants.
+    """Motion of the bodies at k instants.
 
     time (k,) [s].  phase (k,) : 0 before, 1 in, 2 after contact.  q (k, nq) : Pinocchio's configurations.
     travel (k,) [m] : of the target along its normal.
@@ -94,7 +94,7 @@ class PlannedCollision:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedScenario:
-    """What the plan predicts if the target of the :class:`impactopt.Scenario` of this name is hit.
+    """Prediction of the plan for a hit of the :class:`impactopt.Scenario` of this name.
 
     impulse [N s] to that target.
     """
@@ -277,7 +277,7 @@ class Plan:
     def motion(
         self, step: float = 1e-3, *, missed: bool = False, reference: Trajectory | None = None
     ) -> Motion:
-        """What the robot's bodies are expected to do, about every ``step`` [s] from start to rest.
+        """Expected motion of the robot's bodies, about every ``step`` [s] from start to rest.
 
         In contact the robot is slower than the servo's reference: between the states before and after it goes
         the cubic that has both states' rates.
@@ -325,7 +325,7 @@ class Plan:
         return np.asarray(y0 + at * way + bend)
 
     def travel(self, time: Array) -> Array:
-        """How far (k,) [m] the target has gone along the normal at times [s] since the motion's start.
+        """Travel (k,) [m] of the target along the normal at times [s] since the motion's start.
 
         Before contact it comes as fast as it does then, and after it a free one goes on so.
         """

@@ -1,4 +1,4 @@
-"""What a plan and a strike ask of gears and motors."""
+"""Gear and motor loads of a plan and of a strike."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
-from impactopt.robots.loads import DriveLoads, gear_torque
+from impactopt.robots.actuator_loads import DriveLoads, gear_torque
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 
@@ -20,7 +20,7 @@ STEP = 5e-3  # [s] of motions, whose loads change from one node to the next: a c
 
 
 def motion_loads(robot: Robot, way: Trajectory, hit: PlannedCollision) -> DriveLoads:
-    """Of a reference before and after contact, and of the collision, at as many instants as are known."""
+    """Loads of a reference before and after contact, and of the collision, at all known instants."""
     phase, base = way.phase, robot.nv - robot.n
     rates, outside = way.v[:, base:], phase != 1
     jump = rates[phase == 2][0] - rates[phase == 0][-1]
@@ -28,8 +28,8 @@ def motion_loads(robot: Robot, way: Trajectory, hit: PlannedCollision) -> DriveL
 
 
 def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> list[DriveLoads]:
-    """Of a plan's motions every `STEP`, the one that meets nothing included, and of these collisions with its
-    targets.
+    """Loads of a plan's motions every `STEP`, including the one that meets nothing, and of these collisions
+    with its targets.
     """
     expected, *others = hits
     ways = [plan.trajectory(step=STEP, hold=STEP)]
@@ -41,7 +41,7 @@ def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> li
 
 
 def strike_loads(robot: Robot, before: Array, after: Array, hit: PlannedCollision) -> DriveLoads:
-    """Of a collision alone, with the robot's velocities (nv,) before and after it."""
+    """Loads of a collision alone, with the robot's velocities (nv,) before and after it."""
     none = np.zeros((0, robot.n))
     return _loads(robot, (none, none, none), hit, (after - before)[-robot.n :])
 

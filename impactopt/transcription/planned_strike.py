@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.loads import DriveLoads
+from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.transcription.plan import PlannedCollision, PlannedScenario
 from impactopt.transcription.planned_loads import strike_loads
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedStrike:
-    """What a robot hits with, and what the plan predicts of the blow.
+    """State in which a robot hits, and the plan's prediction of the impact.
 
     posture (nq,) and velocity (nv,), pin's, at contact; posture_after, velocity_after at separation. torque
     (n,) [N m] that makes the robot coast at contact, and ground (6,) [N, N m], the total ground wrench about
@@ -65,7 +65,7 @@ class PlannedStrike:
         return out
 
     def loads(self) -> DriveLoads:
-        """What gears and motors bear at most in the blow."""
+        """Peak loads of gears and motors in the impact."""
         before, after = self.velocity, self.velocity_after
         return strike_loads(self.problem.robot, before, after, self.collision)
 

@@ -1,7 +1,7 @@
-"""The rows of a program: what they bound, and how a person reads one that is not met.
+"""The constraints of a program: what they bound, and how a person reads one that is not met.
 
-A row knows its term, its component, its place, whose time is a function of the solution's durations, and the
-measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 % over its limit".
+A constraint knows its term, its component, its place, whose time is a function of the solution's durations,
+and the measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 % over its limit".
 """
 
 from __future__ import annotations
@@ -38,12 +38,14 @@ def by_leg(joints: Index) -> list[Index]:
 
 
 def along(labels: Sequence[str], phrase: str) -> list[Measure]:
-    """Of rows in [m] for directions x, y, z, and in [rad] for all else: the labels' last words say which."""
+    """Measures of constraints in [m] for directions x, y, z, else in [rad], told apart by the labels' last
+    words.
+    """
     return [millimetres(phrase) if _straight(name) else degrees(phrase) for name in labels]
 
 
 def rates(labels: Sequence[str]) -> list[Measure]:
-    """As :func:`along`, of rows in [m/s] and [rad/s]."""
+    """Measures of constraints in [m/s] or [rad/s], likewise."""
     return [Measure("m/s" if _straight(name) else "rad/s", 1.0, "off") for name in labels]
 
 
@@ -53,7 +55,7 @@ def _straight(label: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A constraint's origin: term, place and component, and how its violation is told.
+    """A constraint's origin: term, place and component, and how its violation is reported.
 
     whole : what the component is a part of, and what messages name in its place; None: the component.
     """
@@ -68,7 +70,7 @@ class Row:
         return _joined(self.term, self.place.name, self.component)
 
     def told(self, x: Array, amount: float) -> tuple[str, str]:
-        """Which row this is at solver variables (n,), and by how much it is violated."""
+        """Name of this constraint and amount of its violation in words, at solver variables (n,)."""
         by = f"by {amount:.3g}" if self.measure is None else self.measure.told(x, amount)
         component = self.component if self.whole is None else self.whole
         return _joined(self.term, self.place.told(x), component), by
@@ -89,7 +91,7 @@ class Rows:
     origins: list[Row] = field(default_factory=list)
 
     def copy(self) -> Rows:
-        """The same rows, to which others can be added."""
+        """The same constraints, to which others can be added."""
         return Rows(*(list(getattr(self, f.name)) for f in fields(self)))
 
     def bound(self, k: int, lower: ArrayLike, upper: ArrayLike) -> None:
@@ -98,7 +100,7 @@ class Rows:
             sides[k] = np.broadcast_to(np.asarray(given, dtype=float), sides[k].shape)
 
     def add_each(self, origins: Sequence[Row], *, outputs: Index, lower: float) -> None:
-        """Append rows of these origins:  lower <= out[outputs]."""
+        """Append constraints of these origins:  lower <= out[outputs]."""
         n = len(origins)
         self.outputs.append(np.asarray(outputs, dtype=np.intp))
         self.affine.append(Affine.zeros(n))
@@ -119,9 +121,9 @@ class Rows:
         measure: Measure | Sequence[Measure] | None = None,
         whole: str | None = None,
     ) -> None:
-        """Append ``len(components)`` rows  lower <= out[outputs] + affine <= upper.
+        """Append ``len(components)`` constraints  lower <= out[outputs] + affine <= upper.
 
-        measure : of all, or one a row; place as text: one without a time; whole : of :class:`Row`.
+        measure : of all, or one a constraint; place as text: one without a time; whole : of :class:`Row`.
         Rows that are unbounded on both sides are dropped.
         """
         n = len(components)

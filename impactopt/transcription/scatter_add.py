@@ -37,7 +37,7 @@ class Runs:
 
     @classmethod
     def make(cls, entry: Index, place: Index, length: Index, factor: Array, shape: tuple[int, int]) -> Runs:
-        """Of numbers of any kind."""
+        """Makes runs from index arrays of any integer type."""
         return cls(entry.astype(np.int32), place.astype(np.int32), length.astype(np.int32), factor, shape)
 
     def add_to(self, out: Array, entries: Array) -> None:
@@ -57,7 +57,7 @@ class Runs:
 
 
 def with_transposed(values: Array, across: Places) -> Array:
-    """Of a matrix with a symmetric pattern the values (nnz,) of the sum with its own transpose.
+    """Values (nnz,) of the sum of a matrix with a symmetric pattern and its transpose.
 
     across (nnz,) : of each place the one across the diagonal.
     """
@@ -87,5 +87,5 @@ def union(first: Index, length: Index | int = 1) -> Index:
 
 @functools.cache
 def _library() -> Any:
-    """In C where there is a compiler; None: sparse products do it."""
+    """C library, if there is a compiler; None: sparse products replace it."""
     return native_library(__package__, "scatter_add")

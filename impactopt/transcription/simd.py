@@ -75,7 +75,7 @@ _IN_EACH_LANE = {
 
 
 def _formula(kind: int) -> str:
-    """Of the vectors a, b and c."""
+    """C expression of an operation on the vectors a, b and c."""
     return _OF_VECTORS.get(kind) or f"op_{kind}(a, {'b' if 'y' in _IN_EACH_LANE[kind] else 'a'})"
 
 
@@ -184,7 +184,7 @@ def _number(value: float) -> str:
 
 
 def _interface(programs: Mapping[ca.Function, Arranged], lanes: int) -> str:
-    """What CasADi writes around functions of as many instances as there are lanes, around these bodies."""
+    """Interface code of CasADi for functions of as many instances as there are lanes, around these bodies."""
     generator = ca.CodeGenerator("c", {"with_header": False})
     for f in programs:
         inputs = [ca.SX.sym("x", ca.repmat(f.sparsity_in(i), 1, lanes)) for i in range(f.n_in())]

@@ -18,6 +18,7 @@ from impactopt.transcription.rows import Place, percent
 
 __all__ = ["SpringPoint", "add_hinges", "add_springs", "follow_springs", "swing_springs"]
 
+# weights of an interval's begin, middle and end: Simpson's rule, exact for the splines' cubics
 SIMPSON = (1 / 6, 4 / 6, 1 / 6)
 
 
@@ -35,7 +36,7 @@ class SpringPoint(NamedTuple):
 
 
 def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
-    """Of a motion to contact: means over the spline's intervals, and its end.
+    """Spring constraints of a motion to contact: means over the spline's intervals, and its end.
 
     Accelerations of a spline are linear in an interval, those of a spring are not. Where their means are
     right, so are the speeds at the intervals' ends, and with them the blow.
@@ -58,7 +59,9 @@ def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) ->
 
 
 def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
-    """Of a motion to rest: the ends of the spline's intervals. With means it would swing about them."""
+    """Spring constraints of a motion to rest: the ends of the spline's intervals. With means it would
+    oscillate.
+    """
     return [
         SpringPoint(motion.place_at(s), torque, *motion.at(s)[:2], motion.T[0])
         for s, torque in zip(motion.nodes, torques, strict=True)
@@ -67,7 +70,7 @@ def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[Sprin
 
 
 def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> None:
-    """At some points: torque = torque at rest - stiffness x turn - damping x rate.
+    """Adds spring constraints at some points: torque = torque at rest - stiffness x turn - damping x rate.
 
     In contact the servo's own law is that of the spring.
 
@@ -98,7 +101,7 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
 
 
 def add_hinges(b: Builder, points: Sequence[tuple[Place, Affine]]) -> None:
-    """At places with these torques over limit (n,): those of soles' hinges are zero.
+    """Adds constraints at places with these torques over limit (n,): those of soles' hinges are zero.
 
     In contact the servo's own law is that: feed-forward and gains are zero.
     """

@@ -110,7 +110,7 @@ def strike_iterate(t: StrikeTranscription, *, speed: float = 1.0, noise: float =
     """Solver variables (n,) of a strike, as of :func:`first_iterate`."""
     hit = reached(t, speed=speed, noise=noise, seed=seed)
     x = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
-    with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+    with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
         hit = replace(hit, legs=t.coordinates.solve_legs(hit.y, hit.legs))
     t.y.write(x, hit.y)
     t.legs.write(x, hit.legs)
@@ -149,11 +149,11 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
 
 
 def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
-    """Variables, multipliers of rows and of bounds of a program with more nodes than an old one, or elements,
-    or of another model of the collision that lasts, or with a first instant of contact.
+    """Variables, multipliers of constraints and of bounds of a program with more nodes than an old one, or
+    elements, or of another model of the collision that lasts, or with a first instant of contact.
 
     What is at nodes is between those of the old nodes, and the contact is that of its polynomials;
-    multipliers are those of the same rows and variables.
+    multipliers are those of the same constraints and variables.
     """
     stages = same_places(t.hit.stages, old.hit.stages)
     places = {}
@@ -213,9 +213,9 @@ def _model(t: ContactProgram) -> tuple[str, int]:
 
 
 def _of_same_rows(rows: Sequence[Row], known: Sequence[Row], numbers: Array) -> Array:
-    """The numbers of known rows for these: those of the same name, as often as there are any; else 0.
+    """The numbers of known constraints for these: those of the same name, as often as there are any; else 0.
 
-    Most rows in front are the very same: programs differ by what comes after them.
+    Most constraints in front are the very same: programs differ by what comes after them.
     """
     differ = (k for k, (one, other) in enumerate(zip(rows, known, strict=False)) if one is not other)
     same = next(differ, min(len(rows), len(known)))
@@ -224,7 +224,7 @@ def _of_same_rows(rows: Sequence[Row], known: Sequence[Row], numbers: Array) -> 
 
 
 def _keys(rows: Sequence[Row]) -> Iterator[tuple[tuple[str, str, str], int]]:
-    """What a row is, and how many of that name come before it."""
+    """Name of each constraint, and the number of earlier ones of that name."""
     seen: dict[tuple[str, str, str], int] = {}
     for row in rows:
         name = row.term, row.place.name, row.component
@@ -238,7 +238,7 @@ def _finished(t: ContactProgram, x: Array) -> Array:
 
 
 def _durations(t: Transcription) -> tuple[float, float]:
-    """Of swing and follow-through [s]."""
+    """Durations of swing and follow-through [s]."""
     return float(np.mean(t.problem.swing.duration)), float(np.mean(t.problem.follow.duration))
 
 
@@ -255,7 +255,7 @@ def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
     ):
         legs, all_legs, all_w = t.legs0, [], []
         for y in spline.sample(nodes * spline.duration)[0]:
-            with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+            with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
                 legs = c.solve_legs(y, legs)
             all_legs.append(np.clip(legs, limits.legs_lower, limits.legs_upper))
             all_w.append(static_wrenches(c, y, legs))

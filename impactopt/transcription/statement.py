@@ -1,4 +1,4 @@
-"""What a saved result says of its program: names of variables and rows, and what the mesh has more."""
+"""Summary of a saved result's program: names of variables and constraints, and additions to the mesh."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["statement_of"]
 
 
 def statement_of(t: Transcription) -> str:
-    """As JSON, for a reader that knows nothing of this package.
+    """JSON summary of a program, for a reader that knows nothing of this package.
 
     `groups`: name, count and size of the variables, in their order. `rows`: term, place and the number of a
     list of `components`. `more`: nodes beside those of the mesh. `elements`, `guarded`, `shares`,

@@ -68,7 +68,7 @@ class StrikeTranscription(ContactProgram):
             left = self.expected.state_after
             self.angular_momentum = add_balance(b, state, left, self.hit.scenarios)
         self._finish(
-            tuple(term for term in problem.terms if not term.whole_motion),
+            tuple(term for term in problem.active_terms if not term.whole_motion),
             tuple(o for o in problem.objectives if not o.whole_motion),
         )
 
@@ -101,7 +101,7 @@ class StrikeTranscription(ContactProgram):
         )
 
     def _prices(self) -> Prices:
-        """Of sole wrenches, and of the least accelerations that lead to the state at contact from rest.
+        """Costs of sole wrenches, and of the least accelerations that lead from rest to the state at contact.
 
         A coordinate that has to go the way d to the rate u in the time T accelerates with at least
         integral a^2 dt = 12 d^2/T^3 - 12 d u/T^2 + 4 u^2/T (the cubic).

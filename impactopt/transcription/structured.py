@@ -41,7 +41,7 @@ class StructuredProgram:
     ) -> None:
         """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``rows`` and the layout's bounds.
 
-        determined : variables that equality rows of their own determine.
+        determined : variables that equality constraints of their own determine.
         """
         self.determined = tuple(determined)
         self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(rows.origins)
@@ -73,11 +73,11 @@ class StructuredProgram:
         quadratic: sp.spmatrix | sp.sparray,
         linear: Array,
     ) -> None:
-        """The numbers of another program of the same structure, whose blocks and rows are the first of this
-        one's; the others keep theirs.
+        """The numbers of another program of the same structure, whose blocks and constraints are the first of
+        this one's; the others keep theirs.
 
-        Blocks and rows touch the same variables, with the same weights: what differs are bounds, constants
-        and parameters.
+        Blocks and constraints touch the same variables, with the same weights: what differs are bounds,
+        constants and parameters.
         """
         self.x_lower, self.x_upper = layout.lower, layout.upper
         for mine, other in zip(self.blocks, blocks, strict=False):
@@ -100,7 +100,7 @@ class StructuredProgram:
         self._c0, self._Q = float(affine.const.sum()), sp.csc_array(quadratic)
 
     def same_numbers(self, other: StructuredProgram) -> bool:
-        """Whether bounds, constants, weights and parameters are those of another program, to rounding."""
+        """True if bounds, constants, weights and parameters equal those of another program, to rounding."""
         mine, its = self._numbers(), other._numbers()
         return len(mine) == len(its) and all(
             a.shape == b.shape and np.allclose(a, b, rtol=1e-12, atol=1e-12)
@@ -143,7 +143,7 @@ class StructuredProgram:
         return {b.name: b.value(z).copy() for b, z in zip(self.blocks, self._lifted(x), strict=True)}
 
     def all_outputs(self, x: Array) -> Array:
-        """Those of all blocks one after the other, as rows and lifted variables number them."""
+        """Outputs of all blocks one after the other, as constraints and lifted variables number them."""
         return np.concatenate([b.value(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)])
 
     def objective(self, x: Array) -> float:
@@ -184,7 +184,7 @@ class StructuredProgram:
         return str(self.origins[i])
 
     def row_group(self, i: int) -> tuple[str, str]:
-        """Its term and place: the rows that one message stands for."""
+        """Its term and place: the constraints that one message stands for."""
         return self.origins[i].term, self.origins[i].place.name
 
     def describe_violation(self, i: int, x: Array, amount: float) -> tuple[str, str]:

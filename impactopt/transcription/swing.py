@@ -1,4 +1,4 @@
-"""From rest to contact: variables and rows of the swing."""
+"""Variables and constraints of the swing, from rest to contact."""
 
 from __future__ import annotations
 

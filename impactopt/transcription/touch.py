@@ -1,4 +1,4 @@
-"""Where and how the striking point meets the target: rows at contact."""
+"""Contact conditions: constraints on position and direction of the striking point as it meets the target."""
 
 from __future__ import annotations
 

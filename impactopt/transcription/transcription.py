@@ -1,4 +1,4 @@
-"""From an impact problem to a nonlinear program, and from its solution back to a plan.
+"""Transcribes an impact problem to a nonlinear program, and its solution back to a plan.
 
 Phases: swing (rest to contact), compression, restitution, follow-through (the predicted state after contact
 to rest).  Swing and follow-through are cubic splines in the independent coordinates; their legs and sole
@@ -136,7 +136,7 @@ class Transcription(ContactProgram):
             y, y1, T = self.follow.start
             left = [y, y1, self.follow.legs[0], T]
             self.angular_momentum = add_balance(b, contact.state, left, self.hit.scenarios)
-        self._finish(problem.terms, problem.objectives)
+        self._finish(problem.active_terms, problem.objectives)
 
     # ------------------------------------------------------------------ for terms and objectives
     @property
@@ -172,7 +172,7 @@ class Transcription(ContactProgram):
         """Torques over limit of all motions, of a program that has them as variables."""
         return torque_courses(self.builder, self.swing, self.follows, self.torques)
 
-    # ------------------------------------------------------------------ rows
+    # ------------------------------------------------------------------ constraints
     def _add_motions(self) -> None:
         """One block for the nodes of all motions, and of coasting in contact; and what bounds the splines."""
         b, limits = self.builder, self.builder.limits
@@ -204,7 +204,7 @@ class Transcription(ContactProgram):
 
     @property
     def torques_lifted(self) -> bool:
-        """Whether the torques at the nodes are variables, as something beside their limit asks for them."""
+        """True if the torques at the nodes are variables, as a term beside their limit needs them."""
         p = self.problem
         if self.robot.passive.any() or any(term.needs_torques for term in p.active_terms):
             return True
@@ -244,7 +244,7 @@ class Transcription(ContactProgram):
         self.hit.add_feedforward_rows(outputs[contact])
 
     def _add_links(self) -> None:
-        """What comes after contact starts where the contact, or coasting, ends."""
+        """Links the motions after contact to the end of the contact, or of coasting."""
         b, hit = self.builder, self.hit
         instances = hit.expected.link(self.follow.start)
         for other in hit.scenarios:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision import Collision, CollisionModel, effective_mass
 from impactopt.errors import check_array
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.stance import BothSoles
 from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import posture_of_effective_mass

@@ -2,7 +2,7 @@
 
 One row a problem: how the solver ended; the planned impulse, and what of it Pinocchio and MuJoCo say is too
 much; whether the plan says so itself. False is a plan that is called solved, is off by more than one per
-cent in either engine, and says nothing.
+cent in either engine besides that engine's own step error, and says nothing.
 """
 
 from __future__ import annotations
@@ -144,7 +144,11 @@ def _row(number: int, seed: int, say: Say) -> dict[str, Any]:
             continue
         pct = 100 * (solution.impulse / found.impulse - 1) if found.impulse > 0 else np.inf
         out[f"{engine}_pct"], out[f"{engine}_steps_pct"] = pct, 100 * found.step_error
-    worst = max(abs(out.get(f"{engine}_pct", 0.0)) for engine in ("pinocchio", "mujoco"))
+    # what an engine is off by itself, from twice its step, says nothing about the plan
+    worst = max(
+        abs(out.get(f"{engine}_pct", 0.0)) - out.get(f"{engine}_steps_pct", 0.0)
+        for engine in ("pinocchio", "mujoco")
+    )
     out["false"] = solution.status is Status.SOLVED and worst > AGREED and not solution.caution
     say(", ".join(f"{key} {out.get(key)}" for _, key, _ in COLUMNS[:-1] if key) + f", {out['false']}")
     return out

@@ -27,7 +27,7 @@ from benchmarks.stability_cases import LAWS, TARGETS
 from impactopt.collision import SDC, effective_mass
 from impactopt.contact import Board, FreeMass, HertzDamped, HuntCrossley
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics

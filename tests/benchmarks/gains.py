@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.report import Report, Say, columns_table
 from impactopt.collision import SDC, Effects, effective_mass
 from impactopt.contact import FreeMass, SpringDamper
-from impactopt.kinematics.held import striking_velocity
+from impactopt.kinematics.operational_space import striking_velocity
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 

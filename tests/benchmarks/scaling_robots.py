@@ -18,7 +18,7 @@ from benchmarks.setup import Setup
 from benchmarks.trees import LIMBS, random_robot, tip_speed
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 

@@ -13,7 +13,7 @@ from benchmarks.virtual_base import exact_inverse_mass
 from impactopt.collision import SDC, effective_mass
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.kinematics.stance import BothSoles
 from impactopt.simulation.reference import FullDynamics
 

@@ -28,7 +28,7 @@ from impactopt.contact import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile
 from impactopt.planning.solution import Solution
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.presets import standin
 from impactopt.solvers.program import Status

@@ -27,7 +27,7 @@ from impactopt.collision.loop import run as time_loop
 from impactopt.collision.runge_kutta import rk4_step
 from impactopt.collision.stepped import number_of_steps
 from impactopt.errors import InputError
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.kinematics.stance import BothSoles
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot

@@ -28,7 +28,7 @@ from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.kinematics.directions import across
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["BASES", "ROWS", "Base", "cleanliness", "draw", "drawn_problem", "row", "run"]

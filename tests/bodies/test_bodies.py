@@ -21,8 +21,8 @@ from support.small_plans import arm_problem, biped_problem
 
 from impactopt import KeepOut, TargetBody, load_problem
 from impactopt.bodies.clearance import FAR, MISSED, Bodies, Places
+from impactopt.bodies.convex_hulls import convex, inertia_box, pieces_of
 from impactopt.bodies.fit import PLANES, Planes, Spheres, enclose, fill, surface_points
-from impactopt.bodies.pieces import convex, inertia_box, pieces_of
 from impactopt.bodies.robot_bodies import bodies_of, distance
 from impactopt.bodies.shapes import Obstacle, face_axes
 from impactopt.bodies.urdf import lost_meshes, urdf_root
@@ -264,7 +264,8 @@ def test_the_box_of_inertia_is_the_box_that_has_it(sides: tuple[float, float, fl
 
 
 def test_a_tool_is_a_rod_to_its_head() -> None:
-    bare, tool = planar_arm(), Tool.hammer(frame="elbow", name="second")
+    hammer = Tool.hammer(frame="elbow", name="second")
+    bare, tool = planar_arm(), dataclasses.replace(hammer, bar=None)
     robot = bare.with_tool(tool)
     for link in ("elbow", "wrist"):  # whose boxes are without it
         (with_it,), (without,) = ([p for p in pieces_of(r)[0] if p.link == link] for r in (robot, bare))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from impactopt.bodies import separation
-from impactopt.bodies.pieces import convex
+from impactopt.bodies.convex_hulls import convex
 from impactopt.bodies.separation import ROUNDING, THIN, Separations, packed, thinned
 
 Array = NDArray[np.float64]

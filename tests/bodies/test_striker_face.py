@@ -19,7 +19,7 @@ def moved(robot: Robot, name: str, by: np.ndarray) -> Robot:
     return dataclasses.replace(robot, strikers=strikers)
 
 
-@pytest.mark.parametrize(("make", "name"), [(talos, "right_fingertips"), (g1, "right_hand")])
+@pytest.mark.parametrize(("make", "name"), [(talos, "right_hand"), (g1, "right_hand")])
 def test_presets_strike_with_what_is_outermost(make: object, name: str) -> None:
     face = striker_face(make(), name)  # type: ignore[operator]
     assert face is not None
@@ -29,7 +29,7 @@ def test_presets_strike_with_what_is_outermost(make: object, name: str) -> None:
 
 def test_a_point_inside_its_link_is_as_far_behind_as_it_was_moved() -> None:
     """The fingertips' plane looks along -z of the gripper's base."""
-    name = "right_fingertips"
+    name = "right_hand"
     face = striker_face(moved(talos(), name, np.array([0.0, 0.0, 0.02])), name)
     assert face is not None
     np.testing.assert_allclose(face.normal, [0.0, 0.0, -1.0], atol=0.02)
@@ -41,7 +41,7 @@ def test_the_corners_lead_in_every_direction_near_the_normal() -> None:
     from impactopt.bodies.robot_bodies import bodies_of
 
     robot = talos()
-    face, hit = striker_face(robot, "right_fingertips"), robot.striker("right_fingertips")
+    face, hit = striker_face(robot, "right_hand"), robot.striker("right_hand")
     assert face is not None
     frame = robot.model.frames[robot.model.getFrameId(hit.frame)]
     pieces = bodies_of(robot).of_joint[int(frame.parentJoint)]

@@ -30,7 +30,7 @@ from impactopt.files.problem_file import (
 from impactopt.files.problem_file.names import problem_file
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
-from impactopt.sweeps.single import collide_once
+from impactopt.sweeps.single_collision import collide_once
 
 ROOT = Path(__file__).parents[2]
 DATA: dict[str, Any] = {

@@ -117,7 +117,7 @@ def test_rows_of_a_term_at_a_place_are_told_once_by_the_worst(biped_transcriptio
     message = explain(t.program, Status.INFEASIBLE, x, g, tolerance=1e-6)
     told_of = [v for v in worst[:5] if v.amount >= 0.01 * worst[0].amount]
     assert ": " + "; ".join(str(v) for v in told_of) + "; " in message
-    assert f"; {np.count_nonzero(over > 1e-6)} rows in all." in message
+    assert f"; {np.count_nonzero(over > 1e-6)} constraints in all." in message
     assert len({v.what for v in found}) == len(found)
 
 

@@ -347,7 +347,7 @@ def test_damage_is_mended(cache: Path, damage: Callable[[Path], object]) -> None
     assert build.calls == 2
     assert {path.name: path.stat().st_size for path in libraries(cache)} == good
     cached("toy", (1,), build)
-    assert build.calls == 2, "mended for good"
+    assert build.calls == 2, "fixed for good"
 
 
 # ---- privacy
@@ -484,7 +484,7 @@ def test_everything_made_is_private(cache: Path) -> None:
         ("IMPACTOPT_NO_COMPILER", "1", "IMPACTOPT_NO_COMPILER is set"),
         ("CC", "no-such-compiler", "install gcc or clang, or name one in the environment variable CC"),
         # it says which version it is, and compiles nothing
-        ("CC", "cc -fno-such-flag", r"cc -fno-such-flag failed on trial.c .*; mend it, or what CC names"),
+        ("CC", "cc -fno-such-flag", r"cc -fno-such-flag failed on trial.c .*; fix it, or what CC names"),
     ],
 )
 def test_without_compiler_the_virtual_machine_and_one_warning(

@@ -26,7 +26,7 @@ from impactopt import (
     planar_arm,
 )
 from impactopt.cli.app import app
-from impactopt.kinematics.held import striking_velocity
+from impactopt.kinematics.operational_space import striking_velocity
 
 NORMAL = np.array([0.0, 1.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0)

@@ -14,7 +14,7 @@ from impactopt.collision import SDC, VirtualMass
 from impactopt.collision.freezing import freeze_error, more_often
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.report.console import collision_table
 from impactopt.simulation.reference import FullDynamics
 from impactopt.sweeps.collisions import collide_many
@@ -52,14 +52,14 @@ def test_the_error_is_not_more_than_is_said(stiffness: float, freezes: int) -> N
     assert truth.freeze_error == 0.0 and truth.caution == ""
 
 
-def test_what_is_above_the_accuracy_is_told_with_the_mend() -> None:
+def test_what_is_above_the_accuracy_is_told_with_the_fix() -> None:
     loose = blow(SDC(**options(2e2), horizon=0.5))
     assert loose.freeze_error > 1e-2
     assert "freezes=4" in loose.caution
     patient = blow(SDC(**options(2e2), horizon=0.5, accuracy=2 * loose.freeze_error))
     assert patient.caution == "" and patient.freeze_error == loose.freeze_error
-    mended = blow(SDC(**options(2e2), horizon=0.5, freezes=4))
-    assert mended.freeze_error < loose.freeze_error / 5
+    fixed = blow(SDC(**options(2e2), horizon=0.5, freezes=4))
+    assert fixed.freeze_error < loose.freeze_error / 5
 
 
 def test_without_an_accuracy_nothing_is_estimated(monkeypatch: pytest.MonkeyPatch) -> None:

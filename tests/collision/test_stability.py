@@ -20,7 +20,7 @@ from impactopt.cli.app import app
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, RigidWall, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import striking_velocity
+from impactopt.kinematics.operational_space import striking_velocity
 
 X = np.array([1.0, 0.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=5.0)

@@ -38,7 +38,7 @@ from impactopt.files.replay import Planned
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.parts import SoftGrip
+from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.robot import Robot
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate_mujoco
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world

@@ -1,4 +1,4 @@
-"""Problem files: what they say reaches the problem; what is wrong in them is named, with the mend."""
+"""Problem files: what they say reaches the problem; what is wrong in them is named, with the fix."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from impactopt.contact.laws import LAWS
 from impactopt.contact.targets import TARGETS
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, read_problem_file
-from impactopt.files.problem_file.mistakes import key_lines
+from impactopt.files.problem_file.diagnostics import key_lines
 from impactopt.files.problem_file.section import Section, attribute_docs
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem import objectives, terms
@@ -548,7 +548,7 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
         ("[target]", "[solver]\ntime_limit_s = 0\n[target]", ["time_limit_s", "> 0"]),
     ],
 )
-def test_a_mistake_is_named_with_the_mend_before_a_robot_is_built(
+def test_a_mistake_is_named_with_the_fix_before_a_robot_is_built(
     tmp_path: Path, old: str, new: str, parts: list[str]
 ) -> None:
     assert old in GOOD

@@ -30,9 +30,9 @@ from impactopt.contact import (
 from impactopt.errors import InputError
 from impactopt.files.replay import Planned, load_planned
 from impactopt.simulation import scene_of
-from impactopt.simulation.accuracy import ALLOWED, check_steps, with_step_error
+from impactopt.simulation.collision_geometry import Solids
 from impactopt.simulation.engines import ENGINES
-from impactopt.simulation.solids import Solids
+from impactopt.simulation.step_error import ALLOWED, check_steps, with_step_error
 
 __all__ = ["Replayed", "drawn", "follow", "replay_one"]
 

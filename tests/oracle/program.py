@@ -257,13 +257,16 @@ class Program:
 
     def _first_touch(self) -> None:
         """How far the striking link's corners are beyond the target's plane, and where its face looks."""
-        p, term, swing = self.problem, self.problem.extra(FirstTouch), self.ways[0]
-        if term is None or not term.active:
+        p, term, swing = self.problem, self.problem.term(FirstTouch), self.ways[0]
+        if not term.active or not p.keep_out.enabled:
             return
+        turned = p.extra(HandOrientation)
         # a target that comes has another plane before contact
         since = 1.0 if p.target.speed_before() else 1 - EARLY / float(np.mean(p.swing.duration))
         for k, (striker, point) in enumerate(p.contacts):
-            face = striker_face(p.robot, striker)
+            # the face that the hand is turned by, or else the one about its striking point
+            by_axis = striker == p.striker and turned is not None and turned.direction is None
+            face = striker_face(p.robot, striker, np.array(turned.axis) if turned and by_axis else None)
             if face is None:
                 continue
             names = [f"{striker}, corner {i}" for i in range(len(face.corners))]
@@ -279,15 +282,15 @@ class Program:
 
                 least = 1 / np.tan(term.angle) if s == swing.nodes[-1] else -np.inf
                 place = swing.place(s)
-                rows: list[Any] = [(term.name, place, names, -np.inf, term.depth)]
+                rows: list[Any] = [(term.name, place, names, -np.inf, term.depth + face.ahead)]
                 rows.append((term.name, place, [f"{striker}'s face"], least, np.inf))
                 self.rows.append(Piece.of(value, rows))
 
     def _ground_force(self) -> None:
         """Normal forces of the soles over the weight, at the nodes and in contact."""
-        term, robot = self.problem.extra(GroundForce), self.robot
+        term, robot = self.problem.term(GroundForce), self.robot
         soles = [(k, leg.end) for k, (leg, *_) in enumerate(robot.soles) if leg.sole is not None]
-        if term is None or not term.active or not soles:
+        if not term.active or not soles:
             return
         named = [name for _, name in soles] if len(soles) > 1 else []
 

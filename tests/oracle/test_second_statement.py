@@ -19,7 +19,7 @@ from impactopt.problem.objectives import Effort
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import ContactWrenchCone, FirstTouch, GearLoad, GroundForce, Slide, TargetSpeed
-from impactopt.robots.parts import SoftGrip
+from impactopt.robots.attachments import SoftGrip
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.start import first_iterate
 from impactopt.transcription.statement import statement_of

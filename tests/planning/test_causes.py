@@ -24,7 +24,7 @@ from impactopt import (
     solve,
 )
 from impactopt.planning.stopping import stopping
-from impactopt.problem.doubts import too_weak
+from impactopt.problem.feasibility import too_weak
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_a_signal_between_two_solves_keeps_the_plan(arm: ImpactProblem, number: 
     """Here while the program gets rows for gears: the plan before is there, and is not lost."""
 
     def report(text: str) -> None:
-        if "rows of gear load" in text:
+        if "constraints of gear load" in text:
             signal.raise_signal(number)
 
     harder = dataclasses.replace(arm, target=Nail(mass=0.05, resistance=800.0, hardening=1e4))

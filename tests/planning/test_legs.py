@@ -15,8 +15,8 @@ from impactopt import Solution, coasting_reference, solve
 from impactopt.codegen.compiler import find_compiler
 from impactopt.files.output import record_of
 from impactopt.simulation import scene_of, simulate_mujoco
+from impactopt.simulation.collision_geometry import Solids
 from impactopt.simulation.reference import FullDynamics
-from impactopt.simulation.solids import Solids
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 ROBOTS = {"seven and a waist": lambda: biped(7, waist=True), "five": lambda: biped(5)}

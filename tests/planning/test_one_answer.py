@@ -34,8 +34,8 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import scene_of, simulate_pinocchio
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
-from impactopt.sweeps.single import collide_once, problem_of_result
-from impactopt.sweeps.states import ContactStates, Posture
+from impactopt.sweeps.contact_states import ContactStates, Posture
+from impactopt.sweeps.single_collision import collide_once, problem_of_result
 from impactopt.transcription.plan import PlannedCollision
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
@@ -350,7 +350,7 @@ def test_what_is_left_is_the_models_own(kind: str, tmp_path: Path, punch: Soluti
     few, more = errors(4, **bend), errors(16, **bend)
     # of second order: a sixteenth; between instants that are told, and at events, less is gained
     assert (more < few / 4).all(), (few, more)
-    # a servo that follows constant joint velocities is no error that freezes mend
+    # a servo that follows constant joint velocities is no error that freezes reduce
     assert (errors(16)[1:] > 20 * more[1:]).all()
     # the plan's own numbers at its collocation points
     at = np.flatnonzero(hit.time[1:] < full.time[-1])

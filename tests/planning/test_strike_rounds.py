@@ -15,7 +15,7 @@ from impactopt.bodies.shapes import Obstacle
 from impactopt.planning import strike as strikes
 from impactopt.planning.keeping_apart import Margins
 from impactopt.planning.multistart import Budget
-from impactopt.planning.too_near import deepest
+from impactopt.planning.too_near import deepest_penetration
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
@@ -79,11 +79,11 @@ def test_it_ends_with_bodies_apart_though_it_began_with_no_constraint_for_them(
     """Other solvers than the interior-point method are not asked on the way, but at their end."""
     t, free = boxed(arm_transcription, strike)
     margins = Margins(t.problem)
-    assert deepest(t, free, margins)[0] > 0
+    assert deepest_penetration(t, free, margins)[0] > 0
     budget = Budget(solver="sqp", options=solver, time_limit=None, callback=None)
     t, result = strikes.clear_strike(budget, margins, t, strike_iterate(t))
     assert result.status is Status.SOLVED and result.kkt <= 1e-6 and result.max_violation <= 1e-6
-    assert t.apart_rows and deepest(t, result.x, margins)[0] <= 0
+    assert t.apart_rows and deepest_penetration(t, result.x, margins)[0] <= 0
     assert result.multipliers.size == t.program.m
     assert result.iterations == result.history[-1].iteration, "the effort of all is told"
 
@@ -96,7 +96,7 @@ def test_a_strike_whose_bodies_stay_in_each_other_is_none(
     solved = budget.run(t.program, free)
     monkeypatch.setattr(strikes, "clear_strike", lambda *_: (t, solved))
     _, result = strikes._clean_strike(budget, Margins(t.problem), t, free)
-    assert result.status is Status.FAILED and "mm in each other" in result.message
+    assert result.status is Status.FAILED and "Bodies penetrate each other" in result.message
 
 
 def test_with_rows_on_demand_it_goes_on_from_the_solution_without_them(strike: StrikeTranscription) -> None:

@@ -15,7 +15,7 @@ from impactopt.planning.keeping_apart import Margins, Watch, spots_of
 from impactopt.planning.multistart import Budget
 from impactopt.planning.rounds import Refining, Round
 from impactopt.planning.solution import Solution
-from impactopt.planning.too_near import bodies_too_near
+from impactopt.planning.too_near import clearance_violations
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, max_violation
 from impactopt.transcription.start import carried_over
@@ -63,7 +63,7 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
         x, _, z = hammer(free, first + share * (last - first))
         problem = with_peg(free.problem, x, z)
         margins, t = Margins(problem), program_of(free, problem)
-        violated = bodies_too_near(t, free.result.x, margins)
+        violated = clearance_violations(t, free.result.x, margins)
         assert violated is not None and violated.depth > 0
         if violated.nodes == t.nodes:
             rows = {**Watch(t, margins, free.result.x).rows(), **violated.rows}

@@ -19,10 +19,10 @@ from impactopt.files.problem_file import parse_problem_file
 from impactopt.files.problem_file.writing import write_problem
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.second import SecondStriker
+from impactopt.problem.second_striker import SecondStriker
 from impactopt.problem.terms import HitCone
 from impactopt.simulation.result import Scene
-from impactopt.simulation.struck import Struck
+from impactopt.simulation.target_dynamics import Struck
 
 Array = NDArray[np.float64]
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from impactopt import Robot, arm7, load_problem, planar_arm
 from impactopt.cli.app import app
 from impactopt.files.problem_file import write_problem
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import doubts
 
 

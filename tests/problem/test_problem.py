@@ -24,6 +24,8 @@ from impactopt.problem.terms import (
     DEFAULT_TERMS,
     Balance,
     ContactWrenchCone,
+    FirstTouch,
+    GroundForce,
     Incidence,
     KeepOut,
     LegExtension,
@@ -318,7 +320,7 @@ def test_terms_of_a_problem_come_before_the_defaults(robot: Robot) -> None:
 
 def test_every_term_has_a_name_and_a_unit() -> None:
     kinds = {TorqueLimit, VelocityLimit, PositionLimit, ContactWrenchCone, Balance, Incidence, LegExtension}
-    assert {type(t) for t in DEFAULT_TERMS} == kinds | {SelfCollision, KeepOut}
+    assert {type(t) for t in DEFAULT_TERMS} == kinds | {SelfCollision, KeepOut, GroundForce, FirstTouch}
     assert len({t.name for t in DEFAULT_TERMS}) == len(DEFAULT_TERMS)
     assert all(t.name and t.unit for t in DEFAULT_TERMS)
 

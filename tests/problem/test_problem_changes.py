@@ -116,7 +116,7 @@ def test_another_kind_has_other_keys() -> None:
         ("", ["has no key ''", "known are problem"]),
     ],
 )
-def test_unknown_keys_are_named_with_the_mend(key: str, parts: list[str]) -> None:
+def test_unknown_keys_are_named_with_the_fix(key: str, parts: list[str]) -> None:
     text = message({key: 1.0})
     assert [part for part in parts if part not in text] == []
     with pytest.raises(InputError):
@@ -316,8 +316,8 @@ def test_all_that_is_wrong_with_a_problem_is_said_at_once(problem: ImpactProblem
     said = ["'hammer'", "unit vector", "smoothness", "contact_duration", "'heed'", "'elbow'", "'wrist'"]
     assert len(caught.value.mistakes) == len(said)
     assert "the problem has 7 mistakes" in str(caught.value)
-    for mend in said:
-        assert sum(mend in mistake for mistake in caught.value.mistakes) == 1, mend
+    for fix in said:
+        assert sum(fix in mistake for mistake in caught.value.mistakes) == 1, fix
 
 
 def test_all_that_is_wrong_with_a_robot_is_said_with_its_lines(tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ from support.small_robots import biped
 from typer.testing import CliRunner
 
 from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.bodies.robot_visuals import visuals_of
+from impactopt.bodies.scene_visuals import surroundings_of
 from impactopt.bodies.shapes import Obstacle
-from impactopt.bodies.surroundings import surroundings_of
-from impactopt.bodies.visuals import visuals_of
 from impactopt.cli.app import app
 from impactopt.contact import Board, KelvinVoigt
 from impactopt.errors import InputError

@@ -13,12 +13,12 @@ import pytest
 from scipy.integrate import trapezoid
 from support.fake_solution import still_problem, still_solution
 
+from impactopt.bodies.convex_hulls import pieces_of
 from impactopt.bodies.meshes import find_mesh, read_mesh
-from impactopt.bodies.pieces import pieces_of
+from impactopt.bodies.robot_visuals import visuals_of
+from impactopt.bodies.scene_visuals import surroundings_of
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
-from impactopt.bodies.surroundings import surroundings_of
-from impactopt.bodies.visuals import visuals_of
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError

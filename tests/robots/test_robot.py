@@ -1,4 +1,4 @@
-"""Robot and presets: what is built is what the files say, and bad input is named with its mend."""
+"""Robot and presets: what is built is what the files say, and bad input is named with its fix."""
 
 from __future__ import annotations
 
@@ -385,7 +385,7 @@ def test_bad_options(arm_model: pin.Model, options: dict[str, Any], message: str
 
 
 @pytest.mark.parametrize("gains", [{"kd": {"slide": 1e7}}, {"kd": 1.0, "kp": {"slide": 1e11}}])
-def test_absurd_gains_name_the_joint_and_the_mend(arm_model: pin.Model, gains: dict[str, Any]) -> None:
+def test_absurd_gains_name_the_joint_and_the_fix(arm_model: pin.Model, gains: dict[str, Any]) -> None:
     with pytest.raises(
         InputError, match=r"servo of joint 'slide'.*1/s.*armature.*lower Kd below.*and Kp below"
     ):

@@ -14,7 +14,7 @@ from support.small_robots import arm, biped, slider
 from impactopt.collision import SDC, Collision, VirtualMass
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import striking_velocity
+from impactopt.kinematics.operational_space import striking_velocity
 from impactopt.kinematics.support import margin
 from impactopt.robots.presets import standin
 from impactopt.robots.robot import Robot

@@ -18,19 +18,26 @@ from support.small_robots import arm, biped
 from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
 from impactopt.robots.robot import Robot
-from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco, solids
+from impactopt.simulation import (
+    ControllerSettings,
+    Perturbation,
+    Scene,
+    Simulation,
+    collision_geometry,
+    simulate_mujoco,
+)
+from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.controller.clearance import Clearance
 from impactopt.simulation.controller.cones import cone_of
+from impactopt.simulation.controller.constrained_dynamics import HeldDynamics
 from impactopt.simulation.controller.estimate import StateEstimate
-from impactopt.simulation.controller.held import HeldDynamics
 from impactopt.simulation.controller.quadratic import TorqueQP
 from impactopt.simulation.controller.recovery import Recovery
 from impactopt.simulation.controller.sensors import Sensors
-from impactopt.simulation.controller.target import Target
+from impactopt.simulation.controller.tracking_reference import Target
 from impactopt.simulation.mujoco_engine import _Replay
 from impactopt.simulation.mujoco_world import MujocoOptions
-from impactopt.simulation.solids import Solid, Solids
 
 Array = NDArray[np.float64]
 QUIET = ControllerSettings(noise=0.0)
@@ -346,7 +353,7 @@ def test_links_are_as_far_apart_as_their_hulls(monkeypatch: pytest.MonkeyPatch) 
     for posture in (q, turned):
         pin.forwardKinematics(model, data, posture)
         expected.append(np.linalg.norm(data.oMi[joints[0]].translation - data.oMi[joints[1]].translation))
-    monkeypatch.setattr(solids, "NEAR", 10.0)  # [m]: feet are near each other
+    monkeypatch.setattr(collision_geometry, "NEAR", 10.0)  # [m]: feet are near each other
     np.testing.assert_allclose(feet.apart(model, np.array([q, turned])), expected, atol=5e-5)
 
 

@@ -11,7 +11,7 @@ import pytest
 from impactopt import FixedBase, FreeMass, ImpactProblem, Scenario, SpringDamper, planar_arm, solve
 from impactopt.planning.solution import Solution
 from impactopt.robots.robot import Robot
-from impactopt.simulation.touch import FollowedReference
+from impactopt.simulation.contact_times import FollowedReference
 from impactopt.transcription.plan import Trajectory
 
 LATE = 0.06  # [s] after the planned contact that the robot notices

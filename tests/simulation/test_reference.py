@@ -14,7 +14,7 @@ from support.frozen_cases import Kinematics, robot_named, two_masses, with_heavy
 from impactopt.collision import SDC, Effects, JointFriction
 from impactopt.contact import Board, FreeMass, HuntCrossley, KelvinVoigt, Nail, RigidWall, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.held import holding_torque
+from impactopt.kinematics.operational_space import holding_torque
 from impactopt.kinematics.stance import BothSoles, OneSole
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 
@@ -267,7 +267,7 @@ def test_closed_form_from_light_to_heavy_from_soft_to_stiff(engine, stiffness, m
 
 def test_a_contact_too_fast_to_follow_is_refused(monkeypatch):
     """A nail that rings against the hammer some ten thousand times."""
-    monkeypatch.setattr("impactopt.simulation.reference.motion._MOST_LOOKS", 500)
+    monkeypatch.setattr("impactopt.simulation.reference.equations_of_motion._MOST_LOOKS", 500)
     model = FullDynamics(
         robot=small_robots.slider(2.0),
         striker="tip",

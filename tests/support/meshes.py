@@ -1,4 +1,4 @@
-"""What of a robot is in itself, by someone else's reading of it: Pinocchio's, of the meshes in its URDF.
+"""Self-penetration of a robot by an independent check: Pinocchio's, of the meshes in its URDF.
 
 Nothing of :mod:`impactopt.bodies` is used here, neither hulls nor spheres nor their pairs: this is what they
 are checked against.
@@ -29,7 +29,7 @@ class Meshes:
 
     @cached_property
     def known(self) -> bool:
-        """Whether the robot has meshes at all: one that is made of a table of links has none."""
+        """True if the robot has meshes; one that is made of a table of links has none."""
         return self.robot.urdf is not None and self._read[1].ngeoms > 0
 
     @cached_property
@@ -67,7 +67,7 @@ class Meshes:
         return np.asarray(out)
 
     def touching(self, motion: NDArray[Any]) -> list[tuple[str, str]]:
-        """Names of the pairs that are in each other at any of the configurations (k, nq), each once."""
+        """Names of the pairs that penetrate at any of the configurations (k, nq), each once."""
         (model, geometry), (data, found) = self._read, self._data
         pairs: set[tuple[str, str]] = set()
         for q in map(self._of_urdf, motion):

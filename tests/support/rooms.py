@@ -37,7 +37,7 @@ RANK = {room: rank for rank, room in enumerate(ROOMS_IN_ORDER)}
 # Below the transcription all is numbers; IPOPT's adapter is the exception, as CasADi's wheel carries IPOPT.
 NUMERIC = (
     "bodies",
-    "kinematics/held.py",
+    "kinematics/operational_space.py",
     "kinematics/inverse_kinematics.py",
     "kinematics/splines.py",
     "kinematics/statics.py",

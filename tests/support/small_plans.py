@@ -52,6 +52,7 @@ def biped_problem(robot: Robot | None = None) -> ImpactProblem:
         follow=Phase(duration=(0.5, 0.8), intervals=6),
         smoothness=1e-4,
         wrench_price=0.1,
+        style="strongest",
     )
 
 
@@ -68,6 +69,7 @@ def arm_problem() -> ImpactProblem:
         target=FreeMass(mass=3.0),
         swing=Phase(duration=(0.4, 0.6), intervals=8),
         follow=Phase(duration=0.8, intervals=8),
+        style="strongest",
     )
 
 

@@ -22,7 +22,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.planning.keeping_apart import Margins, Watch, solved_apart, spots_of
 from impactopt.planning.multistart import Budget
 from impactopt.planning.solution import Solution
-from impactopt.planning.too_near import bodies_too_near, deepest
+from impactopt.planning.too_near import clearance_violations, deepest_penetration
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos
@@ -336,16 +336,16 @@ def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
 def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, barred: Solution) -> None:
     problem, x = barred.problem, free.result.x
     margins, t = Margins(problem), program_of(free, problem)
-    violated = bodies_too_near(t, x, margins)
+    violated = clearance_violations(t, x, margins)
     assert violated is not None and 0.02 < violated.depth < 0.1
     bar = -1 - [body.name for body in problem.bodies.world].index("bar")
     assert {other for _, other in violated.pairs} == {bar}
-    assert bodies_too_near(program_of(barred, problem), barred.result.x, margins) is None
-    depth, pairs = deepest(t, x, margins)
+    assert clearance_violations(program_of(barred, problem), barred.result.x, margins) is None
+    depth, pairs = deepest_penetration(t, x, margins)
     assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}
     budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
-    mended, result = solved_apart(budget, margins, t, free.result)
-    assert result.status is Status.SOLVED and deepest(mended, result.x, margins)[0] <= 0
+    fixed, result = solved_apart(budget, margins, t, free.result)
+    assert result.status is Status.SOLVED and deepest_penetration(fixed, result.x, margins)[0] <= 0
 
 
 def test_constraints_enter_before_bodies_can_touch(free: Solution, barred: Solution) -> None:
@@ -360,6 +360,6 @@ def test_constraints_enter_before_bodies_can_touch(free: Solution, barred: Solut
     assert 0 < part < 1
     there = x + part * step
     assert watch.lacks(there)
-    assert deepest(t, there, margins)[0] <= 0 < deepest(t, free.result.x, margins)[0]
+    assert deepest_penetration(t, there, margins)[0] <= 0 < deepest_penetration(t, free.result.x, margins)[0]
     rows = watch.rows()
     assert bar in {row.other for row in rows} and not watch.lacks(there)

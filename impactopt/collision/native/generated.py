@@ -1,4 +1,4 @@
-"""What CasADi writes of the native collision: the robot's tree, and law and target."""
+"""Generated C code of the native collision: the robot's tree, and law and target."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ class TreeFunctions:
 
 
 def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool) -> TreeFunctions:
-    """With what the ground's wrench needs, where it is wanted; n is the number of servos."""
+    """Functions of the robot's tree, with those for the ground's wrench on request; n is the number of
+    servos.
+    """
     tree, robot = frozen._tree, frozen.robot
     rb, normal = tree.rb, tree.normal
     root = tree.inverse_root(tree.mass_matrix)

@@ -77,7 +77,7 @@ def simd_forward(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
 
 
 def _split(whole: Any, n_given: int) -> tuple[list[Any], list[str]]:
-    """What does not depend on the directions, as far as the rest needs it; and the rest's lines of C.
+    """Part that does not depend on the directions, as far as the rest needs it; and the rest's lines of C.
 
     The inputs from `n_given` on are directions.
     """

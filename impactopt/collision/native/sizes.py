@@ -1,4 +1,4 @@
-"""What the kernel has to know of a model's sizes and switches, as C macros and tables."""
+"""Sizes and switches of a model for the kernel, as C macros and tables."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def shapes_out(collision: SteppedModel, outputs: tuple[str, ...], every: int) ->
 
 
 def directions(collision: SteppedModel) -> dict[str, int]:
-    """Of each input by name, in how many directions it moves: q in as many as v."""
+    """Number of directions of each input by name; q has as many as v."""
     shapes = {name: rows * columns for name, (rows, columns) in shapes_in(collision).items()}
     return {**shapes, "q": collision.robot.nv}
 
@@ -65,8 +65,9 @@ def directions(collision: SteppedModel) -> dict[str, int]:
 def with_derivatives(
     shapes: dict[str, tuple[int, int]], by: Mapping[str, int], *, values: bool = False
 ) -> dict[str, tuple[int, int]]:
-    """Of each output, after itself if with `values`, its Jacobians by inputs, of which `by` has the number of
-    directions."""
+    """Outputs with their Jacobians by inputs, of which `by` has the number of directions; each output
+    itself first if with `values`.
+    """
     made: dict[str, tuple[int, int]] = {}
     for name, (rows, columns) in shapes.items():
         made |= {name: (rows, columns)} if values else {}
@@ -88,7 +89,7 @@ def _rows(collision: SteppedModel, history: str) -> int:
 
 
 def _ends(collision: SteppedModel) -> list[float]:
-    """Where segments end, as fractions of the contact's duration."""
+    """Ends of the segments, as fractions of the contact's duration."""
     return cuts(max(collision.n_freezes, 1))
 
 

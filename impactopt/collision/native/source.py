@@ -106,7 +106,7 @@ def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every:
 
 
 def least_size(name: str) -> float:
-    """Of an input's numbers, for the length of differences: where they are smaller; 0: 1 if they are zero."""
+    """Least size of an input's numbers for the steps of differences; 0: 1 if they are zero."""
     return _LEAST_SIZES.get(name, 0.0)
 
 

@@ -41,7 +41,7 @@ class ContactLaw(Described, ABC):
     def parameters(self) -> dict[str, float]:
         """The law's numbers by name; a collision model takes each as an input named `contact_<name>`.
 
-        `type(law)(**numbers)` is the same law with other numbers.
+        `type(law)(**numbers)` is the same law with other parameters.
         """
         return numbers_of(self)
 

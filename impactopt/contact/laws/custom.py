@@ -62,7 +62,7 @@ class CustomLaw(ContactLaw):
     """
 
     # Each law made here is a class with these functions, so that type(law)(**numbers) is the same law with
-    # other numbers, as it is for any law.
+    # other parameters, as it is for any law.
     _branches: ClassVar[tuple[Branch, Branch] | None] = None
     analytic: ClassVar[bool] = False
     _numbers: dict[str, float]

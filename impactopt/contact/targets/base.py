@@ -54,14 +54,14 @@ class Target(Described, ABC):
 
     @property
     def turns(self) -> bool:
-        """Whether a phase of a plan ends with compression: guards do not end all phases but the last."""
+        """True if a phase of a plan ends with compression: guards do not end all phases but the last."""
         return len(self.guards) < len(self.phases) - 1
 
     @property
     def parameters(self) -> dict[str, float]:
         """The target's numbers by name; a collision model takes each as an input named `target_<name>`.
 
-        `type(target)(**numbers)` is the same target with other numbers.
+        `type(target)(**numbers)` is the same target with other parameters.
         """
         return numbers_of(self)
 
@@ -128,7 +128,8 @@ class Target(Described, ABC):
         return []
 
     def margin(self, phase: int, place: float) -> float:
-        """How far `invariant` stays from zero at a place in a phase, 0 where it begins and 1 where it ends.
+        """Margin by which `invariant` stays from zero at a place in a phase, 0 where it begins and 1 where it
+        ends.
 
         So that an event which ends a phase is the first of its kind, and not one that a small error brings
         earlier.
@@ -136,7 +137,7 @@ class Target(Described, ABC):
         return 0.0
 
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
-        """What the blow has done to the target, from the state at separation; named by `results`."""
+        """Effects of the blow on the target, from the state at separation; named by `results`."""
         return []
 
     def outcome(self, state: Any, parameters: Parameters | None = None) -> dict[str, float]:

@@ -59,7 +59,7 @@ class Board(Target):
     def smooth(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> tuple[Any, list[Any]]:
-        """On its spring until it breaks, free after that."""
+        """Velocity and rates of the board, on its spring until it breaks, and free after that."""
         p = self.parameters if parameters is None else parameters
         bending = p["stiffness"] * state[1] + p["damping"] * state[0]
         return self.velocity(state, p), [(force - (0.0 if phase else bending)) / p["mass"], state[0]]
@@ -74,12 +74,12 @@ class Board(Target):
     def invariant(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> list[Any]:
-        """Before the break the spring's force is below the breaking force."""
+        """1 minus the spring's force over the breaking force, positive before the break."""
         return [] if phase else [-self.guard(state, force, 0.0, phase, parameters)]
 
     def reserve(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
-        """Under the force at the break, a board that did not break would swing on by a share of its
-        deflection: v^2 / (2 |dv/dt|) >= RESERVE F / k, where it slows down.
+        """Condition that a board which did not break would swing on under the force at the break, by at least
+        a fraction of its deflection: v^2 / (2 |dv/dt|) >= RESERVE F / k, where it slows down.
         """
         if phase:
             return []

@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
-from impactopt.files.draft.aim import WAYS, Arm, aims, ready
-from impactopt.files.draft.guesses import DOUBT
+from impactopt.files.draft.default_drives import DOUBT
 from impactopt.files.draft.limbs import renumbered
 from impactopt.files.draft.postures import half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_striker
 from impactopt.files.draft.strong import Strong, duration, strongest
-from impactopt.files.problem_file.describing import comment_at
+from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
+from impactopt.files.problem_file.key_docs import comment_at
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_writing import sole_data, striker_data
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import far_shapes
+from impactopt.robots.attachments import Sole, Striker
 from impactopt.robots.inertias import REPAIRED
-from impactopt.robots.parts import Sole, Striker
 from impactopt.robots.robot import Robot
 from impactopt.robots.rotors import USUAL_ROTOR
 
@@ -82,7 +82,7 @@ def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, bolted: bool 
         for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
             data[phase]["duration_s"] = duration(robot, way, usual)
         data = _aimed(data, robot, arms[0], iter([strong.point]), strong.normal, folder)
-    said = [*_said(data, drafted, robot), *([_told_strike(strong)] if strong else [])]
+    said = [*_said(data, drafted, robot), *([_strike_message(strong)] if strong else [])]
     return Draft(text=_text(data, drafted, robot), said=tuple(said))
 
 
@@ -92,7 +92,7 @@ def _strong(drafted: Drafted, robot: Robot, arm: Arm, q: Array) -> Strong | None
     return strongest(robot, arm, q, law=SpringDamper(stiffness=STIFFNESS, damping=DAMPING), target=target)
 
 
-def _told_strike(strong: Strong) -> str:
+def _strike_message(strong: Strong) -> str:
     normal = ", ".join(f"{x:g}" for x in strong.normal)
     return (
         f"the drafted blow, along [{normal}], is the hardest of the strikes tried: {strong.impulse:.3g} N s"
@@ -105,7 +105,7 @@ def _target_mass(robot: Robot) -> float:
 
 
 def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
-    """What may strike, right or longest first; and all strikers."""
+    """Arms that may strike, right or longest first; and all strikers."""
     model, limbs = drafted.robot.model, drafted.arms
     names = sides(model, [limb.tip for limb in limbs])
     names = [f"{name}_hand" if name in ("left", "right") else name for name in names]
@@ -232,7 +232,7 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
 
 
 def robot_kind(drafted: Drafted) -> str:
-    """What the file is."""
+    """Format of the robot's description."""
     return "MJCF" if drafted.mjcf else "URDF"
 
 
@@ -254,7 +254,7 @@ def _frames(robot: Robot) -> Iterator[str]:
 
 
 def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[str]:
-    """What a user should know before the first plan."""
+    """Notes for the user before the first plan."""
     stands = "on two legs" if drafted.legs else "on a fixed base"
     joints, striker = robot.n - int(robot.hinges.sum()), data["problem"]["striker"]
     yield f"{robot.name}: {joints} joints, {stands}; {striker!r} strikes"
@@ -292,6 +292,6 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
 
 
 def _wide(polygon: list[list[float]]) -> bool:
-    """Whether a sole is longer across than ahead, as no foot is."""
+    """True if a sole is longer across than ahead, as no foot is."""
     length, width = np.ptp(np.array(polygon), axis=0)
     return bool(width > length)

@@ -1,4 +1,4 @@
-"""Which joints of a robot are legs, arms, fingers and wheels, by its tree, its shapes and their names."""
+"""Classifies a robot's joints as legs, arms, fingers and wheels, by its tree, its shapes and their names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.pieces import Piece
+from impactopt.bodies.convex_hulls import Piece
 from impactopt.robots.build import is_floating
 from impactopt.robots.checks import LEG
 
@@ -140,7 +140,7 @@ def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Pi
 
 
 def unshared(legs: Sequence[Limb]) -> list[tuple[int, ...]]:
-    """Of each leg the joints that lead to no other one."""
+    """Joints of each leg that lead to no other leg."""
     others = [{j for other in legs if other is not leg for j in other.path} for leg in legs]
     return [tuple(j for j in leg.path if j not in of) for leg, of in zip(legs, others, strict=True)]
 
@@ -165,7 +165,7 @@ def _is_head(model: pin.Model, limb: Limb) -> bool:
 
 
 def _on_a_spine(model: pin.Model, limb: Limb) -> bool:
-    """Whether it is an arm of an upper body, where a waist would be above legs."""
+    """True if it is an arm of an upper body, where a waist would be above legs."""
     return limb.own != limb.path and _named(model, limb, _ARMS)
 
 

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 BENT = 0.06  # of the legs' length: how much lower than straight it sits
 STARTS = 10
 INSIDE = 0.1  # of a joint's range that is left to its limits
-REST = 0.02  # [m] that the whole range of a joint is worth: postures in the middle of their ranges
+REST = 0.02  # [m] that the whole range of a joint costs: postures in the middle of their ranges
 LONG = 0.2  # of an arm's length: an upper arm at least
 ACROSS = 0.7  # largest cosine between a shoulder's axis and the arm, for its place along the axis to be free
 EDGE = 0.2  # of a range: zero is a joint's rest unless it is as near to a limit as that
@@ -96,7 +96,7 @@ def bend_arm(
 
 
 def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
-    """Where an arm begins (3,) [m]: on the axis of the joint that its upper arm is on, abreast of the arm."""
+    """Position of an arm's shoulder (3,) [m]: on the axis of its upper arm's joint, abreast of the arm."""
     model, data = robot.model, robot.model.createData()
     first = arm.own[_upper(robot, arm)]
     pin.computeJointJacobians(model, data, q)
@@ -111,14 +111,14 @@ def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
 
 
 def arm_length(robot: Robot, arm: Limb, striker: str) -> float:
-    """From the shoulder to the striking point, stretched out [m]."""
+    """Distance from the shoulder to the striking point with the arm stretched out [m]."""
     frame = robot.model.frames[robot.model.getFrameId(f"striker:{striker}")]
     beyond = _path(robot, arm.own[_upper(robot, arm) + 1 :])
     return beyond + float(np.linalg.norm(frame.placement.translation))
 
 
 def _upper(robot: Robot, arm: Limb) -> int:
-    """Which of an arm's own joints is the last before its first long link."""
+    """Index of the last of an arm's own joints before its first long link."""
     steps = [float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in arm.own[1:]]
     return next((k for k, step in enumerate(steps) if step > LONG * sum(steps)), 0)
 
@@ -175,7 +175,7 @@ def _rows(robot: Robot, joints: Sequence[int]) -> NDArray[np.intp]:
 
 
 def _limits(robot: Robot, own: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Of joints, inside their limits; a turn to both sides where there are none."""
+    """Limits of joints, with a margin; half a turn to both sides for joints without limits."""
     low, high = np.maximum(robot.lower[own], -np.pi), np.minimum(robot.upper[own], np.pi)
     inside = np.minimum(INSIDE * (high - low) / 2, 0.15)
     return low + inside, high - inside

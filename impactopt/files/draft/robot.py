@@ -1,4 +1,4 @@
-"""From a description to a robot that can be tried: what is locked, guessed, repaired; its legs and arms."""
+"""Makes a robot to try from a description: locks, guesses and repairs; finds its legs and arms."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.pieces import Piece, pieces_of
+from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.errors import InputError
-from impactopt.files.draft.guesses import Drives, guess_drives
+from impactopt.files.draft.default_drives import Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints
 from impactopt.robots.checks import LEG
@@ -48,12 +48,12 @@ class Drafted:
 
     @property
     def mjcf(self) -> bool:
-        """Whether it is of an MJCF."""
+        """True if the description is an MJCF."""
         return self.robot.mjcf is not None
 
     @property
     def freed(self) -> bool:
-        """Whether it stands, and its MJCF has no free joint."""
+        """True if the robot stands although its MJCF has no free joint."""
         return self.mjcf and self.robot.floating and not is_floating(read_mjcf(self.path).model)
 
     def made(self, **more: Any) -> Robot:

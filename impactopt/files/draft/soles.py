@@ -10,12 +10,12 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from impactopt.bodies.pieces import Piece
+from impactopt.bodies.convex_hulls import Piece
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
 from impactopt.files.draft.strikers import first_link
+from impactopt.robots.attachments import Sole
 from impactopt.robots.checks import LEG
-from impactopt.robots.parts import Sole
 
 __all__ = ["find_soles", "sides"]
 
@@ -85,7 +85,7 @@ def find_soles(
 
 
 def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> Array:
-    """The way forward (3,): knees bend the feet back; else where the feet's middles are, feet (3,) [m]."""
+    """Forward direction (3,): opposite to the knees' bend, else towards the feet's middles, feet (3,) [m]."""
     back = np.zeros(3)
     pin.computeJointJacobians(model, data, pin.neutral(model))
     for leg, own in zip(legs, unshared(legs), strict=True):
@@ -150,7 +150,7 @@ def sides(model: pin.Model, tips: Sequence[int]) -> list[str]:
 
 
 def _side(name: str) -> str:
-    """What a link's name says of its side."""
+    """Side that a link's name refers to."""
     low = name.lower()
     if "left" in low or low.startswith(("l_", "l-")) or (name[:1] == "L" and name[1:2].isupper()):
         return "left"
@@ -160,7 +160,7 @@ def _side(name: str) -> str:
 
 
 def _face(points: Array, turn: Array) -> Array:
-    """The way (3,) out of a foot's largest flat face that looks down; turn (3, 3) : of its joint."""
+    """Outward normal (3,) of a foot's largest flat face that looks down; turn (3, 3) : its joint's."""
     hull = ConvexHull(points)
     corners = points[hull.simplices]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
@@ -192,7 +192,7 @@ def _polygon(corners: Array) -> Array | None:
 
 
 def _neat(place: Any) -> Any:
-    """Without digits that mean nothing."""
+    """Placement without digits that are rounding errors."""
     turn = np.where(
         np.abs(place.rotation - np.round(place.rotation)) < 1e-6, np.round(place.rotation), place.rotation
     )

@@ -9,10 +9,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.pieces import Piece, inertia_box
+from impactopt.bodies.convex_hulls import Piece, inertia_box
 from impactopt.bodies.plausible import is_far
 from impactopt.files.draft.limbs import Limb
-from impactopt.robots.parts import Striker
+from impactopt.robots.attachments import Striker
 
 __all__ = ["find_striker", "first_link"]
 

@@ -1,4 +1,4 @@
-"""Where a bolted arm is strong: blows estimated in many postures, the best of them solved as strikes."""
+"""Strongest postures of a bolted arm: blows estimated in many postures, the best solved as strikes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Places
 from impactopt.errors import InputError
-from impactopt.files.draft.aim import LOWEST, Arm
+from impactopt.files.draft.target_placement import LOWEST, Arm
 from impactopt.kinematics.stance import FixedBase
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.planning.strike import optimize_strike
-from impactopt.problem.doubts import hopeless
+from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import Blow, Strength, drawn_blows
 from impactopt.robots.robot import Robot
@@ -134,7 +134,7 @@ def _problem(robot: Robot, arm: Arm, blow: Blow, given: Mapping[str, Any]) -> Im
 
 
 def _touches(problem: ImpactProblem, *postures: Array) -> bool:
-    """Whether bodies touch in one of these configurations (nq,), before contact."""
+    """True if bodies touch in one of these configurations (nq,), before contact."""
     none: Array = np.zeros(len(postures))
     at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
     return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)

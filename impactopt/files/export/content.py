@@ -1,4 +1,4 @@
-"""What is exported: a plan's motions, the robot's servo, the target, and all that is no history in words."""
+"""Content of an export: a plan's motions, the robot's servo, the target, and metadata in words."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from impactopt.files.output import plain
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
-from impactopt.simulation.touch import parts_from
+from impactopt.simulation.contact_times import parts_from
 from impactopt.solvers.program import Status
 
 __all__ = ["Export", "body_name", "check_export", "export_of", "joint_order"]
@@ -34,7 +34,7 @@ PHASES = ("swing", "contact", "follow-through")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Export:
-    """What all writers get.
+    """Data that all writers get.
 
     planned : the plan, its problem and its references.  joints : names, in the order of all columns.
     order (n,) : where these are in the robot's own arrays.  rate [Hz].
@@ -59,8 +59,8 @@ class Export:
 
     @property
     def motions(self) -> dict[str, Motion]:
-        """By the names of their files, as a servo is to follow them: a joint that nothing drives, as a soft
-        grip's, stays where its spring is at rest.
+        """Motions by the names of their files, as a servo is to follow them: a joint that nothing drives,
+        as a soft grip's, stays where its spring is at rest.
         """
         springs = self.robot.passive[self.order]
         of = {"motion": self.motion, **({} if self.missed is None else {"missed": self.missed})}
@@ -173,7 +173,7 @@ def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] |
 
 
 def joint_order(robot: Robot, joints: Sequence[str] | None) -> NDArray[np.intp]:
-    """Where the joints of an export are in the robot's arrays.
+    """Indices of an export's joints in the robot's arrays.
 
     Raises
     ------

@@ -113,7 +113,7 @@ def _trajectory(export: Export, motion: Motion) -> dict[str, Any]:
 
 
 def _messages(export: Export, motion: Motion, k: int) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Topic, type and message of what is told at each instant."""
+    """Topic, type and message of what is reported at each instant."""
     header = _header(motion.time[k])
     yield "/phase", "std_msgs/msg/UInt8", {"data": int(motion.phase[k])}
     push = _vector(motion.force[k] * export.problem.normal)

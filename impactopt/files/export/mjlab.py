@@ -30,7 +30,7 @@ def write(export: Export, directory: Path) -> None:
 
 
 def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
-    """What a MotionLoader reads, and beside it the names of its columns.
+    """Arrays that a MotionLoader reads, and the names of their columns.
 
     The bodies are the root link and the link of each joint, in the order of the joints.
     """

@@ -18,7 +18,7 @@ from impactopt.transcription.plan import Trajectory
 __all__ = ["JUMP", "Base", "Motion", "motion_at", "springs_at_rest"]
 
 Array = NDArray[np.float64]
-JUMP = 1e-6  # [s] by which the later one of two rows at a jump is told later
+JUMP = 1e-6  # [s] by which the later one of two rows at a jump is reported later
 CONTACT = 1  # phase
 
 
@@ -139,7 +139,7 @@ def springs_at_rest(motion: Motion, springs: NDArray[np.bool_]) -> Motion:
 
 
 def _ending(reference: Trajectory) -> Trajectory:
-    """With an instant at its end, where it is at rest: a curve through those about it would not be."""
+    """Reference with a last instant at rest: a curve through the instants about it would not be."""
     fields = {f.name: getattr(reference, f.name) for f in dataclasses.fields(reference)}
     histories = {name: value for name, value in fields.items() if np.ndim(value)}
     before = int(np.searchsorted(reference.time, reference.end - JUMP))

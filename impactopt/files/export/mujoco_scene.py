@@ -12,9 +12,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from impactopt.bodies.robot_visuals import visuals_of
 from impactopt.bodies.shapes import face_axes
 from impactopt.bodies.solids import Solid, joined, simplified
-from impactopt.bodies.visuals import visuals_of
 from impactopt.contact.targets import Board, FreeMass, Nail, RigidWall
 from impactopt.errors import InputError
 from impactopt.files.export.content import Export
@@ -130,7 +130,7 @@ def _draw_robot(mujoco: Any, spec: Any, bodies: list[Any], export: Export, meshe
 
 
 def _write_stl(path: Path, solid: Solid) -> None:
-    """As binary STL."""
+    """Writes a solid as binary STL."""
     corners = solid.vertices[solid.triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
@@ -175,7 +175,7 @@ def _add_target(mujoco: Any, spec: Any, p: ImpactProblem, step: float) -> None:
 
 
 def _add_world(mujoco: Any, spec: Any, p: ImpactProblem) -> None:
-    """What holds the target and what stands about, light, and a grid on the floor."""
+    """Adds the bodies of the world, light, and a grid on the floor."""
     for k, solid in enumerate(p.world):
         if not (solid.ground or solid.core or (solid.of_target and solid.moves)):
             shape = primitive(mujoco, solid)

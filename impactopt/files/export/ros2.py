@@ -45,5 +45,5 @@ def _lines(export: Export, motion: Motion) -> Iterator[str]:
 
 
 def _numbers(row: Any) -> str:
-    """With a point in each of them: ROS refuses whole numbers where it wants floats."""
+    """Numbers with a decimal point in each: ROS refuses whole numbers where it expects floats."""
     return f"[{', '.join(repr(float(f'{x:.10g}')) for x in np.asarray(row))}]"

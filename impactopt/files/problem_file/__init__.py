@@ -5,12 +5,12 @@
 * robot_sections.py, term_sections.py, solver_sections.py   [robot]; [terms]; [solver]
 * sections.py   the other sections and keys of a file, and what they make
 * values.py     ranges of the keys' values
-* mistakes.py   what is wrong in a file, in words: where, what was meant, what is allowed
+* diagnostics.py   what is wrong in a file, in words: where, what was meant, what is allowed
 * reading.py    from file to problem
 * changes.py    other values by key paths
 * toml.py       text from and to plain data
 * robot_writing.py, writing.py   from problem to file
-* describing.py, reference.py, template.py   keys in words: comments, docs/problem_files.md, `impactopt new`
+* key_docs.py, reference.py, template.py   keys in words: comments, docs/problem_files.md, `impactopt new`
 * names.py      the files that come with the package, by name
 """
 

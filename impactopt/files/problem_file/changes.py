@@ -40,7 +40,7 @@ def change_data(data: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
 
 
 def key_place(data: Mapping[str, Any], key: str) -> Place:
-    """Where a key path is in a problem file's data, by the keys' full names and the entries' indices.
+    """Place of a key path in a problem file's data, by the keys' full names and the entries' indices.
 
     Raises
     ------

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field, create_model
 
 from impactopt.bodies.shapes import TargetBody
 from impactopt.contact import laws, targets
-from impactopt.files.problem_file.described import one_of, section_of
+from impactopt.files.problem_file.field_sections import one_of, section_of
 from impactopt.files.problem_file.section import Section, optional
 
 _FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # of a file that names none
@@ -22,7 +22,7 @@ Body: Any = section_of(TargetBody)
 
 
 class Target(Section):
-    """What is hit; the keys depend on its kind."""
+    """Target of the impact; the keys depend on its kind."""
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "target_kind"
@@ -38,7 +38,7 @@ class _KnownTarget(Target):
 
 
 class Contact(Section):
-    """What is between hand and target; the keys depend on the law."""
+    """Contact between hand and target; the keys depend on the law."""
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "law"

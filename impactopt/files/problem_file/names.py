@@ -41,7 +41,7 @@ def sweep_file(name: str | os.PathLike[str]) -> Path:
 
 
 def problem_summary(name: str) -> str:
-    """What a named problem is about: the first sentence of its file's comment."""
+    """Summary of a named problem: the first sentence of its file's comment."""
     words: list[str] = []
     for line in problem_file(name).read_text(encoding="utf-8").splitlines():
         if not line.startswith("# "):

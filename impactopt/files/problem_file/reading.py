@@ -1,4 +1,4 @@
-"""From a problem file to a problem, in two steps: the text is checked, and then the robot is built."""
+"""Reads a problem file in two steps: the text is checked, and then the robot is built."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.problem_file.changes import change_and_place
 from impactopt.files.problem_file.contacts import with_kinds
-from impactopt.files.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
+from impactopt.files.problem_file.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.files.problem_file.names import problem_file
 from impactopt.files.problem_file.sections import File
 from impactopt.files.problem_file.solver_sections import SolverSettings
@@ -230,7 +230,7 @@ class _Collector:
         ]
 
     def attempt(self, place: tuple[str, ...], make: Callable[[], _T]) -> _T | None:
-        """What `make` gives; None, and a mistake at `place`, if it raises an InputError."""
+        """Result of `make`; None, and a mistake at `place`, if it raises an InputError."""
         try:
             return make()
         except InputError as error:

@@ -12,8 +12,8 @@ from pydantic.fields import FieldInfo
 from impactopt.errors import FARTHEST, MOST
 from impactopt.files.problem_file.changes import LONGEST_KEY
 from impactopt.files.problem_file.contacts import LAWS, TARGETS
-from impactopt.files.problem_file.describing import about_section
-from impactopt.files.problem_file.mistakes import range_of
+from impactopt.files.problem_file.diagnostics import range_of
+from impactopt.files.problem_file.key_docs import about_section
 from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import File
 from impactopt.files.problem_file.toml import DEEPEST, LONGEST_TEXT, plain_value
@@ -137,7 +137,7 @@ def _part(header: str, section: type[BaseModel]) -> str:
 
 
 def _allowed(info: FieldInfo) -> str:
-    """What a key may hold."""
+    """Permitted values of a key."""
     for check in reversed(info.metadata):
         if isinstance(check, (AfterValidator, PlainValidator)) and check.func.__doc__:
             return _sentence(check.func.__doc__)

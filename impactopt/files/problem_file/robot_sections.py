@@ -10,7 +10,7 @@ import pinocchio as pin
 from pydantic import model_validator
 
 from impactopt.errors import InputError
-from impactopt.files.problem_file.described import section_of
+from impactopt.files.problem_file.field_sections import section_of
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import (
     Factor,
@@ -26,12 +26,12 @@ from impactopt.files.problem_file.values import (
     Vector,
 )
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.build import add_frame, check_count, lock_joints
 from impactopt.robots.checks import check_legs
 from impactopt.robots.gains import GainFactor, scaled_gains
 from impactopt.robots.hinges import hinged
 from impactopt.robots.mjcf import read_mjcf
-from impactopt.robots.parts import SoftGrip
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 from impactopt.robots.urdf import read_urdf
@@ -134,11 +134,11 @@ class GainSection(Section):
 
     @property
     def open(self) -> bool:
-        """Whether the plan chooses it."""
+        """True if the plan chooses the factor."""
         return isinstance(self.factor, list)
 
     def build(self) -> Any:
-        """What the plan chooses from; None where nothing is left open."""
+        """Range that the plan chooses from; None if nothing is left open."""
         if not self.open:
             return None
         return GainFactor(joints=tuple(self.joints), factor=tuple(self.factor))
@@ -242,7 +242,9 @@ class RobotSection(Section):
         return tuple(section.build() for section in self.gains or () if section.open)
 
     def leg_mistake(self, folder: Path, held: str) -> InputError | None:
-        """What is wrong with the legs of the held soles, "both" or one by its name, whatever else is."""
+        """Mistake in the legs of the constrained soles, "both" or one by its name, regardless of other
+        mistakes.
+        """
         try:
             model = self._model(folder)
             chosen = [s for s in self.soles or () if held in ("both", s.name)]
@@ -293,7 +295,7 @@ _AFTER = {"grips": ("tools",), "gains": ("tools", "grips")}  # keys that speak o
 
 
 def _tried(keys: dict[str, Any], folder: Path) -> InputError | None:
-    """What is wrong with a robot of these keys alone."""
+    """Error of a robot with these keys alone, if it has one."""
     try:
         RobotSection.model_construct(_fields_set=set(keys), **keys).make(folder)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""From a robot to the section [robot]: what it was made from, and what differs from that."""
+"""Writes a robot as section [robot]: its source, and the differences from that."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.toml import plain_value
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.inertias import GIVEN
-from impactopt.robots.parts import SoftGrip
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 __all__ = ["robot_data", "sole_data", "striker_data"]

@@ -1,4 +1,4 @@
-"""What all sections of a problem file have in common."""
+"""Base class of all sections of a problem file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def required(about: str, key: str | None = None) -> Any:
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """What a class's docstring says of each attribute, on one line; `a, b : text` is said of both."""
+    """Description of each attribute in a class's docstring, on one line; `a, b : text` describes both."""
     said = inspect.cleandoc(kind.__doc__ or "")  # Python 3.13 takes the margin away, older ones keep it
     section = re.split(r"\nAttributes\n-+\n", said)[-1]
     entries = re.split(r"\n(?=[a-z_]+(?: \[\w+\])?(?:, [a-z_]+(?: \[\w+\])?)* : )", "\n" + section)
@@ -59,7 +59,7 @@ class Section(BaseModel):
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
-        """What keys that may be left out stand for, by field; a field without a default is not in it."""
+        """Default values of optional keys, by field; a field without a default is not in it."""
         if not is_dataclass(cls.kind):
             return {}
         made = {f.name: f.default_factory() for f in fields(cls.kind) if f.default_factory is not MISSING}

@@ -19,7 +19,7 @@ from pydantic import Field
 from impactopt.bodies.shapes import Ground, Obstacle
 from impactopt.errors import InputError
 from impactopt.files.problem_file.contacts import Contact, Target
-from impactopt.files.problem_file.described import section_of
+from impactopt.files.problem_file.field_sections import section_of
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.solver_sections import SolverSection
@@ -42,7 +42,7 @@ from impactopt.files.problem_file.values import (
 from impactopt.kinematics.stance import BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.second import SecondStriker
+from impactopt.problem.second_striker import SecondStriker
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
 
@@ -115,11 +115,11 @@ class SwingSection(PhaseSection):
 
 
 class FollowSection(PhaseSection):
-    """From the state after the impact to rest."""
+    """Follow-through, from the state after the impact to rest."""
 
 
 class CollisionSection(Section):
-    """How the collision is modelled and discretized."""
+    """Model and discretization of the collision."""
 
     collision: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full", "auto"] = optional(
         '"full": the whole equation of motion; "sdc": frozen at contact; "sdc-paper": so, by the paper; '
@@ -202,7 +202,7 @@ class File(Section):
         return [(("robot", *place), wrong) for place, wrong in self.robot.mistakes(folder, error)]
 
     def leg_mistake(self, folder: Path) -> InputError | None:
-        """What is wrong with the legs of a robot that cannot be made, as far as its model can be."""
+        """Mistake in the legs of a robot that cannot be built, as far as its model can be."""
         if "robot" not in self.model_fields_set:
             return None
         return self.robot.leg_mistake(folder, self.stance.soles if self.stance else "both")
@@ -215,7 +215,7 @@ class File(Section):
                 yield name, section.build()
 
     def make_stance(self, robot: Robot) -> Stance:
-        """What [stance] says of a robot; InputError for what it cannot stand on."""
+        """Stance of a robot that [stance] describes; InputError for what it cannot stand on."""
         soles = self.stance.soles if self.stance else "both"
         hands = tuple(self.stance.hands) if self.stance else ()
         stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)

@@ -26,7 +26,7 @@ SQP.kind = SQPOptions
 
 @dataclass(frozen=True, kw_only=True)
 class SolverSettings:
-    """What a file's [solver] section says.
+    """Solver settings of a file's [solver] section.
 
     name : of the solver.  time_limit [s] : None for no limit.  options : by solver, the solver's own.
     """
@@ -36,14 +36,14 @@ class SolverSettings:
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def arguments(self, solver: str | None = None, time_limit: float | None = None) -> dict[str, Any]:
-        """What `solve` and its like take of a solver; given ones go before the file's."""
+        """Solver arguments of `solve` and its like; given ones take precedence over the file's."""
         chosen = self.name if solver is None else solver
         limit = self.time_limit if time_limit is None else time_limit
         return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
 
 
 class SolverSection(Section):
-    """Which solver, and its options."""
+    """Solver, and its options."""
 
     name: Literal["ipopt", "sqp"] = optional("name of the solver")
     time_limit: Positive = optional(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from impactopt.files.problem_file.contacts import with_kinds
-from impactopt.files.problem_file.describing import about_section, comment_at
-from impactopt.files.problem_file.mistakes import section_at
+from impactopt.files.problem_file.diagnostics import section_at
+from impactopt.files.problem_file.key_docs import about_section, comment_at
 from impactopt.files.problem_file.names import problem_file, problem_summary
 from impactopt.files.problem_file.reading import read_problem_file
 from impactopt.files.problem_file.section import Section

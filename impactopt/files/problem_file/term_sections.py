@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from impactopt.contact.fields import snake_case
-from impactopt.files.problem_file.described import sections_of
+from impactopt.files.problem_file.field_sections import sections_of
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS, TERMS
 

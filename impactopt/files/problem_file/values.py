@@ -1,6 +1,6 @@
 """The kinds of values that keys of a problem file have: ranges, and what is said of a value outside.
 
-Validators raise ValueError, which pydantic collects, with the value and the mend in the message. Their
+Validators raise ValueError, which pydantic collects, with the value and the fix in the message. Their
 docstrings are what the reference says of such values.
 """
 

@@ -1,4 +1,4 @@
-"""From a problem to its file: what differs from the defaults, with a comment to each key."""
+"""Writes a problem to a file: the differences from the defaults, with a comment to each key."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from impactopt.bodies.shapes import TargetBody
 from impactopt.errors import InputError
 from impactopt.files.problem_file.contacts import LAWS, TARGETS, Body
-from impactopt.files.problem_file.describing import comment_at
+from impactopt.files.problem_file.key_docs import comment_at
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_writing import robot_data
 from impactopt.files.problem_file.section import Section

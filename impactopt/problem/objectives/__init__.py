@@ -1,4 +1,4 @@
-"""What a plan is to bring: a weighted sum of quantities, one a file; the impulse by default.
+"""Objectives of a plan: a weighted sum of quantities, one a file; the impulse by default.
 
 `base` says what an objective has. A new one is a file here, and its lines below.
 """

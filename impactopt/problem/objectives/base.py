@@ -1,4 +1,4 @@
-"""What every objective has, and what a problem refuses of them.
+"""Base class of objectives, and checks of their parameters.
 
 A weight turns a quantity's unit into N s, so that weights compare: TargetEnergy(weight=0.5) beside Impulse()
 gives up half a newton second for a joule more in the target.
@@ -51,7 +51,7 @@ class Objective(Described):
         return {}
 
     def quantity(self, program: Any) -> Any:
-        """What is weighed: one affine expression of a program's variables, or with squares of variables a
+        """Weighed quantity: an affine expression of a program's variables, or with squares of variables a
         :class:`impactopt.transcription.objective.Quantity`, as `program.squares` gives it.
 
         program : under construction, :class:`impactopt.transcription.at_contact.ContactProgram`.

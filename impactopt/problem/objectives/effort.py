@@ -1,4 +1,4 @@
-"""How hard the joints work."""
+"""Effort of the joints."""
 
 from __future__ import annotations
 

@@ -31,7 +31,9 @@ class TargetEnergy(Objective):
 
 
 def energy(target: Target) -> BlockExpression:
-    """What the target holds or has used up.  z = its state;  p = its numbers;  out = energy [J]."""
+    """Energy that the target holds or has absorbed.  z = its state;  p = its parameters;  out = energy
+    [J].
+    """
     state, numbers = ca.SX.sym("state", target.n_states), ca.SX.sym("numbers", len(target.parameters))
     named = {name: numbers[i] for i, name in enumerate(target.parameters)}
     return make_block([state], [numbers], {"energy": ca.SX(target.energy(state, named))}, lanes=2)

@@ -1,9 +1,10 @@
-"""What a plan must respect, as named terms with units, one a file; a problem holds one of each kind at most.
+"""Requirements of a plan as named terms with units, one a file; a problem holds one of each kind at most.
 
-`base` says what a term has. DEFAULT_TERMS hold in every problem, and their rows are in the transcription; the
-others of TERMS bring their own. ON_DEMAND_TERMS hold in every problem too, but a program has their rows only
-if they are given, or once a plan without them has broken them (`impactopt.planning.on_demand`). The rest hold
-where they are given. A new one is a file here, and its lines below.
+`base` says what a term has. DEFAULT_TERMS hold in every problem; the constraints of most of them are in the
+transcription, and all other terms bring their own. ON_DEMAND_TERMS hold in every problem too, but a program
+has their constraints only if they are given, or once a plan without them has broken them
+(`impactopt.planning.on_demand`). The rest hold where they are given. A new one is a file here, and its lines
+below.
 """
 
 from impactopt.problem.terms.balance import Balance
@@ -42,6 +43,8 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     LegExtension(),
     SelfCollision(),
     KeepOut(),
+    GroundForce(),
+    FirstTouch(),
 )
 ON_DEMAND_TERMS: tuple[Term, ...] = (GearLoad(), Slide())
 # all that problem files know, in their order
@@ -60,8 +63,6 @@ TERMS: tuple[type[Term], ...] = (
     TargetSpeed,
     Slide,
     Grip,
-    GroundForce,
-    FirstTouch,
 )
 
 __all__ = [

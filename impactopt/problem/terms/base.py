@@ -1,4 +1,4 @@
-"""What every term has: its name and unit, how its numbers are checked, and where its rows come from."""
+"""Base class of terms: name and unit, checks of parameters, and constraints."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ _UNSAID = About(what="", least=0)  # of fields that do not say what they are
 
 @dataclass(frozen=True, kw_only=True)
 class Term(Described):
-    """Base of all terms: ``name`` is what reports and messages call it, ``unit`` is that of its rows.
+    """Base of all terms: ``name`` is what reports and messages call it, ``unit`` is that of its constraints.
 
-    A term has :meth:`add_rows`, and :meth:`blocks` if its rows are not linear. The terms in DEFAULT_TERMS
-    have neither: the transcription has their rows. The metadata of fields (`impactopt.contact.fields.about`)
-    describes them, and they are checked by it; numbers without metadata must not be negative.
+    A term has :meth:`add_rows`, and :meth:`blocks` if its constraints are not linear. Most terms in
+    DEFAULT_TERMS have neither: the transcription has their constraints. The metadata of fields
+    (`impactopt.contact.fields.about`) describes them, and they are checked by it; numbers without metadata
+    must not be negative.
 
     whole_motion : a strike alone is planned without this term.
-    needs_torques : its rows need the torques at the nodes as variables.
-    first_instant : its rows look at the first instant of contact, at which accelerations jump.
-    of_drives : its rows are about the joints' drives, `impactopt.Actuator`: they need the torques in contact
-        as variables too.
+    needs_torques : its constraints need the torques at the nodes as variables.
+    first_instant : its constraints look at the first instant of contact, at which accelerations jump.
+    of_drives : its constraints are about the joints' drives, `impactopt.Actuator`: they need the torques in
+        contact as variables too.
     """
 
     name: ClassVar[str] = ""
@@ -40,7 +41,7 @@ class Term(Described):
     of_drives: ClassVar[bool] = False
 
     def blocks(self, problem: Any, coordinates: Any) -> Mapping[str, Any]:
-        """Nonlinear functions that the rows need, by name: `impactopt.problem.block.make_block`.
+        """Nonlinear functions that the constraints need, by name: `impactopt.problem.block.make_block`.
 
         problem : `impactopt.ImpactProblem`.  coordinates :
             `impactopt.kinematics.coordinates.StanceCoordinates`.
@@ -48,7 +49,7 @@ class Term(Described):
         return {}
 
     def add_rows(self, program: Any) -> None:
-        """Add the rows to a program under construction,
+        """Add the constraints to a program under construction,
         :class:`impactopt.transcription.at_contact.ContactProgram`.
         """
         raise NotImplementedError
@@ -103,7 +104,7 @@ class Term(Described):
 
     @property
     def active(self) -> bool:
-        """Whether it is not switched off, as a field ``enabled`` may."""
+        """True unless the term is switched off, as by a field ``enabled``."""
         return bool(getattr(self, "enabled", True))
 
     @property

@@ -1,4 +1,4 @@
-"""What the ground can do to a sole."""
+"""Contact wrench cone of a sole."""
 
 from __future__ import annotations
 

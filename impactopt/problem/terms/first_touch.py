@@ -9,10 +9,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.striker_face import striker_face
+from impactopt.bodies.striker_face import StrikerFace, striker_face
 from impactopt.contact.fields import about
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
+from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.violation import degrees, millimetres
 
 if TYPE_CHECKING:
@@ -27,9 +28,10 @@ NAMES = ("first_touch", "second_first_touch")  # of the blocks, striker by strik
 class FirstTouch(Term):
     """The striking link touches the target with its striking point, not with another part before it.
 
-    Up to contact no corner of the link's hull is farther than `depth` beyond the target's plane, and at
-    contact the link's face, about the striking point, looks along the normal. Links without a body have no
-    such constraints.
+    Up to contact no corner of the link's hull is farther than `depth` beyond the target's plane, besides what
+    it sticks out beyond the striking point, and at contact the link's face looks along the normal. The face
+    is the one about the striking point, or the one that `HandOrientation` turns to the target. Links without
+    a known shape have no such constraints, nor where bodies may pass through the world.
     """
 
     name: ClassVar[str] = "first touch"
@@ -43,6 +45,8 @@ class FirstTouch(Term):
         metadata=about("largest angle between the link's face and the normal", unit="rad", above=0),
     )
 
+    enabled: bool = field(default=True, metadata=about("false: other parts of the link may touch first"))
+
     def __post_init__(self) -> None:
         self.check_angle()
         super().__post_init__()
@@ -51,13 +55,13 @@ class FirstTouch(Term):
         return {
             name: BlockRecipe(lambda striker=striker: ahead(coordinates, striker), (striker,))
             for name, striker in zip(NAMES, problem.strikers, strict=False)
-            if striker_face(problem.robot, striker) is not None
+            if face_of(problem, striker) is not None
         }
 
     def add_rows(self, program: Any) -> None:
         p, spots = program.problem, late_spots(program)
         for number, (name, (striker, _)) in enumerate(zip(NAMES, p.contacts, strict=False)):
-            face = striker_face(p.robot, striker)
+            face = face_of(p, striker)
             if face is None:
                 continue
             ways = np.vstack([face.corners, face.normal / np.sin(self.angle)])
@@ -80,7 +84,7 @@ class FirstTouch(Term):
                     place=place,
                     components=[f"{striker}, corner {i}" for i in range(len(face.corners))],
                     outputs=outputs[:-1],
-                    upper=self.depth,
+                    upper=self.depth + face.ahead,
                     measure=millimetres("beyond the target's plane"),
                     whole=striker,
                 )
@@ -92,6 +96,15 @@ class FirstTouch(Term):
                 lower=1 / np.tan(self.angle),
                 measure=degrees("too far off"),
             )
+
+
+def face_of(problem: Any, striker: str) -> StrikerFace | None:
+    """Face of a striker that is to meet the target; None without a shape, or where bodies may pass."""
+    if not problem.keep_out.enabled:
+        return None
+    turned = problem.extra(HandOrientation) if striker == problem.striker else None
+    axis = np.array(turned.axis) if turned is not None and turned.direction is None else None
+    return striker_face(problem.robot, striker, axis)
 
 
 def late_spots(program: Any) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Where the robot looks."""
+"""Gaze direction of the robot."""
 
 from __future__ import annotations
 

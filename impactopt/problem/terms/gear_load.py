@@ -1,4 +1,4 @@
-"""What gears bear, in the blow above all."""
+"""Limit on gear loads, above all in the impact."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a hand that holds on can bear."""
+"""Limits of a supporting hand's grip."""
 
 from __future__ import annotations
 

@@ -36,6 +36,8 @@ class GroundForce(Term):
         metadata=about("least normal force of each sole, as a share of the weight", least=0, most=0.45),
     )
 
+    enabled: bool = field(default=True, metadata=about("false: soles may be unloaded, and land hard"))
+
     def add_rows(self, program: Any) -> None:
         legs, weight = program.coordinates.legs, program.builder.limits.weight
         soles = [k for k, leg in enumerate(legs) if leg.sole is not None]

@@ -1,4 +1,4 @@
-"""How the hand is turned at contact."""
+"""Orientation of the hand at contact."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From where it hits, if that is free."""
+"""Cone of free directions of the impact."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ def hit_cone(c: StanceCoordinates, striker: str) -> BlockExpression:
     """z = y, y', T;  p = axes of the face (9, by rows), tangent of the angle.
 
     out = ((tangent x speed along the normal)^2 - (speed across it)^2) / (2 tangent x 1 m/s) [m/s]: smooth,
-    also where there is no speed across. That the speed along the normal is one of approach is a row anyway.
+    also where there is no speed across. That the speed along the normal is one of approach is a constraint
+    anyway.
     """
     y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
     rows, tangent = ca.SX.sym("axes", 9), ca.SX.sym("tan")

@@ -1,4 +1,4 @@
-"""Where it hits, if that is free."""
+"""Region of free hit points."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class HitRegion(Term):
         return {"hit_region": BlockRecipe(lambda: hit_region(coordinates, problem.striker, disc), (disc,))}
 
     def add_rows(self, program: Any) -> None:
-        """In the place of those of the hit point."""
+        """Adds constraints that replace those of the hit point."""
 
         def numbers(problem: Any) -> Any:
             size = [] if self.radius is None else [self.radius]

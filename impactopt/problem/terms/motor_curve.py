@@ -1,4 +1,4 @@
-"""How much torque is left of a motor at its speed."""
+"""Torque limit of a motor at its speed."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class MotorCurve(Term):
 def motor_speed(c: StanceCoordinates) -> BlockExpression:
     """z of `joint_motion`;  p = what a speed takes of the line [s/rad] (n).
 
-    out = that of each joint's speed (n), twice: a row takes one output, and an output is of one row.
+    out = that of each joint's speed (n), twice: one output a constraint.
     """
     motion, per_speed = joint_motion(c), ca.SX.sym("per_speed", c.robot.n)
     speed = per_speed * motion.velocity

@@ -1,4 +1,4 @@
-"""What motors may give and take."""
+"""Limits on motor power, driving and braking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far the striking point slides across the target."""
+"""Limit on the striking point's slide across the target."""
 
 from __future__ import annotations
 

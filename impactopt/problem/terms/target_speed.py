@@ -1,4 +1,4 @@
-"""How fast the target is after the blow."""
+"""Speed of the target after the impact."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How fast torques may change."""
+"""Limit on the rate of torques."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class TorqueRate(Term):
     )
 
     def add_rows(self, program: Any) -> None:
-        """The torques are variables, so these rows are linear, of a duration that is one too."""
+        """The torques are variables, so these constraints are linear, of a duration that is one too."""
         names = program.robot.joint_names
         limit = of_joints(self.limit, names)
         joints = np.flatnonzero(np.isfinite(limit))

@@ -1,4 +1,4 @@
-"""How much faster or slower a blow makes joints."""
+"""Limit on the jump of joint velocities in the impact."""
 
 from __future__ import annotations
 

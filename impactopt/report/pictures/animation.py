@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 from scipy.spatial import ConvexHull
 
-from impactopt.bodies.surroundings import surroundings_of
+from impactopt.bodies.scene_visuals import surroundings_of
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
 from impactopt.files.replay import Replay
@@ -45,7 +45,7 @@ SIDE, BEHIND, ABOVE = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Instant:
-    """What is drawn of one instant: places in the world and arrows [m]."""
+    """Drawn state of one instant: places in the world and arrows [m]."""
 
     sticks: Array  # (links, 2, 3)
     soles: list[Array]  # (corners, 3) each
@@ -88,7 +88,7 @@ class _Drawing:
         self.views = (SIDE, BEHIND, ABOVE)
 
     def look(self, k: int) -> _Instant:
-        """What there is at recorded instant `k`."""
+        """Drawn state at recorded instant `k`."""
         model, data, sim, scene = self.robot.model, self.data, self.sim, self.scene
         pin.framesForwardKinematics(model, data, sim.q[k])
         joints = np.array([place.translation for place in data.oMi])
@@ -197,7 +197,7 @@ class _Drawing:
             moving.append(_arrow(axes, view @ scene.hand, view @ scene.push, VERMILION))
 
     def _plane(self, axes: Any, view: Array, place: Array, moving: list[Any]) -> None:
-        """Where it is seen edge-on, the plane of contact: a hand meets it beside the target too."""
+        """Draws the plane of contact if it is seen edge-on: a hand meets it beside the target too."""
         normal = view @ self.scene.normal
         if np.linalg.norm(normal) > 0.9:
             face, way = view @ place, np.array([-normal[1], normal[0]])

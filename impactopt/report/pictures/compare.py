@@ -1,4 +1,4 @@
-"""What several plans expect, over each other: force, ZMP margin, torque; one colour each."""
+"""Predictions of several plans in one picture: force, ZMP margin, torque; one colour each."""
 
 from __future__ import annotations
 

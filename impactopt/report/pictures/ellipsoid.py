@@ -1,4 +1,4 @@
-"""What the fist weighs at contact, by the direction that it hits in: the effective-mass ellipsoid."""
+"""Effective mass of the fist at contact by the direction of the hit: the effective-mass ellipsoid."""
 
 from __future__ import annotations
 

@@ -90,6 +90,6 @@ def _delivered(hit: Collision, time: Array) -> Array:
 
 
 def _error(hit: Collision, true: Collision) -> str:
-    """Of the impulse."""
+    """Error of the impulse as text."""
     error = 100 * (hit.impulse / true.impulse - 1)
     return f"{error:+.2f} %" if abs(error) >= 0.005 else "< 0.01 %"

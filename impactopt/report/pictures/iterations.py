@@ -1,4 +1,4 @@
-"""How a solver went: what is maximized, what was violated, and the optimality, over its iterations."""
+"""Convergence of a solver: objective, violation and stationarity over its iterations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LEAST = 1e-12  # drawn for what is smaller
 
 @styled
 def iterations(record: Record) -> Picture | None:
-    """What is maximized (the impulse, less small prices) above; violation and stationarity below.
+    """Objective (the impulse, less small prices) above; violation and stationarity below.
 
     None without a history.
     """

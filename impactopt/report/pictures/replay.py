@@ -1,4 +1,4 @@
-"""How the soles stood in a replay: where each was pressed, how hard, and whether it slipped or rose."""
+"""Contact of the soles in a replay: centre and size of the pressure, slip and lift."""
 
 from __future__ import annotations
 

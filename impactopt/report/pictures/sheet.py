@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 from matplotlib.collections import PolyCollection
 
+from impactopt.bodies.scene_visuals import Part, surroundings_of
 from impactopt.bodies.solids import Solid, simplified
-from impactopt.bodies.surroundings import Part, surroundings_of
 from impactopt.files.output import Record
 from impactopt.problem.motion_style import joints_to
 from impactopt.problem.problem import ImpactProblem
@@ -68,7 +68,7 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
 
 
 def _hides(part: Part) -> bool:
-    """Whether a body would hide the robot, as a wall does."""
+    """True if a body would hide the robot, as a wall does."""
     return part.clear and part.kind != "obstacle"
 
 
@@ -98,7 +98,7 @@ def _chosen(track: Track) -> list[int]:
 
 
 def _solids(problem: ImpactProblem) -> list[Drawn]:
-    """What the robot looks like: triangles of each joint, with their normals and colours."""
+    """Solids of the robot: triangles of each joint, with their normals and colours."""
     robot = problem.robot
     striking = joints_to(robot, [robot.striker(name).model_frame for name in problem.strikers])
     standing = joints_to(robot, [sole.frame for sole in problem.stance.soles(robot)])

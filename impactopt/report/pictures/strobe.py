@@ -28,7 +28,7 @@ def strobe(record: Record) -> Picture:
 
 
 def strobe_height(record: Record) -> float:
-    """How high [in] it is where it is as wide as a page."""
+    """Height [in] of the picture at the width of a page."""
     low, high, width = _extent(record)
     scale = (PAGE - 0.6) / (len(record.arrays["pose_time"]) * (width + GAP))  # [in/m]
     return min(float((high - low) * scale) + 0.75, PAGE)
@@ -87,7 +87,9 @@ def _key(record: Record) -> list[Line2D | Patch]:
 
 
 def _view(record: Record) -> tuple[Array, str]:
-    """What projects the world onto the picture (2, 3), and where from: no blow goes to the left."""
+    """Projection of the world onto the picture (2, 3), and the side it is seen from: no blow goes to the
+    left.
+    """
     n = record.arrays["pose_normal"]
     if abs(n[1]) > abs(n[0]):
         sign = -1.0 if n[1] < 0 else 1.0

@@ -101,7 +101,7 @@ class Picture(Figure):
             self.savefig(file, format="png")
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
-        """For notebooks: half as many pixels on the page as in the file, which is sharp on any screen."""
+        """PNG for notebooks: half as many pixels on the page as in the file, which is sharp on any screen."""
         width, height = (int(side * DPI / 2) for side in self.get_size_inches())
         memory = io.BytesIO()
         self.write(memory)
@@ -126,7 +126,7 @@ def title(record: Record, what: str) -> str:
 
 
 def model_colour(model: str, freezes: float = 0) -> str:
-    """Of a collision model by its name in a file, frozen again on the way so often."""
+    """Colour of a collision model by its name in a file, and its number of freezes."""
     return MODELS["freezes" if freezes else model]
 
 
@@ -136,7 +136,9 @@ def joint_label(name: object) -> str:
 
 
 def simulated_phases(record: Record) -> NDArray[np.intp]:
-    """Of the simulated instants (k,): 0 before, 1 in, 2 after contact; planned contact if there was none."""
+    """Phase of the simulated instants (k,): 0 before, 1 in, 2 after contact; the planned one if there was
+    none.
+    """
     a = record.arrays
     kind = "simulated" if np.isfinite(a["simulated_contact_start"]) else "reference"
     start, end = (float(a[f"{kind}_contact_{which}"]) for which in ("start", "end"))

@@ -257,7 +257,7 @@ def _scales(axes: Any, section: Section) -> None:
 
 
 def _number(x: float) -> str:
-    """As it is written by hand; large and small powers of ten as such."""
+    """Number as it is written by hand; large and small powers of ten as such."""
     power = round(np.log10(abs(x))) if x else 0
     if abs(power) >= 4 and np.isclose(abs(x), 10.0**power, rtol=1e-9):
         return f"${'-' if x < 0 else ''}10^{{{power}}}$"

@@ -54,7 +54,7 @@ class SweepColumns:
         return self.section.labels.get(name, _label(name))
 
     def note(self) -> str:
-        """Why rows are impossible, most often first."""
+        """Reasons why rows are impossible, most frequent first."""
         return "; ".join(reason.partition(";")[0] for reason, _ in self.reasons.most_common(2))
 
 
@@ -79,7 +79,7 @@ def name_of_error(section: Section, data: SweepColumns, name: str) -> str:
 
 
 def errors_against(section: Section, data: SweepColumns, values: Array) -> Array:
-    """In per cent off the rows with the same x, panel and whatever else, but these keys."""
+    """Deviations [%] from the rows with the same x, panel and all other keys but these."""
     keys = {name: data.values(name) for name in section.against}
     base = np.ones(len(values), dtype=bool)
     for name, wanted in section.against.items():
@@ -95,7 +95,7 @@ def errors_against(section: Section, data: SweepColumns, values: Array) -> Array
 
 
 def combined(names: Sequence[str], data: SweepColumns) -> tuple[NDArray[np.intp], list[str]]:
-    """Of each row which combination of the columns' values it has, and what these are called."""
+    """Combination of the columns' values in each row, by number, and the combinations' names."""
     if not names:
         return np.zeros(len(data.values(data.section.x)), dtype=np.intp), [""]
     columns = [data.values(name) for name in names]

@@ -64,7 +64,7 @@ def _gears(record: Record) -> dict[str, tuple[Array, Array]]:
 
 
 def _draw_gears(figure: FigureBase, record: Record, gears: dict[str, tuple[Array, Array]]) -> None:
-    """Of the joints whose gears bear most; at contact it jumps where a damper has a force at once."""
+    """Draws the joints with the largest gear loads, which jump at contact if a damper has a force at once."""
     axes, names = figure.subplots(), record.arrays["joints"]
     most = np.max([np.abs(load).max(axis=0) for _, load in gears.values()], axis=0)
     for k, colour in zip(np.argsort(-most), (BLUE, VERMILION, GREEN), strict=False):
@@ -80,7 +80,7 @@ def _draw_gears(figure: FigureBase, record: Record, gears: dict[str, tuple[Array
 
 
 def torque_height(record: Record) -> float:
-    """How high [in] it has to be, so that joints can be read."""
+    """Height [in] at which joints can be read."""
     return 0.75 + ROW * max(len(record.arrays["joints"]), 8)
 
 

@@ -22,7 +22,7 @@ from impactopt.robots.rigid_body._tree import Kind, Tree
 
 
 class Kinematics:
-    """Where links and frames are."""
+    """Placements and velocities of links and frames."""
 
     def __init__(self, tree: Tree, coordinates: Coordinates) -> None:
         self.tree, self.coordinates = tree, coordinates

@@ -22,7 +22,7 @@ SNAP = 1e-14  # rotation entries this near to 0, 1 or -1, lengths this short [m]
 
 
 class Kind(enum.Enum):
-    """What a joint does, seen in its turned frame."""
+    """Type of a joint, seen in its turned frame."""
 
     FIXED = "the universe"
     FREE = "free-flyer"

@@ -3,10 +3,10 @@
 * settings.py   its numbers
 * sensors.py    what encoders, an inertial unit and the striking hand's force sensor tell it
 * estimate.py   from there to the state of the robot
-* aim.py        what it tracks at one instant
-* target.py     what it tracks, by what it has felt of the blow
+* setpoint.py        what it tracks at one instant
+* tracking_reference.py     what it tracks, by what it has felt of the blow
 * recovery.py   how it comes to rest after the blow
-* held.py       accelerations and sole wrenches as functions of the torques
+* constrained_dynamics.py       accelerations and sole wrenches as functions of the torques
 * cones.py      what wrenches soles can have, and where they are pressed
 * clearance.py  near bodies slow down before they touch
 * tasks.py      squared errors, weighed against each other

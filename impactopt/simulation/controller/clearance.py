@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.simulation.solids import FLOOR, Solid, Solids
+from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids
 
 __all__ = ["Clearance"]
 
@@ -137,7 +137,7 @@ def _least(distance: Any, rate: Any) -> Any:
 
 
 def _shape(solid: Solid) -> tuple[Any, Any]:
-    """As coal has it, and where it is in its joint's frame."""
+    """Shape for coal, and its placement in its joint's frame."""
     if solid.vertices is not None:
         return solid.hull, pin.SE3.Identity()
     assert solid.half is not None and solid.place is not None and solid.rotation is not None

@@ -1,4 +1,4 @@
-"""What wrenches soles can have, and where they are pressed: rows in the torques."""
+"""Wrench cones and contact pressure of soles, as constraints on the torques."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def cone_of(corners: Array, settings: ControllerSettings) -> Array:
 
 
 class Cones:
-    """Of soles with corners (c, 2) [m] each, for a robot of n joints and a weight [N].
+    """Wrench cones of soles with corners (c, 2) [m] each, for a robot of n joints and a weight [N].
 
     m : rows of all of them.
     """

@@ -1,4 +1,4 @@
-"""How a robot comes to rest after a blow: its plan's follow-through, slower, farther from its soles' edges.
+"""Recovery after an impact: the plan's follow-through, slower and farther from the soles' edges.
 
 On its way to rest a plan may bring the capture point to the soles' edges, and joints to their torque limits.
 At a slower pace the same postures need less, and legs that shift the body keep the capture point away from
@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
-from impactopt.simulation.controller.aim import Aim
+from impactopt.simulation.controller.setpoint import Aim
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.result import Scene, distance_inside
 
@@ -50,7 +50,7 @@ class Recovery:
         self.place = np.array(pin.centerOfMass(self.model, self.model.createData(), q)[:2])
 
     def clock(self, since: float) -> tuple[float, float, float]:
-        """How far the plan goes on [s] in a time since the recovery began, and the first and second rate."""
+        """Progress in the plan [s] at a time since the recovery began, with its first and second rate."""
         slower, braked = 1.0 - self.pace, min(since, BRAKING)
         gone = since - slower * (braked**2 / (2 * BRAKING) + since - braked)
         brakes = since < BRAKING
@@ -74,9 +74,9 @@ class Recovery:
 
 
 def _clear_part(model: Any, reference: Any, scene: Scene, shift: Array) -> float:
-    """How much of a shift (nv,) of the postures after the blow leaves links as far apart as planned, or by
-    `CLEAR`: legs that shift the body may bring thighs together. All of it, if the plan's capture point comes
-    nearer to the soles' edges than `SAFE`: a robot that touches itself still stands.
+    """Fraction of a shift (nv,) of the postures after the blow that leaves links as far apart as planned, or
+    by `CLEAR`: legs that shift the body may bring thighs together. All of it, if the plan's capture point
+    comes nearer to the soles' edges than `SAFE`: a robot that touches itself still stands.
     """
     time, postures = np.asarray(reference.time), np.asarray(reference.q)
     looked = np.arange(float(reference.contact_end), float(time[-1]) + LOOK, LOOK)

@@ -1,4 +1,4 @@
-"""What encoders, an inertial unit and the hand's force sensor tell of the robot, with their errors.
+"""Sensor model: encoders, an inertial unit and the hand's force sensor, with their errors.
 
 The inertial unit is Xsens' MTi-300 (data sheet of Movella, May 2023): roll and pitch within 0.2 degrees RMS,
 gyroscope with 0.01 deg/s/sqrt(Hz) and a bias of 10 deg/h. Encoders behind the gears have 19 bits, and rates
@@ -51,7 +51,7 @@ class Sensors:
         self._rate, self._gyro = np.sqrt(2) * ENCODER * rate, GYRO_DENSITY * np.sqrt(rate / 2)
 
     def read(self, angles: Array, v: Array, rotation: Array, forces: Array) -> Measured:
-        """Of a robot with joint angles (n,), velocity v (nv,), base rotation (3, 3) and forces (h,)."""
+        """Readings for joint angles (n,), velocity v (nv,), base rotation (3, 3) and forces (h,)."""
         s, n, drawn = self.noise, self.n, self._random.standard_normal(6 + 2 * self.n + len(forces))
         off = pin.exp3(s * (self._tilt + FLUTTER * drawn[:3]))
         gyro = v[3:6] if len(v) >= n + 6 else np.zeros(3)

@@ -1,4 +1,4 @@
-"""The numbers of the whole-body controller, and what its sensors are worth."""
+"""The numbers of the whole-body controller, and the accuracy of its sensors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _weight(what: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSettings(Described):
-    """How the whole-body controller follows a plan in a replay.
+    """Settings of the whole-body controller that follows a plan in a replay.
 
     Its weights are those of squared errors in accelerations: of the centre of mass [m/s^2], of the angular
     momentum's rate over mass [m^2/s^2], of the hand [m/s^2] and of joints and trunk [rad/s^2].

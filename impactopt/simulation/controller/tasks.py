@@ -1,4 +1,4 @@
-"""What the controller weighs against each other: squared errors that are linear in the torques."""
+"""Tasks of the controller: weighted squared errors that are linear in the torques."""
 
 from __future__ import annotations
 

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
 from impactopt.robots.robot import Robot
-from impactopt.simulation.controller.aim import Aim
 from impactopt.simulation.controller.clearance import MOST, Clearance
 from impactopt.simulation.controller.cones import Cones
+from impactopt.simulation.controller.constrained_dynamics import HeldDynamics
 from impactopt.simulation.controller.estimate import StateEstimate
-from impactopt.simulation.controller.held import HeldDynamics
 from impactopt.simulation.controller.quadratic import TorqueQP
 from impactopt.simulation.controller.recovery import Recovery
 from impactopt.simulation.controller.sensors import Sensors
+from impactopt.simulation.controller.setpoint import Aim
 from impactopt.simulation.controller.settings import ControllerSettings
-from impactopt.simulation.controller.target import Target
 from impactopt.simulation.controller.tasks import Tasks
+from impactopt.simulation.controller.tracking_reference import Target
 from impactopt.simulation.result import Scene
 from impactopt.simulation.servo import Servo
 

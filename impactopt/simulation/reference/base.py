@@ -1,4 +1,4 @@
-"""What the reference models share: gains, friction, tolerance, and the search for what meets it."""
+"""Base of the reference models: gains, friction, tolerance, and the search for the step that meets it."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class ReferenceModel(CollisionModel):
 
     @property
     def _held(self) -> tuple[Robot, tuple[str, ...], Array, str]:
-        """Robot, held frames, their compliance, and striking frame."""
+        """Robot, constrained frames, their compliance, and striking frame."""
         robot, held_by = self.robot, self.held_by
         striker = robot.striker(self.striker).model_frame
         return robot, held_by.constraint_frames(robot), held_by.compliance, striker

@@ -1,4 +1,4 @@
-"""How a reference that coasts with its soles in place bends: what a plan's servo holds on to in contact."""
+"""Accelerations of a reference that coasts with its soles in place, as a plan's servo keeps it in contact."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.settings import REFERENCE_ORDER, no_bend
 from impactopt.errors import InputError, check_array
-from impactopt.kinematics.closing import base_motion
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.leg_closure import base_motion
 
 __all__ = ["coasting_reference", "independent_rates"]
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class Phase(NamedTuple):
-    """Where each law of force is on a smooth branch of its own.
+    """Branch of each law of force, on which it is smooth.
 
     touching, compressing : of the contact.
     saturated, sliding : (n) -1, 0 or 1: at which torque limit, or in which direction out of the friction's
@@ -34,7 +34,7 @@ class Phase(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Forces:
-    """What acts on joints, hand and target (paper, eqs. 5, 10, 12, 17).
+    """Forces on joints, hand and target (paper, eqs. 5, 10, 12, 17).
 
     Attributes
     ----------

@@ -23,8 +23,8 @@ from impactopt.simulation.mujoco_world import (
 )
 from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.reference.base import ReferenceModel, converge
+from impactopt.simulation.reference.equations_of_motion import Instant, Scales, contact_scales
 from impactopt.simulation.reference.forces import Forces, Phase
-from impactopt.simulation.reference.motion import Instant, Scales, contact_scales
 from impactopt.simulation.reference.record import collision_from
 
 __all__ = ["HeldRobot", "MujocoDynamics", "march"]
@@ -39,12 +39,12 @@ _RESOLVED, _LEVELS, _MOST_STEPS = 0.02, 9, 300_000
 class MujocoDynamics(ReferenceModel):
     """A robot hits a target, in MuJoCo.
 
-    The held frames are welded to the world, as hard as MuJoCo lets them be: their time constant is two steps,
-    so that they get rigid as the step goes to zero. Servo, friction and contact act as applied forces, in
-    MuJoCo's semi-implicit Euler steps. All this is of first order in the step: steps that resolve the servo
-    and the contact are halved until impulse, energy and velocity, extrapolated to steps without length from
-    the two shortest, are found. The histories, and the rest, are those of the shortest steps. The contact's
-    end is found to within a step.
+    The constrained frames are welded to the world, as hard as MuJoCo lets them be: their time constant is two
+    steps, so that they get rigid as the step goes to zero. Servo, friction and contact act as applied forces,
+    in MuJoCo's semi-implicit Euler steps. All this is of first order in the step: steps that resolve the
+    servo and the contact are halved until impulse, energy and velocity, extrapolated to steps without length
+    from the two shortest, are found. The histories, and the rest, are those of the shortest steps. The
+    contact's end is found to within a step.
 
     Attributes
     ----------
@@ -137,7 +137,9 @@ class HeldRobot(MujocoRobot):
         self.welds.put(self.data)
 
     def wrenches(self) -> tuple[Array, Array]:
-        """Of the ground on the welded frames (6 a frame), and their places, at the last step's start."""
+        """Wrenches of the ground on the welded frames (6 a frame), and their places, at the last step's
+        start.
+        """
         found, places = self.welds.wrenches(self.data)
         return found.ravel(), places
 

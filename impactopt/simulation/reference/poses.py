@@ -1,4 +1,4 @@
-"""Where a motion's links are at some instants, and what its fist weighs at contact: for pictures."""
+"""Placements of a motion's links at some instants, and effective mass at contact, for pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.world import WorldBody
-from impactopt.kinematics.held import Held
+from impactopt.kinematics.operational_space import Held
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
@@ -70,7 +70,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
 
 
 def inverse_mass(problem: ImpactProblem, q: Array) -> Array:
-    """J P J' (3, 3) [1/kg] of the striking point, as of `impactopt.kinematics.held.Held`."""
+    """J P J' (3, 3) [1/kg] of the striking point, as of `impactopt.kinematics.operational_space.Held`."""
     robot = problem.robot
     frames = problem.stance.constraint_frames(robot)
     return Held.at(robot.model, q, frames, robot.striker(problem.striker).model_frame).inverse_mass()
@@ -106,14 +106,14 @@ def _point(data: pin.Data, model: pin.Model, frame: pin.Frame) -> Array:
 
 
 def _place(robot: Robot, striker: str, q: Array) -> Array:
-    """Where the striking point is (3,) [m]."""
+    """Position of the striking point (3,) [m]."""
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, q)
     return _point(data, model, _striker(robot, striker))
 
 
 def _corners(bodies: Sequence[WorldBody]) -> Array:
-    """Of each body's surface, as many as the one with most has (b, c, 3) [m]."""
+    """Corners of each body's surface, padded to the largest number (b, c, 3) [m]."""
     found = [body.solid.vertices for body in bodies]
     most = max(map(len, found), default=0)
     padded = [np.pad(v, ((0, most - len(v)), (0, 0)), mode="edge") for v in found]

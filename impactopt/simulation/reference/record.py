@@ -1,4 +1,4 @@
-"""From the instants of a collision to its result."""
+"""Assembles a collision's result from its recorded instants."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.collision.result import Collision
+from impactopt.simulation.reference.equations_of_motion import Instant
 from impactopt.simulation.reference.forces import Forces
-from impactopt.simulation.reference.motion import Instant
 
 __all__ = ["collision_from"]
 
@@ -30,7 +30,7 @@ def collision_from(
 ) -> Collision:
     """The result of a collision with that end, and that largest force [N].
 
-    soles : how many of the held frames, the first, are soles.
+    soles : how many of the constrained frames, the first, are soles.
     """
     columns: dict[str, Any] = {
         name: np.array([getattr(i, name) for i in instants]) for name in Instant._fields

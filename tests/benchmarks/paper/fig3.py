@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.costs import HRP2, TOTAL_TIME, cost_aba, cost_full, cost_sdc, iterations
 from benchmarks.paper.timing import Times, measure
 from benchmarks.report import Report, Say, cell, columns_table
-from impactopt.kinematics.held import striking_velocity
+from impactopt.kinematics.operational_space import striking_velocity
 from impactopt.robots.presets import standin
 
 if TYPE_CHECKING:

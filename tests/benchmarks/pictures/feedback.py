@@ -1,4 +1,4 @@
-"""How many draws stand, over what a plan's impulse is: with the joints' servos, and with a controller."""
+"""Fraction of draws that stand over a plan's impulse: with the joints' servos, and with a controller."""
 
 from __future__ import annotations
 

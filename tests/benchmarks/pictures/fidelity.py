@@ -1,4 +1,4 @@
-"""How far collision models are from full dynamics: impulse error over the number of freezes."""
+"""Errors of collision models against full dynamics: impulse error over the number of freezes."""
 
 from __future__ import annotations
 

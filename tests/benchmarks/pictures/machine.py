@@ -1,4 +1,4 @@
-"""What a blow brings, over what gears may bear."""
+"""Impulse of a blow over the limit of gear loads."""
 
 from __future__ import annotations
 

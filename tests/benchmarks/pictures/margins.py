@@ -1,4 +1,4 @@
-"""What margins cost and what they buy: impulse and share of standing over each option's values."""
+"""Cost and benefit of margins: impulse and fraction standing over each option's values."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _name_values(axes: Any, labels: Sequence[str]) -> None:
 
 
 def _legend(axes: Any) -> None:
-    """What the marks mean, in a place of its own."""
+    """Legend of the marks, in axes of its own."""
     axes.axis("off")
 
     def mark(label: str, **style: Any) -> Line2D:

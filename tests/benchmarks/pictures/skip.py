@@ -1,4 +1,4 @@
-"""What leaving things out of a collision function saves."""
+"""Savings by leaving terms out of a collision function."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a blow brings, and what its gears bear, over stiffness; and the stiffness that a plan chooses."""
+"""Impulse and gear loads of a blow over stiffness; and the stiffness that a plan chooses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How exact virtual bases are: errors over the mass M_g that is put under the soles, in two forms."""
+"""Accuracy of virtual bases: errors over the mass M_g that is put under the soles, in two forms."""
 
 from __future__ import annotations
 

@@ -1,0 +1,202 @@
+"""Convex hulls of a robot's links, from its own files or from the links' inertia."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from impactopt.bodies.mjcf import geoms_of
+from impactopt.bodies.solids import Solid, cylinder, rounded_box
+from impactopt.bodies.urdf import lost_meshes, shapes_of, urdf_root
+from impactopt.codegen.directory import kept
+from impactopt.robots.robot import Robot, Tool
+from impactopt.robots.tools import without
+
+__all__ = ["Piece", "bare_joints", "convex", "inertia_box", "pieces_of", "tool_solids"]
+
+Array = NDArray[np.float64]
+ROD = 0.012  # [m] radius of a tool
+SIDE = 0.02  # [m] least side of a box of inertia
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Piece:
+    """The convex hull of a shape of a link.
+
+    joint : index in the model of the joint that moves it; its frame is that of the numbers.
+    vertices (k, 3) [m], triangles (m, 3) : of the hull, counter-clockwise seen from outside.
+    assumed : it is a box of the link's inertia, as no shape is known.
+    """
+
+    link: str
+    joint: int
+    vertices: Array
+    triangles: NDArray[np.intp]
+    assumed: bool = False
+
+    @cached_property
+    def shape(self) -> Any:
+        """The hull as coal has it."""
+        return convex(self.vertices, self.triangles)
+
+    def depth(self, point: Array) -> float:
+        """Distance [m] of a point (3,) inside the hull to its surface; < 0 outside."""
+        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
+        out = np.cross(b - a, c - a)
+        lengths = np.linalg.norm(out, axis=1)
+        flat = lengths <= 1e-12  # [m2] a facet without area has no normal
+        return float(np.min((((a - point) * out).sum(axis=1) / np.where(flat, 1.0, lengths))[~flat]))
+
+
+def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
+    """A coal.Convex of a hull."""
+    points, facets = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    points.extend(list(vertices))
+    facets.extend([coal.Triangle(*(int(i) for i in t)) for t in triangles])
+    return coal.Convex(points, facets)
+
+
+def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
+    """The pieces of a robot, and in words where they are from.
+
+    They are hulls of its URDF's or MJCF's collision shapes, or of the visual ones of a link that has no
+    others. A robot without any, and what has lost its meshes, is rounded boxes of the links' inertia. Tools
+    are rods to their heads.
+    """
+    if robot.mjcf is not None:
+        found, source = list(_from_mjcf(robot, robot.mjcf)), "collision shapes of its MJCF"
+    else:
+        found, source = list(_from_urdf(robot)), "collision shapes of its URDF"
+    if not found:
+        found, source = list(_from_inertia(robot)), "boxes of its links' inertia"
+    else:
+        bare = bare_joints(robot, {piece.joint for piece in found})
+        found += [piece for piece in _from_inertia(robot) if piece.joint in bare]
+        source += f", and boxes of the inertia of {len(bare)} that have lost their meshes" if bare else ""
+    found += [piece for tool in robot.tools for piece in _of_tool(robot, tool)]
+    return tuple(found), source
+
+
+def bare_joints(robot: Robot, shown: Collection[int]) -> set[int]:
+    """Joints whose bodies are not known, as all their meshes are nowhere; shown : those of which some are."""
+    urdf = Path(robot.urdf) if robot.urdf is not None else None
+    root = urdf_root(urdf) if urdf is not None else None
+    lost = lost_meshes(robot.model, root, urdf) if root is not None and urdf is not None else {}
+    return {joint for joint in lost if joint not in shown}
+
+
+def _from_urdf(robot: Robot) -> Iterator[Piece]:
+    urdf = Path(robot.urdf) if robot.urdf is not None else None
+    root = urdf_root(urdf) if urdf is not None else None
+    if root is None or urdf is None:
+        return
+    found = {kind: list(shapes_of(robot.model, root, urdf, kind)) for kind in ("collision", "visual")}
+    bodied = {shape.link for shape in found["collision"]}
+    for shape in [*found["collision"], *(s for s in found["visual"] if s.link not in bodied)]:
+        piece = _hull(shape.link, shape.joint, shape.solid)
+        if piece is not None:
+            yield piece
+
+
+def _from_mjcf(robot: Robot, mjcf: str) -> Iterator[Piece]:
+    geoms = geoms_of(robot.model, mjcf)
+    bodied = {geom.link for geom in geoms if geom.collides}
+    for geom in geoms:
+        if geom.collides or geom.link not in bodied:
+            piece = _hull(geom.link, geom.joint, geom.solid)
+            if piece is not None:
+                yield piece
+
+
+def _from_inertia(robot: Robot) -> Iterator[Piece]:
+    model = robot.model
+    held = [pin.Inertia.Zero() for _ in range(model.njoints)]
+    for tool in robot.tools:
+        frame = model.frames[model.getFrameId(tool.own_frame)]
+        own = pin.Inertia(tool.mass, tool.center, tool.inertia)
+        held[frame.parentJoint] += frame.placement.act(own)
+    for j in range(1, model.njoints):
+        inertia = model.inertias[j]
+        if held[j].mass > 0:
+            inertia = without(inertia, held[j])
+        if inertia.mass > 1e-6:
+            piece = _hull(model.names[j], j, inertia_box(inertia))
+            if piece is not None:
+                yield replace(piece, assumed=True)
+
+
+def inertia_box(inertia: Any) -> Solid:
+    """The box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis; rounded."""
+    moments, axes = np.linalg.eigh(np.array(inertia.inertia))
+    squares = 6.0 / inertia.mass * (moments.sum() - 2 * moments)
+    axes = axes if np.linalg.det(axes) > 0 else -axes
+    sides = np.sqrt(np.maximum(squares, SIDE**2))
+    return rounded_box(sides).moved(axes, np.array(inertia.lever))
+
+
+def _of_tool(robot: Robot, tool: Tool) -> Iterator[Piece]:
+    frame = robot.model.frames[robot.model.getFrameId(tool.own_frame)]
+    place = frame.placement
+    for solid in tool_solids(tool):
+        piece = _hull(tool.name, int(frame.parentJoint), solid.moved(place.rotation, place.translation))
+        assert piece is not None  # a rod has a hull
+        yield piece
+
+
+def tool_solids(tool: Tool) -> list[Solid]:
+    """The solids of a tool in its own frame: a rod to the point that hits, or to the bar of a hammer."""
+    if tool.bar is None:
+        return [_rod(np.zeros(3), np.asarray(tool.head), ROD)]
+    back, middle = tool.head - tool.bar, tool.head - tool.bar / 2
+    return [_rod(np.zeros(3), middle, ROD), _rod(back, np.asarray(tool.head), tool.bar_width / 2)]
+
+
+def _rod(start: Array, end: Array, radius: float) -> Solid:
+    """A cylinder from one point to another [m]."""
+    length = max(float(np.linalg.norm(end - start)), 2 * ROD)
+    along = (end - start) / length if length > 2 * ROD else np.array([0.0, 0.0, 1.0])
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
+    return cylinder(radius, length).moved(np.eye(3), np.array([0.0, 0.0, length / 2])).moved(turn, start)
+
+
+def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
+    """The hull of a solid, from disk if it was made before; None where it has no volume."""
+    digest = hashlib.sha256(np.round(solid.vertices, 9).tobytes()).hexdigest()
+
+    def make() -> bytes:
+        file = io.BytesIO()
+        vertices, triangles = _hull_of(solid.vertices)
+        np.savez(file, vertices=vertices, triangles=triangles)
+        return file.getvalue()
+
+    with np.load(io.BytesIO(kept("hull", digest, make)), allow_pickle=False) as found:
+        vertices, triangles = found["vertices"], found["triangles"]
+    return Piece(link=link, joint=joint, vertices=vertices, triangles=triangles) if len(triangles) else None
+
+
+def _hull_of(points: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Vertices and triangles of the hull of points (k, 3), none where it has no volume."""
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp)
+    place = np.full(len(points), -1)
+    place[hull.vertices] = np.arange(len(hull.vertices))
+    triangles = place[hull.simplices]
+    # Qhull does not order a facet's corners: turn those that look inwards
+    vertices = points[hull.vertices]
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    return vertices, triangles

@@ -1,0 +1,132 @@
+"""Visual shapes of a robot: those in its URDF or MJCF, or boxes of its links' inertia."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.bodies.convex_hulls import ROD, bare_joints, inertia_box, tool_solids
+from impactopt.bodies.mjcf import geoms_of
+from impactopt.bodies.solids import Solid, cylinder, sphere
+from impactopt.bodies.urdf import numbers, shapes_of, urdf_root
+from impactopt.robots.attachments import Tool
+from impactopt.robots.robot import Robot, Striker
+
+__all__ = ["Visual", "visuals_of"]
+
+Array = NDArray[np.float64]
+GREY = (0.72, 0.74, 0.77)  # of what has no colour of its own
+JOINT, BONE = (0.35, 0.37, 0.40), (0.55, 0.57, 0.60)
+THIN, THICK = ROD, 0.028  # [m] radii of a bone, and of the ball at its joint
+
+
+@dataclass(frozen=True, kw_only=True)
+class Visual:
+    """A solid in the frame of the joint of that index, and its colour (red, green, blue) in [0, 1]."""
+
+    joint: int
+    solid: Solid
+    colour: tuple[float, float, float] = GREY
+
+
+def visuals_of(robot: Robot) -> list[Visual]:
+    """The robot's visual shapes; tools are rods, with a bar across the end of a hammer.
+
+    What has lost its meshes is drawn by boxes of the links' inertia and bones between the joints, and so is a
+    robot without shapes.
+    """
+    found = [] if robot.urdf is None else _from_urdf(robot, Path(robot.urdf))
+    if robot.mjcf is not None:
+        found = _from_mjcf(robot, robot.mjcf)
+    if not found:
+        return _from_inertia(robot)
+    bare = bare_joints(robot, {visual.joint for visual in found})
+    found += [visual for visual in _from_inertia(robot) if visual.joint in bare] if bare else []
+    return [*found, *(visual for tool in robot.tools for visual in _of_tool(robot, tool))]
+
+
+def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
+    root = urdf_root(urdf)
+    if root is None:
+        return []
+    colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
+    found = []
+    for shape in shapes_of(robot.model, root, urdf, "visual"):
+        material = shape.element.find("material")
+        colour = None if material is None else _colour(material) or colours.get(material.get("name", ""))
+        found.append(Visual(joint=shape.joint, solid=shape.solid, colour=colour or GREY))
+    return found
+
+
+def _from_mjcf(robot: Robot, mjcf: str) -> list[Visual]:
+    """Visual geoms of each link; its collision geoms if it has none."""
+    geoms = geoms_of(robot.model, mjcf)
+    seen = {geom.link for geom in geoms if not geom.collides}
+    return [
+        Visual(joint=geom.joint, solid=geom.solid, colour=geom.colour)
+        for geom in geoms
+        if not geom.collides or geom.link not in seen
+    ]
+
+
+def _colour(material: ElementTree.Element) -> tuple[float, float, float] | None:
+    """The <color> of a <material>; None if it has none, or none that can be read."""
+    colour = material.find("color")
+    try:
+        red, green, blue, _ = numbers("" if colour is None else colour.get("rgba", ""), 4).tolist()
+    except ValueError:
+        return None
+    return red, green, blue
+
+
+def _from_inertia(robot: Robot) -> list[Visual]:
+    model, found = robot.model, []
+    for j in range(1, model.njoints):
+        inertia = model.inertias[j]
+        if inertia.mass > 0:
+            found.append(Visual(joint=j, solid=inertia_box(inertia)))
+        parent = int(model.parents[j])
+        if parent or not robot.floating:
+            found.append(Visual(joint=j, solid=sphere(THICK), colour=JOINT))
+        if parent > robot.floating:
+            found += _bone(parent, np.array(model.jointPlacements[j].translation))
+    return found + _bones_to(robot, robot.strikers.values())
+
+
+def _of_tool(robot: Robot, tool: Tool) -> Iterator[Visual]:
+    """A tool as large as it is, with a ball at a rod's end."""
+    frame = robot.model.frames[robot.model.getFrameId(tool.own_frame)]
+    solids = tool_solids(tool)
+    if tool.bar is None:
+        solids.append(sphere(THIN).moved(np.eye(3), np.asarray(tool.head)))
+    for solid in solids:
+        moved = solid.moved(frame.placement.rotation, frame.placement.translation)
+        yield Visual(joint=int(frame.parentJoint), solid=moved, colour=JOINT)
+
+
+def _bones_to(robot: Robot, strikers: Iterable[Striker]) -> list[Visual]:
+    """Sticks from the frame of each striker to its striking point, with a ball there."""
+    model, found = robot.model, []
+    for striker in strikers:
+        frame = model.frames[model.getFrameId(striker.frame)]
+        joint, place = int(frame.parentJoint), frame.placement
+        ball = sphere(THIN).moved(np.eye(3), place.act(striker.point))
+        rod = _bone(joint, np.array(striker.point))
+        found += [replace(v, solid=v.solid.moved(place.rotation, place.translation)) for v in rod]
+        found.append(Visual(joint=joint, solid=ball, colour=JOINT))
+    return found
+
+
+def _bone(joint: int, end: Array) -> list[Visual]:
+    length = float(np.linalg.norm(end))
+    if length < THIN:
+        return []
+    solid = cylinder(THIN, length).moved(np.eye(3), np.array([0.0, 0.0, length / 2]))
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), end / length).matrix()
+    return [Visual(joint=joint, solid=solid.moved(turn, np.zeros(3)), colour=BONE)]

@@ -1,0 +1,190 @@
+"""Diagnostics of a TOML file: place of a mistake, its probable intention, and permitted values."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from impactopt.errors import did_you_mean, shortened
+from impactopt.files.problem_file.toml import Place
+
+# no two parts of these can take the same character: a long line costs its length, not its square
+_HEADER = re.compile(r"""^\s*(\[\[?)([\w."'\s-]+)\]\]?\s*(?:#.*)?$""")
+_KEY = re.compile(r"""^\s*([\w."'-]+)\s*=""")
+
+_KINDS = {
+    "finite_number": "give a finite number",
+    "float_type": "give a number",
+    "int_type": "give a whole number",
+    "int_from_float": "give a whole number",
+    "string_type": "give text in quotes",
+    "bool_type": "give true or false",
+    "list_type": "give a list, [..., ...]",
+    "dict_type": "give a table, {key = value, ...}",
+    "model_type": "give a section of its own",
+    "model_attributes_type": "give a section of its own",
+}
+_MOST, _LONGEST = 100, 1000  # mistakes that are reported, and characters of each
+_SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mistake:
+    """A mistake at a place in the file.
+
+    place : path of keys and indices; the first `sections` of them name the table.  first : it is to be fixed
+    before the others.
+    """
+
+    place: Place
+    sections: int
+    text: str
+    first: bool = False
+
+    def __str__(self) -> str:
+        table = ".".join(str(part) for part in self.place[: self.sections] if isinstance(part, str))
+        key = ""
+        for part in self.place[self.sections :]:
+            key += f"[{part}]" if isinstance(part, int) else f"{'.' if key else ''}{part}"
+        where = " ".join(filter(None, (f"[{table}]" if table else "", key)))
+        return f"{where}: {self.text}" if where else self.text
+
+
+def report_mistakes(where: str, lines: Mapping[Place, int], mistakes: Iterable[Mistake]) -> str:
+    """One message for all mistakes, in the order of the file, with the lines where they can be found.
+
+    where : the file, or what else it was.  lines : of keys (`key_lines`); 0 for what was set from outside.
+    """
+    found = []
+    for mistake in mistakes:
+        place = mistake.place
+        # what is missing has no line of its own, and neither has a key inside a value
+        line = next((lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in lines), None)
+        at = "" if line is None else f"line {line}, " if line else "as set, "
+        found.append((not mistake.first, line is None, line or 0, f"{at}{mistake}"))
+    rows = list(dict.fromkeys(shortened(row, _LONGEST) for *_, row in sorted(found)))
+    if len(rows) == 1:
+        return f"{where}, {rows[0]}" if rows[0].startswith(("line", "as set")) else f"{where}: {rows[0]}"
+    told = rows[:_MOST] + ([f"... and {len(rows) - _MOST} more"] if len(rows) > _MOST else [])
+    return "\n".join([f"{where} has {len(rows)} mistakes:", *(f"  {row}" for row in told)])
+
+
+def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]:
+    """Mistakes that pydantic found in a file that `model` describes."""
+    out, meant = [], set()
+    for e in error.errors(include_url=False):
+        if e["type"] == "extra_forbidden":
+            section, sections = section_at(model, e["loc"][:-1])
+            key, known = str(e["loc"][-1]), [_key(section, name) for name in section.model_fields]
+            near = did_you_mean(key, known)
+            meant |= {(e["loc"][:-1], name) for name in known if near and repr(name) in near}
+            what = "section" if isinstance(e["input"], Mapping) else "key"
+            text = f"unknown {what}{near or '; known are ' + ', '.join(known)}"
+            out.append(Mistake(place=e["loc"], sections=sections, text=text))
+        elif e["type"] != "missing":
+            out.append(_mistake(model, e))
+    for e in error.errors(include_url=False):
+        # a key that is there, misspelt, is not missing as well
+        if e["type"] == "missing" and (e["loc"][:-1], e["loc"][-1]) not in meant:
+            _, sections = section_at(model, e["loc"])
+            out.append(Mistake(place=e["loc"], sections=sections, text="missing"))
+    return out
+
+
+def _mistake(model: type[BaseModel], e: Mapping[str, Any]) -> Mistake:
+    section, sections = section_at(model, e["loc"])
+    context, value = e.get("ctx", {}), _show(e["input"])
+    if e["type"] == "value_error":
+        text = str(context["error"])
+    elif e["type"] in ("too_short", "too_long"):
+        wanted = context.get("min_length", context.get("max_length"))
+        text = f"has {context['actual_length']} values; give {wanted}"
+    elif e["type"] in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
+        text = f"{value}; give a number {_range(section, e['loc'][sections:]) or _bound(e)}"
+    elif e["type"] == "literal_error":
+        near = did_you_mean(str(e["input"]), _choices(context))
+        text = f"{value} is unknown{near}; give {context['expected']}"
+    else:
+        text = f"{value}; {_KINDS.get(e['type'], e['msg'])}"
+    return Mistake(place=e["loc"], sections=sections, text=text)
+
+
+def section_at(model: type[BaseModel], place: Place) -> tuple[type[BaseModel], int]:
+    """The innermost table of the file that holds `place`, and how much of the place names it."""
+    depth = 0
+    while depth < len(place):
+        fields: dict[str | int, Any] = {_key(model, name): info for name, info in model.model_fields.items()}
+        annotation = fields[place[depth]].annotation if place[depth] in fields else None
+        inner = [kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type)]
+        inner = [kind for kind in inner if issubclass(kind, BaseModel)]
+        by_name = get_origin(annotation) is dict
+        if not inner or (by_name and depth + 1 == len(place)):
+            break
+        model, depth = inner[0], depth + 1
+        if depth < len(place) and (isinstance(place[depth], int) or by_name):
+            depth += 1
+    return model, depth
+
+
+def _key(model: type[BaseModel], name: str) -> str:
+    return model.model_fields[name].alias or name
+
+
+def _range(section: type[BaseModel], keys: Sequence[str | int]) -> str:
+    """The allowed range of a number, "> 0 and <= 1"; "" where it is not in the model."""
+    for name, info in section.model_fields.items():
+        if len(keys) == 1 and _key(section, name) == keys[0]:
+            return range_of(info)
+    return ""
+
+
+def range_of(info: FieldInfo) -> str:
+    """The allowed range of a field's numbers, "> 0 and <= 1"; "" for any."""
+    limits = [m for m in info.metadata if isinstance(m, (Gt, Ge, Lt, Le))]
+    bounds = [(key, getattr(m, key)) for m in limits for key in _SIGNS if hasattr(m, key)]
+    return " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in bounds)
+
+
+def _bound(e: Mapping[str, Any]) -> str:
+    return " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in e["ctx"].items() if key in _SIGNS)
+
+
+def _choices(context: Mapping[str, Any]) -> list[str]:
+    return re.findall(r"'([^']*)'", str(context.get("expected", "")))
+
+
+def _show(value: Any) -> str:
+    text = repr(value) if not isinstance(value, Mapping) else "a table"
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def key_lines(text: str) -> dict[Place, int]:
+    """The line (from 1) of every section and key of a TOML text, as far as a glance tells.
+
+    TOML parsers give no positions; keys inside inline tables and multi-line values are not looked for.
+    """
+    lines: dict[Place, int] = {}
+    table: Place = ()
+    entries: Counter[Place] = Counter()
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := _HEADER.match(line):
+            table = _split(header.group(2))
+            if header.group(1) == "[[":
+                lines.setdefault(table, number)
+                entries[table] += 1
+                table = (*table, entries[table] - 1)
+            lines.setdefault(table, number)
+        elif key := _KEY.match(line):
+            lines.setdefault((*table, *_split(key.group(1))), number)
+    return lines
+
+
+def _split(path: str) -> Place:
+    return tuple(part.strip().strip("\"'") for part in path.split("."))

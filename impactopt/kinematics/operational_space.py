@@ -1,0 +1,127 @@
+"""Effective mass, mobility and coasting torque of a constrained robot's striking point.
+
+In numbers for one configuration, by Pinocchio and least squares. For many of them, and for gradients,
+there are compiled graphs, `impactopt.collision.effective_mass` and `impactopt.collision.striking`; tests
+hold them to this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.errors import MOST, InputError, check_array
+from impactopt.kinematics.stance import Stance, usual_stance
+from impactopt.robots.robot import Robot
+
+__all__ = ["Held", "holding_torque", "striking_velocity"]
+
+Array = NDArray[np.float64]
+_DEPENDENT = 1e-12  # of the largest: a robot of few joints has rows that depend on each other
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A model at one configuration: inertia (nv, nv), Jacobian (c, nv) of the frames that are held, and
+    linear Jacobian (3, nv) of the striking point; world axes.
+    """
+
+    inertia: Array
+    held: Array
+    hand: Array
+
+    @classmethod
+    def at(cls, model: pin.Model, q: Array, frames: Sequence[str], striker: str) -> Held:
+        """Quantities at a configuration (nq,), with frames by their names in the model."""
+        data = model.createData()
+        upper = np.triu(pin.crba(model, data, q))
+        rows = _jacobians(model, q, [*frames, striker])
+        return cls(upper + np.triu(upper, 1).T, rows[:-6], rows[-6:-3])
+
+    def inverse_mass(self) -> Array:
+        """J P J' (3, 3) [1/kg]: P is the inverse inertia of the robot as it is held, its joints free.
+
+        1 / (n' J P J' n) is the effective mass along n (the paper's virtual mass, its section III).
+        """
+        rows = np.vstack([self.held, self.hand])
+        inner = rows @ np.linalg.solve(self.inertia, rows.T)
+        c = len(self.held)
+        lost = np.linalg.lstsq(inner[:c, :c], inner[:c, c:], rcond=_DEPENDENT)[0]
+        return np.asarray(inner[c:, c:] - inner[c:, :c] @ lost)
+
+
+def striking_velocity(
+    robot: Robot,
+    q: ArrayLike,
+    striker: str,
+    normal: ArrayLike,
+    speed: float,
+    *,
+    stance: Stance | None = None,
+) -> Array:
+    """Velocity (nv) of least kinetic energy with the striking point at `speed` [m/s] along the normal.
+
+    What the stance holds (None: all soles, or the fixed base) is at rest, and so is the striking point across
+    the normal (3,); its rotation is free. The least energy makes heavy links move little, whatever the
+    joints' units.
+
+    Raises
+    ------
+    InputError : wrong shapes or NaN; an unknown striker; a stance the robot cannot take; a posture in which
+        the striking point cannot move like that.
+    """
+    q, n = robot.check_configuration(q), check_array("normal", normal, (3,), most=MOST)
+    speed = float(check_array("speed [m/s]", speed, (), most=MOST))
+    held_by = usual_stance(robot) if stance is None else stance
+    frames = held_by.constraint_frames(robot)
+    body = Held.at(robot.model, q, frames, robot.striker(striker).model_frame)
+    J = np.vstack([body.held, body.hand])
+    wanted = np.concatenate([np.zeros(len(body.held)), speed * n])
+    # v = H^-1 J' x
+    spread = np.linalg.solve(body.inertia, J.T)
+    v = spread @ np.linalg.lstsq(J @ spread, wanted, rcond=_DEPENDENT)[0]
+    off = float(np.abs(J @ v - wanted).max())
+    if not off <= 1e-6 * max(1.0, abs(speed)):
+        raise InputError(
+            f"q: here {striker!r} cannot move along {np.round(n, 3).tolist()} with what is held at rest (off "
+            f"by {off:.2g} m/s): choose another posture"
+        )
+    return np.array(v)
+
+
+def holding_torque(
+    robot: Robot, q: ArrayLike, v: ArrayLike | None = None, *, stance: Stance | None = None
+) -> Array:
+    """Torque (n) [N m] that keeps all velocities as they are, on a stance.
+
+    The least-norm solution (tau, lambda) of S' tau + J_c' lambda = c + g at q (nq), v (nv; None: at rest).
+
+    Raises
+    ------
+    InputError : wrong shapes or NaN; a stance the robot cannot take.
+    """
+    q = robot.check_configuration(q)
+    v = np.zeros(robot.nv) if v is None else robot.check_velocity(v)
+    held_by = usual_stance(robot) if stance is None else stance
+    bias = pin.nonLinearEffects(robot.model, robot.model.createData(), q, v)
+    if not np.all(np.isfinite(bias)):
+        raise InputError("q, v: the forces of this motion are no finite numbers; give smaller ones")
+    held = _jacobians(robot.model, q, held_by.constraint_frames(robot))
+    columns = np.hstack([np.eye(robot.nv)[:, -robot.n :], held.T])
+    return np.array(np.linalg.lstsq(columns, bias, rcond=None)[0][: robot.n])
+
+
+def _jacobians(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
+    """(6 a frame, nv), one below the other."""
+    data = model.createData()
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    out = np.zeros((len(frames), 6, model.nv))
+    for k, frame in enumerate(frames):
+        J = pin.getFrameJacobian(model, data, model.getFrameId(frame), pin.LOCAL_WORLD_ALIGNED)
+        out[k] = np.reshape(J, (6, model.nv))  # a single column comes without its second dimension
+    return out.reshape(-1, model.nv)

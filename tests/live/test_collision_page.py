@@ -1,0 +1,67 @@
+"""A live look at one collision: what its sliders do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from impactopt import SDC, load_problem
+from impactopt.errors import InputError
+from impactopt.kinematics.operational_space import holding_torque, striking_velocity
+from impactopt.live.collision_page import LiveBlow
+
+FILE = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
+LONG = 60.0  # [s]
+
+
+@pytest.fixture(scope="module")
+def look() -> Iterator[LiveBlow]:
+    with LiveBlow(load_problem(FILE)) as made:
+        assert made.wait(LONG)
+        yield made
+
+
+def test_at_first_the_hand_is_at_the_target_and_hits(look: LiveBlow) -> None:
+    p, hit = look.problem, look.blow.collision
+    assert look.blow.q == pytest.approx(p.contact_posture)
+    q = p.contact_posture
+    v = striking_velocity(p.robot, q, p.striker, p.normal, float(look.speed.value), stance=p.stance)
+    names = ("robot", "striker", "normal", "law", "target", "stance")
+    model = SDC(**{name: getattr(p, name) for name in names}, freezes=4)
+    assert hit is not None
+    assert hit.impulse == model.collide(q, v, holding_torque(p.robot, q, v, stance=p.stance)).impulse
+    assert f"**{hit.impulse:.3g} N s**" in look.told.content
+
+
+def test_a_slider_of_posture_or_speed_makes_another_collision(look: LiveBlow) -> None:
+    assert look.blow.collision is not None
+    before, q = look.blow.collision.impulse, look.blow.q
+    look.speed.value = 2.0
+    assert look.wait(LONG)
+    faster = look.blow.collision
+    assert faster is not None
+    assert faster.impulse > before
+    name = next(reversed(look.joints))
+    look.joints[name].value = look.joints[name].value - 0.2
+    assert look.wait(LONG)
+    assert look.blow.q is not None
+    assert q is not None
+    assert np.abs(look.blow.q - q).max() == pytest.approx(0.2)
+    assert look.blow.collision is not None
+    assert look.blow.collision.impulse != faster.impulse
+
+
+def test_where_there_is_no_collision_the_page_says_why(
+    look: LiveBlow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stuck(*_: object, **__: object) -> None:
+        raise InputError("the hand cannot move along the normal")
+
+    monkeypatch.setattr("impactopt.live.collision_page.striking_velocity", stuck)
+    look.speed.value = 3.0
+    assert look.wait(LONG)
+    assert look.blow.collision is None
+    assert look.told.content == "**No collision.** the hand cannot move along the normal"

@@ -1,0 +1,342 @@
+"""A live look at a planned arm: what its controls do to the plan, and whether its page works in a browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import types
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.parse import quote, urlsplit
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import viser
+import websockets.asyncio.server
+from support.browser import Job, visit
+from support.small_plans import biped_problem
+from typer.testing import CliRunner
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from impactopt import load_problem, solve
+from impactopt.cli.app import app
+from impactopt.contact.targets import RigidWall
+from impactopt.errors import InputError
+from impactopt.files.output import load_record, record_of, save_record
+from impactopt.files.replay import problem_of
+from impactopt.files.resume import resumed
+from impactopt.live import plan_page as look_module
+from impactopt.live.motion import moment_of
+from impactopt.live.plan_page import LiveLook
+from impactopt.live.replanning import Replanning
+from impactopt.live.requests import PlanRequest, numbers_of, request_of
+from impactopt.planning.solution import Solution
+from impactopt.report.tracks import planned_track, tracks_of
+from impactopt.solvers.program import SolverResult, Status
+
+FILE = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
+LONG = 60.0  # [s]
+
+
+@pytest.fixture(scope="module")
+def arm() -> Solution:
+    return solve(load_problem(FILE), refine=False)
+
+
+@pytest.fixture
+def look(arm: Solution) -> Iterator[LiveLook]:
+    with LiveLook(arm) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def saved(arm: Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("arm")
+    save_record(record_of(arm, problem=FILE.read_text(encoding="utf-8")), directory)
+    return directory
+
+
+# ---- controls
+
+
+def test_a_slider_makes_a_new_plan(look: LiveLook, arm: Solution) -> None:
+    mass = 1.2 * arm.problem.target.mass
+    look.sliders["mass"].value = mass
+    assert look.wait(LONG)
+    wanted = arm.moved(mass=mass)
+    assert look.answer.solution is not None
+    assert look.answer.solution.problem.target.mass == mass
+    assert look.answer.solution.impulse == pytest.approx(wanted.impulse, rel=1e-3)
+    assert look.answer.solution.impulse != arm.impulse
+    assert f"**{look.answer.solution.impulse:.2f} N s**" in look.told.content
+    assert "All constraints are met." in look.told.content
+    assert look.status.content == ""
+
+
+def test_a_dragged_hit_point_is_hit_where_it_is(look: LiveLook, arm: Solution) -> None:
+    point = arm.problem.point + np.array([0.01, 0.0, -0.01])
+    look.hit.position = point
+    look.changed()
+    assert look.wait(LONG)
+    track = look.answer.track
+    assert track is not None
+    hand = moment_of(track, track.contact_start).hand
+    assert hand @ arm.problem.normal == pytest.approx(point @ arm.problem.normal, abs=2e-3)
+    assert hand[0] == pytest.approx(point[0], abs=2e-3)
+
+
+def test_what_cannot_be_hit_leaves_the_old_plan_and_says_why(look: LiveLook, arm: Solution) -> None:
+    look.hit.position = arm.problem.point + np.array([0.0, 0.5, 0.0])  # out of the arm's plane
+    look.changed()
+    assert look.wait(LONG)
+    assert look.answer.solution is arm
+    assert "out of reach" in look.status.content
+    look.reset()
+    assert look.wait(LONG)
+    assert look.status.content == ""
+    assert look.hit.position == pytest.approx(arm.problem.point)
+
+
+def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
+    look: LiveLook, arm: Solution, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object, **__: object) -> Solution:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr(Solution, "moved", broken)
+    look.sliders["stiffness"].value = 1.1 * arm.problem.law.stiffness
+    assert look.wait(LONG)
+    assert look.answer.solution is arm
+    assert "by nothing" in look.status.content
+    assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_a_stale_request_stops_the_solver(arm: Solution) -> None:
+    replanning = Replanning(arm)
+    request = request_of(arm.problem)
+    heavy = dataclasses.replace(request, numbers=(("mass", 3 * arm.problem.target.mass), request.numbers[1]))
+    answer = replanning(heavy, lambda: True)
+    assert answer.solution is None
+    assert Status.INTERRUPTED.message.split(";")[0] in answer.why
+    assert replanning.last is arm
+
+
+def test_a_plan_of_another_program_is_solved_from_the_last(
+    arm: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(self: Solution, **_: object) -> Solution:
+        raise InputError("the program has other constraints then")
+
+    monkeypatch.setattr(Solution, "moved", refused)
+    request = request_of(arm.problem)
+    mass = 1.1 * arm.problem.target.mass
+    answer = Replanning(arm)(dataclasses.replace(request, numbers=(("mass", mass),)), lambda: False)
+    assert answer.solution is not None
+    assert answer.solution.problem.target.mass == mass
+
+
+def test_the_motion_plays_and_begins_again(look: LiveLook) -> None:
+    assert look.answer.track is not None
+    end = float(look.answer.track.time[-1])
+    look.speed.value = "1"
+    look.play(0.5)
+    assert look.time.value == pytest.approx(0.5)
+    look.play(end)
+    assert look.time.value == 0.0
+    assert look.time.max == end
+
+
+# ---- requests and motions
+
+
+def test_a_legged_robot_has_a_margin_and_a_wall_no_mass(arm: Solution) -> None:
+    assert [n.name for n in numbers_of(arm.problem)] == ["mass", "stiffness"]
+    biped = biped_problem()
+    assert [n.name for n in numbers_of(biped)] == ["mass", "stiffness", "margin"]
+    wall = dataclasses.replace(biped, target=RigidWall())
+    assert [n.name for n in numbers_of(wall)] == ["stiffness", "margin"]
+    for number in numbers_of(biped):
+        assert number.least < number.value < number.most
+    assert request_of(biped).changes(biped) == {}
+    other = PlanRequest(point=(0.0, 0.0, 1.0), numbers=(("mass", 3.0), ("margin", 0.01)))
+    assert list(other.changes(biped)) == ["point", "margin"]
+
+
+def test_between_instants_joints_are_where_the_robot_would_be(arm: Solution) -> None:
+    track, model = planned_track(arm), arm.problem.robot.model
+    for k, time in enumerate(arm.trajectory.time):
+        if arm.trajectory.phase[k] == 0 and k % 37 == 5:
+            moment, data = moment_of(track, float(time)), model.createData()
+            pin.forwardKinematics(model, data, arm.trajectory.q[k])
+            for joint in range(1, model.njoints):
+                assert moment.place[joint] == pytest.approx(data.oMi[joint].translation, abs=3e-3)
+                w, x, y, z = moment.turn[joint]
+                turned = pin.Quaternion(w, x, y, z).matrix()
+                assert turned == pytest.approx(data.oMi[joint].rotation, abs=1e-2)
+
+
+def test_a_solutions_track_is_its_records(arm: Solution) -> None:
+    kept = tracks_of(record_of(arm), arm.problem)[0]
+    for field in dataclasses.fields(kept):
+        np.testing.assert_array_equal(getattr(planned_track(arm), field.name), getattr(kept, field.name))
+
+
+# ---- from a saved result
+
+
+def test_a_saved_result_is_a_start_again(arm: Solution, saved: Path) -> None:
+    record = load_record(saved)
+    again = resumed(record, problem_of(record, saved, None, None))
+    for field in dataclasses.fields(SolverResult):
+        if field.name != "history":
+            np.testing.assert_equal(getattr(again.result, field.name), getattr(arm.result, field.name))
+    assert again.objectives == arm.objectives
+    assert again.trajectory.q == pytest.approx(arm.trajectory.q, abs=1e-12)
+    mass = 1.1 * arm.problem.target.mass
+    assert again.moved(mass=mass).impulse == pytest.approx(arm.moved(mass=mass).impulse, rel=1e-9)
+
+
+@pytest.mark.parametrize("without", ["program_statement", "solver_x"])
+def test_a_result_that_does_not_say_its_program_is_solved_again(
+    arm: Solution, saved: Path, without: str
+) -> None:
+    record = load_record(saved)
+    arrays = dict(record.arrays)
+    arrays[without] = arrays["solver_x"][:-1] if without == "solver_x" else arrays.pop(without)[..., None]
+    if without == "program_statement":
+        del arrays[without]
+    again = resumed(dataclasses.replace(record, arrays=arrays), arm.problem)
+    assert again.status is Status.SOLVED
+    assert again.impulse == pytest.approx(arm.impulse, rel=1e-3)
+
+
+# ---- the page
+
+
+def test_a_port_that_is_taken_is_refused(look: LiveLook, arm: Solution) -> None:
+    port = urlsplit(look.address).port
+    with pytest.raises(InputError, match=rf"cannot serve a page at 127\.0\.0\.1:{port}.*another --port"):
+        LiveLook(arm, port=port)
+
+
+def _opened(address: str, origin: str | None) -> int:
+    """Status of a websocket's handshake, 101 if it is opened, as the page asks for it."""
+    headers = {"Origin": origin} if origin else {}
+    protocol = [Subprotocol(f"viser-v{viser.__version__}")]
+    try:
+        with connect(address, additional_headers=headers, subprotocols=protocol) as socket:
+            assert socket.recv(timeout=LONG)
+            return 101
+    except InvalidStatus as error:
+        return error.response.status_code
+
+
+def test_pages_of_other_origins_and_those_without_the_address_drive_nothing(look: LiveLook) -> None:
+    there, token = look.address.rsplit("/", 1)
+    own, host = there.replace("http", "ws"), urlsplit(look.address).netloc
+    assert len(token) == 32
+    assert _opened(f"{own}/{token}", there) == 101
+    assert _opened(f"{own}/{token}", None) == 101  # no browser: it knows the token
+    for origin in ("http://example.com", "null", f"http://example.com@{host}", f"http://{host}.example.com"):
+        assert _opened(f"{own}/{token}", origin) == 403, origin
+    for path in ("", "/", f"/{token[:-1]}", f"/x/{token}", f"/?{token}", "/é"):
+        assert _opened(f"{own}{quote(path)}", there) == 403, path
+    for path in ("/", "/index.html", f"/{token[::-1]}/"):
+        with pytest.raises(HTTPError, match="403"):
+            urllib.request.urlopen(there + path, timeout=LONG)
+    with urllib.request.urlopen(look.address, timeout=LONG) as page:
+        assert b"<html" in page.read().lower()
+
+
+def test_a_viser_that_lets_no_request_be_checked_is_refused(
+    arm: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = websockets.asyncio.server.serve
+    monkeypatch.setattr(
+        "viser.infra._infra.websockets",
+        types.SimpleNamespace(
+            asyncio=types.SimpleNamespace(server=types.SimpleNamespace(serve=served)),
+            datastructures=websockets.datastructures,
+            exceptions=websockets.exceptions,
+        ),
+    )
+    with pytest.raises(InputError, match="lets no request be checked"):
+        LiveLook(arm)
+
+
+def test_viser_that_is_missing_is_named(arm: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match=r"a live look needs the package viser.*\[live\]"):
+        look_module.LiveLook(arm)
+
+
+def test_a_plan_that_is_none_is_refused(arm: Solution) -> None:
+    failed = dataclasses.replace(arm, result=dataclasses.replace(arm.result, status=Status.FAILED))
+    with pytest.raises(InputError, match="no solution"):
+        LiveLook(failed)
+
+
+# the mass's is the second one, after the time's
+SLIDE = """(() => {
+  const thumb = document.querySelectorAll("[role=slider]")[1];
+  thumb.focus();
+  thumb.dispatchEvent(new KeyboardEvent("keydown", { key: "End", code: "End", bubbles: true }));
+  return thumb.getAttribute("aria-valuemax");
+})()"""
+
+
+def test_the_page_opens_in_a_browser_and_its_slider_plans(look: LiveLook, arm: Solution) -> None:
+    first = f"{arm.result.iterations} iterations"
+    there = f"(document.body?.innerText ?? '').includes({first!r})"
+    ready = f"{there} && document.querySelector('canvas') !== null"
+    job = Job(page=look.address, ready=ready, scripts=("document.body.innerText", SLIDE), done=f"!{there}")
+    (seen,) = visit(job)
+    assert first in seen.values[0]
+    assert "target's mass [kg]" in seen.values[0]
+    assert [line for line in seen.console if line.startswith("Error")] == []
+    own = (look.address, look.address.replace("http", "ws"), "data:", "blob:")
+    assert [url for url in seen.requests if not url.startswith(own)] == []
+    assert look.answer.solution is not None
+    assert look.answer.solution.problem.target.mass == pytest.approx(float(seen.values[1]))
+
+
+def test_the_command_serves_until_ctrl_c(saved: Path) -> None:
+    command = [sys.executable, "-m", "impactopt", "show", str(saved), "--live"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # a shell's job in the background ignores Ctrl-C, and so would what the tests start there
+    pipes["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(command, **pipes) as process:  # type: ignore[call-overload]
+        try:
+            line = process.stdout.readline()
+            assert line.startswith("http://127.0.0.1:"), process.stderr.read()
+            with urllib.request.urlopen(line.split()[0], timeout=LONG) as page:
+                assert b"<html" in page.read().lower()
+            os.kill(process.pid, signal.SIGINT)
+            out, err = process.communicate(timeout=LONG)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    assert (out, err) == ("", "the live page has ended\n")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["standin", "--live"], "--live is for a result, or for a problem file"),
+        (["results/none", "--live"], "there is no"),
+        (["standin", "--port", "8000"], "--live alone"),
+        (["results/none", "--live", "--out", "page.html"], "a live page is not written"),
+    ],
+)
+def test_what_a_live_page_cannot_be_of_is_refused(given: list[str], told: str) -> None:
+    done = CliRunner().invoke(app, ["show", *given])
+    assert done.exit_code == 2
+    assert told in " ".join(done.stderr.replace("│", "").split())

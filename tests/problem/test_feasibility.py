@@ -1,0 +1,123 @@
+"""What `check` finds before anything is planned."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from support import urdfs
+from support.small_robots import arm, biped
+from typer.testing import CliRunner
+
+from impactopt.cli.app import app
+from impactopt.contact.laws import SpringDamper
+from impactopt.contact.targets import FreeMass
+from impactopt.files.draft.drafting import draft_problem
+from impactopt.kinematics.stance import FixedBase
+from impactopt.kinematics.support import margin, support_polygon
+from impactopt.problem.feasibility import hopeless
+from impactopt.problem.plausibility import doubts
+from impactopt.problem.problem import ImpactProblem
+
+LAW, BALL = SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0)
+
+
+def _punch(point: list[float], normal: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> ImpactProblem:
+    return ImpactProblem(
+        robot=biped(), striker="fist", point=np.array(point), normal=np.array(normal), law=LAW, target=BALL
+    )
+
+
+def _fist(problem: ImpactProblem) -> np.ndarray:
+    model = problem.robot.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, problem.start_posture)
+    return np.array(data.oMf[model.getFrameId(f"striker:{problem.striker}")].translation)
+
+
+def test_a_point_that_only_a_fall_reaches_is_out_of_balance() -> None:
+    start = _fist(_punch([0.45, -0.2, 1.0]))
+    near, far = _punch(np.add(start, [0.1, 0.0, 0.0]).tolist()), _punch([1.15, start[1], start[2]])
+    assert hopeless(near) == []
+    # kinematics alone reach both, and the farther one by leaning out of the soles
+    assert far.contact_posture is not None
+    (said,) = hopeless(far)
+    assert "out of balance's reach" in said and "left, right" in said
+    centre = pin.centerOfMass(far.robot.model, far.robot.model.createData(), far.contact_posture)
+    polygon = support_polygon(far.robot, far.coordinates)
+    assert margin(polygon, np.array(centre)[None, :2])[0] < 0.0
+
+
+def test_a_start_beyond_the_target_is_told_with_its_distance() -> None:
+    start = _fist(_punch([0.45, -0.2, 1.0]))
+    ahead = _punch(np.add(start, [0.08, 0.0, 0.0]).tolist(), (-1.0, 0.0, 0.0))
+    (said,) = hopeless(ahead)
+    assert "beyond the target" in said and "80 mm past" in said
+    assert hopeless(_punch(np.add(start, [0.08, 0.0, 0.0]).tolist())) == []
+
+
+def test_a_fixed_base_is_not_asked_for_balance() -> None:
+    problem = ImpactProblem(
+        robot=arm(), striker="hand", point=np.array([0.55, 0.2, 0.6]), normal=np.array([1.0, 0.0, 0.0]),
+        law=LAW, target=BALL, stance=FixedBase(), start="start",
+    )  # fmt: skip
+    assert [text for text in hopeless(problem) if "balance" in text] == []
+
+
+def test_joints_without_rotors_are_named() -> None:
+    assert doubts(arm()) == []
+    soft = {"kp": 1.0, "kd": 1.0}
+    (said,) = doubts(arm(armature={"turn": 0.1, "shoulder": 0.1, "wrist": 0.1}, **soft))
+    assert "armature" in said and "elbow" in said and "turn" not in said
+    (said,) = doubts(arm(armature=0.0, **soft))
+    assert said.startswith("no joint has armature")
+
+
+def _written(folder: Path, text: str) -> Path:
+    (folder / "walker.urdf").write_text(text)
+    file = folder / "walker.toml"
+    file.write_text(draft_problem(folder / "walker.urdf", folder=folder).text)
+    return file
+
+
+def test_legs_come_before_lesser_findings(tmp_path: Path) -> None:
+    file = _written(tmp_path, urdfs.biped())
+    text = file.read_text()
+    # a leg is a joint short now, and inertias, a striker and a frame are wrong too
+    (tmp_path / "walker.urdf").write_text(
+        urdfs.biped(moments='ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"').replace(
+            'name="left_hip_yaw" type="revolute"', 'name="left_hip_yaw" type="fixed"'
+        )
+    )
+    lines = [line for line in text.splitlines() if not line.startswith("left_hip_yaw")]
+    file.write_text("\n".join(lines))
+    said = CliRunner().invoke(app, ["check", str(file), "--json"])
+    assert said.exit_code == 2
+    first, *rest = json.loads(said.stdout)["mistakes"]
+    assert "'left' has 5 joints" in first and "hinge" in first
+    assert any("right_elbow" in text for text in rest)
+
+
+def test_legs_come_first_where_the_robot_can_be_built(tmp_path: Path) -> None:
+    file = _written(tmp_path, urdfs.biped())
+    text = file.read_text().replace('striker = "right_hand"', 'striker = "nose"', 1)
+    (tmp_path / "walker.urdf").write_text(
+        urdfs.biped().replace('name="left_hip_yaw" type="revolute"', 'name="left_hip_yaw" type="fixed"')
+    )
+    file.write_text("\n".join(line for line in text.splitlines() if not line.startswith("left_hip_yaw")))
+    first, second = json.loads(CliRunner().invoke(app, ["check", str(file), "--json"]).stdout)["mistakes"]
+    assert "'left' has 5 joints" in first and "'nose'" in second
+
+
+def test_check_refuses_what_no_solve_can_fix(tmp_path: Path) -> None:
+    file = _written(tmp_path, urdfs.biped())
+    runner = CliRunner()
+    sound = runner.invoke(app, ["check", str(file), "--json"])
+    assert sound.exit_code == 0 and json.loads(sound.stdout)["doubts"] == []
+    turned = runner.invoke(app, ["check", str(file), "--set", "problem.normal=[-1.0,0.0,0.0]"])
+    assert turned.exit_code == 2 and "beyond the target" in turned.output
+    soft = ["--set", "robot.kp_N_m_rad=100.0", "--set", "robot.kd_N_m_s_rad=5.0"]
+    bare = runner.invoke(app, ["check", str(file), "--set", "robot.armature_kg_m2=0.0", *soft])
+    assert bare.exit_code == 0 and "no joint has armature" in bare.output

@@ -340,7 +340,11 @@ def test_every_law_and_target_plays(planned: Planned, law: Any, target: Any, tmp
         settle=0.0,
         until=planned.reference.contact_end + 0.2,
     )
-    assert play(tmp_path / "scene")[0] == pytest.approx(fine.impulse, rel=NEAR)
+    # a damped law's force starts with a jump: steps may begin it one step early or late
+    jump = law.damping * np.abs(fine.hand_speed).max() * 2e-4 if isinstance(law, SpringDamper) else 0.0
+    assert play(tmp_path / "scene")[0] == pytest.approx(
+        fine.impulse, rel=NEAR, abs=NEAR * fine.impulse + jump
+    )
 
 
 def test_formulas_are_the_laws() -> None:

@@ -128,7 +128,7 @@ def _read(path: Path) -> Any:
 
 
 def _same_program(t: Transcription, record: Record) -> bool:
-    """Whether variables and constraints have the names and numbers that the record says, in its order."""
+    """Equality of the names and numbers of variables and constraints with those that the record says."""
     told, today = json.loads(str(record.arrays["program_statement"])), json.loads(statement_of(t))
     n, m = t.program.n, t.program.m
     sizes = {"solver_x": n, "solver_bound_multipliers": n, "solver_multipliers": m}

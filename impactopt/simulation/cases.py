@@ -116,7 +116,7 @@ class _PostureSearch:
         return np.asarray(margin_in(self.polygon, com[None, :2]) - self.inside)
 
     def from_here(self, d: Array) -> Array:
-        """Where SLSQP goes."""
+        """Point (nv,) that SLSQP goes to."""
         rules: list[dict[str, Any]] = [
             {"type": "eq", "fun": self.equalities, "jac": lambda x: _slopes(self.equalities, x)}
         ]
@@ -154,7 +154,7 @@ def _slopes(function: Any, x: Array, by: float = 1e-6) -> Array:
 def errors_against(
     result: Collision, reference: Collision, *, torque_limit: ArrayLike | None = None
 ) -> dict[str, float | None]:
-    """How far a model's collision is from a reference's; None where one of them has no such history.
+    """Errors of a model's collision against a reference's; None where one of them has no such history.
 
     * impulse_error_pct, f_max_error_pct : 100 (result - reference) / reference, so positive where the model
       promises too much. The paper's eq. (24) has the other sign.

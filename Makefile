@@ -7,8 +7,11 @@ STAMP  := $(VENV)/.installed
 LEAN   := $(VENV)/.demo
 BROWSER := $(VENV)/.browser
 NEEDED := robots,validate
-EXTRAS := robots,validate,qp,peers,sweep,cluster,mcap,live,docs,notebooks,dev
+EXTRAS := robots,validate,peers,sweep,cluster,mcap,live,docs,notebooks,dev
 ARGS   ?=
+STUDY  := PYTHONPATH=tests $(BIN)/python -m
+# ARGS, where their first word is a name; else a default name before them
+named = $(if $(filter-out -%,$(firstword $(ARGS))),,$(1)) $(ARGS)
 
 .DEFAULT_GOAL := help
 .PHONY: help venv demo test lint types format bench attack reproduce figures docs notebooks clean distclean
@@ -71,17 +74,17 @@ types: $(STAMP) ## check types with mypy
 format: $(STAMP) ## rewrite the sources in the project's style
 	@$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
-bench: $(STAMP) ## run every benchmark, about an hour; tables, JSON and pictures in results/bench
-	@$(BIN)/impactopt bench all --out results/bench $(ARGS)
+bench: $(STAMP) ## run every benchmark, about an hour (ARGS=NAME for one); tables, JSON and pictures in results/bench
+	@$(STUDY) benchmarks $(call named,all) --out results/bench
 
 attack: $(STAMP) ## attack it at length: files, URDFs, commands, calls, collisions (ARGS='--seed 7'); faults in results/attack
-	@$(BIN)/impactopt bench attack --out results/attack $(ARGS)
+	@$(STUDY) benchmarks attack --out results/attack $(ARGS)
 
-reproduce: $(STAMP) ## the paper's tables and figures beside ours, some minutes; results/reproduce
-	@$(BIN)/impactopt reproduce all --out results/reproduce $(ARGS)
+reproduce: $(STAMP) ## the paper's tables and figures beside ours, some minutes (ARGS=fig7 for one); results/reproduce
+	@$(STUDY) benchmarks.paper $(call named,all) --out results/reproduce
 
 figures: $(STAMP) ## make the figures of docs/ anew (ARGS='strobe fig7' for some; the benchmarks' only by name)
-	@$(BIN)/impactopt figures $(ARGS)
+	@$(STUDY) benchmarks.figures $(ARGS)
 
 docs: $(STAMP) ## build the documentation, needs no internet: build/docs/index.html
 	@$(BIN)/python -m sphinx -W --keep-going -q docs build/docs

@@ -1,7 +1,7 @@
 """New values for the numbers that README and docs repeat: `python docs/refresh_figures.py results/bench`.
 
-Reads what `impactopt bench NAME --out results/bench` wrote, and puts each value into docs/figures.json and
-into all sentences that are listed there. What no bench in the directory has measured stays as it is.
+Reads what `python -m benchmarks NAME --out results/bench` wrote, and puts each value into docs/figures.json
+and into all sentences that are listed there. What no bench in the directory has measured stays as it is.
 `tests/test_docs_figures.py` holds the documents to the file.
 """
 

@@ -35,7 +35,7 @@ def test_blocks_of_a_page_work(page: Path, tmp_path: Path, monkeypatch: pytest.M
         "impactopt solve punch --starts many",
         "impactopt solve",
         "impactopt check no_such_problem",
-        "impactopt bench trouth",
+        "python -m benchmarks trouth",
         "make demmo",
         "make demo ARG='--quiet'",
         "pip install impactopt[robot]",

@@ -87,9 +87,7 @@ BROUGHT_BY = {
     "mcap_ros2": "mcap-ros2-support",
     "websockets": "viser",
     "pinocchio": "pin",
-    "pounce": "pounce-solver",
 }
-ELSEWHERE = {"crocoddyl"}  # in an environment of its own: studies/bench/crocoddyl_plan.py
 
 
 def test_what_is_imported_is_declared() -> None:
@@ -98,7 +96,6 @@ def test_what_is_imported_is_declared() -> None:
     known = {
         *sys.stdlib_module_names,
         "impactopt",
-        *ELSEWHERE,
         *(name.replace("-", "_") for name in declared),
     }
     tops = {name.split(".")[0] for file in FILES for name in imports(file)}

@@ -43,9 +43,6 @@ from impactopt.cli.sweep import sweep
 from impactopt.cli.validate import validate
 from impactopt.cli.verify import EXAMPLES, verify
 from impactopt.report.plain_errors import plain_errors
-from impactopt.studies.bench_command import app as bench_app
-from impactopt.studies.figures import figures
-from impactopt.studies.reproduce_command import reproduce
 
 if TYPE_CHECKING:
     from impactopt.files.output import Record
@@ -54,7 +51,7 @@ if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
     from impactopt.report.console import SolveConsole
 
-__all__ = ["app", "main", "program"]
+__all__ = ["app", "main"]
 
 app = typer.Typer(
     name="impactopt",
@@ -65,8 +62,6 @@ app = typer.Typer(
     "fault of impactopt; 130 Ctrl-C. Each command's own help has examples; docs/command_line.md has more.",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-app.add_typer(bench_app)
 
 
 class Start(str, enum.Enum):
@@ -79,19 +74,10 @@ def main() -> None:
     app()
 
 
-def program() -> typer.Typer:
-    """Command-line program that `main` runs, for callers below that run it too; they get it as the
-    context's `obj`.
-    """
-    return app
-
-
 @app.callback(invoke_without_command=True)
 def _root(
-    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
-    context.obj = program
     if version:
         from impactopt import __version__
 
@@ -231,12 +217,6 @@ app.command(
         "impactopt sweep my.toml --out results/s", "impactopt sweep collision_target --out results/t"
     )
 )(sweep)
-app.command(epilog=examples("impactopt reproduce table3", "impactopt reproduce all --out results/r"))(
-    reproduce
-)
-app.command(epilog=examples("impactopt figures strobe fig7", "impactopt figures --out results/figures"))(
-    figures
-)
 app.command(epilog=examples("impactopt new", "impactopt new punch > my.toml", "impactopt new --reference"))(
     new
 )

@@ -35,7 +35,7 @@ def strike(
         typer.Option("--out", "-o", metavar="DIR", help="Directory for the numbers."),
     ] = None,
     method: Annotated[
-        str, typer.Option(metavar="METHOD", help="Of the contact: collocation, or shooting (by the SDC).")
+        str, typer.Option(metavar="METHOD", hidden=True, help="Of the contact: collocation.")
     ] = "collocation",
     starts: Starts = 4,
     workers: Workers = 1,

@@ -1,4 +1,4 @@
-"""The command `impactopt verify`: is a result what it says, computed anew by code of its own?"""
+"""The command `impactopt verify`: is a result what it says, computed anew computed anew?"""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 With N freezes the error of the impulse falls as 1/N^2 where the robot moves little, and by leaps where a push
 ends or not by a hair. So no constant is a bound of it, but the difference from a collision that is frozen
-more often tells both. Twice the difference, and a thousandth, is what is said; `impactopt bench freezes`
+more often tells both. Twice the difference, and a thousandth, is what is said; `python -m benchmarks freezes`
 measures against full dynamics how often the error is more.
 """
 

@@ -21,7 +21,7 @@ from impactopt.transcription.mesh import Elements
 from impactopt.transcription.mesh_refinement import MoreNodes
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["resumed"]
+__all__ = ["program_of_record", "resumed", "solution_of_record"]
 
 _SAME = 1e-6  # of constraints: those of a program that is not the record's are off by more
 
@@ -34,22 +34,23 @@ def resumed(record: Record, problem: ImpactProblem) -> Solution:
 
     problem : the record's, as `impactopt.files.replay.load_planned` builds it.
     """
-    made = _program(record, problem)
+    made = program_of_record(record, problem)
     x = np.asarray(record.arrays["solver_x"])
     if made is not None and _is_of(made, record):
-        return _solution(record, made)
+        return solution_of_record(record, made)
     if made is None or made.program.n != len(x):
         return solve(problem)
     return solve(problem, start=x)
 
 
-def _program(record: Record, problem: ImpactProblem) -> Transcription | None:
+def program_of_record(record: Record, problem: ImpactProblem) -> Transcription | None:
+    """The program that a record says it is of, made again; None where it says nothing."""
     if "program_statement" not in record.arrays:
         return None
     told: dict[str, Any] = json.loads(str(record.arrays["program_statement"]))
     elements: Elements = tuple(tuple(e) for e in told["elements"]) if told["guarded"] else ()
     nodes = MoreNodes(*(tuple(places) for places in told["more"]))
-    t = program_on(problem, nodes, elements, ())
+    t = program_on(problem, nodes, elements, tuple(told.get("shares", ())))
     return t.with_apart(_apart(told["apart"])) if told["apart"] else t
 
 
@@ -72,7 +73,8 @@ def _is_of(t: Transcription, record: Record) -> bool:
     return bool(found <= float(record.arrays["solver_max_violation"]) + _SAME)
 
 
-def _solution(record: Record, t: Transcription) -> Solution:
+def solution_of_record(record: Record, t: Transcription) -> Solution:
+    """The solution that a program's variables in a record are."""
     summary = record.summary
     given = {f.name: record.arrays.get(f"solver_{f.name}") for f in dataclasses.fields(SolverResult)}
     numbers: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in given.items() if v is not None}

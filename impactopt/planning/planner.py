@@ -72,7 +72,7 @@ def solve(
     """Plan the motion that maximizes the problem's objectives, by default the impulse, within its terms.
 
     solver : "sqp", our own, or "ipopt". Ours is a primal-dual interior-point method: it takes one Newton step
-        on each quadratic model of the program. ``options={"qp_solver": "piqp"}`` makes it a true SQP, which
+        on each quadratic model of the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which
         solves its QPs to their end, for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
     start : "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such
         a reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables (n,); or

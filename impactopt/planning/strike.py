@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_array
 from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.contact_replay import checked
 from impactopt.planning.gears import gear_caution
@@ -34,12 +33,11 @@ from impactopt.planning.solution import Solved, impact_summary, versions
 from impactopt.planning.too_near import deepest_penetration
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import GearLoad
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.start import strike_iterate
-from impactopt.transcription.strike import ShootingStrike, StrikeTranscription
+from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
@@ -49,7 +47,6 @@ ROUNDS = 10  # of freezes that come when they are to
 BARRIER_ARM, BARRIER_ON = 0.03, 1e-2
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 Work = Callable[[StrikeTranscription, Array | SolverResult], tuple[StrikeTranscription, SolverResult]]
-METHODS = {"collocation": StrikeTranscription, "shooting": ShootingStrike}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -106,16 +103,10 @@ def optimize_strike(
 
     The motion before and after is free. So near the state at contact of a motion, the impulse of the strike
     is an upper bound on that of the motion. There are local optima: different postures can differ by a
-    factor. Gears bear what `GearLoad` lets them, by default too; not by shooting, which knows of no
-    accelerations in contact.
+    factor. Gears bear what `GearLoad` lets them, by default too.
 
-    method : "collocation", the whole equation of motion while the contact lasts, as in a motion; or
-        "shooting", what the SDC predicts, with H, J and bias frozen at contact: a program of few variables,
-        by quasi-Newton steps. On arms both give the same impulse within 1 %. In a push of 60 ms impulses
-        differ by some percent, and torques by more; `StrikeSolution.model_error` estimates it. The planned
-        force is known at a few instants, so its peak may be too low.
-    solver, options, time_limit, report, callback : as of :func:`impactopt.solve`. By shooting the solver is
-        the SQP with a QP solver: DAQP if it is installed, else OSQP, unless `options` name one.
+    method : "collocation", the only one: the whole equation of motion while the contact lasts.
+    solver, options, time_limit, report, callback : as of :func:`impactopt.solve`.
     starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,
         drawn by ``seed``; the best strike is kept. ``StrikeSolution.attempts`` has all.
     workers : processes that these starts are solved on, side by side; then no callback is asked.
@@ -124,24 +115,17 @@ def optimize_strike(
     Raises
     ------
     InputError : an unknown method, solver or option; a start of the wrong length; `starts` beside a given
-        start; objectives of a whole motion only; with "shooting", a quantity that it has no derivatives of.
+        start; objectives of a whole motion only.
     """
-    if method not in METHODS:
-        raise InputError(
-            f"unknown method {method!r}{did_you_mean(method, METHODS)}: give {' or '.join(METHODS)}"
-        )
-    if method == "shooting":
-        if problem.coordinates.hands or problem.second is not None:
-            raise InputError('by shooting one hand strikes, and none holds on: take method="collocation"')
-        if problem.gains:
-            raise InputError('by shooting no gains are chosen: take method="collocation", or give them')
-        options = _of_shooting(solver, options)
+    if method != "collocation":
+        gone = "is no longer supported" if method == "shooting" else "is unknown"
+        raise InputError(f'method {method!r} {gone}: give "collocation", or leave it out')
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=start is not None)
     check_workers(workers, callback)
     if all(o.whole_motion for o in problem.objectives):
         raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
-    if problem.collision == "auto" and method == "collocation":
+    if problem.collision == "auto":
         common: dict[str, Any] = {
             "solver": solver,
             "options": options,
@@ -158,14 +142,13 @@ def optimize_strike(
         return climbed(problem, run, time_limit=time_limit, report=report)
     if workers > 1 and starts > 1:
         block_functions(roomy(problem), problem.coordinates, report)  # compiled here, not by each
-        run = partial(_optimized, problem, method, None, seed)
+        run = partial(_optimized, problem, None, seed)
         return best_side_by_side(run, budget, starts=starts, workers=workers, report=report)
-    return _optimized(problem, method, start, seed, budget, range(starts), report)
+    return _optimized(problem, start, seed, budget, range(starts), report)
 
 
 def _optimized(
     problem: ImpactProblem,
-    method: str,
     start: ArrayLike | StrikeSolution | None,
     seed: int,
     budget: Budget,
@@ -179,24 +162,19 @@ def _optimized(
     mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()
     functions = block_functions(problem, problem.coordinates, report, *mesh[:1])
     budget = budget.started()
-    t = METHODS[method](problem, problem.coordinates, functions, *mesh)
+    t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
         same = partial(_program_of, start)
-        start = (start.result if method == "shooting" else carried_start(t, same, start, start.apart)).x
+        start = carried_start(t, same, start, start.apart).x
     given = None if start is None else check_array("start", start, (t.program.n,))
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
-    work = partial(_clean_strike, budget, margins)
-    if method != "shooting":
-        work = partial(_bounded_strike, work, report)
+    work = partial(_bounded_strike, partial(_clean_strike, budget, margins), report)
     t, fields = solve_from(t, _starts(t, given, which, seed), budget, began, work)
     t, fields = settled(t, fields, budget, report)
     result = fields["result"] = with_reason(t, fields["result"])
     problem = fields["problem"]
-    if method == "shooting":  # it is what the result is to be told as: it knows of no accelerations
-        terms = (*(term for term in problem.terms if not isinstance(term, GearLoad)), GearLoad(enabled=False))
-        fields["problem"] = problem = replace(problem, collision="sdc", terms=terms)
     strike, contact = t.decode(result.x), None
     if result.status.usable:
         contact = planned_contact(t, result.x, strike, problem)
@@ -215,21 +193,7 @@ def _program_of(solution: StrikeSolution) -> StrikeTranscription:
     """The program of a solution, without clearance constraints."""
     p, elements = solution.problem, solution.elements
     functions = block_functions(p, p.coordinates, None, elements)
-    t = StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
-    if t.layout.n != solution.result.x.size:
-        raise InputError('start: a strike by shooting has other variables; give one by method="collocation"')
-    return t
-
-
-def _of_shooting(solver: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The solver's options for programs without second derivatives."""
-    if solver != "sqp":
-        raise InputError(f'method "shooting" has no second derivatives: solver is {solver!r}; give "sqp"')
-    quickest = "osqp" if importlib.util.find_spec("daqp") is None else "daqp"
-    own = {"qp_solver": quickest, "hessian": "bfgs", "kkt_tolerance": 1e-4, **(options or {})}
-    if own["qp_solver"] == "interior" or own["hessian"] != "bfgs":
-        raise InputError('method "shooting" has no second derivatives: give hessian "bfgs" and a qp_solver')
-    return own
+    return StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
 
 
 def clear_strike(

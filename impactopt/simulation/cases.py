@@ -1,14 +1,7 @@
-"""Situations in which collision models are compared: postures of a given effective mass, and motions.
-
-The paper's nine motions are three postures, whose virtual masses are 4, 6 and 8 kg, at three speeds (its
-Table I). It does not give the postures; `posture_of_effective_mass` finds some by optimization.
-"""
+"""Postures of a given effective mass, and errors of one collision against another."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,114 +9,24 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
-from impactopt.collision import Collision, CollisionModel, effective_mass
+from impactopt.collision import Collision, effective_mass
 from impactopt.errors import InputError, check_array
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.operational_space import holding_torque, striking_velocity
-from impactopt.kinematics.stance import BothSoles, Stance, usual_stance
+from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.kinematics.support import margin as margin_in
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.robot import Robot
 
 __all__ = [
-    "PAPER_MASSES",
-    "PAPER_SPEEDS",
-    "Case",
     "errors_against",
-    "paper_motions",
     "posture_of_effective_mass",
 ]
 
 Array = NDArray[np.float64]
 
-PAPER_MASSES = {"A": 4.0, "B": 6.0, "C": 8.0}  # [kg] by the motions' letters (paper, Table I)
-PAPER_SPEEDS = (0.4, 0.7, 1.0)  # [m/s] of the motions 1, 2, 3
 LEAST_WEIGHT = 50.0  # [N] on the ground; with less the ZMP is a quotient of small numbers
 _MASS_TOLERANCE = 1e-6  # [kg]
 _AXES = pin.LOCAL_WORLD_ALIGNED
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Case:
-    """A robot at the moment of contact.
-
-    Attributes
-    ----------
-    robot : what strikes.
-    name : of the motion, such as "A-1".
-    striker : name of the robot's striking point.
-    normal : (3,) unit vector along the blow, world axes.
-    q, v : (nq), (nv) at contact, Pinocchio's.
-    torque : (n) [N m] feed-forward.
-    effective_mass : [kg] along the normal.
-    speed : [m/s] of the striking point along the normal.
-    overrides : numbers of the collision other than the model's, by name, as of `CollisionModel.collide`; of
-        those, a model is given the ones that it has.
-    """
-
-    robot: Robot
-    name: str
-    striker: str
-    normal: Array
-    q: Array
-    v: Array
-    torque: Array
-    effective_mass: float
-    speed: float
-    overrides: Mapping[str, ArrayLike] = field(default_factory=dict)
-
-    def collide(self, model: CollisionModel, *, require_separation: bool = False) -> Collision:
-        """Collision that a model predicts for this case; a contact may outlast the horizon.
-
-        Raises
-        ------
-        InputError : as of `CollisionModel.collide`.
-        """
-        # a point mass has no servo, and the paper's SDC no stiffness
-        known = getattr(model, "settings", self.overrides)
-        given = {name: value for name, value in self.overrides.items() if name in known}
-        return model.collide(self.q, self.v, self.torque, require_separation=require_separation, **given)
-
-
-def paper_motions(
-    robot: Robot,
-    *,
-    striker: str = "right_hand",
-    normal: ArrayLike = (1.0, 0.0, 0.0),
-    masses: Mapping[str, float] = PAPER_MASSES,
-    speeds: Sequence[float] = PAPER_SPEEDS,
-) -> list[Case]:
-    """The paper's nine motions, A-1 to C-3 (its Table I), on a robot that stands on both soles.
-
-    Velocities are those of `striking_velocity`, torques those of `holding_torque`.
-
-    Raises
-    ------
-    InputError : as of `posture_of_effective_mass` and `striking_velocity`.
-    """
-    n, stance = check_array("normal", normal, (3,)), BothSoles()
-    mass = effective_mass(robot, striker=striker, normal=n, stance=stance)
-    postures = {
-        letter: posture_of_effective_mass(robot, wanted, striker, n, stance=stance)
-        for letter, wanted in masses.items()
-    }
-    cases = []
-    for (letter, q), (k, speed) in product(postures.items(), enumerate(speeds, 1)):
-        v = striking_velocity(robot, q, striker, n, speed, stance=stance)
-        cases.append(
-            Case(
-                robot=robot,
-                name=f"{letter}-{k}",
-                striker=striker,
-                normal=n,
-                q=q,
-                v=v,
-                torque=holding_torque(robot, q, v, stance=stance),
-                effective_mass=float(mass(q)),
-                speed=float(speed),
-            )
-        )
-    return cases
 
 
 # ---------------------------------------------------------------- posture
@@ -140,7 +43,7 @@ def posture_of_effective_mass(
     """A configuration (nq,) whose effective mass at the striking point is `mass` [kg], within 1e-6 kg.
 
     The one found nearest to `start` (None: the posture half_sitting) by SLSQP, in the sum of squares of what
-    the joints move [rad], with fixed soles where they are, joints inside their limits by 0.02 rad, and the
+    the joints move [rad], with held soles where they are, joints inside their limits by 0.02 rad, and the
     centre of mass over the soles, `inside` [m] from their edge. Deterministic.
 
     Raises
@@ -213,7 +116,7 @@ class _PostureSearch:
         return np.asarray(margin_in(self.polygon, com[None, :2]) - self.inside)
 
     def from_here(self, d: Array) -> Array:
-        """Solution of SLSQP from this initial guess."""
+        """Point (nv,) that SLSQP goes to."""
         rules: list[dict[str, Any]] = [
             {"type": "eq", "fun": self.equalities, "jac": lambda x: _slopes(self.equalities, x)}
         ]
@@ -251,7 +154,7 @@ def _slopes(function: Any, x: Array, by: float = 1e-6) -> Array:
 def errors_against(
     result: Collision, reference: Collision, *, torque_limit: ArrayLike | None = None
 ) -> dict[str, float | None]:
-    """Errors of a model's collision against a reference; None where one of them lacks the history.
+    """Errors of a model's collision against a reference's; None where one of them has no such history.
 
     * impulse_error_pct, f_max_error_pct : 100 (result - reference) / reference, so positive where the model
       promises too much. The paper's eq. (24) has the other sign.

@@ -27,7 +27,6 @@ from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.rows import Index, Measure, Place, Rows
-from impactopt.transcription.shot import Shot
 from impactopt.transcription.springs import SpringPoint, add_hinges, add_springs
 from impactopt.transcription.structured import StructuredProgram
 
@@ -136,10 +135,6 @@ class ContactProgram(ABC):
     def drive_points(self) -> list[DrivePoint]:
         """Torques and motions of the joints, as variables: at the nodes, and at collocation points of all
         contacts.
-
-        Raises
-        ------
-        InputError : a collision by shooting.
         """
         return self._points
 
@@ -177,9 +172,6 @@ class ContactProgram(ABC):
 
     def target_energy(self) -> Affine:
         """[J] in the target at separation, as a variable."""
-        hit: Any = self.expected
-        if isinstance(hit, Shot):
-            return hit.target_energy()
 
         def numbers(problem: ImpactProblem) -> Array:
             return np.array(list(problem.target.parameters.values()))
@@ -191,8 +183,6 @@ class ContactProgram(ABC):
     def peak_force(self) -> Affine:
         """The largest contact force [N], of one that lasts, as a variable."""
         hit: Any = self.expected
-        if isinstance(hit, Shot):
-            return hit.peak_force()
         forces = hit.f
         at = self.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
         return self.lift("peak force", np.array([at]))[0] * PEAK_SCALE

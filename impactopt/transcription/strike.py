@@ -28,7 +28,6 @@ from impactopt.transcription.objective import Prices, wrench_prices
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.reference import total_ground_wrench
 from impactopt.transcription.rows import Measure, Place, along, by_leg
-from impactopt.transcription.shot import Shots
 from impactopt.transcription.touch import add_touch_rows
 
 
@@ -57,7 +56,7 @@ class StrikeTranscription(ContactProgram):
         coasting = add_coasting(b, {"lower": -fastest, "upper": fastest})
         still, one = Affine.zeros(b.ny), Affine.constant(1.0)
         state = ContactState(self.y[0], coasting.u0[0], still, one, self.legs[0], self.w[0])
-        super().__init__(b, self._make_hit(b, Contact(state, *coasting), elements, shares))
+        super().__init__(b, Hit(b, Contact(state, *coasting), elements, shares, after=True))
         node = [state.y, state.y1, state.y2, state.legs, state.w, state.T]
         (torque,) = add_nodes(b, [node], ["contact"])
         self._node = node
@@ -72,10 +71,6 @@ class StrikeTranscription(ContactProgram):
             tuple(term for term in problem.active_terms if not term.whole_motion),
             tuple(o for o in problem.objectives if not o.whole_motion),
         )
-
-    def _make_hit(self, b: Builder, contact: Contact, elements: Elements, shares: Shares) -> Any:
-        """The contact with all targets."""
-        return Hit(b, contact, elements, shares, after=True)
 
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         return [(Place.plain("contact"), self.feedforward[0], self._node)]
@@ -164,14 +159,3 @@ class StrikeTranscription(ContactProgram):
             ground=total_ground_wrench(c, self.w.read(x))[0],
             **self.hit.decode(x, self.program.outputs(x)),
         )
-
-
-class ShootingStrike(StrikeTranscription):
-    """The same with collisions that the SDC predicts, by shooting: they are no variables.
-
-    H, J and bias are frozen at contact, so it predicts what the SDC does, not what the whole dynamics do. Its
-    second derivatives are not known: for quasi-Newton methods.
-    """
-
-    def _make_hit(self, b: Builder, contact: Contact, elements: Elements, shares: Shares) -> Any:
-        return Shots(b, contact)

@@ -226,7 +226,7 @@ def test_a_fault_of_ours_is_no_answer(file: Path, monkeypatch: pytest.MonkeyPatc
 def test_every_command_has_examples_that_name_its_options() -> None:
     commands = re.findall(r"(?m)^. (\w[\w-]*)  ", run("--help")[0].split("Commands")[1])
     assert {"solve", "strike", "collide", "validate", "new", "check", "robots", "problems"} <= {*commands}
-    for command in {*commands} - {"bench"}:
+    for command in commands:
         shown = run(command, "--help")[0]
         examples = re.findall(rf"impactopt {command}[^\n│]*", shown.split("Examples:")[-1])
         assert "Examples:" in shown and examples, command
@@ -251,7 +251,7 @@ def test_help_and_completion_load_nothing_heavy() -> None:
         "from impactopt.cli.options import complete_problem, complete_sweep\n"
         "assert 'punch' in complete_problem('pun')\n"
         "assert complete_sweep('collision_t') == ['collision_target']\n"
-        "for arguments in (['--help'], ['solve', '--help'], ['collide', '-h'], ['bench', '--help'], []):\n"
+        "for arguments in (['--help'], ['solve', '--help'], ['collide', '-h'], []):\n"
         "    CliRunner().invoke(app, arguments)\n"
         # pydantic is not in it: newer versions of typer import it themselves
         "heavy = ('casadi', 'pinocchio', 'numpy', 'scipy', 'matplotlib', 'mujoco')\n"

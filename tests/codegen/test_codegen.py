@@ -653,7 +653,7 @@ def test_model_hash_leaves_limits_out() -> None:
     assert model_hash(changed) == model_hash(model())
 
 
-@pytest.mark.parametrize("room", ["cli", "files", "planning", "report", "studies", "sweeps"])
+@pytest.mark.parametrize("room", ["cli", "files", "planning", "report", "sweeps"])
 def test_an_edit_that_shapes_no_function_leaves_all_of_them(
     room: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import freezes as bench
+from benchmarks.stability_robots import make_robot
 
 from impactopt.collision import SDC, VirtualMass
 from impactopt.collision.freezing import freeze_error, more_often
@@ -15,8 +17,6 @@ from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.report.console import collision_table
 from impactopt.simulation.reference import FullDynamics
-from impactopt.studies.bench import freezes as bench
-from impactopt.studies.bench.stability_robots import make_robot
 from impactopt.sweeps.collisions import collide_many
 
 X = np.array([1.0, 0.0, 0.0])

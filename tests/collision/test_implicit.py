@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support import small_robots
+from support.exact import ExactCollision
 from support.exact_reference import random_case, robot_named
 from support.frozen_cases import two_masses
 
@@ -28,7 +29,6 @@ from impactopt.contact import (
     SpringDamper,
 )
 from impactopt.errors import InputError
-from impactopt.studies.exact import ExactCollision
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 

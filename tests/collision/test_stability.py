@@ -8,6 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import stability
+from benchmarks.stability import judge_rig
+from benchmarks.stability_cases import RIGS, Rig
+from benchmarks.stability_others import freezes_of, refusals
+from benchmarks.stability_robots import make_robot
 from support import small_robots
 from typer.testing import CliRunner
 
@@ -15,12 +20,7 @@ from impactopt.cli.app import app
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, RigidWall, SpringDamper
 from impactopt.errors import InputError
-from impactopt.simulation.cases import striking_velocity
-from impactopt.studies.bench import stability
-from impactopt.studies.bench.stability import judge_rig
-from impactopt.studies.bench.stability_cases import RIGS, Rig
-from impactopt.studies.bench.stability_others import freezes_of, refusals
-from impactopt.studies.bench.stability_robots import make_robot
+from impactopt.kinematics.operational_space import striking_velocity
 
 X = np.array([1.0, 0.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=5.0)

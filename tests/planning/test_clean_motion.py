@@ -8,10 +8,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support.meshes import Meshes
 from support.small_plans import BODILESS
 
 from impactopt import Solution, load_problem, solve
-from impactopt.simulation.reference.meshes import Meshes
 
 
 def test_no_mesh_is_in_another_from_start_to_rest_or_after_a_miss(punch: Solution) -> None:
@@ -40,7 +40,7 @@ def test_nor_when_it_is_bent(punch: Solution, aside: tuple[float, float, float])
 
 
 def test_nor_in_another_problem() -> None:
-    """All of them: `impactopt bench truth`."""
+    """All of them: `python -m benchmarks truth`."""
     solution = solve(load_problem("door"))
     assert solution.status.usable, solution.result.message
     meshes = Meshes(solution.problem.robot, solution.problem.start_posture)

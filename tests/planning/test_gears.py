@@ -22,7 +22,7 @@ from impactopt import (
     solve,
 )
 from impactopt.cli.app import app
-from impactopt.files.output import record_of, record_of_strike, save_record
+from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file.writing import write_problem
 from impactopt.files.replay import load_planned
 from impactopt.files.resume import resumed
@@ -101,12 +101,6 @@ def test_a_strike_is_bounded_too() -> None:
     assert kept.impulse < free.impulse
     again = optimize_strike(_weak(), start=kept)
     assert again.impulse == pytest.approx(kept.impulse, rel=1e-4) and _on_gears(again.problem)
-
-
-def test_a_strike_by_shooting_says_that_it_is_not() -> None:
-    found = optimize_strike(load_problem("arm_planar"), method="shooting")
-    assert found.problem.describe()["off"] == ["gear load"]
-    assert record_of_strike(found).summary["rows_on_demand"] == []
 
 
 def test_scenarios_count() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impactopt import Solution, coasting_reference, load_problem, optimize_strike, solve
+from impactopt import Solution, coasting_reference, load_problem, solve
 from impactopt.codegen.compiler import find_compiler
 from impactopt.errors import InputError
 from impactopt.files.problem_file import parse_problem_file
@@ -169,8 +169,6 @@ def test_what_cannot_hold_on_is_refused(problem: ImpactProblem) -> None:
     ):
         with pytest.raises(InputError, match=told):
             replace(problem, **changes)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="collocation"):
-        optimize_strike(problem, method="shooting")
     short = load_robot("standin", locked=("left_wrist_yaw", "left_wrist_pitch"))
     with pytest.raises(InputError, match="of the last 6 joints that lead to it, chest_yaw, chest_pitch"):
         replace(

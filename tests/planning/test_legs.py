@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
+from oracle.verdict import verify_record
 from support.small_plans import biped_problem
 from support.small_robots import biped
 
@@ -16,7 +17,6 @@ from impactopt.files.output import record_of
 from impactopt.simulation import scene_of, simulate_mujoco
 from impactopt.simulation.collision_geometry import Solids
 from impactopt.simulation.reference import FullDynamics
-from impactopt.verification.verdict import verify_record
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 ROBOTS = {"seven and a waist": lambda: biped(7, waist=True), "five": lambda: biped(5)}

@@ -13,6 +13,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+from support.exact import ExactCollision
 from support.frozen_cases import slider
 from support.native_cases import LAW, X, call, native, robot_named, situation
 from support.small_plans import Planned
@@ -33,7 +34,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import scene_of, simulate_pinocchio
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
-from impactopt.studies.exact import ExactCollision
 from impactopt.sweeps.contact_states import ContactStates, Posture
 from impactopt.sweeps.single_collision import collide_once, problem_of_result
 from impactopt.transcription.plan import PlannedCollision

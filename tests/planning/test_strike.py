@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from support.derivative_checks import check_derivatives
 from support.fake_solution import PROBLEM_FILE
-from support.small_plans import BODILESS, Planned, changed
+from support.small_plans import BODILESS, Planned, arm_problem, changed
 from typer.testing import CliRunner
 
 from impactopt.cli.app import app
@@ -476,3 +476,9 @@ def test_objectives_of_the_blow_are_reported(
     ).angular
     assert found.objectives["angular momentum after contact, squared"] == pytest.approx(h @ h, abs=1e-3)
     assert found.objectives["impulse"] == found.impulse
+
+
+def test_a_method_that_is_gone_names_its_replacement() -> None:
+    for method in ("shooting", "shoting"):
+        with pytest.raises(InputError, match='give "collocation", or leave it out'):
+            optimize_strike(arm_problem(), method=method)

@@ -72,7 +72,7 @@ def boxed(arm_transcription: Transcription, strike: StrikeTranscription) -> tupl
     return StrikeTranscription(of_box.problem, of_box.coordinates, of_box.functions), free.x
 
 
-@pytest.mark.parametrize("solver", [{}, {"qp_solver": "daqp"}])
+@pytest.mark.parametrize("solver", [{}, {"qp_solver": "active_set"}])
 def test_it_ends_with_bodies_apart_though_it_began_with_no_constraint_for_them(
     arm_transcription: Transcription, strike: StrikeTranscription, solver: dict[str, Any]
 ) -> None:

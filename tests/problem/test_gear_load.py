@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from support.small_motions import strike
 from support.small_plans import changed, struck
 
-from impactopt import Actuator, Scenario, load_problem, optimize_strike, solve
+from impactopt import Actuator, Scenario, load_problem, solve
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError
 from impactopt.planning.solution import Solution
@@ -149,8 +149,6 @@ def test_a_strike_keeps_its_gears_too(bounded: Any) -> None:
     assert strike.loads().gear.max() == pytest.approx(0.6, abs=1e-4)
     # no swing has to lead there, so it is an upper bound
     assert strike.impulse > bounded[0].decode(bounded[1]).impulse - 1e-3
-    with pytest.raises(InputError, match='method "shooting" does not know how joints accelerate'):
-        optimize_strike(problem, method="shooting")
 
 
 @pytest.mark.parametrize("term", [MotorCurve(fraction=0.2), PowerLimit(limit=30.0)])

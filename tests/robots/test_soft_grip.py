@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from support.meshes import Meshes
 
 from impactopt import (
     SDC,
@@ -26,7 +27,6 @@ from impactopt import (
 )
 from impactopt.collision import Effects
 from impactopt.robots.tools import mapped
-from impactopt.simulation.reference.meshes import Meshes
 from impactopt.simulation.servo import Servo
 
 ONLY_SERVO = Effects(bias=False, jdot=False, saturation=False, feedforward=False)

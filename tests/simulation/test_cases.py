@@ -8,21 +8,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from benchmarks.cases import Case, paper_motions
 from support.small_robots import arm, biped, slider
 
 from impactopt.collision import SDC, Collision, VirtualMass
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
+from impactopt.kinematics.operational_space import striking_velocity
 from impactopt.kinematics.support import margin
 from impactopt.robots.presets import standin
 from impactopt.robots.robot import Robot
-from impactopt.simulation.cases import (
-    Case,
-    errors_against,
-    paper_motions,
-    posture_of_effective_mass,
-    striking_velocity,
-)
+from impactopt.simulation.cases import errors_against, posture_of_effective_mass
 
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=5.0)
 

@@ -18,7 +18,14 @@ from support.small_robots import arm, biped
 from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
 from impactopt.robots.robot import Robot
-from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco, solids
+from impactopt.simulation import (
+    ControllerSettings,
+    Perturbation,
+    Scene,
+    Simulation,
+    collision_geometry,
+    simulate_mujoco,
+)
 from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.controller.clearance import Clearance
@@ -346,7 +353,7 @@ def test_links_are_as_far_apart_as_their_hulls(monkeypatch: pytest.MonkeyPatch) 
     for posture in (q, turned):
         pin.forwardKinematics(model, data, posture)
         expected.append(np.linalg.norm(data.oMi[joints[0]].translation - data.oMi[joints[1]].translation))
-    monkeypatch.setattr(solids, "NEAR", 10.0)  # [m]: feet are near each other
+    monkeypatch.setattr(collision_geometry, "NEAR", 10.0)  # [m]: feet are near each other
     np.testing.assert_allclose(feet.apart(model, np.array([q, turned])), expected, atol=5e-5)
 
 

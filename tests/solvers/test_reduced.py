@@ -6,6 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from benchmarks.attempts import judged
+from benchmarks.solve import planning_program, strike_program
 from support.textbook import INF, Textbook, assert_optimal
 
 import impactopt.solvers.sqp.reduced_qp as reduced_qp_module
@@ -18,12 +20,10 @@ from impactopt.solvers.sqp.qp_solvers import make_qp_solver
 from impactopt.solvers.sqp.reduced_hessian import make_model
 from impactopt.solvers.sqp.reduced_qp import ReducedQP, Solved
 from impactopt.solvers.sqp.reduction import Reduction
-from impactopt.studies.bench.attempts import judged
-from impactopt.studies.bench.solve import planning_program, strike_program
 
 WAYS = {
     "osqp": SQPOptions(qp_solver="osqp"),
-    "daqp": SQPOptions(qp_solver="daqp"),
+    "active_set": SQPOptions(qp_solver="active_set"),
     "bfgs": SQPOptions(qp_solver="osqp", hessian="bfgs"),
 }
 

@@ -24,8 +24,6 @@ WAYS = {
     "default": SQPOptions(),
     "active_set": SQPOptions(qp_solver="active_set"),
     "osqp": SQPOptions(qp_solver="osqp"),
-    "daqp": SQPOptions(qp_solver="daqp"),
-    "piqp": SQPOptions(qp_solver="piqp"),
     "as if large": SQPOptions(qp_solver="osqp", dense_limit=0),
     "bfgs": SQPOptions(qp_solver="active_set", hessian="bfgs"),
 }

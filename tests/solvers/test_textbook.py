@@ -20,7 +20,7 @@ from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, SQPOptions, make_qp_solv
 EXACT = {"tol": 1e-9, "bound_relax_factor": 0.0}
 # for six digits of an objective however many bounds hold
 SHARP = SQPOptions(complementarity_tolerance=1e-8)
-WAYS = {"default": SQPOptions(), "piqp": SQPOptions(qp_solver="piqp")}
+WAYS = {"default": SQPOptions(), "osqp": SQPOptions(qp_solver="osqp")}
 
 
 @functools.cache

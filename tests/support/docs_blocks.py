@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import importlib
 import inspect
 import io
 import os
@@ -130,14 +131,19 @@ def commands(text: str) -> Iterator[list[str]]:
             yield words
 
 
+def named(program: Any, name: str, words: list[str]) -> tuple[Any, str, list[str]]:
+    """The command that the first words name, its whole name, and the words after it."""
+    command: Any = get_command(program)
+    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+        assert words[0] in command.commands, f"{name} has no command {words[0]!r}"
+        command, name, words = command.commands[words[0]], f"{name} {words[0]}", words[1:]
+    return command, name, words
+
+
 def check_impactopt(words: list[str]) -> None:
     """An `impactopt` command's name, arguments and options exist, of the right kind; quick ones run."""
-    command: Any = get_command(app)
     words, written = (words[:-2], words[-1]) if words[-2:-1] == [">"] else (words, None)
-    name, rest = "impactopt", words
-    while hasattr(command, "commands") and rest and not rest[0].startswith("-"):
-        assert rest[0] in command.commands, f"{name} has no command {rest[0]!r}"
-        command, name, rest = command.commands[rest[0]], f"{name} {rest[0]}", rest[1:]
+    command, name, rest = named(app, "impactopt", words)
     if words[:1] and words[0] in QUICK:
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
@@ -146,6 +152,14 @@ def check_impactopt(words: list[str]) -> None:
         if written is not None:
             Path(written).write_text(printed.getvalue(), encoding="utf-8")
     elif not {"--help", "--version"} & set(rest):
+        command.make_context(name, list(rest))
+
+
+def check_benchmark(module: str, words: list[str]) -> None:
+    """A command of `tests/benchmarks/`, by its arguments and options."""
+    file = module if module.endswith(".figures") else f"{module}.__main__"
+    command, name, rest = named(importlib.import_module(file).app, f"python -m {module}", words)
+    if "--help" not in rest:
         command.make_context(name, list(rest))
 
 
@@ -170,6 +184,8 @@ def check_line(words: list[str]) -> None:
     program = Path(words[0]).name
     if program == "impactopt":
         check_impactopt(words[1:])
+    elif words[1:2] == ["-m"] and words[2].partition(".")[0] == "benchmarks":
+        check_benchmark(words[2], words[3:])
     elif program == "make":
         check_make(words[1:])
     elif program == "pip":

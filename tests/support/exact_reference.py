@@ -21,8 +21,8 @@ from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall, Spr
 from impactopt.kinematics.stance import BothSoles
 from impactopt.robots.presets import standin, talos
 from impactopt.robots.robot import Robot
-from impactopt.studies.exact import ExactCollision
 from support import small_robots
+from support.exact import ExactCollision
 
 TOLERANCES = {"rtol": 1e-13, "atol": 1e-16}
 LONGEST = 1e-4  # [s] of a step

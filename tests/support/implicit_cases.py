@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from impactopt.collision import SDC
-from impactopt.studies.exact import ExactCollision
+from support.exact import ExactCollision
 from support.native_cases import LAW, ROBOTS, TARGET, X, call, robot_named
 
 # of the steps: their errors do not count beside those of differences

@@ -21,7 +21,6 @@ ROOMS_IN_ORDER = (
     "collision",
     "bodies",
     "problem",
-    "verification",
     "solvers",
     "transcription",
     "simulation",
@@ -31,7 +30,6 @@ ROOMS_IN_ORDER = (
     "identification",
     "report",
     "live",
-    "studies",
     "cli",
     "__main__",
 )
@@ -52,7 +50,6 @@ NUMERIC = (
     "solvers/sqp",
     "transcription/plan.py",
     "transcription/planned_strike.py",
-    "verification",
 )
 # What an engine may know of this package, so that it can contradict the rest of it.
 ENGINE = {"contact", "errors", "robots", "simulation"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.solvers.sqp.qp_solvers import QP_SOLVERS
+from impactopt.solvers.sqp.qp_solvers import QP_SOLVERS, check_qp_solver
 
 HESSIANS = ("exact", "bfgs")
 
@@ -78,14 +78,10 @@ class SQPOptions:
         ------
         InputError : an unknown name, or a number out of its range.
         """
-        for name, value, known in (
-            ("qp_solver", self.qp_solver, ("interior", *QP_SOLVERS)),
-            ("hessian", self.hessian, HESSIANS),
-        ):
-            if value not in known:
-                raise InputError(
-                    f"{name}: no '{value}'{did_you_mean(value, known)}; there are: {', '.join(sorted(known))}"
-                )
+        check_qp_solver(self.qp_solver, ("interior", *QP_SOLVERS))
+        if self.hessian not in HESSIANS:
+            near = did_you_mean(self.hessian, HESSIANS)
+            raise InputError(f"hessian: no '{self.hessian}'{near}; there are: {', '.join(sorted(HESSIANS))}")
         if self.qp_solver == "interior" and self.hessian != "exact":
             raise InputError(
                 'hessian: with qp_solver "interior" it is "exact"; for "bfgs" give another qp_solver, '

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
-from impactopt.errors import InputError, did_you_mean, missing_package
+from impactopt.errors import InputError, did_you_mean
 from impactopt.solvers.sqp.qp import QPSolver
 
 
@@ -14,35 +14,20 @@ def _active_set(_tolerance: float) -> QPSolver:
     return ActiveSetSolver()
 
 
-def _daqp(tolerance: float) -> QPSolver:
-    from impactopt.solvers.sqp.daqp_solver import DaqpSolver
-
-    return DaqpSolver(tolerance=tolerance)
-
-
 def _osqp(tolerance: float) -> QPSolver:
     from impactopt.solvers.sqp.osqp_solver import OsqpSolver
 
     return OsqpSolver(tolerance=tolerance)
 
 
-def _piqp(tolerance: float) -> QPSolver:
-    from impactopt.solvers.sqp.piqp_solver import PiqpSolver
-
-    return PiqpSolver(tolerance=tolerance)
-
-
 QP_SOLVERS: dict[str, Callable[[float], QPSolver]] = {
     "active_set": _active_set,
-    "daqp": _daqp,
     "osqp": _osqp,
-    "piqp": _piqp,
 }
 """Name of a QP solver -> what makes one, given the tolerance of its residuals. Add your own here.
-
-Ours, and OSQP, are always there. `impactopt[qp]` brings DAQP (MIT, 4 MB, needs NumPy), the quickest up to
-some hundred variables, and PIQP (BSD, 5 MB, NumPy and SciPy), the quickest beyond.
 """
+GONE = {"daqp": "osqp", "piqp": "osqp"}
+"""QP solvers that there were, and what to ask for in their place."""
 
 
 def make_qp_solver(name: str, tolerance: float = 1e-6) -> QPSolver:
@@ -50,14 +35,21 @@ def make_qp_solver(name: str, tolerance: float = 1e-6) -> QPSolver:
 
     Raises
     ------
-    InputError : no such solver; or its package is not installed.
+    InputError : no such solver.
     """
-    if name not in QP_SOLVERS:
-        raise InputError(
-            f"no QP solver '{name}'{did_you_mean(name, QP_SOLVERS)}; "
-            f"there are: {', '.join(sorted(QP_SOLVERS))}"
-        )
-    try:
-        return QP_SOLVERS[name](tolerance)
-    except ImportError as error:
-        raise missing_package(f"the QP solver {name!r}", name, "qp") from error
+    check_qp_solver(name, QP_SOLVERS)
+    return QP_SOLVERS[name](tolerance)
+
+
+def check_qp_solver(name: str, known: Iterable[str]) -> None:
+    """Refuse names that are not among the known ones.
+
+    Raises
+    ------
+    InputError : no such solver, or none any more.
+    """
+    known = sorted(known)
+    if name in GONE and name not in known:
+        raise InputError(f"qp_solver: {name!r} is no longer supported; give {GONE[name]!r}")
+    if name not in known:
+        raise InputError(f"qp_solver: no {name!r}{did_you_mean(name, known)}; there are: {', '.join(known)}")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.figures import FIGURES, app, chosen, drawn
 from matplotlib.collections import LineCollection, PathCollection
 from PIL import Image
 from support.fake_solution import MissingSolution, still_problem, still_solution
@@ -18,7 +19,6 @@ from support.picture_checks import frowns
 from support.small_plans import Planned
 from typer.testing import CliRunner
 
-from impactopt.cli.app import app
 from impactopt.collision import effective_mass
 from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of
@@ -28,7 +28,6 @@ from impactopt.report.pictures import PICTURES, hierarchy, overview
 from impactopt.report.pictures.ellipsoid import effective_masses
 from impactopt.report.pictures.style import DPI, PAGE, Picture
 from impactopt.simulation.reference.poses import inverse_mass, poses_of
-from impactopt.studies.figures import FIGURES, chosen, drawn
 
 ROOT = Path(__file__).resolve().parents[3]
 DRAWS: dict[str, Callable[[Record], Picture | None]] = {"overview": overview, **PICTURES}
@@ -281,19 +280,19 @@ def test_figures_are_made_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return lambda name: Picture(1.0, 1.0)
 
     monkeypatch.setattr(
-        "impactopt.studies.figures._MAKERS",
+        "benchmarks.figures._MAKERS",
         dict.fromkeys(("plot", "reproduce", "bench", "sweep"), maker),
     )
-    result = CliRunner().invoke(app, ["figures", "zmp", "fig7", "force", "--quiet", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["zmp", "fig7", "force", "--quiet", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["fig7.png", "force.png", "zmp.png"]
     assert made == ["punch", "fig7"], "what has one source is computed once"
-    result = CliRunner().invoke(app, ["figures", "figg7"])
+    result = CliRunner().invoke(app, ["figg7"])
     assert result.exit_code == 2 and "fig7" in result.output
 
 
 def test_every_figure_has_a_source_that_exists() -> None:
-    from impactopt.studies.registry import BENCHES, REPRODUCED
+    from benchmarks.registry import BENCHES, REPRODUCED
 
     studies = {path.stem for path in (ROOT / "problems" / "sweeps").glob("*.toml")}
     known = {"plot": DRAWS, "reproduce": REPRODUCED, "bench": BENCHES, "sweep": studies}

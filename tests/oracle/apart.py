@@ -1,0 +1,165 @@
+"""Constraints between bodies: the rounded distance of two convex pieces, written down a second time.
+
+The largest separation over unit vectors u is where its slope is a multiple of u. Here that is one Newton
+iteration on u and the multiplier together, for all pairs of a place at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import KeepOut, SelfCollision
+from oracle.robot_motion import RobotMotion
+from oracle.variables import Piece, Variables
+
+__all__ = ["apart_pieces"]
+
+Array = NDArray[np.float64]
+ROUND = 1e-3  # [m] of supports
+LONGEST, STEPS, DONE = 0.3, 60, 1e-11  # of u a step, and how many; [m] of slope across u that is none
+
+
+def apart_pieces(
+    problem: ImpactProblem,
+    robot: RobotMotion,
+    nodes: Mapping[str, Callable[[Variables], Any]],
+    rows: Sequence[Mapping[str, Any]],
+) -> tuple[list[Piece], list[str]]:
+    """The constraints that a result says it had, in its order; and what is not known of them.
+
+    nodes : of all motions, by their places.  rows : place, joint, other and number, way, reach [m] and travel
+    [m], as `impactopt.transcription.apart` has them.
+    """
+    known: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        known.setdefault(str(row["place"]), []).append(row)
+    missing = [f"rows between bodies at {place!r}" for place in known if place not in nodes]
+    pieces = [
+        _piece(problem, robot, place, nodes[place], at) for place, at in known.items() if place in nodes
+    ]
+    return pieces, missing
+
+
+class _Hulls:
+    """Vertices (m, most, 3) of m hulls, and which of them are there."""
+
+    def __init__(self, points: Array, which: NDArray[np.int64]) -> None:
+        most = int(which[:, 1].max())
+        self.vertices = points[which[:, :1] + np.minimum(np.arange(most), which[:, 1:] - 1)]
+        self.missing = np.arange(most) >= which[:, 1:]
+
+    def support(self, u: Array) -> tuple[Array, Array, Array]:
+        """Rounded supports (m,), their gradients (m, 3) and second derivatives (m, 3, 3) in directions."""
+        height = np.einsum("mki,mi->mk", self.vertices, u) / ROUND
+        height[self.missing] = -np.inf
+        most = height.max(axis=1, keepdims=True)
+        weight = np.exp(height - most)
+        total = weight.sum(axis=1, keepdims=True)
+        weight /= total
+        mean = np.einsum("mk,mki->mi", weight, self.vertices)
+        square = np.einsum("mk,mki,mkj->mij", weight, self.vertices, self.vertices)
+        second = (square - mean[:, :, None] * mean[:, None]) / ROUND
+        return ROUND * (most + np.log(total))[:, 0], mean, second
+
+
+def _distances(one: _Hulls, two: _Hulls, turn: Array, shift: Array, u: Array) -> tuple[Array, Array]:
+    """Of pairs whose first is so turned (m, 3, 3) and shifted (m, 3) as the second sees it; directions."""
+
+    def separation(u: Array) -> tuple[Array, Array, Array]:
+        a, b = one.support(-np.einsum("mji,mj->mi", turn, u)), two.support(u)
+        slope = np.einsum("mij,mj->mi", turn, a[1]) + shift - b[1]
+        second = -turn @ a[2] @ turn.transpose(0, 2, 1) - b[2]
+        return (u * shift).sum(axis=1) - a[0] - b[0], slope, second
+
+    value, slope, second = separation(u)
+    for _ in range(STEPS):
+        along = (u * slope).sum(axis=1)
+        across = slope - along[:, None] * u
+        if np.abs(across).max() < DONE:
+            break
+        kkt = np.zeros((len(u), 4, 4))
+        # where it curves the wrong way, as bodies are in each other, less of a step
+        bent = np.linalg.eigvalsh(second - along[:, None, None] * np.eye(3))[:, -1]
+        kkt[:, :3, :3] = second - (along + np.maximum(bent, 0.0))[:, None, None] * np.eye(3)
+        kkt[:, :3, 3] = kkt[:, 3, :3] = u
+        given = np.concatenate([-across, np.zeros((len(u), 1))], axis=1)
+        step = np.linalg.solve(kkt, given[:, :, None])[:, :3, 0]
+        size = np.linalg.norm(step, axis=1)
+        part = np.minimum(1.0, LONGEST / np.maximum(size, 1e-12))
+        for _ in range(30):
+            new = u + part[:, None] * step
+            new /= np.linalg.norm(new, axis=1, keepdims=True)
+            found = separation(new)
+            worse = (found[0] < value) & (size > 1e-6)
+            if not worse.any():
+                break
+            part[worse] *= 0.5
+        u, (value, slope, second) = new, found
+    return value, u
+
+
+def _piece(
+    problem: ImpactProblem,
+    robot: RobotMotion,
+    place: str,
+    node: Callable[[Variables], Any],
+    at: Sequence[Mapping[str, Any]],
+) -> Piece:
+    """All constraints at a place."""
+    bodies, shapes = problem.bodies, problem.bodies.shapes
+    flat = [(int(row["joint"]), int(row["other"]), row) for row in at]
+    numbers = [shapes.index[joint, other, int(row["number"])] for joint, other, row in flat]
+    one, two = (
+        _Hulls(shapes.points, shapes.hulls[numbers, :2]),
+        _Hulls(shapes.points, shapes.hulls[numbers, 2:]),
+    )
+    reach = np.array([row["reach"] for _, _, row in flat], dtype=float) + shapes.radius[numbers]
+    ways = np.array([row["way"] for _, _, row in flat], dtype=float)
+    # frames: those of joints, and behind them one for each row whose other body is the world's
+    joints = sorted({joint for joint, _, _ in flat} | {other for _, other, _ in flat if other >= 0})
+    index = {joint: k for k, joint in enumerate(joints)}
+    turns, shifts = list[Array](), list[Array]()
+    first, second = list[int](), list[int]()
+    for joint, other, row in flat:
+        first.append(index[joint])
+        if other >= 0:
+            second.append(index[other])
+            continue
+        body = bodies.world[-1 - other]
+        second.append(len(joints) + len(turns))
+        turns.append(np.asarray(body.rotation))
+        shifts.append(body.place + float(row["travel"]) * bodies.normal * body.moves)
+
+    def value(v: Variables) -> Array:
+        y, _, _, legs, _, _ = node(v)
+        pin.forwardKinematics(robot.model, robot.data, robot.posture(y, legs))
+        placed = [robot.data.oMi[joint] for joint in joints]
+        turn = np.array([*(at.rotation for at in placed), *turns])
+        shift = np.array([*(at.translation for at in placed), *shifts])
+        back = turn[second].transpose(0, 2, 1)
+        apart = np.einsum("kij,kj->ki", back, shift[first] - shift[second])
+        found, ways[...] = _distances(one, two, back @ turn[first], apart, ways)
+        return found - reach
+
+    rows = [
+        (
+            (SelfCollision if other >= 0 else KeepOut).name,
+            place,
+            [_named(bodies.names((joint, other)), int(row["number"]))],
+            0.0,
+            np.inf,
+        )
+        for joint, other, row in flat
+    ]
+    return Piece.of(value, rows)
+
+
+def _named(names: tuple[str, str], number: int) -> str:
+    """What a constraint between two bodies is called; those of further pieces by their number, from 2."""
+    return " and ".join(names) + (f" {number + 1}" if number else "")

@@ -1,0 +1,231 @@
+"""Swing and motions to rest: their splines, and the rows at their nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from impactopt.kinematics.splines import graded_breaks, knots
+from impactopt.kinematics.wrench_cone import contact_wrench_cone
+from impactopt.problem.phase import Phase
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import (
+    ContactWrenchCone,
+    Grip,
+    LegExtension,
+    PositionLimit,
+    TorqueLimit,
+    VelocityLimit,
+)
+from impactopt.problem.terms.grip import WRENCH
+from impactopt.robots.hinges import inside
+from oracle.robot_motion import RobotMotion
+from oracle.variables import Piece, Variables
+
+__all__ = ["Limits", "Way", "node_piece", "rate_pieces"]
+
+Array = NDArray[np.float64]
+DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
+
+
+class Limits:
+    """What bounds a motion, as numbers of the problem's terms."""
+
+    def __init__(self, problem: ImpactProblem, robot: RobotMotion) -> None:
+        r = problem.robot
+        self.torque, self.velocity = problem.term(TorqueLimit), problem.term(VelocityLimit)
+        self.cone, self.extension = problem.term(ContactWrenchCone), problem.term(LegExtension)
+        self.grip = problem.extra(Grip)
+        lower, upper = inside(r, problem.term(PositionLimit).margin)
+        box = BASE_BOX[: robot.base]
+        self.y = (
+            np.concatenate([robot.y0[: robot.base] - box, lower[robot.independent]]),
+            np.concatenate([robot.y0[: robot.base] + box, upper[robot.independent]]),
+        )
+        self.legs = lower[robot.dependent], upper[robot.dependent]
+
+    def cone_rows(
+        self, robot: RobotMotion, place: str, margin: float | None, least: float
+    ) -> tuple[Callable[[Array], Array], list[Any]]:
+        """Of wrenches (6 a sole): how far inside the cone they are, and what hands that hold on bear, over
+        what they may; with the rows that say so.  margin : [m]; None: the cone is not asked for.
+        """
+        parts, rows = [], list[Any]()
+        for k, (leg, *_) in enumerate(robot.soles):
+            if leg.sole is None:
+                assert self.grip is not None  # the problem has it
+                most = np.repeat([self.grip.force, self.grip.moment], 3)
+                parts.append((k, np.diag(1 / most)))
+                rows.append((self.grip.name, place, [f"{leg.end} {name}" for name in WRENCH], -1.0, 1.0))
+                continue
+            if margin is None:
+                continue
+            facets = contact_wrench_cone(leg.sole.polygon, self.cone.friction, margin=margin) / robot.weight
+            normal = np.zeros((1, 6))
+            normal[0, 2] = 1 / robot.weight
+            parts.append((k, np.vstack([facets, normal])))
+            name = leg.end
+            components = [f"{name}, facet {i}" for i in range(len(facets))]
+            rows.append((self.cone.name, place, components, 0.0, np.inf))
+            rows.append(("normal force", place, [name], least / robot.weight, np.inf))
+
+        def inside(w: Array) -> Array:
+            found = [matrix @ w[6 * k : 6 * k + 6] for k, matrix in parts]
+            return np.concatenate([np.zeros(0), *found])
+
+        return inside, rows
+
+
+class Way:
+    """A motion before or after contact: a cubic spline whose control points are variables.
+
+    kind : first word of its variables' names; name : of its places.  more : nodes beside the ends and middles
+    of its intervals.
+    """
+
+    def __init__(
+        self, problem: ImpactProblem, robot: RobotMotion, kind: str, name: str, more: tuple[float, ...]
+    ) -> None:
+        self.kind, self.name, self.swings = kind, name, kind == "swing"
+        self.phase: Phase = problem.swing if self.swings else problem.follow
+        self.breaks = graded_breaks(self.phase.intervals, self.phase.grading, fine_end=self.swings)
+        middles = (self.breaks[1:] + self.breaks[:-1]) / 2
+        inside = np.sort(np.concatenate([self.breaks, middles]))
+        self.nodes = np.union1d(inside[1:] if self.swings else inside, more)
+        self.more, self._y0 = more, robot.y0
+        t = knots(self.breaks)
+        # the velocity's control points are these times differences of the curve's
+        self.factors = 3.0 / (t[4:-1] - t[1:-4])
+        self._curve = BSpline(t, np.eye(len(self.breaks) + 2), 3)
+        self.control_group, self.T = f"{kind} control point", f"{kind} duration"
+
+    @property
+    def points(self) -> int:
+        """How many control points are variables."""
+        return self.phase.intervals + (-1 if self.swings else 1)
+
+    def place(self, s: float) -> str:
+        percent = f"{100 * s:.2f} %" if s in self.more else f"{100 * s:.0f} %"
+        return f"{self.name}, {percent}"
+
+    def control(self, v: Variables, j: int) -> Array:
+        """Control point j = 0 .. intervals + 2: a swing starts at rest and ends without acceleration, the
+        others end at rest.
+        """
+        if not self.swings:
+            return v.get(self.control_group, min(j, self.points - 1))
+        if j <= 2:
+            return self._y0
+        if j < self.phase.intervals + 2:
+            return v.get(self.control_group, j - 3)
+        one, two = self.control(v, j - 2), self.control(v, j - 1)
+        return two + (two - one) * (self.factors[-2] / self.factors[-1])
+
+    def curve(self, v: Variables) -> tuple[BSpline, BSpline, BSpline]:
+        """y, y' and y'' as functions of s."""
+        points = np.array([self.control(v, j) for j in range(len(self.breaks) + 2)])
+        curve = BSpline(knots(self.breaks), points, 3)
+        return curve, curve.derivative(), curve.derivative(2)
+
+    def at(self, s: float) -> Callable[[Variables], tuple[Array, Array, Array]]:
+        """y, y', y'' at a fraction s, as a function of the variables."""
+        weights = [self._curve(s, order) for order in range(3)]
+        used = np.flatnonzero(np.abs(weights).max(axis=0))
+
+        def values(v: Variables) -> tuple[Array, Array, Array]:
+            points = np.array([self.control(v, int(j)) for j in used])
+            y, y1, y2 = (w[used] @ points for w in weights)
+            return y, y1, y2
+
+        return values
+
+
+def node_piece(
+    robot: RobotMotion,
+    limits: Limits,
+    place: str,
+    state: Callable[[Variables], tuple[Array, Array, Array, Array, Array, float]],
+    *,
+    closed: bool = True,
+    feedforward: bool = False,
+    lifted: str | None = None,
+) -> Piece:
+    """Rows of a node.  state : y, y', y'', legs, sole wrenches, T.
+
+    closed : whether its legs have rows of their own.  feedforward : whether its torque is that variable.
+    lifted : variables that are its torque over limit; None: there are none.
+    """
+    problem_limits, n = robot.robot, robot.n
+    names, fraction = problem_limits.joint_names, limits.torque.fraction
+    rates, fast = problem_limits.velocity_limit[robot.dependent], limits.velocity.fraction
+    inside, cone = limits.cone_rows(robot, place, limits.cone.margin, limits.cone.minimum_force)
+    closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
+
+    def value(v: Variables) -> Array:
+        y, y1, y2, legs, w, T = state(v)
+        q, qd, qdd = robot.motion(y, legs, y1 / T, y2 / T**2)
+        tau = robot.torque(q, qd, qdd, w)
+        demand = tau[robot.base :] / problem_limits.torque_limit
+        if feedforward:
+            demand = demand - v.get("feed-forward at contact")
+        elif lifted is not None:
+            demand = demand - v.get(lifted)
+        parts = [robot.closure(q)] if closed else []
+        parts += [qd[robot.base + robot.dependent] / rates, tau[: robot.base] / robot.base_scale]
+        return np.concatenate([*parts, robot.extension(q), inside(w), demand])
+
+    rows: list[Any] = [("closed legs", place, closure, 0.0, 0.0)] if closed else []
+    rows += [
+        (limits.velocity.name, place, robot.leg_labels, -fast, fast),
+        ("equation of motion of the base", place, DIRECTIONS[: robot.base], 0.0, 0.0),
+        (
+            limits.extension.name,
+            place,
+            [leg.limb for leg, *_ in robot.soles],
+            limits.extension.minimum,
+            np.inf,
+        ),
+        *cone,
+    ]
+    if feedforward:
+        rows.append(("feed-forward that makes the robot coast", "contact", names, 0.0, 0.0))
+    else:
+        most = np.full(n, 0.0 if lifted is not None else fraction)
+        rows.append((limits.torque.name, place, names, -most, most))
+    return Piece.of(value, rows)
+
+
+def rate_pieces(robot: RobotMotion, limits: Limits, way: Way) -> list[Piece]:
+    """Velocity control points within the limit, multiplied by the duration."""
+    joints = np.arange(robot.base, robot.ny)
+    bound = (limits.velocity.fraction * robot.robot.velocity_limit)[robot.independent]
+    names = robot.labels[robot.base :]
+    shortest, longest = way.phase.duration
+    steps = range(2, way.phase.intervals + 2) if way.swings else range(way.phase.intervals)
+    out = []
+    for j in steps:
+
+        def step(v: Variables, j: int = j) -> Array:
+            found = (way.control(v, j + 1) - way.control(v, j))[joints]
+            return np.asarray(found * way.factors[j] / bound)
+
+        name = f"{way.name}, control point {j}"
+        if shortest == longest:
+            out.append(Piece.of(step, [(limits.velocity.name, name, names, -longest, longest)]))
+            continue
+
+        def both(v: Variables, step: Callable[[Variables], Array] = step) -> Array:
+            found, T = step(v), v.one(way.T)
+            return np.concatenate([found - T, -found - T])
+
+        rows: list[Any] = [
+            (limits.velocity.name, f"{name}, {direction}", names, -np.inf, 0.0)
+            for direction in ("forward", "backward")
+        ]
+        out.append(Piece.of(both, rows))
+    return out

@@ -1,0 +1,266 @@
+"""What else a result has in its file, against its variables: splines, reference, blow, summary, bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.bodies.clearance import MISSED, Places
+from impactopt.kinematics.support import margin, support_polygon, zmp
+from impactopt.problem.objectives import Impulse
+from impactopt.problem.terms import ContactWrenchCone
+from impactopt.robots.sole_margins import SHARE, cop_margin, least_kept
+from oracle.motions import Way
+from oracle.program import Program
+from oracle.variables import Variables
+
+__all__ = ["Off", "off_in_record"]
+
+Array = NDArray[np.float64]
+Arrays = Mapping[str, NDArray[Any]]
+INTEGRAL = 0.02  # of the impulse: by how much forces at a few instants may miss it
+
+
+class Off(NamedTuple):
+    """By how much a part of a record is off, and where: rows beside the program's."""
+
+    name: str
+    amount: float
+    where: str
+
+
+def off_in_record(p: Program, v: Variables, arrays: Arrays, summary: Mapping[str, Any]) -> Iterator[Off]:
+    """All of it; only of what a record has."""
+    yield from _splines(p, v, arrays)
+    for prefix, last in (("reference", 1), ("missed", 2)):
+        if f"{prefix}_time" in arrays and last < len(p.ways):
+            yield from _reference(p, v, arrays, prefix, p.ways[last])
+    if p.blows:
+        yield from _blow(p, v, arrays)
+        yield from _summary(p, v, summary)
+    if p.problem.keeps_apart and "reference_time" in arrays:
+        yield from _bodies(p, v, arrays)
+
+
+def _gap(found: Any, wanted: Any, scale: float | Array = 1.0) -> float:
+    """Largest difference over a scale; inf for other shapes and what is no number."""
+    one, two = np.asarray(found, dtype=float), np.asarray(wanted, dtype=float)
+    if one.shape != two.shape:
+        return np.inf
+    off = np.abs(one - two) / scale
+    return float(np.max(np.where(np.isnan(off), np.inf, off), initial=0.0))
+
+
+def _splines(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
+    for way in p.ways[:2]:
+        control = np.array([way.control(v, j) for j in range(len(way.breaks) + 2)])
+        for key, value in (
+            ("control", control),
+            ("breaks", way.breaks),
+            ("duration", v.one(way.T)),
+        ):
+            if f"{way.kind}_{key}" in arrays:
+                yield Off("spline", _gap(arrays[f"{way.kind}_{key}"], value), f"{way.kind}_{key}")
+        if f"plan_{way.kind}_wrench" in arrays and p.robot.soles:
+            found = arrays[f"plan_{way.kind}_wrench"][int(way.swings) :]
+            wanted = v.all(f"{way.kind} sole wrench")
+            yield Off("spline", _gap(found, wanted, p.robot.wrench_scale), f"plan_{way.kind}_wrench")
+
+
+class _Worst:
+    """Keeps where something is worst."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, tuple[float, str]] = {}
+
+    def note(self, name: str, amount: float, where: str) -> None:
+        if name not in self.found or not amount <= self.found[name][0]:
+            self.found[name] = amount, where
+
+    def all(self) -> Iterator[Off]:
+        yield from (Off(name, amount, where) for name, (amount, where) in self.found.items())
+
+
+def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way) -> Iterator[Off]:
+    """The servo's reference: the splines', on held soles, with the torque that it needs, within limits."""
+    a = {name: arrays[f"{prefix}_{name}"] for name in ("time", "phase", "q", "v", "a", "torque", "ground")}
+    robot, swing, worst = p.robot, p.ways[0], _Worst()
+    r, n = robot.robot, robot.n
+    start, end = (float(arrays[f"{prefix}_contact_{side}"]) for side in ("start", "end"))
+    worst.note(f"{prefix} times", _gap(start, v.one(swing.T)), "contact")
+    lasts = blow = sum(v.one(name) for name in p.blows[0].durations) if p.blows else end - start
+    if not p.problem.lasts:
+        lasts = blow = 0.0
+    if last.kind == "abort":
+        lasts = float(p.problem.abort_after or 0.0)
+    worst.note(f"{prefix} times", _gap(end - start, lasts), "end of contact")
+    worst.note(f"{prefix} times", _gap(float(arrays[f"{prefix}_end"]), end + v.one(last.T)), "end")
+    angles = np.array([r.joint_positions(q) for q in a["q"]])
+    if "reference_angle" in arrays and prefix == "reference":
+        worst.note(f"{prefix} angles", _gap(arrays["reference_angle"], angles), "reference_angle")
+    y0, u0, ff = p.at_contact(v), p.state_at_contact(v)[1], v.get("feed-forward at contact")
+    polygon = support_polygon(r, p.problem.coordinates) if robot.soles else np.zeros((0, 2))
+    curves = {way.kind: way.curve(v) for way in (swing, last)}
+    for k, time in enumerate(map(float, a["time"])):
+        where = f"{prefix} at {time:.4g} s"
+        phase = int(a["phase"][k])
+        if phase == 1:
+            y, u, slope = y0 + u0 * (time - start), u0, 0 * u0
+        else:
+            way, begin = (swing, 0.0) if phase == 0 else (last, end)
+            T = v.one(way.T)
+            s = min(max((time - begin) / T, 0.0), 1.0)
+            y, u, slope = (c(s) / T**order for order, c in enumerate(curves[way.kind]))
+        found, legs = robot.split(a["q"][k])
+        q, qd, qdd = robot.motion(y, legs, u, slope)
+        worst.note(f"{prefix} posture", _gap(found, y), where)
+        tau = robot.torque(q, qd, qdd, np.zeros(6 * len(robot.soles)))
+        worst.note(f"{prefix} rates", _gap(a["v"][k], qd), where)
+        worst.note(f"{prefix} accelerations", _gap(a["a"][k], qdd, max(1.0, np.abs(qdd).max())), where)
+        demand = a["torque"][k] / r.torque_limit
+        if phase == 1 and time <= start + blow + 1e-9:  # its last instant is rounded otherwise
+            worst.note(f"{prefix} torque", _gap(demand, ff), where)
+        else:
+            for what, off in _balanced(p, q, tau, a["torque"][k], a["ground"][k]):
+                worst.note(f"{prefix} {what}", off, where)
+        worst.note(f"{prefix} closed legs", _gap(robot.closure(q), 0 * robot.closure(q)), where)
+        worst.note(f"{prefix} torque limit", float(np.abs(demand).max() - 1), where)
+        fast = np.abs(a["v"][k][-n:]) / r.velocity_limit
+        worst.note(f"{prefix} velocity limit", float(fast.max() - 1), where)
+        # in contact the reference coasts, and hinges follow none: rows bound how far they turn there
+        outside = np.maximum(r.lower - angles[k], angles[k] - r.upper)[~(r.hinges & (phase == 1))]
+        worst.note(f"{prefix} position limit", float(outside.max()), where)
+        # in contact the hand bears force too: what the coasting reference stands on is nobody's
+        if len(polygon) and (phase != 1 or prefix == "missed"):
+            inside = float(margin(polygon, zmp(a["ground"][k : k + 1]))[0])
+            worst.note(f"{prefix} ZMP", -inside, where)
+    yield from worst.all()
+
+
+def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) -> Iterator[tuple[str, float]]:
+    """Whether torques and the ground's wrench are what a motion needs, that needs tau (nv,) without soles.
+
+    Each sole's wrench follows from its leg's torques; together they have to be the ground's, and each has to
+    keep half of the margins that the problem asks for.
+    """
+    robot, limit = p.robot, p.problem.robot.torque_limit
+    free, rest = np.setdiff1d(np.arange(robot.n), robot.dependent), tau.copy()
+    wrenches = np.zeros(0)
+    if robot.soles:
+        wrenches = robot.wrenches(q, tau - np.concatenate([np.zeros(robot.base), torque]))
+        robot.relieve(rest, q, wrenches)  # a hand that holds on is borne by the waist, too
+    yield "torque", _gap(torque[free] / limit[free], rest[robot.base + free] / limit[free])
+    if not robot.soles:
+        return
+    world = robot.ground(wrenches)
+    six = robot.wrench_scale[:6]
+    yield "ground wrench", _gap(world, ground, six)
+    yield "equation of motion of the base", _gap(rest[: robot.base] / six, np.zeros(robot.base))
+    if robot.standing:
+        corners = [leg.sole.polygon for leg, *_ in robot.soles if leg.sole is not None]
+        own, cone = wrenches.reshape(-1, 6)[: robot.standing], p.problem.term(ContactWrenchCone)
+        kept = float(cop_margin(robot.robot, corners, own[None]).min())
+        yield "margin of a sole's centre of pressure", least_kept(cone.margin) - kept
+        yield "normal force of a sole", (SHARE * cone.minimum_force - float(own[:, 2].min())) / robot.weight
+
+
+def _blow(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
+    """What a record says of the blow on the expected target; it may be computed again, on a finer mesh."""
+    blow = p.blows[0]
+    if "collision_time" not in arrays:
+        return
+    time, force = arrays["collision_time"], arrays["collision_force"]
+    impulse = float(blow.get(v, "impulse so far", blow.end[-1])[0])
+    durations = [v.one(name) for name in blow.durations]
+    own = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in blow.stages]
+    if len(time) == len(own) + 1:
+        forces = np.array([blow.get(v, "contact force", i).sum() for i in range(len(own))])
+        yield Off("blow", _gap(time[1:], own), "collision_time")
+        yield Off("blow", _gap(force[1:], forces, 100.0), "collision_force")
+    else:
+        given = float(np.trapezoid(force, time))
+        off = abs(given - impulse) / abs(impulse) - INTEGRAL
+        yield Off("blow", max(off, 0.0), "impulse of collision_force")
+    limits = p.problem.robot.torque_limit
+    start = v.get("feed-forward at contact")
+    yield Off("blow", _gap(arrays["collision_torque"][0] / limits, start), "collision_torque at contact")
+
+
+def _summary(p: Program, v: Variables, summary: Mapping[str, Any]) -> Iterator[Off]:
+    blow = p.blows[0]
+    contact = sum(v.one(name) for name in blow.durations)
+    y, u = p.state_at_contact(v)
+    wanted = {
+        "impulse_Ns": float(blow.get(v, "impulse so far", blow.end[-1])[0]),
+        "contact_ms": 1e3 * contact,
+        "hand_speed_m_s": float(p.robot.normal @ p.robot.striking(y, u)[1]),
+        "duration_s": contact + sum(v.one(way.T) for way in p.ways[:2]),
+    }
+    for key, value in wanted.items():
+        if key in summary:
+            yield Off("summary", _gap(_number(summary[key]), value, max(abs(value), 1e-3)), key)
+    state, target = blow.get(v, "target state", blow.end[-1]), p.problem.target
+    for key, value in target.outcome(state, blow.target).items():
+        told = summary.get("target") or {}
+        if key in told:
+            yield Off("summary", _gap(_number(told[key]), value, max(abs(value), 1e-3)), f"target.{key}")
+    told = summary.get("objectives") or {}
+    if Impulse.name in told:
+        value = wanted["impulse_Ns"]
+        yield Off("summary", _gap(_number(told[Impulse.name]), value, abs(value)), "objectives.impulse")
+    for scenario, other in zip(summary.get("scenarios") or (), p.blows[1:], strict=False):
+        value = float(other.get(v, "impulse so far", other.end[-1])[0])
+        off = _gap(_number(scenario.get("impulse_Ns")), value, abs(value))
+        yield Off("summary", off, f"impulse_Ns, if {scenario.get('name')}")
+
+
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
+    """Exact distances between all bodies that are not to touch, at all instants that a record has."""
+    phase, q = np.asarray(arrays["reference_phase"]), np.asarray(arrays["reference_q"])
+    time = np.asarray(arrays["reference_time"])
+    parts = [(time[k], q[k], np.full(int(k.sum()), n), n) for n in (0, 2) if (k := phase == n).any()]
+    bodies = p.problem.bodies
+    gone = 0.0
+    if p.blows:
+        blow, y0 = p.blows[0], p.at_contact(v)
+        stages = [blow.moved(v, i, y0) for i in range(len(blow.stages))]
+        legs = [blow.get(v, "collision legs", i) for i in range(len(stages))]
+        postures = np.array([p.robot.posture(s[0], leg) for s, leg in zip(stages, legs, strict=True)])
+        times = np.array([s[1] for s in stages]) + v.one(p.ways[0].T)
+        survey = bodies.survey(
+            times,
+            Places.of(
+                p.problem.robot,
+                postures,
+                np.array([s[3] for s in stages]),
+                np.ones(len(stages), dtype=np.intp),
+            ),
+        )
+        yield Off("distance of bodies", max(-survey.clearance, 0.0), " and ".join(survey.nearest))
+        state = blow.get(v, "target state", blow.end[-1])
+        gone, speed = stages[-1][3], float(p.problem.target.velocity(state, blow.target))
+        if p.problem.target.stays:
+            speed = 0.0
+    else:
+        speed = 0.0
+    if "missed_q" in arrays:
+        after = np.asarray(arrays["missed_phase"]) == 2
+        postures = np.asarray(arrays["missed_q"])[after]
+        parts.append(
+            (np.asarray(arrays["missed_time"])[after], postures, np.full(len(postures), MISSED), MISSED)
+        )
+    for times, postures, phases, n in parts:
+        travel = np.zeros(len(times))
+        if n == 2:
+            travel = gone + speed * (times - float(arrays["reference_contact_end"]))
+        at = Places.of(p.problem.robot, postures, travel, phases)
+        survey = bodies.survey(times, at)
+        where = f"{' and '.join(survey.nearest)} at {survey.time:.4g} s"
+        yield Off("distance of bodies", max(-survey.clearance, 0.0), where)

@@ -1,0 +1,204 @@
+"""The program written down a second time has the rows, bounds and objective of the first, at any point."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.small_plans import Planned, arm_problem, changed, transcribed
+
+from impactopt.contact import FreeMass
+from impactopt.files.problem_file import load_problem
+from impactopt.planning.keeping_apart import Margins, Watch
+from impactopt.problem.objectives import Effort
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import ContactWrenchCone, FirstTouch, GearLoad, GroundForce, Slide, TargetSpeed
+from impactopt.robots.attachments import SoftGrip
+from impactopt.transcription.plan import Trajectory
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.statement import statement_of
+from impactopt.transcription.transcription import Transcription, block_functions
+from oracle.kkt import lagrangian_gradient
+from oracle.program import Program
+from oracle.recorded import off_in_record
+from oracle.variables import Variables
+from oracle.verdict import claims_of
+
+PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
+ALLOWED = {"bodies", "contact", "errors", "kinematics", "problem", "robots"}
+# those of `kinematics` that are numbers alone
+NUMBERS = {"impactopt.kinematics.splines", "impactopt.kinematics.support", "impactopt.kinematics.wrench_cone"}
+
+
+def test_it_shares_no_code_with_program_and_solver() -> None:
+    own = [f for f in Path(__file__).parent.glob("*.py") if not f.name.startswith(("test_", "__main__"))]
+    assert len(own) > 5
+    for file in own:
+        nodes = [n for n in ast.walk(ast.parse(file.read_text("utf-8"))) if isinstance(n, ast.ImportFrom)]
+        used = {str(n.module) for n in nodes if str(n.module).startswith("impactopt")}
+        assert {name.split(".")[1] for name in used} <= ALLOWED, file
+        assert {name for name in used if name.startswith("impactopt.kinematics")} <= NUMBERS, file
+
+
+def away_from_start(t: Transcription) -> np.ndarray:
+    x, draw = first_iterate(t), np.random.default_rng(0)
+    return x + 1e-2 * draw.standard_normal(len(x)) * np.clip(np.abs(x), 1e-3, 1.0)
+
+
+def second(t: Transcription, x: np.ndarray) -> tuple[Program, Variables]:
+    claims = claims_of({"program_statement": np.array(statement_of(t))})
+    program = Program(t.problem, claims)
+    return program, Variables(claims.groups, program.scales, x)
+
+
+def check_rows(t: Transcription) -> None:
+    x = away_from_start(t)
+    program, v = second(t, x)
+    assert program.missing == []
+    found: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for piece in program.rows:
+        for name, g, low, high in zip(piece.names, piece.value(v), piece.lower, piece.upper, strict=True):
+            if np.isfinite(low) or np.isfinite(high):
+                found.setdefault(name, []).append((g - low, high - g))
+    g, lower, upper = t.program.constraints(x), t.program.g_lower, t.program.g_upper
+    for row, below, above in zip(t.rows.origins, g - lower, upper - g, strict=True):
+        own = found[row.term, row.place.name, row.component].pop(0)
+        assert own == pytest.approx((below, above), abs=1e-9, rel=1e-9), str(row)
+    assert not any(found.values())
+    worth = sum(float(part.value(v)[0]) for part in program.worth)
+    assert worth == pytest.approx(t.program.objective(x), rel=1e-10)
+    for name, (low, high) in program.bounds.items():
+        if name in v and v.count(name):
+            assert v.scaled(name, low) == pytest.approx(t.program.x_lower[v.span(name)])
+            assert v.scaled(name, high) == pytest.approx(t.program.x_upper[v.span(name)])
+    bounded = np.isfinite(t.program.x_lower) | np.isfinite(t.program.x_upper)
+    for name in v.names:
+        assert name in program.bounds or not bounded[v.span(name)].any(), name
+
+
+def test_of_a_robot_on_two_soles(biped_transcription: Transcription) -> None:
+    check_rows(biped_transcription)
+
+
+def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> None:
+    t = changed(biped_transcription)
+    rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).rows(0.15)
+    assert len(rows) > 100
+    check_rows(t.with_apart(rows))
+
+
+def test_with_scenarios() -> None:
+    others = (Scenario(name="soft", stiffness=0.5, torque=0.9), Scenario(name="heavy", mass=2.0))
+    check_rows(transcribed(dataclasses.replace(arm_problem(), scenarios=others)))
+
+
+def test_of_a_ball_that_comes_and_is_caught() -> None:
+    p = arm_problem()
+    still = TargetSpeed(least=-0.1, most=0.2)
+    ball = FreeMass(mass=0.5, initial_velocity=-3.0)
+    check_rows(transcribed(dataclasses.replace(p, target=ball, terms=(*p.terms, still))))
+
+
+def test_of_a_slide_that_is_bounded() -> None:
+    p = arm_problem()
+    check_rows(transcribed(dataclasses.replace(p, terms=(*p.terms, Slide(most=0.02)))))
+
+
+def test_of_the_ground_s_force_and_the_first_touch(biped_transcription: Transcription) -> None:
+    p = biped_transcription.problem
+    others = (
+        Scenario(name="soft", stiffness=0.5),
+        Scenario(name="nothing", missing=True, abort_after=0.02),
+    )
+    kept = tuple(term for term in p.terms if not isinstance(term, GroundForce | FirstTouch))
+    terms = (*kept, GroundForce(least=0.4, sole=0.2), FirstTouch(depth=2e-3, angle=0.5))
+    check_rows(transcribed(dataclasses.replace(p, terms=terms, scenarios=others)))
+
+
+def test_of_a_striking_link_with_corners() -> None:
+    p = load_problem(PROBLEMS / "arm7.toml")
+    kept = tuple(term for term in p.terms if not isinstance(term, FirstTouch))
+    t = _drawn(dataclasses.replace(p, terms=(*kept, FirstTouch())))
+    assert any(row.term == FirstTouch.name for row in t.rows.origins)
+    check_rows(t)
+
+
+@pytest.mark.parametrize("name", ["strike_holding_on", "push_two_hands"])
+def test_of_two_hands(name: str) -> None:
+    problem = load_problem(PROBLEMS / f"{name}.toml")
+    functions = block_functions(problem, problem.coordinates)
+    check_rows(Transcription(problem, problem.coordinates, functions))
+
+
+@pytest.mark.parametrize("name", ["arm_planar", "chop_arm"])
+def test_of_targets_with_events(name: str) -> None:
+    problem = load_problem(PROBLEMS / f"{name}.toml")
+    functions = block_functions(problem, problem.coordinates)
+    check_rows(Transcription(problem, problem.coordinates, functions))
+
+
+def test_slopes_are_those_of_the_program(arm_transcription: Transcription) -> None:
+    t = arm_transcription
+    x = away_from_start(t)
+    program, v = second(t, x)
+    y = np.random.default_rng(1).standard_normal(t.program.m)
+    left: dict[tuple[str, str, str], list[float]] = {}
+    for row, weight in zip(t.rows.origins, y, strict=True):
+        left.setdefault((row.term, row.place.name, row.component), []).append(weight)
+    weights = [np.array([left[n].pop(0) if n in left else 0.0 for n in p.names]) for p in program.rows]
+    pieces = [*program.rows, *program.worth]
+    found, doubt = lagrangian_gradient(pieces, [*weights, *[np.ones(1)] * len(program.worth)], v)
+    wanted = t.program.gradient(x) + t.program.jacobian(x).T @ y
+    assert found == pytest.approx(wanted, rel=1e-7, abs=1e-6)
+    assert np.abs(found - wanted).max() <= 10 * doubt.max() + 1e-7 * np.abs(wanted).max()
+
+
+def _drawn(problem: ImpactProblem) -> Transcription:
+    return Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
+
+
+@pytest.mark.parametrize("limit", [None, 1.5, {"elbow": 2.0}], ids=["default", "one", "by joint"])
+def test_of_gears_in_a_damped_contact(limit: Any) -> None:
+    """With the first instant, at which a damper has its force already, and in scenarios too."""
+    p = load_problem(PROBLEMS / "arm_planar.toml")
+    others = (
+        Scenario(name="heavy", mass=2.0, torque=0.9),
+        Scenario(name="nothing", missing=True, abort_after=0.02),
+    )
+    terms = (*(t for t in p.terms if not isinstance(t, GearLoad)), GearLoad(limit=limit))
+    check_rows(_drawn(dataclasses.replace(p, terms=terms, scenarios=others)))
+
+
+def test_of_a_tool_in_a_soft_grip() -> None:
+    """Its joint bears what spring and damper do, and no more; with gears beside it."""
+    p = load_problem(PROBLEMS / "arm_planar.toml")
+    grip = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.05])
+    robot = p.robot.with_grip(p.robot.tools[-1].name, grip)
+    check_rows(_drawn(dataclasses.replace(p, robot=robot, terms=(*p.terms, GearLoad()))))
+
+
+def test_of_effort() -> None:
+    p = load_problem(PROBLEMS / "arm_planar.toml")
+    check_rows(_drawn(dataclasses.replace(p, objectives=(*p.objectives, Effort(weight=0.02)))))
+
+
+def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned) -> None:
+    """By the wrenches that the legs' torques leave to the soles, as the plan says."""
+    plan, t = biped_plan.plan, biped_plan.transcription
+    arrays = {f"reference_{f.name}": getattr(biped_plan.trajectory, f.name) for f in fields(Trajectory)}
+    margins = plan.sole_margins(biped_plan.trajectory)["sole_cop_margin_mm"].values()
+    kept = 1e-3 * min(phases[name] for phases in margins for name in ("swing", "follow"))
+    for half, short in ((kept + 3e-3, 3e-3), (kept - 1e-3, 0.0)):
+        cone = ContactWrenchCone(margin=2 * half, minimum_force=0.0)
+        program, v = second(changed(t, terms=(cone,)), biped_plan.result.x)
+        off = {found.name: found.amount for found in off_in_record(program, v, arrays, {})}
+        assert max(off["reference margin of a sole's centre of pressure"], 0.0) == pytest.approx(
+            short, abs=1e-6
+        )
+        assert off["reference normal force of a sole"] < 0

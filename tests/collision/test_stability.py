@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
@@ -14,9 +13,7 @@ from benchmarks.stability_cases import RIGS, Rig
 from benchmarks.stability_others import freezes_of, refusals
 from benchmarks.stability_robots import make_robot
 from support import small_robots
-from typer.testing import CliRunner
 
-from impactopt.cli.app import app
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, RigidWall, SpringDamper
 from impactopt.errors import InputError
@@ -124,9 +121,7 @@ def test_the_command_counts_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stability, "MASSES", ())
     monkeypatch.setattr(stability, "FREEZES", ())
     monkeypatch.setattr(stability, "CASES", 80)
-    result = CliRunner().invoke(app, ["bench", "stability", "--quick", "--workers", "1", "--json", "-q"])
-    assert result.exit_code == 0, result.output
-    numbers = json.loads(result.stdout)
+    numbers = stability.run(lambda _: None, quick=True, workers=1).numbers
     assert numbers.keys() >= {"cases", "agree", "refused", "nan", "wrong", "seconds", "reasons"}
     assert numbers["cases"] == numbers["agree"] + numbers["refused"]
     assert sum(numbers["reasons"].values()) == numbers["cases"]

@@ -290,7 +290,7 @@ BAR = Obstacle(name="bar", start=(0.6, -0.2, 1.04), end=(0.6, 0.2, 1.04), radius
 
 @pytest.fixture(scope="module")
 def free() -> Solution:
-    return solve(load_problem("arm_planar"))
+    return solve(dataclasses.replace(load_problem("arm_planar"), style="strongest"))
 
 
 @pytest.fixture(scope="module")

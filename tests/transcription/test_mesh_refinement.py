@@ -220,8 +220,7 @@ def test_all_objectives_and_extra_terms_are_tried_here() -> None:
     """The biped's test below has the angular momentum, and what is about soles and the striking link. The
     small robots have no hand that could hold on: of `Grip` tests/planning/test_holding_on.py has its own.
     """
-    on_legs = {GroundForce, FirstTouch}
-    assert {*OBJECTIVES, *TERMS} - {*map(type, DEFAULT_TERMS)} == KINDS | on_legs | {Grip}
+    assert {*OBJECTIVES, *TERMS} - {*map(type, DEFAULT_TERMS)} == KINDS | {Grip}
 
 
 def with_more(t: Transcription, *things: Objective | Term, **changes: Any) -> Transcription:

@@ -186,7 +186,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
             **_kept(told, told, "planned"),
             **_kept(held, told, "held"),
             "soles": {name: _soles(found) for name, found in (("planned", told), ("held", held))},
-            **{key: told[key] for _, key, _ in MOTION if key in told},
+            **{key: told[key] for _, key, _ in MOTION[1:] if key in told},
         }
         least, most = told.get("ground_force_share") or (None, None)
         out |= {

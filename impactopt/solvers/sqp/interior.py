@@ -6,8 +6,8 @@ interior-point method of Waechter and Biegler (Mathematical Programming 106, 200
 search, second-order correction and inertia control. What is ours is the Newton system (`newton`): rows that
 determine variables of their own are eliminated first (`condense`), and what is left gets a Cholesky factor.
 
-Where no step is progress any more the rows become elastic: they may be violated at a price, as in Sl1QP
-(Nocedal and Wright 2006, section 18.5), so that an infeasible program ends at a point of least violation.
+Where no step is progress any more the rows become elastic: they may be violated at a price (Nocedal and
+Wright 2006, section 18.5), so that an infeasible program ends at a point of least violation.
 
 The loop is here. What it moves is a `BarrierProblem`, how far along a step a `LineSearch` says, and what is
 aimed at where that finds nothing an `ElasticPhase`.

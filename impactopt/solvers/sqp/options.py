@@ -19,8 +19,8 @@ class SQPOptions:
     qp_solver : "interior": a primal-dual interior-point method, which takes one Newton step on each quadratic
         model; or a name in `QP_SOLVERS`, which solves every QP to its end (SQP in the strict sense). Options
         of only one of the two say so.
-    hessian : with QP solvers, "exact" (made convex) or "bfgs" (damped; dense, for some hundred variables at
-        most).
+    hessian : with QP solvers, "exact" (made convex) or "bfgs" (damped; dense, for some hundred free
+        variables at most).
     violation_tolerance : largest violation of a row or bound at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
     complementarity_tolerance : of "interior", largest product of a multiplier and the distance to its bound
@@ -28,21 +28,10 @@ class SQPOptions:
     acceptable_tolerance : tolerance in place of kkt_tolerance for the status ACCEPTABLE, if no step helps.
     max_iterations : most iterations; then the best iterate is returned.
     time_limit : [s]; then the best iterate is returned.
-    radius : with QP solvers, first radius of the trust region |d|_inf <= radius.
-    radius_max : with QP solvers, its largest radius.
+    radius : with QP solvers, largest radius of the trust region |d|_inf <= radius.
     price : first price of violations: with QP solvers in the merit function f + price * sum of violations,
         with "interior" in its elastic phase. It rises by itself; if it is too low, it takes more iterations.
     price_max : largest price of violations. If it is too low, the end may be infeasible.
-    levenberg : with QP solvers, multiple of the identity that is always added to the Hessian. It rises by
-        itself where the QP solver has difficulties.
-    augmentation : with QP solvers, weight of the active rows (in multiples of the Hessian's norm) in making
-        the Hessian convex.
-    curvature_floor : with QP solvers, least eigenvalue, in multiples of the Hessian's norm, after making it
-        convex.
-    dense_limit : with QP solvers, most variables for which matrices are treated as dense: the Hessian made
-        convex by its eigenvalues rather than by a shift, QPs solved by the dense active-set method. Like
-        levenberg, augmentation and curvature_floor it is for programs that do not say which variables their
-        rows determine, such as textbook problems. Plans and strikes say so.
     second_order_correction : whether a refused step is corrected for the curvature of the rows.
     barrier : of "interior", first barrier parameter of a start without multipliers.
     barrier_warm : the same of a start with multipliers. Below 5e-3 it falls at once where the start is near a
@@ -59,13 +48,8 @@ class SQPOptions:
     max_iterations: int = 500
     time_limit: float | None = None
     radius: float = 1.0
-    radius_max: float = 100.0
     price: float = 100.0
     price_max: float = 1e5
-    levenberg: float = 0.0
-    augmentation: float = 10.0
-    curvature_floor: float = 1e-6
-    dense_limit: int = 300
     second_order_correction: bool = True
     barrier: float = 3e-2
     barrier_warm: float = 1e-5
@@ -87,7 +71,6 @@ class SQPOptions:
                 'hessian: with qp_solver "interior" it is "exact"; for "bfgs" give another qp_solver, '
                 'such as "active_set"'
             )
-        may_be_zero = {"levenberg", "augmentation", "max_iterations", "dense_limit"}
         for option in fields(self):
             value, default = getattr(self, option.name), option.default
             if isinstance(default, (bool, str)) or (value is None and default is None):
@@ -98,10 +81,7 @@ class SQPOptions:
             number = float(check_array(option.name, value, ()))
             if isinstance(default, int) and number != int(number):
                 raise InputError(f"{option.name}: {value!r}; give a whole number")
-            if not (value > 0 or (value == 0 and option.name in may_be_zero)):
+            if not (value > 0 or (value == 0 and option.name == "max_iterations")):
                 raise InputError(f"{option.name}: {value} is out of range; it must be positive")
-        for low, high in (("radius", "radius_max"), ("price", "price_max")):
-            if getattr(self, low) > getattr(self, high):
-                raise InputError(
-                    f"{low} ({getattr(self, low):g}) must not exceed {high} ({getattr(self, high):g})"
-                )
+        if self.price > self.price_max:
+            raise InputError(f"price ({self.price:g}) must not exceed price_max ({self.price_max:g})")

@@ -12,13 +12,14 @@ import scipy.sparse as sp
 
 from impactopt.solvers.program import Vector
 from impactopt.solvers.sqp.active_set import ActiveSetSolver
-from impactopt.solvers.sqp.answers import HOPELESS, SMALL, answer, no_answer, split
 from impactopt.solvers.sqp.qp import QPSolution, QPStatus, QuadraticProgram
 from impactopt.solvers.sqp.refine import active_set, refine
 
 _USABLE = (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE)
 _INFEASIBLE = (osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE, osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE)
 _UNFINISHED = (osqp.SolverStatus.OSQP_MAX_ITER_REACHED, osqp.SolverStatus.OSQP_TIME_LIMIT_REACHED)
+_SMALL = 300  # variables; up to here dense factorizations are cheap
+_HOPELESS = 1e-2  # largest error of an answer that is of any use
 _FEW = 5  # rows that a guess of the active set may lack or have too many
 
 
@@ -76,7 +77,7 @@ class OsqpSolver:
 
     def _known(self, qp: QuadraticProgram, start: tuple[Vector, Vector, Vector]) -> QPSolution | None:
         """The solution, if the guess has its active set but for a few rows."""
-        if qp.n <= SMALL:
+        if qp.n <= _SMALL:
             found = self._near.solve(qp, start=start)
             exact = found.status is QPStatus.SOLVED and qp.error(found.x, found.y, found.z) <= self.tolerance
             return dataclasses.replace(found, iterations=0) if exact else None
@@ -89,7 +90,7 @@ class OsqpSolver:
         """Let OSQP run for longer and longer, and try to finish from its answer each time."""
         assert self._solver is not None
         iterations, best = 0, no_answer(qp, QPStatus.FAILED)
-        worst = HOPELESS
+        worst = _HOPELESS
         for more in self._stages:
             left = deadline - time.perf_counter()
             if left <= 0.0:
@@ -101,7 +102,7 @@ class OsqpSolver:
             if status == osqp.SolverStatus.OSQP_SIGINT:
                 raise KeyboardInterrupt
             if status in _INFEASIBLE:
-                if qp.n <= SMALL:  # OSQP may be wrong about it; this is exact
+                if qp.n <= _SMALL:  # OSQP may be wrong about it; this is exact
                     return self._active_set.solve(qp, time_limit=None if left == np.inf else left)
                 return no_answer(qp, QPStatus.INFEASIBLE, iterations)
             if status not in _USABLE + _UNFINISHED or not (
@@ -123,7 +124,7 @@ class OsqpSolver:
     ) -> tuple[Vector, Vector, float]:
         """The best of OSQP's answer and what can be made of it, with its error."""
         worst = qp.error(x, *split(qp, unit))
-        if qp.n <= SMALL:
+        if qp.n <= _SMALL:
             guess = (x, *split(qp, active_set(qp, x, unit).astype(float)))
             left = None if deadline == np.inf else deadline - time.perf_counter()
             exact = self._active_set.solve(qp, start=guess, time_limit=left)
@@ -161,3 +162,20 @@ class OsqpSolver:
         self._solver, self._pattern = solver, pattern
         self.setups += 1
         return True
+
+
+def split(qp: QuadraticProgram, unit: Vector) -> tuple[Vector, Vector]:
+    """Multipliers (y, z) from those of the unit rows of `qp.stacked` (m + n,)."""
+    y = unit * qp.row_scale
+    return y[: qp.m], y[qp.m :]
+
+
+def answer(qp: QuadraticProgram, x: Vector, unit: Vector, status: QPStatus, iterations: int) -> QPSolution:
+    """x and the multipliers of the unit rows as a solution."""
+    y, z = split(qp, unit)
+    return QPSolution(x=x, y=y, z=z, status=status, iterations=iterations)
+
+
+def no_answer(qp: QuadraticProgram, status: QPStatus, iterations: int = 0) -> QPSolution:
+    """A status without a solution."""
+    return answer(qp, np.zeros(qp.n), np.zeros(qp.m + qp.n), status, iterations)

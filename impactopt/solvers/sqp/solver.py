@@ -11,7 +11,6 @@ from impactopt.solvers.sqp.interior import InteriorRun
 from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.reduced import ReducedRun
 from impactopt.solvers.sqp.run import Path, Run, Task, Watch
-from impactopt.solvers.sqp.sl1qp import Sl1QPRun
 from impactopt.solvers.threads import threads
 
 
@@ -68,9 +67,8 @@ def solve_sqp(
     )
     interior = options.qp_solver == "interior"
     determined = getattr(program, "determined", ())
-    reduced = ReducedRun(task, determined) if determined and not interior else None
-    run: Run = reduced or (InteriorRun if interior else Sl1QPRun)(task)
-    with threads().limit(limits=1 if interior or determined else None, user_api="blas"):
+    run: Run = InteriorRun(task) if interior else ReducedRun(task, determined)
+    with threads().limit(limits=1, user_api="blas"):
         try:
             status = run.iterate()
         except KeyboardInterrupt:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 # not yet rewritten
-LATER = ("impactopt/studies/", "impactopt/verification/", "impactopt/solvers/sqp/")
+LATER = tuple(f"impactopt/solvers/{folder}/" for folder in ("elimination", "ipm", "qp", "sqp"))
 QUESTIONS = {"What", "How", "Where", "Which", "Whether", "Who", "Why", "When", "That", "Those"}
 HEADLESS = {
     "Of",

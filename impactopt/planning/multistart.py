@@ -22,8 +22,8 @@ from impactopt.solvers.program import (
     Violation,
     worst_rows,
 )
+from impactopt.solvers.run import Path, Watch
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.solvers.sqp.run import Path, Watch
 from impactopt.transcription.start import carried_over
 
 if TYPE_CHECKING:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from impactopt.solvers.point import Point
 from impactopt.solvers.program import (
     Determined,
     Status,
@@ -23,12 +24,11 @@ from impactopt.solvers.program import (
     row_violations,
     stationarity,
 )
-from impactopt.solvers.sqp.point import Point
-from impactopt.solvers.sqp.qp_solvers import make_qp_solver
+from impactopt.solvers.qp.registry import make_qp_solver
+from impactopt.solvers.run import Run, Task
 from impactopt.solvers.sqp.reduced_hessian import ReducedModel, make_model
 from impactopt.solvers.sqp.reduced_qp import ReducedQP, Solved
 from impactopt.solvers.sqp.reduction import Reduction
-from impactopt.solvers.sqp.run import Run, Task
 
 _HALVINGS = 12  # of a step
 _ARMIJO = 1e-4

@@ -11,9 +11,9 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.point import Point, TimedProgram
 from impactopt.solvers.program import Matrix, Vector
-from impactopt.solvers.sqp.options import SQPOptions
-from impactopt.solvers.sqp.point import Point, TimedProgram
 from impactopt.solvers.sqp.reduction import Reduction
 
 _FLOOR = 1e-5  # least eigenvalue

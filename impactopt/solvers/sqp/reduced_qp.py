@@ -8,9 +8,9 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from impactopt.solvers.point import Point, TimedProgram
 from impactopt.solvers.program import Matrix, Vector, row_violations
-from impactopt.solvers.sqp.point import Point, TimedProgram
-from impactopt.solvers.sqp.qp import QPSolution, QPSolver, QPStatus, QuadraticProgram
+from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
 from impactopt.solvers.sqp.reduced_hessian import ReducedModel
 from impactopt.solvers.sqp.reduction import Reduction
 

@@ -1,4 +1,4 @@
-"""Sequential quadratic programming where each QP is taken one interior-point step towards its solution.
+"""Interior-point method: each quadratic model is taken one Newton step towards its solution.
 
 The QPs of a whole motion have thousands of rows; solving each of them exactly costs more than the functions.
 So the barrier of the rows is kept from one QP to the next, and every QP gets one Newton step: the primal-dual
@@ -19,11 +19,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from impactopt.solvers.ipm.barrier_problem import BarrierProblem
+from impactopt.solvers.ipm.elastic_phase import ElasticPhase
+from impactopt.solvers.ipm.line_search import LineSearch
 from impactopt.solvers.program import Determined, Status, Vector, complementarity, stationarity
-from impactopt.solvers.sqp.barrier_problem import BarrierProblem
-from impactopt.solvers.sqp.elastic_phase import ElasticPhase
-from impactopt.solvers.sqp.run import Run, Task
-from impactopt.solvers.sqp.search import LineSearch
+from impactopt.solvers.run import Run, Task
 
 _ABSURD = 1e12  # multipliers beyond this come from rows that have none
 _RESTARTS = 2  # where nothing is progress any more

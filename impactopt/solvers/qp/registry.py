@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from impactopt.errors import InputError, did_you_mean
-from impactopt.solvers.sqp.qp import QPSolver
+from impactopt.solvers.qp.quadratic_program import QPSolver
 
 
 def _active_set(_tolerance: float) -> QPSolver:
-    from impactopt.solvers.sqp.active_set import ActiveSetSolver
+    from impactopt.solvers.qp.active_set import ActiveSetSolver
 
     return ActiveSetSolver()
 
 
 def _osqp(tolerance: float) -> QPSolver:
-    from impactopt.solvers.sqp.osqp_solver import OsqpSolver
+    from impactopt.solvers.qp.osqp_solver import OsqpSolver
 
     return OsqpSolver(tolerance=tolerance)
 

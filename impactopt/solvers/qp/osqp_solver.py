@@ -11,9 +11,9 @@ import osqp
 import scipy.sparse as sp
 
 from impactopt.solvers.program import Vector
-from impactopt.solvers.sqp.active_set import ActiveSetSolver
-from impactopt.solvers.sqp.qp import QPSolution, QPStatus, QuadraticProgram
-from impactopt.solvers.sqp.refine import active_set, refine
+from impactopt.solvers.qp.active_set import ActiveSetSolver
+from impactopt.solvers.qp.quadratic_program import QPSolution, QPStatus, QuadraticProgram
+from impactopt.solvers.qp.refine import active_set, refine
 
 _USABLE = (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE)
 _INFEASIBLE = (osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE, osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE)

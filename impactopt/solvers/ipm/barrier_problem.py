@@ -2,7 +2,7 @@
 
 Rows are those that `Condenser` leaves; g - s = 0 for an inequality row with its slack s. Here are its
 residual, its error, its barrier function, the Newton step and what a part of that leads to. Which step is
-taken is the line search's business (`search`), when rows may be violated that of `elastic_phase`.
+taken is the line search's business (`line_search`), when rows may be violated that of `elastic_phase`.
 
 Source: Waechter and Biegler 2006; equation numbers are that paper's.
 """
@@ -14,14 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from impactopt.solvers.ipm.barrier import Bounded
+from impactopt.solvers.ipm.elastic_constraints import Elastic
+from impactopt.solvers.ipm.filter import SearchStart
+from impactopt.solvers.ipm.newton import acquire, release
+from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.point import Point, TimedProgram
 from impactopt.solvers.program import Determined, Vector, scaled_residual
-from impactopt.solvers.sqp.barrier import Bounded
-from impactopt.solvers.sqp.elastic import Elastic
-from impactopt.solvers.sqp.linesearch import SearchStart
-from impactopt.solvers.sqp.newton import acquire, release
-from impactopt.solvers.sqp.options import SQPOptions
-from impactopt.solvers.sqp.point import Point, TimedProgram
-from impactopt.solvers.sqp.run import Path
+from impactopt.solvers.run import Path
 
 _FASTER = 0.2  # mu becomes min(0.2 mu, mu^power) (eq. 7)
 # the barrier problem is solved to so many mu (kappa_epsilon); then mu falls with this power: gently and

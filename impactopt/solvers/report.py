@@ -1,4 +1,4 @@
-"""What an SQP run tells: its history while it runs, its result at the end."""
+"""Report of a run of our solvers: its history while it runs, its result at the end."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 
+from impactopt.solvers.point import Point, TimedProgram
 from impactopt.solvers.program import (
     BestIterate,
     Callback,
@@ -17,7 +18,6 @@ from impactopt.solvers.program import (
     explain,
     stationarity,
 )
-from impactopt.solvers.sqp.point import Point, TimedProgram
 
 
 class Report:

@@ -1,4 +1,4 @@
-"""What one solve is, whatever its steps."""
+"""Base class of one solve, whatever its steps."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
+from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.point import TimedProgram
 from impactopt.solvers.program import Callback, NonlinearProgram, Status, Vector
-from impactopt.solvers.sqp.options import SQPOptions
-from impactopt.solvers.sqp.point import TimedProgram
-from impactopt.solvers.sqp.report import Report
+from impactopt.solvers.report import Report
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Where a solve was left: its barrier, and the slacks of rows (m,) and of variables' bounds (n,), what
-    has none its own value. NaN: of a row that is new.
+    """State in which a solve was left: its barrier, and the slacks of rows (m,) and of variables' bounds
+    (n,), what has none its own value. NaN: of a row that is new.
     """
 
     barrier: float
@@ -29,10 +29,10 @@ class Watch(Protocol):
     """
 
     def lacks(self, x: Vector) -> bool:
-        """Whether an iterate (n,) asks for constraints that the program has not."""
+        """True if an iterate (n,) asks for constraints that the program has not."""
 
     def leave(self, path: Path) -> None:
-        """Where the solve is left for that."""
+        """Take the state in which the solve is left for that."""
 
     def limit(self, x: Vector, step: Vector, most: float) -> float:
         """The part of a step (n,) from an iterate (n,), ``most`` at most, that may be taken."""
@@ -40,7 +40,7 @@ class Watch(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Task:
-    """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds.
+    """Task of a run: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds.
 
     watch, path : as of `solve_sqp`.
     """
@@ -71,7 +71,7 @@ class Run(ABC):
 
     @abstractmethod
     def iterate(self) -> Status:
-        """From the start until a status is reached."""
+        """Run from the initial guess until a status is reached."""
 
     def _out_of_time(self) -> bool:
         return self.options.time_limit is not None and self.report.elapsed() > self.options.time_limit

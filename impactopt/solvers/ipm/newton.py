@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.solvers.elimination.compiled import kernels as fastest
+from impactopt.solvers.elimination.condense import Condenser, Mask, find_eliminations
+from impactopt.solvers.elimination.kernels import Index, Kernels, Products
+from impactopt.solvers.ipm.cholesky import BlockCholesky
 from impactopt.solvers.program import Determined, Matrix, Vector
-from impactopt.solvers.sqp.cholesky import BlockCholesky
-from impactopt.solvers.sqp.compiled import kernels as fastest
-from impactopt.solvers.sqp.condense import Condenser, Mask, find_eliminations
-from impactopt.solvers.sqp.kernels import Index, Kernels, Products
 
 _KEPT = 3  # structures
 _PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step

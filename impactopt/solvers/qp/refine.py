@@ -1,4 +1,4 @@
-"""From an approximate to an exact solution of a QP: the primal-dual active-set method.
+"""Refinement of an approximate QP solution to an exact one: the primal-dual active-set method.
 
 Hintermueller, Ito, Kunisch, SIAM Journal on Optimization 13, 2002.
 """
@@ -15,7 +15,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from impactopt.solvers.program import Matrix, Vector
-from impactopt.solvers.sqp.qp import QuadraticProgram
+from impactopt.solvers.qp.quadratic_program import QuadraticProgram
 
 _DENSE = 400  # up to this many unknowns LAPACK is quicker than a sparse factorization
 _REGULARIZATION = 1e-9

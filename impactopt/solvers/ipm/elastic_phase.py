@@ -7,9 +7,9 @@ gone or least. So an infeasible program ends at a point of least violation.
 
 from __future__ import annotations
 
+from impactopt.solvers.ipm.barrier_problem import BarrierProblem
+from impactopt.solvers.options import SQPOptions
 from impactopt.solvers.program import Status, Vector, is_stationary_violation
-from impactopt.solvers.sqp.barrier_problem import BarrierProblem
-from impactopt.solvers.sqp.options import SQPOptions
 
 # violation from which on elastic rows are made hard again where they do not get further, or this part of what
 # it was when nothing else began to count

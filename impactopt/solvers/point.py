@@ -25,12 +25,12 @@ class Point:
 
     @cached_property
     def finite(self) -> bool:
-        """Whether f and g are."""
+        """True if f and g are finite."""
         return bool(np.isfinite(self.objective) and np.isfinite(self.g).all())
 
     @cached_property
     def differentiable(self) -> bool:
-        """Whether f, g and their derivatives are finite."""
+        """True if f, g and their derivatives are finite."""
         if not self.finite:
             return False
         try:

@@ -17,9 +17,8 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-from impactopt.solvers.program import Determined, Matrix, Vector
-from impactopt.solvers.sqp.kernels import Index, Kernels, Places, Products
-from impactopt.solvers.sqp.patterns import (
+from impactopt.solvers.elimination.kernels import Index, Kernels, Places, Products
+from impactopt.solvers.elimination.patterns import (
     Alike,
     Elimination,
     by_pattern,
@@ -30,6 +29,7 @@ from impactopt.solvers.sqp.patterns import (
     shapes,
     stage,
 )
+from impactopt.solvers.program import Determined, Matrix, Vector
 
 Mask = npt.NDArray[np.bool_]
 

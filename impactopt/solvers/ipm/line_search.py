@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from impactopt.solvers.ipm.barrier_problem import BarrierProblem, Step, Trial
+from impactopt.solvers.ipm.filter import Filter, SearchStart
 from impactopt.solvers.program import Vector
-from impactopt.solvers.sqp.barrier_problem import BarrierProblem, Step, Trial
-from impactopt.solvers.sqp.linesearch import Filter, SearchStart
-from impactopt.solvers.sqp.run import Watch
+from impactopt.solvers.run import Watch
 
 _CORRECTIONS = 4  # second-order corrections a step, at most
 _WORSE = 0.99  # a correction that leaves more than this part of the violation ends them

@@ -11,8 +11,16 @@ import numpy as np
 from scipy.linalg import cython_blas, cython_lapack
 
 from impactopt.codegen.library import address, native_library
+from impactopt.solvers.elimination.kernels import (
+    EliminationStep,
+    Index,
+    Kernels,
+    Panels,
+    Places,
+    Products,
+    Stack,
+)
 from impactopt.solvers.program import Vector
-from impactopt.solvers.sqp.kernels import EliminationStep, Index, Kernels, Panels, Places, Products, Stack
 
 _ROUTINES = (
     (cython_blas, "dgemm"),

@@ -1,4 +1,4 @@
-"""Which steps are progress: the filter and its switching rule.
+"""Filter and switching rule of the interior-point method: acceptance of its steps.
 
 Source: Waechter and Biegler 2006, section 2.3; equation numbers are that paper's.
 """

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from impactopt.solvers.ipm.barrier import longest
 from impactopt.solvers.program import Vector
-from impactopt.solvers.sqp.barrier import longest
 
 _LEAST = 1e-14  # of the price: no multiplier is nearer to it
 

@@ -1,4 +1,4 @@
-"""Which entries a condensed Newton system has, and where they stand: found once for all its numbers."""
+"""Sparsity patterns of condensed Newton systems, found once for all their numbers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from impactopt.solvers.elimination.kernels import EliminationStep, Index, Places, Products
 from impactopt.solvers.program import Matrix
-from impactopt.solvers.sqp.kernels import EliminationStep, Index, Places, Products
 
 
 class Elimination(NamedTuple):

@@ -1,4 +1,4 @@
-"""In which blocks, and in which order, the variables of a sparse symmetric matrix are eliminated."""
+"""Blocks and elimination order of the variables of a sparse symmetric matrix."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.solvers.sqp.kernels import Index
+from impactopt.solvers.elimination.kernels import Index
 
 _WIDEST = 24  # variables of a block that is made of several
 _ZEROS = 0.1  # part of a block's panel that may be zeros, so that it is one block instead of two

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.solvers.elimination.kernels import Index, Kernels, Panels, Places
+from impactopt.solvers.ipm.ordering import elimination_blocks
 from impactopt.solvers.program import Vector
-from impactopt.solvers.sqp.kernels import Index, Kernels, Panels, Places
-from impactopt.solvers.sqp.ordering import elimination_blocks
 
 
 class BlockCholesky:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.solvers.sqp.qp_solvers import QP_SOLVERS, check_qp_solver
+from impactopt.solvers.qp.registry import QP_SOLVERS, check_qp_solver
 
 HESSIANS = ("exact", "bfgs")
 

@@ -22,8 +22,8 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import SolverResult
 from impactopt.solvers.run import Path
-from impactopt.transcription.apart import ApartRow, Held
-from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.clearance import ApartRow, Held
+from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.layout import stack
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from impactopt.solvers.elimination.patterns import Elimination
 from impactopt.solvers.ipm.cholesky import BlockCholesky
 from impactopt.solvers.ipm.newton import NewtonSystem, acquire, release
 from impactopt.solvers.program import Determined
-from impactopt.transcription.start import first_iterate
+from impactopt.transcription.initial_guess import first_iterate
 
 NONE = np.zeros(9, dtype=bool)
 

@@ -17,7 +17,7 @@ from impactopt.solvers.ipm import interior_point as interior
 from impactopt.solvers.ipm import line_search as search
 from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.transcription.start import first_iterate
+from impactopt.transcription.initial_guess import first_iterate
 
 
 def projection(wanted):

@@ -1,4 +1,7 @@
-"""State at contact that all collisions of a program start from, and the servo reference that continues."""
+"""State at contact that all collisions of a program start from, and the servo reference that continues.
+
+Also the points at which a program knows the state of joints and drives: nodes, contact and its ends.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from impactopt.transcription.builder import Builder
+from impactopt.transcription.constraints import Place
 from impactopt.transcription.layout import Affine, Group
 
 GAINS = "logarithms of factors on gains"
@@ -84,3 +88,32 @@ class Contact(NamedTuple):
             )
             out.append([yk, rk, start[2], a, b, self.state.T, *times, one, two, u0, u])
         return out
+
+
+class DrivePoint(NamedTuple):
+    """State of the drives at a node.
+
+    torque (n,) : of the servos, over limit.  slots : z of `impactopt.problem.joint_motion.joint_motion`.
+    """
+
+    place: Place
+    torque: Affine
+    slots: list[Affine]
+
+
+class ContactEnd(NamedTuple):
+    """A contact's two ends.
+
+    before, after : z of `impactopt.problem.joint_motion.joint_motion`.  change (ny,) : of ydot.
+    """
+
+    place: Place
+    before: list[Affine]
+    after: list[Affine]
+    change: Affine
+
+
+def still(y: Affine, rate: Affine, slope: Affine, T: Affine, legs: Affine) -> list[Affine]:
+    """Slots of a motion at y, with ydot = rate/T and yddot = slope/T^2."""
+    none = Affine.zeros(y.size)
+    return [y, none, Affine.zeros(1), none, T, rate, slope, T, legs]

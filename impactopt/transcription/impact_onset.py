@@ -1,4 +1,4 @@
-"""The first instant of a damped contact, at which accelerations jump: as variables, and as numbers."""
+"""Onset of a damped contact, at which accelerations jump: as variables, and as numbers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.contact import Contact
+from impactopt.transcription.constraints import Index, Measure, Place, percent
 from impactopt.transcription.contact_blocks import FORCE_SCALE
+from impactopt.transcription.contact_state import Contact
 from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
-from impactopt.transcription.rows import Index, Measure, Place, percent
 
 TYPICAL = 100.0  # [rad/s^2]
 

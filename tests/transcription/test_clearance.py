@@ -28,9 +28,9 @@ from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
-from impactopt.transcription.apart import ApartRow, Chain, chain_between
+from impactopt.transcription.clearance import ApartRow, Chain, chain_between
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan
-from impactopt.transcription.start import first_iterate
 from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Programs with a contact in them: parts put together, as terms, objectives, starts and planners see them."""
+"""Base class of the nonlinear programs that contain a contact phase."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
-from impactopt.transcription.apart import ApartRow, Held, add_apart_rows, coupled, move_apart
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
+from impactopt.transcription.clearance import ApartRow, Held, add_apart_rows, coupled, move_apart
 from impactopt.transcription.collision import Collision
+from impactopt.transcription.constraints import Index, Measure, Place, Rows
 from impactopt.transcription.contact_blocks import DEPTH_SCALE
-from impactopt.transcription.drives import ContactEnd, DrivePoint, still
+from impactopt.transcription.contact_set import Hit
+from impactopt.transcription.contact_state import ContactEnd, DrivePoint, still
 from impactopt.transcription.elimination import Turn, by_choice, determined
-from impactopt.transcription.hit import Hit
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
-from impactopt.transcription.rows import Index, Measure, Place, Rows
 from impactopt.transcription.springs import SpringPoint, add_hinges, add_springs
 from impactopt.transcription.structured import StructuredProgram
 

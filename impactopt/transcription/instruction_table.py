@@ -1,4 +1,4 @@
-"""A function's operations as numbers, in runs of equal ones: what `transcription.simd` goes through.
+"""Instruction table: a function's operations as numbers, in runs of equal ones, for `transcription.simd`.
 
 As C, an operation a line, a function of TALOS keeps a compiler busy for ten seconds. As numbers it is there
 at once: an operation is the places of what it reads and of what it writes. Loops over runs of equal

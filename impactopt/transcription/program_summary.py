@@ -6,7 +6,7 @@ import json
 from itertools import groupby
 from typing import Any
 
-from impactopt.transcription.apart import SeparationBlock
+from impactopt.transcription.clearance import SeparationBlock
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.transcription import Transcription
 

@@ -9,12 +9,11 @@ import numpy as np
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.contact import Contact
-from impactopt.transcription.drives import ContactEnd, DrivePoint, still
-from impactopt.transcription.first_instant import jump
+from impactopt.transcription.constraints import Index, Place, percent, rates
+from impactopt.transcription.contact_state import Contact, ContactEnd, DrivePoint, still
+from impactopt.transcription.impact_onset import jump
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.mesh import CollocationPoint
-from impactopt.transcription.rows import Index, Place, percent, rates
 
 
 class Collocated:

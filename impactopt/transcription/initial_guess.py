@@ -1,4 +1,4 @@
-"""First iterates: a reach to the target by inverse kinematics, or a strike's state at contact; and back."""
+"""Initial guesses: a reach to the target by inverse kinematics, or a strike's state at contact; and back."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.problem.terms import TargetSpeed
-from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.finer_contact import carry_contact, same_places
-from impactopt.transcription.guess import effective_mass, speed_that_leaves
+from impactopt.transcription.constraints import Row
+from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves
+from impactopt.transcription.contact_program import ContactProgram
+from impactopt.transcription.contact_refinement import carry_contact, same_places
 from impactopt.transcription.layout import Array, Group
 from impactopt.transcription.mesh import with_middles
-from impactopt.transcription.rows import Row
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 

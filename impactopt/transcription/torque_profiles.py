@@ -1,4 +1,4 @@
-"""Torques from node to node of a phase, as terms and objectives take them."""
+"""Torque profiles, from node to node of a phase, as terms and objectives take them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.transcription.builder import Builder
+from impactopt.transcription.constraints import Place
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.reference import complete_reference
-from impactopt.transcription.rows import Place
 
 
 class TorqueCourse(NamedTuple):

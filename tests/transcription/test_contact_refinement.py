@@ -22,10 +22,14 @@ from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import solve_sqp
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.contact_error import ContactError, contact_error, refined_elements
-from impactopt.transcription.finer_contact import same_places
+from impactopt.transcription.contact_refinement import (
+    ContactError,
+    contact_error,
+    refined_elements,
+    same_places,
+)
+from impactopt.transcription.initial_guess import carried_over, first_iterate
 from impactopt.transcription.mesh import Elements, contact_elements, contact_mesh, halved
-from impactopt.transcription.start import carried_over, first_iterate
 from impactopt.transcription.transcription import Transcription
 
 MASS, KP, KD = 2.0, 200.0, 10.0  # [kg], [N/m], [N s/m] of the hammer and its servo

@@ -16,8 +16,8 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from impactopt.transcription.batched import BatchedFunction, Block
+from impactopt.transcription.constraints import Index
 from impactopt.transcription.layout import Array
-from impactopt.transcription.rows import Index
 from impactopt.transcription.scatter_add import Runs, count_up, union, with_transposed
 
 

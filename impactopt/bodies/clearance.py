@@ -1,9 +1,9 @@
-"""Clearances of all bodies of a scene: fast by spheres and planes, exact by convex hulls."""
+"""Clearances of all bodies of a scene: lower bounds by smooth distances, exact ones by convex hulls."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,14 +13,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece
-from impactopt.bodies.fit import Planes
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
-from impactopt.bodies.separation import Placed, Shapes
+from impactopt.bodies.separation import THIN, Placed, Shapes
 from impactopt.bodies.world import BEHIND, WorldBody
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 
-__all__ = ["Bodies", "Near", "Places", "Survey", "Touch"]
+__all__ = ["SLACK", "Bodies", "Places", "Survey", "Touch"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -30,6 +29,8 @@ _REQUEST = coal.DistanceRequest()
 SHALLOW, EVERY = 2e-3, 5e-3  # [m] deeper bodies are looked at once in so long [s]
 CLOSE = 2e-2  # [m] that is looked at first
 DEEPEST = -1e-6  # [m] what is deeper is a touch
+SLACK = 2 * THIN  # [m] by which bodies may be nearer than smooth distances of their thinned hulls
+CHUNK = 256  # instants whose distances are looked at together: memory is theirs times the pairs
 
 
 class Touch(NamedTuple):
@@ -80,37 +81,20 @@ class Places:
     def __len__(self) -> int:
         return len(self.travel)
 
+    def part(self, first: int, last: int) -> Places:
+        """Instants from the first up to the last."""
+        chosen = slice(first, last)
+        return Places(
+            rotation=self.rotation[chosen],
+            translation=self.translation[chosen],
+            travel=self.travel[chosen],
+            phase=self.phase[chosen],
+        )
+
     @cached_property
     def transforms(self) -> dict[tuple[int, int], Any]:
         """Transforms by instant and body, for exact distances: those computed so far."""
         return {}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Near:
-    """Close pairs: at instant ``at`` (m,), a sphere of the robot and another link or a body of the world.
-
-    sphere (m,) : its number.  joint (m,) : that moves it.  other (m,) : joint of the link; or -1 - the index
-    of the world's body.  gap (m,) [m] : between sphere and planes, < 0 for penetration.
-    """
-
-    at: Index
-    sphere: Index
-    joint: Index
-    other: Index
-    gap: Array
-
-    def least(self) -> Near:
-        """Nearest sphere of each instant and pair."""
-        order = np.argsort(self.gap, kind="stable")
-        key = np.zeros(len(order), dtype=np.int64)
-        for part in (self.at, self.joint, self.other) if len(order) else ():  # one number, in their order
-            key = key * (int(np.ptp(part)) + 1) + (part - part.min())
-        return self.only(order[np.unique(key[order], return_index=True)[1]])
-
-    def only(self, chosen: NDArray[Any]) -> Near:
-        """These of them, by number or by mask."""
-        return Near(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
 
 class Closest(NamedTuple):
@@ -201,101 +185,6 @@ class Bodies:
                 )
         return bool(depths) and min(depths) > BEHIND
 
-    # ------------------------------------------------------------------ by spheres and planes
-    @cached_property
-    def _of_joint(self) -> dict[int, Index]:
-        return {j: np.flatnonzero(self.links.joint == j) for j in self.links.joints}
-
-    @cached_property
-    def _about_spheres(self) -> dict[int, tuple[Array, float]]:
-        """Bounding ball of all spheres of each joint: centre (3,) and radius [m]."""
-        links, out = self.links, {}
-        for j, own in self._of_joint.items():
-            centre = links.balls[j][0]
-            away = np.linalg.norm(links.centre[own] - centre, axis=1)
-            out[j] = centre, float((away + links.radius[own]).max())
-        return out
-
-    @cached_property
-    def directed(self) -> dict[Pair, Pair]:
-        """Direction of each pair's check: the joint whose spheres are tested against the other's planes,
-        fitting best.
-        """
-        out = self.links.out
-        return {(a, b): (a, b) if out[a] <= out[b] else (b, a) for a, b in self.pairs}
-
-    def _ball_gaps(self, at: Places) -> Array:
-        """(k, pairs) [m] at least between what two joints move."""
-        balls = self.links.balls
-        place = {j: k for k, j in enumerate(balls)}
-        centre = np.stack([self._placed(at, j, balls[j][0][None])[:, 0] for j in balls], axis=1)
-        radius = np.array([balls[j][1] for j in balls])
-        one, two = (np.array([place[p[k]] for p in self.pairs], dtype=np.intp) for k in (0, 1))
-        apart = np.linalg.norm(centre[:, one] - centre[:, two], axis=2)
-        return np.asarray(apart - radius[one] - radius[two])
-
-    @staticmethod
-    def _placed(at: Places, joint: int, points: Array) -> Array:
-        """Points (m, 3) of a joint's frame in the world (k, m, 3)."""
-        return np.asarray(points @ at.rotation[:, joint].transpose(0, 2, 1) + at.translation[:, joint, None])
-
-    @cached_property
-    def _between(self) -> list[int]:
-        """Number of joints between the two of each pair."""
-        up = [set(joints) for joints in self.robot.model.supports]
-        return [len(up[a] ^ up[b]) for a, b in self.pairs]
-
-    def near(self, at: Places, within: float, between: int = 0, only: set[Pair] | None = None) -> Near:
-        """All spheres that are nearer than ``within`` [m] to what they are not to touch.
-
-        between : of two links, so many joints at least are between them.  only : of these pairs, if given.
-        """
-        links, found = self.links, list[tuple[Index, Index, int, int, Array]]()
-        close = self._ball_gaps(at) < within
-        for n, pair in enumerate(self.pairs):
-            when = np.flatnonzero(close[:, n])
-            if not len(when) or self._between[n] < between or (only is not None and pair not in only):
-                continue
-            a, b = self.directed[pair]
-            own = self._of_joint[a]
-            points = (
-                links.centre[own] @ at.rotation[when, a].transpose(0, 2, 1) + at.translation[when, a, None]
-            )
-            local = np.matmul(points - at.translation[when, b, None], at.rotation[when, b])
-            gap = _outside(links.planes[b], local) - links.radius[own]
-            i, c = np.nonzero(gap < within)
-            found.append((when[i], own[c], a, b, gap[i, c]))
-        for w, body in enumerate(self.world):
-            joints = [j for j, k in self.world_pairs if k == w and (only is None or (j, -1 - w) in only)]
-            when = np.flatnonzero(self.present(body, at))
-            shift = body.place + np.outer(at.travel[when], self.normal) * body.moves
-            for j in joints if len(when) else ():
-                own, (centre, radius) = self._of_joint[j], self._about_spheres[j]
-                ball = centre @ at.rotation[when, j].transpose(0, 2, 1) + at.translation[when, j]
-                gap = _outside(body.planes, ((ball - shift) @ body.rotation)[:, None])[:, 0] - radius
-                near = np.flatnonzero(gap < within)
-                points = (
-                    links.centre[own] @ at.rotation[when[near], j].transpose(0, 2, 1)
-                    + at.translation[when[near], j, None]
-                )
-                local = (points - shift[near, None]) @ body.rotation
-                gap = _outside(body.planes, local) - links.radius[own]
-                i, c = np.nonzero(gap < within)
-                found.append((when[near[i]], own[c], j, -1 - w, gap[i, c]))
-        none = np.zeros(0, dtype=np.intp)
-        instants = np.concatenate([none, *(f[0] for f in found)])
-        sphere = np.concatenate([none, *(f[1] for f in found)])
-        counts = [len(f[0]) for f in found]
-        joint = np.repeat([f[2] for f in found], counts).astype(np.intp)
-        other = np.repeat([f[3] for f in found], counts).astype(np.intp)
-        return Near(
-            at=instants,
-            sphere=sphere,
-            other=other,
-            joint=joint,
-            gap=np.concatenate([np.zeros(0), *(f[4] for f in found)]),
-        )
-
     @staticmethod
     def present(body: WorldBody, at: Places) -> NDArray[np.bool_]:
         """Mask (k,) of the instants at which a body of the world is present."""
@@ -352,25 +241,23 @@ class Bodies:
         solid = self.world[-1 - body]
         return solid.rotation, solid.place + at.travel[k] * self.normal * solid.moves
 
-    def planes(self, body: int) -> Planes:
-        """About what a joint moves, or about a body of the world, -1 - its index."""
-        return self.links.planes[body] if body >= 0 else self.world[-1 - body].planes
-
-    @cached_property
-    def slack(self) -> float:
-        """[m] by how much bodies may be nearer than their spheres and planes say."""
-        return max(self.links.short.values(), default=0.0)
-
     def lower_bounds(self, at: Places, within: float) -> Iterator[tuple[float, int, Pair]]:
-        """No pair is nearer than this [m] at that instant, but for what spheres fall short; nearest first."""
-        near = self.near(at, within).least()
-        for n in np.argsort(near.gap, kind="stable"):
-            a, b = int(near.joint[n]), int(near.other[n])
-            yield float(near.gap[n]), int(near.at[n]), self.known(a, b)
+        """Smooth distances [m] below ``within``, with instant and pair, nearest first.
 
-    def known(self, joint: int, other: int) -> Pair:
-        """A pair as it stands in ``pairs``, if it is one of two joints."""
-        return (joint, other) if other < 0 or (joint, other) in self.pairs else (other, joint)
+        No pair is nearer there than its own less `SLACK`, and no other pair nearer than ``within`` less that.
+        """
+        shapes, found = self.shapes, dict[tuple[int, Pair], float]()
+        every = np.ones(len(shapes), dtype=bool)
+        for first in range(0, len(at), CHUNK):
+            placed = self.placed(at.part(first, first + CHUNK))
+            ways = np.zeros((len(placed.joints), len(shapes), 3))
+            looked = shapes.look(placed, within, ways, every)
+            for gap, k, number in zip(looked.gap, looked.spot.tolist(), looked.pair.tolist(), strict=True):
+                a, b = shapes.pairs[number].tolist()
+                key = first + k, (a, b)
+                found[key] = min(float(gap), found.get(key, np.inf))
+        for (k, pair), gap in sorted(found.items(), key=lambda item: item[1]):
+            yield gap, k, pair
 
     def survey(self, time: Array, at: Places, within: float = 0.1) -> Survey:
         """The least distance of any pair at any instant, and all that touches.
@@ -378,7 +265,7 @@ class Bodies:
         time (k,) [s] : of the instants.  within [m] : pairs that are farther apart count as `FAR`.
         Deep penetrations are looked at every `EVERY`, so that begin and end are that fine.
         """
-        close = self.slack + CLOSE  # of most motions the nearest two are, and then no others matter
+        close = SLACK + CLOSE  # of most motions the nearest two are, and then no others matter
         if close < within:
             found = self._survey(time, at, close)
             if found.clearance <= CLOSE:
@@ -390,7 +277,7 @@ class Bodies:
         found: dict[Pair, list[tuple[int, float]]] = {}
         seen: set[tuple[Pair, int]] = set()
         for bound, k, pair in self.lower_bounds(at, within):
-            if bound - self.slack >= max(least, 0.0):
+            if bound - SLACK >= max(least, 0.0):
                 break
             moment = pair, int(time[k] / EVERY)
             if moment in seen:
@@ -415,8 +302,3 @@ class Bodies:
         """Names of the two bodies in messages."""
         a, b = pair
         return self.links.name(a), self.links.name(b) if b >= 0 else self.world[-1 - b].name
-
-
-def _outside(planes: Planes, points: Array) -> Array:
-    """Least distance (k, m) [m] of points (k, m, 3) from a body, < 0 inside."""
-    return np.asarray((points @ planes.normal.T - planes.offset).max(axis=2))

@@ -1,12 +1,10 @@
-"""A robot's bodies: the hulls of its links, spheres and planes about them, and which of them can meet."""
+"""A robot's bodies: the hulls of its links, and which of them can meet."""
 
 from __future__ import annotations
 
-import hashlib
-import io
 import weakref
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,18 +12,14 @@ import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from impactopt.bodies.convex_hulls import Piece, pieces_of
-from impactopt.bodies.fit import Planes, Spheres, enclose, fill, surface_points
-from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot
 
 __all__ = ["RobotBodies", "bodies_of", "distance", "transform"]
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]
-SPACING, LEAST = 1 / 40, 0.003  # of points on a body's surface: of its extent, and [m]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,20 +27,11 @@ class RobotBodies:
     """Collision geometry of a robot.
 
     pieces : hulls of links, exact.  source : where they are from, in words.
-    joint (c,), centre (c, 3) [m], radius (c,) [m] : spheres that cover them, in the frame of that joint.
-    planes : about the hull of all that a joint moves.
-    out, short [m] : by joint, how far its spheres stick out of that hull, and fall short of its surface.
     """
 
     robot: Robot
     pieces: tuple[Piece, ...]
     source: str
-    joint: NDArray[np.intp]
-    centre: Array
-    radius: Array
-    planes: dict[int, Planes]
-    out: dict[int, float]
-    short: dict[int, float]
 
     @cached_property
     def joints(self) -> tuple[int, ...]:
@@ -123,53 +108,11 @@ _KNOWN: weakref.WeakKeyDictionary[Robot, RobotBodies] = weakref.WeakKeyDictionar
 
 
 def bodies_of(robot: Robot) -> RobotBodies:
-    """The robot's bodies; spheres and planes are fitted once and kept on disk by what they are about."""
+    """The robot's bodies, made once."""
     if robot not in _KNOWN:
         pieces, source = pieces_of(robot)
-        fitted = {j: _fitted([p for p in pieces if p.joint == j]) for j in sorted({p.joint for p in pieces})}
-        spheres = {j: found for j, (found, _) in fitted.items()}
-        _KNOWN[robot] = RobotBodies(
-            robot=robot,
-            pieces=pieces,
-            source=source,
-            joint=np.repeat(list(spheres), [len(s.radius) for s in spheres.values()]).astype(np.intp),
-            centre=np.concatenate([np.zeros((0, 3)), *(s.centre for s in spheres.values())]),
-            radius=np.concatenate([np.zeros(0), *(s.radius for s in spheres.values())]),
-            planes={j: planes for j, (_, planes) in fitted.items()},
-            out={j: s.out for j, s in spheres.items()},
-            short={j: s.short for j, s in spheres.items()},
-        )
+        _KNOWN[robot] = RobotBodies(robot=robot, pieces=pieces, source=source)
     return _KNOWN[robot]
-
-
-def _fitted(pieces: list[Piece]) -> tuple[Spheres, Planes]:
-    """Spheres over the surfaces of pieces, and planes about all of them; from disk if they are there."""
-    digest = hashlib.sha256(b"1")
-    for piece in pieces:
-        digest.update(np.round(piece.vertices, 9).tobytes())
-
-    def fit() -> bytes:
-        points = np.concatenate([p.vertices for p in pieces])
-        spacing = max(SPACING * float(np.ptp(points, axis=0).max()), LEAST)
-        surface = np.concatenate([surface_points(p.vertices, p.triangles, spacing) for p in pieces])
-        hull = ConvexHull(points)
-        spheres, planes = fill(hull, surface), enclose(points[hull.vertices], hull.equations[:, :3])
-        file = io.BytesIO()
-        numbers = {f"spheres_{f.name}": getattr(spheres, f.name) for f in fields(Spheres)}
-        numbers |= {f"planes_{f.name}": getattr(planes, f.name) for f in fields(Planes)}
-        np.savez(file, **numbers)
-        return file.getvalue()
-
-    with np.load(io.BytesIO(kept("bodies", digest.hexdigest(), fit)), allow_pickle=False) as found:
-        of = {
-            kind: {f.name: _plain(found[f"{name}_{f.name}"]) for f in fields(kind)}
-            for name, kind in (("spheres", Spheres), ("planes", Planes))
-        }
-    return Spheres(**of[Spheres]), Planes(**of[Planes])
-
-
-def _plain(value: Array) -> Any:
-    return value if value.ndim else float(value)
 
 
 def transform(rotation: Array, translation: Array) -> Any:

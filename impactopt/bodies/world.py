@@ -10,7 +10,6 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.fit import Planes, enclose
 from impactopt.bodies.shapes import Obstacle, TargetBody, face_axes
 from impactopt.bodies.solids import Solid, capsule
 from impactopt.bodies.solids import box as cuboid
@@ -55,12 +54,6 @@ class WorldBody:
     before: bool = False
     core: bool = False
     ground: bool = False
-
-    @cached_property
-    def planes(self) -> Planes:
-        """About it, in its own frame."""
-        corners = self.half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        return enclose(np.unique(corners, axis=0), np.concatenate([np.eye(3), -np.eye(3)]), self.radius)
 
     @cached_property
     def shape(self) -> Any:

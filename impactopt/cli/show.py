@@ -66,8 +66,7 @@ def show(
 ) -> None:
     """Write a result as one page: numbers, plots, the robot's motion, how it was made. It needs no network.
 
-    For a robot the page shows its bodies: hulls and spheres over its meshes, how well they fit, which may
-    touch.
+    For a robot the page shows its bodies: hulls over its meshes, and which may touch.
 
     Exit code: 0 written, 2 bad input, 130 Ctrl-C, which is how a live page ends.
     """

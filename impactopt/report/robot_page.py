@@ -1,4 +1,4 @@
-"""A robot's bodies on a page: hulls and spheres over its meshes, how well they fit, which may touch."""
+"""A robot's bodies on a page: convex hulls over its meshes, and which may touch."""
 
 from __future__ import annotations
 
@@ -75,8 +75,6 @@ def _page(
         "legged": False,
         "charts": [],
     }
-    arrays |= {f"spheres_{name}": getattr(links, name) for name in ("centre", "radius")}
-    arrays["spheres_joint"] = links.joint.astype("<u2")
     body = "\n".join(_body(links, q, posture, title, world))
     return Report(html_page(title=f"{title}: bodies", kind="report", body=body, header=header, arrays=arrays))
 
@@ -118,13 +116,12 @@ def _body(
     yield f"{escape(links.robot.name)}: what of it can touch something</span>"
     yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
     yield '<div id="trouble"></div>'
-    yield f'<p id="source">Bodies are convex hulls. They are from the {escape(links.source)}. Spheres cover '
-    yield "them for the rows of a plan; clearance is measured between hulls. Point at a row to see its link."
+    yield f'<p id="source">Bodies are convex hulls. They are from the {escape(links.source)}. Point at '
+    yield "a row to see its link."
     yield "</p>"
     yield '<div class="top"><section class="card stays" id="animation" aria-label="bodies"></section>'
     yield f'<section class="card" id="fit" aria-label="links"><h3>Links</h3>{_fit(links)}'
-    yield "<figcaption>Out: how far spheres stick out of the hull of all that the link's joint moves. Short: "
-    yield "what of its surface they leave out.</figcaption></section></div>"
+    yield "</section></div>"
     if world:
         yield f'<h2>The world</h2><section class="card" id="world">{_world(world)}</section>'
     yield "<h2>Pairs that may touch</h2>"
@@ -137,14 +134,8 @@ def _body(
 
 
 def _fit(links: RobotBodies) -> str:
-    rows, joints = [], []
-    for j in links.joints:
-        spheres = int((links.joint == j).sum())
-        millimetres = (f"{1e3 * links.out[j]:.0f}", f"{1e3 * links.short[j]:.1f}")
-        rows.append((links.name(j), str(len(links.of_joint[j])), str(spheres), *millimetres))
-        joints.append(j)
-    head = ("link", "hulls", "spheres", "out [mm]", "short [mm]")
-    return _table(head, rows, joints)
+    rows = [(links.name(j), str(len(links.of_joint[j]))) for j in links.joints]
+    return _table(("link", "hulls"), rows, links.joints)
 
 
 def _world(world: Sequence[WorldBody]) -> str:

@@ -38,7 +38,7 @@ class FirstTouch(Term):
     name: ClassVar[str] = "first touch"
     unit: ClassVar[str] = "m"
     depth: float = field(
-        default=1.5e-3,
+        default=5e-4,
         metadata=about("largest distance of the link's hull beyond the target's plane", unit="m", above=0),
     )
     angle: float = field(

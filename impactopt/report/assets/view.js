@@ -44,7 +44,7 @@ const MARKS = [
   ["force", "force on the target", (h) => !h.hulls], ["com", "centre of mass", (h) => h.legged], ["zmp", "zero-moment point", (h) => h.legged],
   ["ground", "force of the ground", (h) => h.legged], ["polygon", "support polygon", (h) => h.legged], ["paths", "paths", (h) => !h.hulls],
   ["obstacles", "obstacles", (h) => h.world.some((part) => part.kind === "obstacle")],
-  ["meshes", "what the robot looks like", (h) => h.hulls], ["hulls", "hulls", (h) => h.hulls], ["spheres", "spheres that cover them", (h) => h.hulls, false],
+  ["meshes", "what the robot looks like", (h) => h.hulls], ["hulls", "hulls", (h) => h.hulls],
 ];
 
 class View {
@@ -133,10 +133,6 @@ class View {
         take([0, 1, 2].map((k) => m[k] * x + m[4 + k] * y + m[8 + k] * z + m[12 + k]));
       }
     }
-    arrays.spheres_joint?.forEach((joint, k) => {
-      const m = times(this.pose(still, joint), scaled([...arrays.spheres_centre.slice(3 * k, 3 * k + 3)], 1));
-      for (const r of [-arrays.spheres_radius[k], arrays.spheres_radius[k]]) take([m[12] + r, m[13] + r, m[14] + r]);
-    });
     if (header.legged) low[2] = 0;
     this.middle = low.map((x, k) => (x + high[k]) / 2);
     this.size = Math.max(0.35, 0.5 * Math.hypot(...low.map((x, k) => high[k] - x)));
@@ -274,7 +270,7 @@ class View {
     return Math.min(1, Math.max(0, 2 - (2 * Math.abs(travel)) / this.header.far));
   }
 
-  // hulls and spheres of the links, which are seen through; of a link that is pointed at, darker
+  // hulls of the links, which are seen through; of a link that is pointed at, darker
   coverings(now) {
     const { gl, header, arrays, shown } = this, strength = (joint) => (this.pointed == null ? 0.35 : this.pointed === joint ? 0.75 : 0.08);
     for (const hull of shown.hulls ? this.hulls : []) {
@@ -282,12 +278,6 @@ class View {
       this.put(hull.buffer, this.pose(now, hull.joint), HULLS[hull.colour % HULLS.length], 0, strength(hull.joint));
       gl.enable(gl.DEPTH_TEST);
     }
-    if (!header.hulls || !shown.spheres) return;
-    const { spheres_joint: joint, spheres_centre: centre, spheres_radius: radius } = arrays;
-    joint.forEach((j, k) => {
-      const model = times(this.pose(now, j), scaled([...centre.slice(3 * k, 3 * k + 3)], radius[k]));
-      this.put(this.ball, model, themeColour("sphere"), 0, 0.6 * strength(j));
-    });
   }
 
   // where the bodies of the world are after the target's travel: it moves on, and a board's halves tip over;

@@ -26,6 +26,7 @@ ROOMS_IN_ORDER = (
     "simulation",
     "planning",
     "files",
+    "collide",
     "sweeps",
     "identification",
     "report",

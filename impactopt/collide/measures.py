@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.collide.contact_states import States
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.support import margin, zmp
-from impactopt.sweeps.contact_states import States
 
 __all__ = ["MEASURES", "Blow", "Measure", "chosen"]
 

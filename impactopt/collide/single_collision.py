@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.collide.at_contact import NOT_ENDED, AtContact, check_at_contact, collision_model
+from impactopt.collide.contact_states import ContactStates, States
+from impactopt.collide.measures import MEASURES, Blow
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
@@ -17,10 +20,6 @@ from impactopt.files.output import Record, load_record, plain
 from impactopt.files.problem_file import ProblemFile, parse_problem_file
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.robot import Robot
-from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model
-from impactopt.sweeps.collision_batch import NOT_ENDED
-from impactopt.sweeps.contact_states import ContactStates, States
-from impactopt.sweeps.measures import MEASURES, Blow
 
 __all__ = ["collide_once", "planned_numbers", "problem_of_result"]
 

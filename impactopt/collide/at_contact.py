@@ -18,8 +18,9 @@ from impactopt.kinematics.stance import Stance
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
 
-__all__ = ["AtContact", "check_at_contact", "collision_model", "full_names"]
+__all__ = ["NOT_ENDED", "AtContact", "check_at_contact", "collision_model", "full_names"]
 
+NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
 _STEP = 1e-4  # [s] between instants of the full dynamics
 
 

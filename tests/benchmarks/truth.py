@@ -92,6 +92,19 @@ MISSED = (
     ("touches", "missed_touches", 0),
     ("stands", "missed_standing", 0),
 )
+MOTION = (
+    ("problem", "problem", 0),
+    ("idle rad", "idle_travel_rad", 1),
+    ("reversals", "reversals", 0),
+    ("jerk rad/s3", "peak_jerk_rad_s3", 0),
+    ("work J", "work_J", 0),
+    ("end rad", "end_posture_rad", 2),
+    ("ground, least", "ground_least", 2),
+    ("largest", "ground_most", 2),
+    ("touch mm", "first_touch_mm", 1),
+    ("early ms", "first_touch_ms", 2),
+    ("price %", "motion_price_pct", 1),
+)
 
 
 def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> Report:
@@ -110,6 +123,7 @@ def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> R
         columns_table(
             "with the target missing, on free soles", MISSED, [r for r in shown if "missed_standing" in r]
         ),
+        columns_table("the planned motion", MOTION, [r for r in shown if "work_J" in r]),
     )
     return Report(name="truth", numbers={"rows": rows, "controller": controller}, tables=tables)
 
@@ -148,6 +162,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
     its replay on held soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers,
     by sole and phase.
     missed_... : of the replay on free soles where the target is missing.
+    idle_travel_rad ... first_touch_ms : `impactopt.transcription.motion_measures`.
     gear_planned, gear_held, gear_free : load of the worst gear over its torque limit, None without armature.
     """
     out: dict[str, Any] = {"problem": name}
@@ -171,6 +186,13 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
             **_kept(told, told, "planned"),
             **_kept(held, told, "held"),
             "soles": {name: _soles(found) for name, found in (("planned", told), ("held", held))},
+            **{key: told[key] for _, key, _ in MOTION[1:] if key in told},
+        }
+        least, most = told.get("ground_force_share") or (None, None)
+        out |= {
+            "ground_force_share": told.get("ground_force_share"),
+            "ground_least": least,
+            "ground_most": most,
         }
     except InputError as error:
         out["status"] = out.get("status", "error")

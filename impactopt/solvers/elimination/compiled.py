@@ -34,7 +34,7 @@ _ROUTINES = (
 
 
 def kernels() -> Kernels:
-    """In C where there is a compiler, or else in NumPy."""
+    """The kernels in C where there is a compiler, or else in NumPy."""
     library = _library()
     return Kernels() if library is None else CompiledKernels(library)
 
@@ -77,7 +77,7 @@ class _Panels(ctypes.Structure):
 
 
 class CompiledKernels(Kernels):
-    """In C."""
+    """Kernels in C."""
 
     def __init__(self, library: Any):
         self._c = library
@@ -85,7 +85,7 @@ class CompiledKernels(Kernels):
 
     # ------------------------------------------------------------------ what C needs to know
     def _of(self, thing: Any, make: Callable[[Any], Any]) -> Any:
-        """What C takes for a thing, made once, and kept with it and with what it points to."""
+        """Arguments that C takes for a thing, made once, and kept with it and with what it points to."""
         found = self._made.get(id(thing))
         if found is None:
             found = self._made[id(thing)] = thing, make(thing)
@@ -185,6 +185,6 @@ def _runs(places: Places, first: Index) -> Places:
 
 @functools.cache
 def _rows_of_triangle(n: int) -> Index:
-    """Where the rows of a lower triangle begin."""
+    """Beginnings of the rows of a lower triangle."""
     i = np.arange(n)
     return i * (i + 1) // 2

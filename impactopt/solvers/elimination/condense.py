@@ -67,13 +67,13 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
 
 @functools.lru_cache(maxsize=256)
 def _determines(pattern: bytes, size: int) -> bool:
-    """Whether a square system with this pattern can be regular: most systems have that of another."""
+    """True if a square system with this pattern can be regular: most systems have that of another."""
     system = sp.csr_matrix(np.frombuffer(pattern, dtype=bool).reshape(size, size))
     return bool((maximum_bipartite_matching(system) >= 0).all())
 
 
 def _columns(matrix: Matrix) -> Index:
-    """Of each entry of a csc its column."""
+    """Column of each entry of a csc."""
     return np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
 
 
@@ -203,7 +203,7 @@ class Condenser:
 
     @property
     def A(self) -> Vector:
-        """Of the equalities left, by the free variables (l, f)."""
+        """Jacobian of the equalities left, by the free variables (l, f)."""
         out = np.zeros((len(self.left), self.free.size))
         rows, columns, at = self._of_left
         out[rows, columns] = self.J[at]
@@ -211,7 +211,7 @@ class Condenser:
 
     @property
     def curvature(self) -> Vector:
-        """Of the Hessian, along the free variables (f,)."""
+        """Curvature of the Hessian, along the free variables (f,)."""
         out = np.zeros(self.n)
         at, variables = self._curved
         out[variables] = self._hessian[at]

@@ -114,7 +114,7 @@ class Panels:
 
 
 class Kernels:
-    """In NumPy."""
+    """Kernels in NumPy."""
 
     def forget(self, thing: Any) -> None:
         """No operation will be asked for with this list of steps or products any more."""
@@ -173,7 +173,7 @@ class Kernels:
             d[a.e] = -a.x0 - (d[a.c][:, None] @ a.X)[:, 0]
 
     def multipliers(self, stages: Sequence[EliminationStep], v: Vector, y: Vector) -> None:
-        """Those of the stages' rows, from a gradient, which is spent, and from those of the other rows."""
+        """Multipliers of the stages' rows, from a gradient, which is spent, and the other rows' multipliers."""
         for a in stages:
             a.own[:] = v[a.e]
             _add(v, a.c, -(a.X @ a.own[..., None])[..., 0])

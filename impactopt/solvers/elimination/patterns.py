@@ -24,7 +24,7 @@ class Elimination(NamedTuple):
 
 
 class Touched(NamedTuple):
-    """What one system touches.
+    """Rows and variables of one system.
 
     q, e : its rows and variables; t : other equality rows that these variables touch; c : variables that its
     rows touch; u : c, and behind them those that only the Hessian couples to e.
@@ -70,7 +70,7 @@ _Systems = list[tuple[Index, Index]]  # rows and variables of each
 
 
 def _apart(systems: _Systems, touched_by: Any, couples: Any, row_left: Any) -> tuple[_Systems, _Systems]:
-    """Those of these systems that nothing ties to one before them, and the others."""
+    """Systems that nothing ties to one before them, and the others."""
     rows, variables = np.zeros(touched_by.shape[1], dtype=bool), np.zeros(touched_by.shape[0], dtype=bool)
     now, later = _Systems(), _Systems()
     for q, e in systems:
@@ -136,7 +136,7 @@ _lower = functools.cache(np.tril_indices)
 
 
 def products(pairs: Places, groups: Sequence[Alike]) -> list[Products]:
-    """Where products of each row's numbers belong; pairs : places of the entries of W, as of `numbered`."""
+    """Places of the products of each row's numbers; pairs : places of the entries of W, as of `numbered`."""
     out = []
     for columns, counts, rows, values in groups:
         i, j = _lower(columns.shape[1])

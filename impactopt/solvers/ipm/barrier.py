@@ -61,7 +61,7 @@ class Bounded:
         return np.clip(values, np.where(has_lower, least, -np.inf), np.where(has_upper, most, np.inf))
 
     def _distances(self, values: Vector) -> tuple[Vector, Vector]:
-        """To both bounds; 1 where there is none."""
+        """Distances to both bounds; 1 where there is none."""
         return (
             self._has_lower * (values - self._lower) + (1.0 - self._has_lower),
             self._has_upper * (self._upper - values) + (1.0 - self._has_upper),
@@ -69,7 +69,7 @@ class Bounded:
 
     @property
     def multiplier(self) -> Vector:
-        """Of both bounds together: positive where the upper one holds."""
+        """Multipliers of both bounds together: positive where the upper one holds."""
         return self.above - self.below
 
     @property
@@ -94,7 +94,7 @@ class Bounded:
         return out
 
     def stiffness(self) -> Vector:
-        """What the multipliers add to the Hessian's diagonal (eq. 13)."""
+        """Part that the multipliers add to the Hessian's diagonal (eq. 13)."""
         return self.below / self._to_lower + self.above / self._to_upper
 
     def off(self, mu: float) -> float:

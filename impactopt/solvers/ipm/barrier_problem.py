@@ -145,7 +145,7 @@ class BarrierProblem:
         release(self.newton)
 
     def path(self) -> Path:
-        """Where this is, for a solve that goes on from there."""
+        """State, for a solve that goes on from there."""
         c, slacks, n = self._condenser, self._all(self.point), self.point.x.copy()
         slacks[c.rows[self._unequal]] = self.s.values
         m = self.program.m
@@ -158,7 +158,7 @@ class BarrierProblem:
 
     # ------------------------------------------------------------------ how far off it is
     def residual(self, point: Point, slack: Vector) -> Vector:
-        """What the rows (m,) are off by: eliminated ones and equalities, and inequalities against their
+        """Residuals of the rows (m,): eliminated ones and equalities, and inequalities against their
         slacks."""
         out, c = self._all(point), self._condenser
         out[c.eliminated] -= self._gone
@@ -230,8 +230,9 @@ class BarrierProblem:
         return self.step_again(residual) if found else None
 
     def _weights(self, more: float) -> Vector:
-        """Of the rows (k,), and their offsets: of the slacks' barrier, with more curvature, and of elastic
-        rows."""
+        """Weights of the rows (k,), and their offsets: of the slacks' barrier, with more curvature, and of
+        elastic rows.
+        """
         soft, self._offsets = np.zeros(self._condenser.rows.size), np.zeros(self._condenser.rows.size)
         self._stiffness = self.s.stiffness() + more
         soft[self._unequal] = 1.0 / self._stiffness
@@ -269,7 +270,7 @@ class BarrierProblem:
         return length if self.elastic is None else min(length, self.elastic.longest(keep))
 
     def progress(self, step: Step, residual: Vector) -> SearchStart:
-        """What a search along a step starts from."""
+        """Start of a search along a step."""
         mu, point = self.mu, self.point
         slope = float(
             self.sigma * (point.gradient @ step.d)
@@ -307,7 +308,7 @@ class BarrierProblem:
         return Trial(point, slack, self._theta(self.residual(point, slack), excess), phi)
 
     def move(self, step: Step, trial: Trial, length: float) -> None:
-        """To a trial point, and as far along the multipliers' steps as these allow."""
+        """Move to a trial point, and as far along the multipliers' steps as these allow."""
         x, s, mu, keep = self.x, self.s, self.mu, self.keep
         below_x, above_x, dual_x = x.dual_step(step.free, mu, keep)
         below_s, above_s, dual_s = s.dual_step(step.slack, mu, keep)

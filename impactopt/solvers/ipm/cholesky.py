@@ -55,7 +55,7 @@ class BlockCholesky:
         self.size = int(at[-1])
 
     def places(self, i: Index, j: Index) -> Index:
-        """Where the entries (i, j) of the lower triangle, or (j, i), stand."""
+        """Places of the entries (i, j) of the lower triangle, or (j, i)."""
         low, high = np.maximum(self._place[i], self._place[j]), np.minimum(self._place[i], self._place[j])
         row, column = self._block[low], self._block[high]
         p = self._panels

@@ -39,7 +39,7 @@ class Elastic:
         return np.clip(y, -0.9 * self.price, 0.9 * self.price)
 
     def residual(self, residual: Vector) -> Vector:
-        """What of a residual is neither excess nor lack."""
+        """Part of a residual that is neither excess nor lack."""
         return residual - self._p + self._n
 
     def largest(self) -> float:
@@ -47,13 +47,13 @@ class Elastic:
         return float(np.abs(self._p - self._n).max(initial=0.0))
 
     def compliance(self, y: Vector, mu: float) -> tuple[Vector, Vector]:
-        """How far a row gives way per unit of multiplier, and the offset that goes with it."""
+        """Compliance of a row per unit of multiplier, and the offset that goes with it."""
         zp, zn = self._below_price(y)
         give = self._p / zp + self._n / zn
         return give, give * y - (mu / zp - self._p) + (mu / zn - self._n)
 
     def _below_price(self, y: Vector) -> tuple[Vector, Vector]:
-        """How far multipliers are below the price, and above its opposite: more than rounding."""
+        """Distance of the multipliers below the price, and above its opposite: more than rounding."""
         least = _LEAST * self.price
         return np.maximum(self.price - y, least), np.maximum(self.price + y, least)
 
@@ -76,11 +76,11 @@ class Elastic:
         return self._p + length * self._dp, self._n + length * self._dn
 
     def cost(self, p: Vector, n: Vector, mu: float) -> float:
-        """What p and n add to the barrier function."""
+        """Part that p and n add to the barrier function."""
         return float(self.price * (p + n).sum() - mu * (np.log(p).sum() + np.log(n).sum()))
 
     def now(self, mu: float) -> float:
-        """What they add now."""
+        """Part that they add now."""
         return self.cost(self._p, self._n, mu)
 
     def slope(self, mu: float) -> float:

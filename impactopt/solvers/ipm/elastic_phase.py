@@ -21,7 +21,7 @@ _LINGERS = 20  # so many iterations with elastic rows that are met are enough
 
 
 class ElasticPhase:
-    """What is aimed at, and for how long.
+    """Aim of the method, and how long it lasts.
 
     Where one of its methods changes that, a line search has to forget what it knows.
     """
@@ -34,12 +34,12 @@ class ElasticPhase:
         self._changes = 0
 
     def begin(self) -> None:
-        """Of an attempt from a point of its own: the price stays what it has come to."""
+        """Begin an attempt from a point of its own: the price stays what it has come to."""
         self._changes = 0
 
     def verdict(self, problem: BarrierProblem) -> Status | None:
-        """At a solution, or where rows are restored: the end, unless rows are violated, or only the violation
-        counted.
+        """Decide at a solution, or where rows are restored: the end, unless rows are violated, or only the
+        violation counted.
         """
         elastic = problem.elastic
         met = elastic is None or elastic.largest() <= self._options.violation_tolerance
@@ -49,20 +49,20 @@ class ElasticPhase:
         return self.change_aim(problem, met=met or problem.point.max_violation <= near)
 
     def restored(self, problem: BarrierProblem) -> bool:
-        """Whether the violation, which alone counts, is so small that hard rows get further with it."""
+        """True if the violation, which alone counts, is so small that hard rows get further with it."""
         elastic = problem.elastic
         if elastic is None or problem.sigma or elastic.price >= self._options.price_max:
             return False
         return problem.point.max_violation <= _RESTORED
 
     def lingers(self, problem: BarrierProblem) -> bool:
-        """Whether elastic rows have been met for long, and the rest is left to do: hard rows do it sooner."""
+        """True if elastic rows have been met for long, and the rest is left to do: hard rows do it sooner."""
         met = problem.elastic is not None and problem.point.max_violation <= self._options.violation_tolerance
         self._met = self._met + 1 if met and problem.sigma else 0
         return self._met > _LINGERS and self._price < self._options.price_max
 
     def change_aim(self, problem: BarrierProblem, *, met: bool) -> Status | None:
-        """Where elastic rows do not get further: let only the violation count, until it is gone or least."""
+        """Go on where elastic rows stall: let only the violation count, until it is gone or least."""
         assert problem.elastic is not None
         self._changes += 1
         if self._changes > _CHANGES:
@@ -79,7 +79,7 @@ class ElasticPhase:
         return None
 
     def give_way(self, problem: BarrierProblem, residual: Vector) -> str | Status:
-        """What to do where no step is progress: let rows be violated at a price, or end.
+        """Next aim where no step is progress: let rows be violated at a price, or end.
 
         Text: what has been changed.
         """

@@ -16,21 +16,21 @@ _SHORTEST = 0.05  # gamma_alpha of eq. 23
 
 @dataclass(frozen=True, kw_only=True)
 class SearchStart:
-    """What a line search starts from: violation theta, barrier function phi and its slope along the step."""
+    """Start of a line search: violation theta, barrier function phi and its slope along the step."""
 
     theta: float
     phi: float
     slope: float
 
     def switches(self, length: float) -> bool:
-        """Whether a step of that length is to lessen phi rather than theta (eq. 19)."""
+        """True if a step of that length is to lessen phi rather than theta (eq. 19)."""
         return (
             self.slope < 0.0
             and length * (-self.slope) ** _SLOPE_POWER > _SWITCH * self.theta**_VIOLATION_POWER
         )
 
     def falls(self, length: float, phi: float) -> bool:
-        """Whether phi falls as its slope lets expect: Armijo's condition, eq. 20, but for rounding."""
+        """True if phi falls as its slope lets expect: Armijo's condition, eq. 20, but for rounding."""
         return phi <= self.phi + _ARMIJO * length * self.slope + 1e-13 * abs(self.phi)
 
 
@@ -57,7 +57,7 @@ class Filter:
         return max(_SHORTEST * length, 1e-14)
 
     def accepts(self, at: SearchStart, length: float, theta: float, phi: float) -> bool:
-        """Whether a trial point is taken (steps A-5.3 and A-5.4)."""
+        """True if a trial point is taken (steps A-5.3 and A-5.4)."""
         if not (np.isfinite(theta) and np.isfinite(phi)) or theta > self.most:
             return False
         if any(theta >= t and phi >= p for t, p in self.pairs):

@@ -58,11 +58,11 @@ class InteriorRun(Run):
 
     @property
     def _warm(self) -> bool:
-        """Whether multipliers were given to start from."""
+        """True if multipliers were given to start from."""
         return bool(np.any(self.y) or np.any(self.z))
 
     def _start_is_solution(self) -> bool:
-        """Whether the start with the multipliers given meets all tolerances."""
+        """True if the start with the multipliers given meets all tolerances."""
         options, point = self.options, self.point
         self._kkt = stationarity(point.gradient, point.jacobian, self.y, self.z)
         return (
@@ -74,7 +74,7 @@ class InteriorRun(Run):
         )
 
     def _begin(self) -> None:
-        """At the objective, from the point and the multipliers that there are."""
+        """Aim at the objective, from the point and the multipliers that there are."""
         self._problem = BarrierProblem(
             self.program,
             self.options,
@@ -90,7 +90,7 @@ class InteriorRun(Run):
         self._search.forget()
 
     def _back_to_best(self) -> bool:
-        """Whether there is another point to begin at anew: the best so far, with multipliers and a barrier
+        """True if there is another point to begin at anew: the best so far, with multipliers and a barrier
         of its own, as what failed may be the way there.
         """
         x = self.report.best.x
@@ -132,7 +132,7 @@ class InteriorRun(Run):
         return Status.ITERATION_LIMIT
 
     def _lacks(self) -> bool:
-        """Whether the program lacks constraints at the iterate."""
+        """True if the program lacks constraints at the iterate."""
         if self._watch is None or self._problem.elastic is not None:
             return False
         if not self._watch.lacks(self.point.x):

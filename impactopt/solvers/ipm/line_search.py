@@ -39,7 +39,7 @@ class LineSearch:
         self._crawled = 0  # iterations of short steps
 
     def forget(self) -> None:
-        """What has been, as the problem is another from here on: its barrier, objective or rows."""
+        """Forget what has been, as the problem is another from here on: its barrier, objective or rows."""
         self._filter = None
 
     def find(self, problem: BarrierProblem, step: Step, residual: Vector) -> Found | None:

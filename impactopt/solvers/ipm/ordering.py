@@ -73,7 +73,7 @@ class _Block:
         return out[::-1]
 
     def joined(self, other: _Block, sizes: Index) -> _Block | None:
-        """With one that comes after it; None where that would be too many zeros."""
+        """Panel joined with one that comes after it; None where that would be too many zeros."""
         width = self.width + other.width
         below = self.below | other.below
         below[other.groups] = False
@@ -86,7 +86,7 @@ class _Block:
 
 
 def _entries(width: int, height: int) -> float:
-    """Of a panel, with the lower triangle of its own block."""
+    """Number of entries of a panel, with the lower triangle of its own block."""
     return width * (height + 0.5 * (width + 1))
 
 

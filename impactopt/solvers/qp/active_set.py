@@ -95,7 +95,7 @@ class _DualActiveSet:
         self.iterations = 0
 
     def run(self, guess: Vector, max_iterations: int, deadline: float) -> QPStatus:
-        """From the active set that the multipliers in `guess` tell, to the solution."""
+        """Run from the active set that the multipliers in `guess` tell, to the solution."""
         self._warm_start(guess)
         while self.iterations < max_iterations and time.perf_counter() < deadline:
             v = self._M @ self._w
@@ -115,7 +115,7 @@ class _DualActiveSet:
         )
 
     def multipliers(self) -> Vector:
-        """Of all rows, positive where the upper bound holds."""
+        """Multipliers of all rows, positive where the upper bound holds."""
         y = np.zeros(self._norms.size)
         y[self.rows] = self._y * self.signs
         return y

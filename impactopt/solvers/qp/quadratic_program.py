@@ -46,7 +46,7 @@ class QuadraticProgram:
 
     @property
     def dense(self) -> bool:
-        """Whether its matrices are arrays."""
+        """True if its matrices are arrays."""
         return isinstance(self.A, np.ndarray)
 
     @cached_property
@@ -75,7 +75,7 @@ class QuadraticProgram:
 
     @cached_property
     def row_scale(self) -> Vector:
-        """What each row of [A; I] is multiplied by in `stacked`, (m + n,)."""
+        """Factors of the rows of [A; I] in `stacked`, (m + n,)."""
         squares = self.A**2 if self.dense else self.A.multiply(self.A)
         norms = np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
         return np.concatenate([1.0 / np.where(norms > 1e-12, norms, 1.0), np.ones(self.n)])
@@ -102,7 +102,7 @@ class QuadraticProgram:
 
 
 class QPStatus(enum.Enum):
-    """How a QP solver ended. INACCURATE: usable, outside the tolerances."""
+    """End of a QP solver. INACCURATE: usable, outside the tolerances."""
 
     SOLVED = "solved"
     INACCURATE = "inaccurate"
@@ -130,7 +130,7 @@ class QPSolution:
 
     @property
     def usable(self) -> bool:
-        """Whether x, y, z can be used as an (approximate) solution."""
+        """True if x, y, z can be used as an (approximate) solution."""
         return self.status in (QPStatus.SOLVED, QPStatus.INACCURATE)
 
 

@@ -72,7 +72,7 @@ def refine(qp: QuadraticProgram, x: Vector, y: Vector, *, rounds: int = 10) -> R
 
 
 def active_set(qp: QuadraticProgram, x: Vector, y: Vector) -> np.ndarray:
-    """Which unit rows of `qp.stacked` (x, y) holds active.
+    """Unit rows of `qp.stacked` that (x, y) holds active.
 
     +1 at the upper bound (and equalities), -1 at the lower, 0 for the others.
 

@@ -85,7 +85,7 @@ class ReducedRun(Run):
         self._start: float | None = None  # of a phase in which only the violation counts: where it began
 
     def iterate(self) -> Status:
-        """From the start, in one way after the other until one of them leads to a solution."""
+        """Run from the initial guess, in one way after the other until one of them leads to a solution."""
         self.point = self.program.point(self.point.x)
         if not self.point.differentiable:
             return Status.FAILED
@@ -230,7 +230,7 @@ class ReducedRun(Run):
         return trial
 
     def _judge(self, trial: Point, length: float, solved: Solved) -> bool | None:
-        """Whether a point is taken, and then whether for the objective's sake; None: it is not."""
+        """True if a point is taken for the objective's sake, False if for less violation; None: it is not."""
         verdict = self._verdict(trial, length, solved) if trial.finite else None
         return verdict if verdict is not None and trial.differentiable else None
 
@@ -257,7 +257,7 @@ class ReducedRun(Run):
         return False if less or met else None
 
     def _move(self, taken: Taken) -> str:
-        """To a point that is taken."""
+        """Move to a point that is taken."""
         h, before = taken.point.violation, self.point
         if not taken.for_objective and self._start is None:
             pair = Pair(before.violation, before.objective)
@@ -294,7 +294,7 @@ class ReducedRun(Run):
             self._radius = min(max(_REACHED * taken_length, 1e-3), self._radius)
 
     def _give_way(self) -> Status | None:
-        """Where no step is taken: only the violation counts from now on; or it is the end."""
+        """Give way where no step is taken: only the violation counts from now on; or it is the end."""
         if not self._excess():
             return Status.ACCEPTABLE if self._optimal(self.options.acceptable_tolerance) else Status.FAILED
         if self._start is not None:  # where QPs have failed nothing is proved
@@ -345,7 +345,7 @@ class ReducedRun(Run):
         return self.point.max_violation > self.options.violation_tolerance
 
     def _is_stationary(self, solved: Solved) -> bool:
-        """Whether the violation, where only that counts, falls by next to nothing along a QP's step, beside
+        """True if the violation, where only that counts, falls by next to nothing along a QP's step, beside
         the slopes of the rows that are violated."""
         if self._start is None:
             return False

@@ -173,7 +173,7 @@ class Kernels:
             d[a.e] = -a.x0 - (d[a.c][:, None] @ a.X)[:, 0]
 
     def multipliers(self, stages: Sequence[EliminationStep], v: Vector, y: Vector) -> None:
-        """Multipliers of the stages' rows, from a gradient, which is spent, and the other rows' multipliers."""
+        """Multipliers of the stages' rows, from a gradient, which is spent, and those of the other rows."""
         for a in stages:
             a.own[:] = v[a.e]
             _add(v, a.c, -(a.X @ a.own[..., None])[..., 0])

@@ -6,5 +6,5 @@
 * world.py          bodies of the target, the ground and the obstacles
 * clearance.py      clearances of all bodies, with exact geometry
 
-Numbers only: the constraints of a plan are in `transcription/apart.py`.
+Numbers only: the constraints of a plan are in `transcription/clearance.py`.
 """

@@ -74,9 +74,9 @@ def collide(
     limit, no separation), 2 bad input.
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
+        from impactopt.collide.single_collision import collide_once, problem_of_result
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.report.console import SolveConsole
-        from impactopt.sweeps.single_collision import collide_once, problem_of_result
 
         check_loudness(quiet, verbose)
         if not 0 < accuracy < math.inf:

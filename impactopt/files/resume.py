@@ -16,7 +16,7 @@ from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, max_violation
-from impactopt.transcription.apart import ApartRow, Held
+from impactopt.transcription.clearance import ApartRow, Held
 from impactopt.transcription.mesh import Elements
 from impactopt.transcription.mesh_refinement import MoreNodes
 from impactopt.transcription.transcription import Transcription

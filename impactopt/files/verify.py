@@ -26,8 +26,8 @@ from impactopt.files.replay import problem_of
 from impactopt.files.resume import program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import bound_violations, complementarity, row_violations, scaled_residual
-from impactopt.transcription.contact_error import contact_error
-from impactopt.transcription.statement import statement_of
+from impactopt.transcription.contact_refinement import contact_error
+from impactopt.transcription.program_summary import statement_of
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["KKT", "VIOLATION", "Verdict", "motion_of_record", "verify", "verify_record"]

@@ -25,7 +25,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.kinematics.leg_closure import Closing
+from impactopt.kinematics.leg_closure import Closing, Limb
 from impactopt.kinematics.symbolic_elimination import Index, elimination_order, solve_in_order
 from impactopt.robots.checks import LEG, check_arms, check_legs
 from impactopt.robots.hinges import check_held
@@ -314,7 +314,15 @@ class StanceCoordinates:
     @cached_property
     def closing(self) -> Closing:
         """Numerical solver of the legs' closure."""
-        return Closing(self)
+        limbs = [Limb(leg.frame, leg.placement, self.base + leg.joints) for leg in self.legs]
+        return Closing(
+            self.model,
+            self.data,
+            limbs,
+            base=self.base,
+            independent=self.base + self.independent,
+            join=self.join,
+        )
 
     def split(self, q_pin: Array) -> tuple[Array, Array]:
         """(y, legs) of a pin configuration."""

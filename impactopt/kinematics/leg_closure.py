@@ -5,8 +5,8 @@ References and distances between bodies ask for thousands of them, so what all h
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -15,12 +15,10 @@ from scipy.linalg.lapack import dgesv
 
 from impactopt.errors import InputError
 
-if TYPE_CHECKING:
-    from impactopt.kinematics.coordinates import StanceCoordinates
-
-__all__ = ["Closing", "base_motion"]
+__all__ = ["Closing", "Limb", "base_motion"]
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 _STEPS = 50  # of Newton, at most
 _LONGEST = 0.3  # [rad] of a Newton step
 _NEAR = 1e-7  # [m, rad]: Newton's next step leaves its square, so it is the last
@@ -28,18 +26,40 @@ _OFF = 1e-6  # [m, rad] and no more, where Newton ends without getting there
 _DAMPING = 1e-12 * np.eye(6)  # a stretched leg's Jacobian is singular
 
 
+class Limb(NamedTuple):
+    """A limb that holds a frame in its place in the world, by six joints: their columns (6,) in v."""
+
+    frame: str
+    placement: pin.SE3
+    columns: Index
+
+
 class Closing:
     """Inverse kinematics of a stance's legs, and velocities and accelerations from the soles' constraint."""
 
-    def __init__(self, c: StanceCoordinates) -> None:
-        self._c, self._model, self._data = c, c.model, c.data
-        self._frames = [c.model.getFrameId(leg.frame) for leg in c.legs]
+    def __init__(
+        self,
+        model: pin.Model,
+        data: pin.Data,
+        limbs: Sequence[Limb],
+        *,
+        base: int,
+        independent: Index,
+        join: Callable[[Array, Array], Array],
+    ) -> None:
+        """base : number of the base's coordinates, 6 or 0.  independent : columns in v of the other joints
+        that are coordinates.  join : q of coordinates (ny,) and legs (nl,).
+        """
+        self._model, self._data, self._base, self._join = model, data, base, join
+        self._frames = [model.getFrameId(limb.frame) for limb in limbs]
         self._limbs = [
-            (frame, leg.placement, c.base + leg.joints, slice(6 * k, 6 * k + 6))
-            for k, (frame, leg) in enumerate(zip(self._frames, c.legs, strict=True))
+            (frame, limb.placement, limb.columns, slice(6 * k, 6 * k + 6))
+            for k, (frame, limb) in enumerate(zip(self._frames, limbs, strict=True))
         ]
-        self._dependent, self._independent = c.base + c.dependent, c.base + c.independent
-        of_column = {joint.idx_v: joint for joint in c.model.joints}
+        none = np.zeros(0, dtype=np.intp)
+        self._dependent = np.concatenate([none, *(limb.columns for limb in limbs)])
+        self._independent = independent
+        of_column = {joint.idx_v: joint for joint in model.joints}
         joints = [of_column[int(column)] for column in self._dependent]
         turning = all(joint.nq == 1 for joint in joints)  # no joint without limits, which has two numbers
         self._places = np.array([joint.idx_q for joint in joints], dtype=np.intp) if turning else None
@@ -50,10 +70,10 @@ class Closing:
         if not self._limbs:
             return legs
         model, data, worst = self._model, self._data, np.inf
-        q = self._c.join(y, legs)
+        q = self._join(y, legs)
         for _ in range(_STEPS):
             if self._places is None:
-                q = self._c.join(y, legs)
+                q = self._join(y, legs)
             else:
                 q[self._places] = legs
             pin.computeJointJacobians(model, data, q)
@@ -94,8 +114,8 @@ class Closing:
 
     def motion(self, y: Array, yd: Array, ydd: Array, legs: Array) -> tuple[Array, Array, Array, Array]:
         """`StanceCoordinates.complete_motion`, and the soles' Jacobians at its configuration."""
-        model, data, b = self._model, self._data, self._c.base
-        q = self._c.join(y, legs)
+        model, data, b = self._model, self._data, self._base
+        q = self._join(y, legs)
         v, a = np.zeros(model.nv), np.zeros(model.nv)
         if b:
             v[:6], a[:6] = base_motion(y[:6], yd[:6], ydd[:6])

@@ -26,9 +26,9 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
 from impactopt.robots.hinges import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
+from impactopt.transcription.initial_guess import strike_rates
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.reference import complete_reference
-from impactopt.transcription.start import strike_rates
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from impactopt.planning.solution import Solution
 from impactopt.solvers.active import Change
 from impactopt.solvers.predictor import Prediction
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
-from impactopt.transcription.statement import statement_of
+from impactopt.transcription.program_summary import statement_of
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["moved_solution"]

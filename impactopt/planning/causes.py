@@ -25,7 +25,7 @@ from impactopt.problem.phase import LONGEST, SHORTEST, Phase
 from impactopt.solvers.program import NonlinearProgram, SolverResult, max_violation
 from impactopt.solvers.relaxed import RelaxedProgram
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.transcription.start import carried_over, first_iterate
+from impactopt.transcription.initial_guess import carried_over, first_iterate
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["Cause", "Search", "search"]

@@ -15,7 +15,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.gains import scaled_gains, with_room
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 

@@ -21,9 +21,9 @@ from impactopt.planning.multistart import Budget, one_after_the_other
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import SolverResult
-from impactopt.solvers.sqp.run import Path
-from impactopt.transcription.apart import ApartRow, Held
-from impactopt.transcription.at_contact import ContactProgram
+from impactopt.solvers.run import Path
+from impactopt.transcription.clearance import ApartRow, Held
+from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.layout import stack
 
 Array = NDArray[np.float64]

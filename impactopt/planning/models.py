@@ -27,11 +27,11 @@ from impactopt.problem.terms import VelocityLimit
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.reference.coasting import coasting_reference
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.at_contact import ContactProgram
-from impactopt.transcription.guess import fastest
+from impactopt.transcription.contact_guess import fastest
+from impactopt.transcription.contact_program import ContactProgram
+from impactopt.transcription.initial_guess import strike_rates
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.start import strike_rates
 
 Array = NDArray[np.float64]
 AnySolution = TypeVar("AnySolution", bound=Solved)

@@ -12,7 +12,7 @@ from impactopt.planning.multistart import carried, one_after_the_other
 from impactopt.planning.on_demand import program_for
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.start import first_iterate
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["with_first_scale", "within_price"]

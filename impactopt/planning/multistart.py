@@ -22,12 +22,12 @@ from impactopt.solvers.program import (
     Violation,
     worst_rows,
 )
+from impactopt.solvers.run import Path, Watch
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.solvers.sqp.run import Path, Watch
-from impactopt.transcription.start import carried_over
+from impactopt.transcription.initial_guess import carried_over
 
 if TYPE_CHECKING:
-    from impactopt.transcription.at_contact import ContactProgram
+    from impactopt.transcription.contact_program import ContactProgram
 
 Array = NDArray[np.float64]
 Program = TypeVar("Program", bound="ContactProgram")

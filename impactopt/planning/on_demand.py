@@ -22,10 +22,10 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, Slide, Term
 from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status
+from impactopt.transcription.initial_guess import carried_over
 from impactopt.transcription.plan import Plan, PlannedCollision
 from impactopt.transcription.planned_loads import plan_loads, strike_loads
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.start import carried_over
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 

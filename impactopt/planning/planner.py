@@ -41,12 +41,12 @@ from impactopt.planning.window import window_caution
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
-from impactopt.transcription.apart import ApartRow, Held
+from impactopt.transcription.clearance import ApartRow, Held
+from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import PlannedCollision
-from impactopt.transcription.start import first_iterate, iterate_from_strike, strike_iterate
-from impactopt.transcription.statement import statement_of
+from impactopt.transcription.program_summary import statement_of
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 

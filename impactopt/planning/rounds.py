@@ -17,17 +17,17 @@ from impactopt.planning.multistart import Budget, carried, one_after_the_other, 
 from impactopt.planning.too_near import Violated, clearance_violations
 from impactopt.planning.verdict import second_look
 from impactopt.solvers.program import SolverResult, Status
-from impactopt.transcription.apart import ApartRow, Held
-from impactopt.transcription.contact_error import (
+from impactopt.transcription.clearance import ApartRow, Held
+from impactopt.transcription.contact_refinement import (
     ASKED,
     ContactError,
     all_halved,
     contact_error,
     refined_elements,
 )
+from impactopt.transcription.initial_guess import carried_over, first_iterate
 from impactopt.transcription.mesh import Elements, contact_elements
 from impactopt.transcription.mesh_refinement import nodes_to_add
-from impactopt.transcription.start import carried_over, first_iterate
 from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]

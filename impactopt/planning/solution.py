@@ -26,7 +26,7 @@ from impactopt.planning.sliding import slide, slide_caution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
-from impactopt.transcription.contact_error import ContactError
+from impactopt.transcription.contact_refinement import ContactError
 from impactopt.transcription.mesh import Elements, Shares, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.motion_measures import first_touch, motion_measures
@@ -135,7 +135,7 @@ class Solution(Solved):
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
-    statement : names of the program's variables and constraints, as `impactopt.transcription.statement`
+    statement : names of the program's variables and constraints, as `impactopt.transcription.program_summary`
     writes them.
     causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
         cheapest first. Each has the ``problem`` with that value. Empty where none is known to.

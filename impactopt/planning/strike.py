@@ -34,9 +34,9 @@ from impactopt.planning.too_near import deepest_penetration
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status
+from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 

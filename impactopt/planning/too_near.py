@@ -18,8 +18,8 @@ from impactopt.bodies.clearance import DEEPEST, MISSED, Places
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.bodies.separation import THIN
 from impactopt.planning.keeping_apart import AFTER, Margins, Rows, Spots, spots_of
-from impactopt.transcription.apart import ApartRow
-from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.clearance import ApartRow
+from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.mesh_refinement import MoreNodes
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription

@@ -16,9 +16,9 @@ from impactopt.planning.solution import Solution
 from impactopt.problem.feasibility import too_weak
 from impactopt.robots.sole_margins import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
-from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.guess import Parting, fastest, parting
+from impactopt.transcription.contact_guess import Parting, fastest, parting
+from impactopt.transcription.contact_program import ContactProgram
 
 Array = NDArray[np.float64]
 TOLD = 3  # margins at most, in a message

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Bodies
 from impactopt.bodies.shapes import Ground, Obstacle, TargetBody
-from impactopt.bodies.world import WorldBody, ground_body, obstacle_bodies, target_bodies
+from impactopt.bodies.world import WorldBody, body_message, ground_body, obstacle_bodies, target_bodies
 from impactopt.collision.effects import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
@@ -47,7 +47,6 @@ from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_ob
 from impactopt.problem.phase import Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.second_striker import SecondStriker, check_second
-from impactopt.problem.summary import described
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -415,4 +414,40 @@ class ImpactProblem:
 
     def describe(self) -> dict[str, Any]:
         """The problem in a few plain words and numbers, for reports."""
-        return described(self)
+        out: dict[str, Any] = {
+            "name": self.name,
+            "robot": self.robot.name,
+            "striker": self.striker,
+            "point_m": self.point.tolist(),
+            "normal": self.normal.tolist(),
+            "target": repr(self.target),
+            "target_body": body_message(self.body, self.target),
+            "law": repr(self.law),
+            "hash": self.hash,
+        }
+        if not self.robot.floating:
+            out["ground"] = "none" if self.ground_height is None else f"z = {self.ground_height:g} m"
+        if self.collision != "full":
+            frozen = f", {self.freezes} freezes" if self.freezes else ""
+            more = {"rigid": f", restitution {self.coefficient_of_restitution:g}", "sdc": frozen}
+            out["collision"] = self.collision + more.get(self.collision, "")
+        if self.second is not None:
+            out["second"] = {"striker": self.second.striker, "point_m": self.second.point.tolist()}
+        if hands := self.stance.held_hands(self.robot):
+            out["holds_on_with"] = [hand.name for hand in hands]
+        if self.robot.source and self.robot.source.repairs:
+            out["inertias"] = [f"repaired: {text}" for text in self.robot.source.repairs]
+        if self.robot.source and self.robot.source.notes:
+            out["notes"] = list(self.robot.source.notes)
+        out |= {"scenarios": [str(s) for s in self.scenarios]} if self.scenarios else {}
+        if self.gains:
+            out["gains"] = [
+                f"{', '.join(g.joints)}: {g.factor[0]:g} to {g.factor[1]:g} times" for g in self.gains
+            ]
+        if self.objectives != DEFAULT_OBJECTIVES:
+            out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in self.objectives]
+        off = [term.name for term in (self.self_collision, self.keep_out) if not term.active]
+        off += [term.name for term in ON_DEMAND_TERMS if self.term(type(term)) not in self.on_demand]
+        if off:
+            out["off"] = off
+        return out

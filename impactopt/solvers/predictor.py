@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
 
+from impactopt.solvers.ipm.newton import acquire
 from impactopt.solvers.program import Matrix, NonlinearProgram, Vector, max_violation
-from impactopt.solvers.sqp.newton import acquire
 from impactopt.solvers.threads import threads
 
 __all__ = ["Prediction", "Predictor"]

@@ -3,8 +3,8 @@
 * definition.py   sweep files: sections.py, varied_keys.py; design.py: grids, lists and draws
 * units.py        inputs and results of a worker
 * case_kinds.py   from a case's settings to its row; evaluate.py: on a worker; watchdog.py: time limits
-* collisions.py   batches of collisions in compiled code: collision_batch.py, at_contact.py,
-                  collision_keys.py, contact_states.py, scene.py, measures.py
+* collisions.py   batches of collisions in compiled code: collision_batch.py, collision_keys.py;
+                  states and measures of one: `impactopt.collide`
 * local_pool.py   pool of processes on this machine; cluster.py: Dask workers
 * journal.py      finished units on disk; store.py: the directory; table.py: the result
 * progress.py     progress of a sweep

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.collide.at_contact import NOT_ENDED, AtContact
+from impactopt.collide.contact_states import ContactStates, Posture, States
+from impactopt.collide.measures import Blow, Measure
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import too_large
 from impactopt.collision.freezing import FREEZE_ERROR
@@ -18,10 +21,7 @@ from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile
 from impactopt.files.problem_file.toml import Place
-from impactopt.sweeps.at_contact import AtContact
 from impactopt.sweeps.collision_keys import SERVO, setting_of
-from impactopt.sweeps.contact_states import ContactStates, Posture, States
-from impactopt.sweeps.measures import Blow, Measure
 
 __all__ = ["AlikeCollisions"]
 
@@ -31,7 +31,6 @@ Numbers = Mapping[Place, Array]  # columns of numbers, by their keys' places
 
 _ROWS, _WITH_HISTORIES = 8192, 512  # rows at a time: histories are large
 _TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
-NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
 NO_NUMBER = (
     "the collision has no finite numbers: its steps are unstable here, or what holds the robot cannot be "
     "told apart"

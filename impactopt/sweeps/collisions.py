@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from impactopt.collide.at_contact import AtContact, check_at_contact, collision_model, full_names
+from impactopt.collide.contact_states import ContactStates
+from impactopt.collide.measures import chosen
 from impactopt.collision.freezing import FREEZE_ERROR
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError, raw_array
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.problem_file.toml import plain_value
-from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model, full_names
 from impactopt.sweeps.collision_batch import AlikeCollisions
 from impactopt.sweeps.collision_keys import role_of, sweep_place
-from impactopt.sweeps.contact_states import ContactStates
-from impactopt.sweeps.measures import chosen
 
 __all__ = ["Collisions", "collide_many"]
 

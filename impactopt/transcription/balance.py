@@ -11,9 +11,9 @@ from impactopt.kinematics.wrench_cone import inward_edges
 from impactopt.problem.objectives import AngularMomentum
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.contact import ContactState
+from impactopt.transcription.constraints import Measure, millimetres
+from impactopt.transcription.contact_state import ContactState
 from impactopt.transcription.layout import Affine, Group
-from impactopt.transcription.rows import Measure, millimetres
 
 
 def add_balance(

@@ -20,8 +20,10 @@ from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, make_block
 from impactopt.transcription.contact_blocks import (
     SECOND,
+    Joints,
     base_scale,
     carried,
+    chosen_gains,
     coasting,
     collision,
     first_instant,
@@ -31,7 +33,6 @@ from impactopt.transcription.contact_blocks import (
     leg_part,
     moved,
 )
-from impactopt.transcription.gain_blocks import Joints, chosen_gains
 
 __all__ = [
     "BlockExpression",

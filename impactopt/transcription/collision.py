@@ -16,20 +16,19 @@ from impactopt.problem.objectives import PeakForce
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.collocated import Collocated
-from impactopt.transcription.contact import Contact
+from impactopt.transcription.collocation_values import Collocated
+from impactopt.transcription.constraints import Measure, Place, along, by_leg, percent, rates
 from impactopt.transcription.contact_blocks import FORCE_SCALE, typical_state
-from impactopt.transcription.contact_numbers import ContactNumbers
+from impactopt.transcription.contact_guess import blow, coasted, effective_mass
+from impactopt.transcription.contact_parameters import ContactNumbers, pulls_apart, switches
+from impactopt.transcription.contact_state import Contact
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.guess import blow, coasted, effective_mass
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.mesh import CollocationPoint
 from impactopt.transcription.nodes import add_cone_rows
-from impactopt.transcription.phases import pulls_apart, switches
 from impactopt.transcription.plan import PlannedCollision
 from impactopt.transcription.reference import total_ground_wrench
-from impactopt.transcription.rows import Measure, Place, along, by_leg, percent, rates
 
 
 class Collision(ContactNumbers, Collocated):

@@ -18,15 +18,16 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stages import Stage, motion_in_stages
 from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, make_block
-from impactopt.transcription.gain_blocks import Joints, chosen_gains
 
 __all__ = [
     "DEPTH_SCALE",
     "FORCE_SCALE",
     "RESTITUTING",
     "SECOND",
+    "Joints",
     "base_scale",
     "carried",
+    "chosen_gains",
     "coasting",
     "collision",
     "first_instant",
@@ -43,6 +44,7 @@ FORCE_SCALE = 100.0  # [N] contact forces in the program's constraints
 DEPTH_SCALE = 0.01  # [m] penetration in the program's constraints
 SECOND = ("second law", "second rate", "second penetration", "second separation")  # outputs of `force`
 RESTITUTING = 6  # which parameter of `force` says so
+Joints = tuple[tuple[int, ...], ...]  # of each factor, their places among the gains
 
 
 def base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
@@ -400,3 +402,13 @@ def join() -> BlockExpression:
     """
     T1, T2, d1, d2, d = z = [ca.SX.sym(s) for s in ("T1", "T2", "d1", "d2", "d")]
     return make_block(list(z), [], {"travel": T1 * d1 + T2 * d2 - (T1 + T2) * d})
+
+
+def chosen_gains(stiffness: Any, damping: Any, logs: Any, chosen: Joints) -> tuple[Any, Any]:
+    """Stiffness times the factors of ``chosen``, whose logarithms are ``logs``; damping times their roots."""
+    stiffness, damping = ca.SX(stiffness), ca.SX(damping)
+    for k, joints in enumerate(chosen):
+        for joint in joints:
+            stiffness[joint] *= ca.exp(logs[k])
+            damping[joint] *= ca.exp(logs[k] / 2)
+    return stiffness, damping

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from enum import IntEnum
 
 from impactopt.solvers.program import Determined
-from impactopt.transcription.rows import Index
+from impactopt.transcription.constraints import Index
 
 
 class Turn(IntEnum):

@@ -10,12 +10,12 @@ import numpy as np
 from impactopt.kinematics.splines import CubicSpline, graded_breaks
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.contact import Contact
+from impactopt.transcription.constraints import Place
+from impactopt.transcription.contact_state import Contact
 from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase, at_node
-from impactopt.transcription.rows import Place
 
 
 class FollowThrough(MotionPhase):

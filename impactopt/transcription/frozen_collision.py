@@ -24,14 +24,14 @@ from impactopt.collision.graph import target_start
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.contact import Contact
+from impactopt.transcription.constraints import Measure, Place, along, by_leg, rates
+from impactopt.transcription.contact_guess import coasted, effective_mass
+from impactopt.transcription.contact_state import Contact
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.guess import coasted, effective_mass
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.mesh import CollocationPoint, Shares, lagrange, place_of, segment_of
-from impactopt.transcription.rows import Measure, Place, along, by_leg, rates
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,12 @@ import numpy as np
 
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.contact import Contact
-from impactopt.transcription.drives import ContactEnd, still
+from impactopt.transcription.constraints import Measure, Place, percent
+from impactopt.transcription.contact_state import Contact, ContactEnd, still
 from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.plan import PlannedCollision
-from impactopt.transcription.rows import Measure, Place, percent
 
 
 class InstantImpact:

@@ -19,7 +19,7 @@ from impactopt.problem.terms import (
 )
 from impactopt.problem.terms.grip import WRENCH
 from impactopt.robots.hinges import inside
-from impactopt.transcription.rows import Measure
+from impactopt.transcription.constraints import Measure
 
 GRAVITY = 9.81
 LEVER = 0.1  # [m] scale of sole moments against forces

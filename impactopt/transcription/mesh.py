@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from impactopt.contact.targets import Target
 from impactopt.kinematics.splines import Radau
 from impactopt.problem.problem import ImpactProblem
-from impactopt.transcription.guess import mass_at_contact, natural_durations
+from impactopt.transcription.contact_guess import mass_at_contact, natural_durations
 
 Array = NDArray[np.float64]
 Elements = tuple[tuple[float, ...], ...]  # lengths of each phase's, as fractions of it

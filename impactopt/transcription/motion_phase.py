@@ -11,10 +11,10 @@ from impactopt.kinematics.splines import CubicSpline, basis, knots, rate_weights
 from impactopt.problem.problem import Phase
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
+from impactopt.transcription.constraints import Index, Measure, Place, by_leg
 from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.layout import Affine, Array, Group, add, stack
 from impactopt.transcription.mesh import percentage
-from impactopt.transcription.rows import Index, Measure, Place, by_leg
 
 
 class MotionPhase(ABC):

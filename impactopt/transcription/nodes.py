@@ -8,9 +8,9 @@ import numpy as np
 
 from impactopt.kinematics.wrench_cone import contact_wrench_cone
 from impactopt.transcription.builder import Builder
+from impactopt.transcription.constraints import Index, Measure, Place, along, percent
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.limits import DIRECTIONS
-from impactopt.transcription.rows import Index, Measure, Place, along, percent
 
 
 def add_nodes(

@@ -17,8 +17,8 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from impactopt.codegen.library import address, native_library
+from impactopt.transcription.constraints import Index
 from impactopt.transcription.layout import Array
-from impactopt.transcription.rows import Index
 
 Places = npt.NDArray[np.int32]
 

@@ -2,7 +2,7 @@
 
 CasADi's C takes the instances one after the other, a number at a time. The same operations on vectors need
 about as many of the CPU's instructions for eight instances as for one. They are numbers, which a few loops go
-through (`impactopt.transcription.arranged`): a compiler has the loops to compile, and nothing else.
+through (`impactopt.transcription.instruction_table`): a compiler has the loops to compile, and nothing else.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from impactopt.codegen.library import NativeCode
 from impactopt.problem.block import LANES
-from impactopt.transcription.arranged import (
+from impactopt.transcription.instruction_table import (
     LESS_PRODUCT,
     PRODUCT_LESS,
     SUM_OF_PRODUCT,

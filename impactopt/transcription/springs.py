@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.courses import start_torque
+from impactopt.transcription.constraints import Place, percent
 from impactopt.transcription.layout import Affine, add
 from impactopt.transcription.motion_phase import MotionPhase
-from impactopt.transcription.rows import Place, percent
+from impactopt.transcription.torque_profiles import start_torque
 
 __all__ = ["SpringPoint", "add_hinges", "add_springs", "follow_springs", "swing_springs"]
 

@@ -20,9 +20,9 @@ from impactopt.kinematics.stages import Stage
 from impactopt.solvers.program import Determined
 from impactopt.transcription.batched import Block
 from impactopt.transcription.chain_rule import derivatives
+from impactopt.transcription.constraints import Rows
 from impactopt.transcription.layout import Affine, Array, Layout, stack
-from impactopt.transcription.maps import HessianMap, JacobianMap
-from impactopt.transcription.rows import Rows
+from impactopt.transcription.sparsity import HessianMap, JacobianMap
 
 
 class StructuredProgram:

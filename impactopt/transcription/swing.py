@@ -6,7 +6,7 @@ import numpy as np
 
 from impactopt.kinematics.splines import graded_breaks, rate_weights
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.contact import ContactState
+from impactopt.transcription.contact_state import ContactState
 from impactopt.transcription.layout import Affine
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase

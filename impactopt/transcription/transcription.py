@@ -20,29 +20,28 @@ from impactopt.kinematics.statics import static_wrenches
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
-from impactopt.transcription.at_contact import BodyState, ContactProgram
 from impactopt.transcription.balance import add_balance
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.clearance import add_clearance
-from impactopt.transcription.contact import Contact, add_coasting
+from impactopt.transcription.constraints import Index, Place, along, degrees, percent, rates
 from impactopt.transcription.contact_blocks import typical_state
-from impactopt.transcription.courses import TorqueCourse, torque_courses
+from impactopt.transcription.contact_conditions import add_clearance, add_touch_rows
+from impactopt.transcription.contact_program import BodyState, ContactProgram
+from impactopt.transcription.contact_set import Hit
+from impactopt.transcription.contact_state import Contact, add_coasting
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.extra_blocks import ExtraBlock, extra_blocks, own_blocks
 from impactopt.transcription.follow import AbortMotion, FollowThrough
-from impactopt.transcription.hit import Hit
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.nodes import add_nodes
 from impactopt.transcription.objective import Prices, motion_prices, style_prices
 from impactopt.transcription.plan import Plan
-from impactopt.transcription.rows import Index, Place, along, degrees, percent, rates
 from impactopt.transcription.simd import in_lanes
 from impactopt.transcription.springs import SpringPoint, follow_springs, swing_springs
 from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.swing import Swing
-from impactopt.transcription.touch import add_touch_rows
+from impactopt.transcription.term_blocks import ExtraBlock, extra_blocks, own_blocks
+from impactopt.transcription.torque_profiles import TorqueCourse, torque_courses
 
 SECOND_BLOCKS = ("second_contact", "second_approach")
 

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.optimize as so
 import scipy.sparse as sp
 
+from impactopt.solvers.point import TimedProgram
 from impactopt.solvers.program import (
     BestIterate,
     NonlinearProgram,
@@ -19,7 +20,6 @@ from impactopt.solvers.program import (
     max_violation,
     stationarity,
 )
-from impactopt.solvers.sqp.point import TimedProgram
 
 __all__ = ["solve_slsqp", "solve_trust_constr"]
 

@@ -96,7 +96,7 @@ def planning_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgra
     from another posture.
     """
     from impactopt.files.problem_file import load_problem
-    from impactopt.transcription.start import first_iterate
+    from impactopt.transcription.initial_guess import first_iterate
     from impactopt.transcription.transcription import Transcription, block_functions
 
     problem = load_problem(file)
@@ -107,7 +107,7 @@ def planning_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgra
 def strike_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgram, Vector]:
     """As :func:`planning_program`, of the strike."""
     from impactopt.files.problem_file import load_problem
-    from impactopt.transcription.start import strike_iterate
+    from impactopt.transcription.initial_guess import strike_iterate
     from impactopt.transcription.strike import StrikeTranscription
     from impactopt.transcription.transcription import block_functions
 

@@ -40,7 +40,7 @@ from impactopt.kinematics.operational_space import holding_torque, striking_velo
 from impactopt.problem.phase import FINEST
 from impactopt.report.page import html_page
 from impactopt.simulation import simulate
-from impactopt.solvers.sqp.ordering import elimination_blocks
+from impactopt.solvers.ipm.ordering import elimination_blocks
 from impactopt.sweeps import read_sweep_file
 
 ARM = problem_file("arm_planar").read_text(encoding="utf-8")

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 import impactopt
 from impactopt.cli.app import app
 from impactopt.cli.options import complete_problem
+from impactopt.collide.single_collision import collide_once
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import (
     key_place,
@@ -30,7 +31,6 @@ from impactopt.files.problem_file import (
 from impactopt.files.problem_file.names import problem_file
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
-from impactopt.sweeps.single_collision import collide_once
 
 ROOT = Path(__file__).parents[2]
 DATA: dict[str, Any] = {

@@ -34,7 +34,7 @@ def apart_pieces(
     """The constraints that a result says it had, in its order; and what is not known of them.
 
     nodes : of all motions, by their places.  rows : place, joint, other and number, way, reach [m] and travel
-    [m], as `impactopt.transcription.apart` has them.
+    [m], as `impactopt.transcription.clearance` has them.
     """
     known: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:

@@ -67,7 +67,7 @@ class Claims:
     groups : names, counts and sizes of its variables, in their order.  rows : terms, places and components.
     more : nodes beside those of the mesh, of swing and follow-through.  elements : of the contact's phases.
     shortest : of each collision, least durations [s] of its phases.  guarded : whether elements are finer.
-    apart : rows between bodies, as `impactopt.transcription.apart` has them.
+    apart : rows between bodies, as `impactopt.transcription.clearance` has them.
     """
 
     groups: Sequence[tuple[str, int, int]]

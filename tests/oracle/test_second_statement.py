@@ -20,9 +20,9 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import ContactWrenchCone, FirstTouch, GearLoad, GroundForce, Slide, TargetSpeed
 from impactopt.robots.attachments import SoftGrip
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Trajectory
-from impactopt.transcription.start import first_iterate
-from impactopt.transcription.statement import statement_of
+from impactopt.transcription.program_summary import statement_of
 from impactopt.transcription.transcription import Transcription, block_functions
 from oracle.kkt import lagrangian_gradient
 from oracle.program import Program

@@ -35,7 +35,7 @@ from impactopt.planning.models import carried_start
 from impactopt.report.result_rows import result_columns, result_rows
 from impactopt.robots.gains import with_room
 from impactopt.solvers.program import max_violation
-from impactopt.transcription.start import first_iterate
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription, block_functions
 
 GRIP = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.08])

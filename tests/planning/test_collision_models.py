@@ -23,9 +23,9 @@ from impactopt.planning.solution import ModelError
 from impactopt.problem.problem import COLLISIONS, ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.sqp import solve_sqp
+from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.mesh import contact_elements, guessed_shares, place_of
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 
 pytestmark = [

@@ -22,6 +22,8 @@ from typer.testing import CliRunner
 from impactopt import Solution, coasting_reference, load_problem, optimize_strike, solve
 from impactopt.cli.app import app
 from impactopt.codegen.compiler import find_compiler
+from impactopt.collide.contact_states import ContactStates, Posture
+from impactopt.collide.single_collision import collide_once, problem_of_result
 from impactopt.collision import SDC, Effects
 from impactopt.collision.settings import REFERENCE_ORDER, no_bend
 from impactopt.contact import FreeMass
@@ -34,8 +36,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import scene_of, simulate_pinocchio
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
-from impactopt.sweeps.contact_states import ContactStates, Posture
-from impactopt.sweeps.single_collision import collide_once, problem_of_result
 from impactopt.transcription.plan import PlannedCollision
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")

@@ -37,15 +37,15 @@ from impactopt.problem.objectives import PeakForce, Penetration
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import Slide, TargetSpeed
+from impactopt.solvers.elimination.condense import Condenser, find_eliminations
+from impactopt.solvers.elimination.kernels import Kernels
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Determined, Status, check_program
-from impactopt.solvers.sqp.condense import Condenser, find_eliminations
-from impactopt.solvers.sqp.kernels import Kernels
-from impactopt.transcription.clearance import CLEARANCE, HASTE
-from impactopt.transcription.guess import speed_that_leaves
+from impactopt.transcription.contact_conditions import CLEARANCE, HASTE
+from impactopt.transcription.contact_guess import speed_that_leaves
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import contact_mesh
 from impactopt.transcription.plan import Plan
-from impactopt.transcription.start import first_iterate
 
 Array = NDArray[np.float64]
 MASS = 2.0  # [kg] of the hammer

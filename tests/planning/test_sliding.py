@@ -15,8 +15,8 @@ from impactopt.planning.sliding import FAR, slide, slide_caution, slides_beyond
 from impactopt.problem import problem as problems
 from impactopt.problem.terms import GearLoad, Slide
 from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan
-from impactopt.transcription.start import first_iterate
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ from impactopt.problem.terms import (
 )
 from impactopt.simulation.reference import FullDynamics
 from impactopt.solvers.program import Status, check_program
-from impactopt.transcription.start import first_iterate, iterate_from_strike, strike_iterate
+from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 

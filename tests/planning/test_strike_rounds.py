@@ -17,7 +17,7 @@ from impactopt.planning.keeping_apart import Margins
 from impactopt.planning.multistart import Budget
 from impactopt.planning.too_near import deepest_penetration
 from impactopt.solvers.program import SolverResult, Status
-from impactopt.transcription.start import strike_iterate
+from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 

@@ -18,7 +18,7 @@ from impactopt.planning.solution import Solution
 from impactopt.planning.too_near import clearance_violations
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, max_violation
-from impactopt.transcription.start import carried_over
+from impactopt.transcription.initial_guess import carried_over
 from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]

@@ -28,7 +28,7 @@ from impactopt.problem.terms import (
 )
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult, Status
-from impactopt.transcription.start import first_iterate
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

@@ -26,8 +26,8 @@ from impactopt.problem.objectives import (
 from impactopt.problem.terms import Balance
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan
-from impactopt.transcription.start import first_iterate
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

@@ -22,11 +22,11 @@ from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import solve_sqp
 from impactopt.transcription.blocks import make_block
-from impactopt.transcription.extra_blocks import key_of
+from impactopt.transcription.constraints import millimetres
+from impactopt.transcription.initial_guess import first_iterate, strike_iterate
 from impactopt.transcription.objective import Quantity
-from impactopt.transcription.rows import millimetres
-from impactopt.transcription.start import first_iterate, strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.term_blocks import key_of
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

@@ -20,9 +20,9 @@ from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
 from impactopt.simulation import scene_of
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.transcription import clearance as nlp
+from impactopt.transcription import contact_conditions as nlp
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import PlannedCollision, PlannedScenario
-from impactopt.transcription.start import first_iterate
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

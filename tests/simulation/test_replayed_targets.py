@@ -45,7 +45,7 @@ from impactopt.simulation.robustness import PerturbationRanges
 from impactopt.simulation.step_error import check_steps, with_step_error
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.transcription.start import first_iterate
+from impactopt.transcription.initial_guess import first_iterate
 
 Array = NDArray[np.float64]
 Engine = Callable[..., Simulation]

@@ -9,14 +9,14 @@ import scipy.sparse as sp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from impactopt.solvers.elimination.compiled import kernels
+from impactopt.solvers.elimination.condense import Condenser, find_eliminations
+from impactopt.solvers.elimination.kernels import Kernels
+from impactopt.solvers.elimination.patterns import Elimination
+from impactopt.solvers.ipm.cholesky import BlockCholesky
+from impactopt.solvers.ipm.newton import NewtonSystem, acquire, release
 from impactopt.solvers.program import Determined
-from impactopt.solvers.sqp.cholesky import BlockCholesky
-from impactopt.solvers.sqp.compiled import kernels
-from impactopt.solvers.sqp.condense import Condenser, find_eliminations
-from impactopt.solvers.sqp.kernels import Kernels
-from impactopt.solvers.sqp.newton import NewtonSystem, acquire, release
-from impactopt.solvers.sqp.patterns import Elimination
-from impactopt.transcription.start import first_iterate
+from impactopt.transcription.initial_guess import first_iterate
 
 NONE = np.zeros(9, dtype=bool)
 

@@ -13,9 +13,11 @@ from support.small_plans import changed, transcribed
 from support.textbook import CASES, INF, Textbook, assert_optimal
 
 from impactopt import load_problem
+from impactopt.solvers.ipm import interior_point as interior
+from impactopt.solvers.ipm import line_search as search
 from impactopt.solvers.program import Status
-from impactopt.solvers.sqp import SQPOptions, interior, search, solve_sqp
-from impactopt.transcription.start import first_iterate
+from impactopt.solvers.sqp import SQPOptions, solve_sqp
+from impactopt.transcription.initial_guess import first_iterate
 
 
 def projection(wanted):

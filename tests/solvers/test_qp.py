@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from impactopt.errors import InputError
+from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.qp.osqp_solver import OsqpSolver
 from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, QuadraticProgram, make_qp_solver
-from impactopt.solvers.sqp.options import SQPOptions
-from impactopt.solvers.sqp.osqp_solver import OsqpSolver
 
 INF = np.inf
 SOLVERS = sorted(QP_SOLVERS)

@@ -126,7 +126,9 @@ def test_rows_that_contradict_each_other_are_named(name, way):
 @pytest.mark.parametrize("name", UNBOUNDED)
 def test_unbounded_programs_end_far_out(name, way):
     case = UNBOUNDED[name]
-    result = solve_sqp(case.build(), case.x0, options=dataclasses.replace(WAYS[way], max_iterations=50))
+    result = solve_sqp(
+        case.build(), case.x0, options=dataclasses.replace(WAYS[way], max_iterations=50, radius=100.0)
+    )
     assert not result.status.usable
     assert result.status is not Status.INFEASIBLE
     assert result.max_violation <= 1e-6

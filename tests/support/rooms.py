@@ -26,6 +26,7 @@ ROOMS_IN_ORDER = (
     "simulation",
     "planning",
     "files",
+    "collide",
     "sweeps",
     "identification",
     "report",
@@ -46,13 +47,25 @@ NUMERIC = (
     "planning/keeping_apart.py",
     "planning/solution.py",
     "simulation",
+    "solvers/elimination",
+    "solvers/ipm",
+    "solvers/options.py",
+    "solvers/point.py",
     "solvers/program.py",
+    "solvers/qp",
+    "solvers/report.py",
+    "solvers/run.py",
     "solvers/sqp",
     "transcription/plan.py",
     "transcription/planned_strike.py",
 )
 # What an engine may know of this package, so that it can contradict the rest of it.
 ENGINE = {"contact", "errors", "robots", "simulation"}
+
+
+def own_name(name: str) -> str:
+    """Module that defines a name of the package itself."""
+    return f"impactopt.{impactopt._EXPORTS.get(name, name)}"
 
 
 def imports(file: Path) -> Iterator[str]:
@@ -64,10 +77,8 @@ def imports(file: Path) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             above = inside[: len(inside) - node.level + 1] if node.level else ()
             module = ".".join([*above, *([node.module] if node.module else [])])
-            # `from impactopt import cone` names a module, or something of the package's own
-            yield from (
-                [f"{module}.{alias.name}" for alias in node.names] if module == "impactopt" else [module]
-            )
+            # `from impactopt import sweep` names a module, or something of the package's own
+            yield from [own_name(alias.name) for alias in node.names] if module == "impactopt" else [module]
         elif isinstance(node, ast.Call) and "import_module" in ast.dump(node.func):
             yield from (str(a.value) for a in node.args if isinstance(a, ast.Constant))
 
@@ -86,28 +97,28 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ROOMS = {room(file) for file in FILES}
 
 
-# where not even types lead back: parts know what they take, and not who puts them together
-STRICT = ("transcription",)
+# methods of a solution that are made above it, imported by the package's own names when they are called
+REACHES_UP = PACKAGE / "planning" / "solution.py"
 
 
 def modules_imported(file: Path) -> set[str]:
-    """Files of the package that a file imports, lazily too; those for types alone in the rooms `STRICT`."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-        if types and room(file) not in STRICT:
-            node.body = [ast.Pass()]
+    """Modules of the package that a file imports: in functions, for types alone, by its own names too."""
     found = set[str]()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module == "impactopt":
+            found |= set() if file == REACHES_UP else {own_name(alias.name) for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            # a name of a package is a module in it, or the package's own
+            found |= {name if name in MODULES else node.module for name in names}
         elif isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
     return found & set(MODULES)
 
 
+# packages too, but for the one of all, which imports its names when they are used
 MODULES = {
-    ".".join(("impactopt", *file.relative_to(PACKAGE).with_suffix("").parts)): file
+    ".".join(("impactopt", *file.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): file
     for file in FILES
-    if file.name != "__init__.py"
+    if file != PACKAGE / "__init__.py"
 }

@@ -12,6 +12,7 @@ import pytest
 from support.fake_solution import strike_record
 from support.small_robots import arm, biped
 
+from impactopt.collide.contact_states import ContactStates, Posture
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
@@ -22,7 +23,6 @@ from impactopt.kinematics.stance import BothSoles, FixedBase
 from impactopt.kinematics.support import margin
 from impactopt.robots.presets import load_robot
 from impactopt.sweeps.collisions import Collisions, collide_many
-from impactopt.sweeps.contact_states import ContactStates, Posture
 
 POINT, NORMAL = [0.7, 0.0, 0.75], np.array([0.0, 0.0, -1.0])
 

@@ -23,8 +23,8 @@ from impactopt.report.pictures import PICTURES, save_pictures
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
 from impactopt.transcription.contact_blocks import two_mass_restitution
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan
-from impactopt.transcription.start import first_iterate
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

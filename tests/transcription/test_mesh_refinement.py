@@ -45,10 +45,10 @@ from impactopt.simulation.result import distance_inside
 from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import solve_sqp
 from impactopt.transcription import mesh_refinement as between
+from impactopt.transcription.initial_guess import carried_over, first_iterate
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.reference import complete_reference
-from impactopt.transcription.start import carried_over, first_iterate
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

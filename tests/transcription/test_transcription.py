@@ -24,10 +24,10 @@ from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import ContactWrenchCone, Incidence, TorqueLimit, VelocityLimit
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status, check_program
+from impactopt.transcription.contact_conditions import rotation_rows
+from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import collision_mesh, with_middles
 from impactopt.transcription.reference import total_ground_wrench
-from impactopt.transcription.start import first_iterate
-from impactopt.transcription.touch import rotation_rows
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

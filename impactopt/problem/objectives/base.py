@@ -54,7 +54,7 @@ class Objective(Described):
         """Weighed quantity: an affine expression of a program's variables, or with squares of variables a
         :class:`impactopt.transcription.objective.Quantity`, as `program.squares` gives it.
 
-        program : under construction, :class:`impactopt.transcription.at_contact.ContactProgram`.
+        program : under construction, :class:`impactopt.transcription.contact_program.ContactProgram`.
         """
         raise NotImplementedError
 

@@ -50,7 +50,7 @@ class Term(Described):
 
     def add_rows(self, program: Any) -> None:
         """Add the constraints to a program under construction,
-        :class:`impactopt.transcription.at_contact.ContactProgram`.
+        :class:`impactopt.transcription.contact_program.ContactProgram`.
         """
         raise NotImplementedError
 

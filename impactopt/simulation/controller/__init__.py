@@ -9,9 +9,8 @@
 * constrained_dynamics.py       accelerations and sole wrenches as functions of the torques
 * cones.py      what wrenches soles can have, and where they are pressed
 * clearance.py  near bodies slow down before they touch
-* tasks.py      squared errors, weighed against each other
 * quadratic.py  its QP in OSQP, in place
-* whole_body.py the controller
+* whole_body.py the controller, and its tasks: squared errors, weighed against each other
 """
 
 from impactopt.simulation.controller.settings import CONTROLLERS, ControllerSettings, controller_of

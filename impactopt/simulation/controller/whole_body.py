@@ -21,12 +21,11 @@ from impactopt.simulation.controller.recovery import Recovery
 from impactopt.simulation.controller.sensors import Sensors
 from impactopt.simulation.controller.setpoint import Aim
 from impactopt.simulation.controller.settings import ControllerSettings
-from impactopt.simulation.controller.tasks import Tasks
 from impactopt.simulation.controller.tracking_reference import Target
 from impactopt.simulation.result import Scene
 from impactopt.simulation.servo import Servo
 
-__all__ = ["WholeBodyController"]
+__all__ = ["Tasks", "WholeBodyController"]
 
 Array = NDArray[np.float64]
 WINDOW = 0.01  # [s] about the blow in which velocity errors are projected
@@ -216,3 +215,30 @@ class WholeBodyController:
         wanted[3:] = (aim.momentum[1] + s.momentum_gain * error[3:]) / mass
         self.tasks.add(self.moves, lift @ B, lift @ held.b0 - wanted)
         return wanted
+
+
+class Tasks:
+    """Sum of 1/2 weight (rows x + off)^2 over tasks, for n unknowns; one product for all of them.
+
+    most : rows of all tasks together.
+    """
+
+    def __init__(self, n: int, most: int) -> None:
+        self._rows, self._off, self._weight = np.zeros((most, n)), np.zeros(most), np.zeros(most)
+        self._used = 0
+
+    def begin(self) -> None:
+        """There is none."""
+        self._used = 0
+
+    def add(self, weight: float | Array, rows: Array, off: Array) -> None:
+        """Rows (k, n) and off (k,), with one weight or (k,)."""
+        its = slice(self._used, self._used + len(off))
+        self._rows[its], self._off[its], self._weight[its] = rows, off, weight
+        self._used = its.stop
+
+    def sums(self) -> tuple[Array, Array]:
+        """Hessian (n, n) and gradient (n,) at x = 0."""
+        rows = self._rows[: self._used]
+        weighted = rows.T * self._weight[: self._used]
+        return weighted @ rows, weighted @ self._off[: self._used]

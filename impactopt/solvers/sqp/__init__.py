@@ -1,8 +1,8 @@
-"""Our SQP: a nonlinear program by a sequence of quadratic ones; NumPy, SciPy and a QP solver only."""
+"""Sequential quadratic programming in few variables, and the entry to it and to the interior-point method."""
 
-from impactopt.solvers.sqp.options import SQPOptions
-from impactopt.solvers.sqp.qp import QPSolution, QPSolver, QPStatus, QuadraticProgram
-from impactopt.solvers.sqp.qp_solvers import QP_SOLVERS, make_qp_solver
+from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
+from impactopt.solvers.qp.registry import QP_SOLVERS, make_qp_solver
 from impactopt.solvers.sqp.solver import solve_sqp
 
 __all__ = [

@@ -15,13 +15,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from impactopt.solvers.program import Determined, Status, Vector, complementarity, stationarity
-from impactopt.solvers.sqp.point import Point
-from impactopt.solvers.sqp.qp_solvers import make_qp_solver
+from impactopt.solvers.point import Point
+from impactopt.solvers.program import (
+    Determined,
+    Status,
+    Vector,
+    complementarity,
+    row_violations,
+    stationarity,
+)
+from impactopt.solvers.qp.registry import make_qp_solver
+from impactopt.solvers.run import Run, Task
 from impactopt.solvers.sqp.reduced_hessian import ReducedModel, make_model
 from impactopt.solvers.sqp.reduced_qp import ReducedQP, Solved
 from impactopt.solvers.sqp.reduction import Reduction
-from impactopt.solvers.sqp.run import Run, Task
 
 _HALVINGS = 12  # of a step
 _ARMIJO = 1e-4
@@ -39,6 +46,7 @@ _CLOSE = 0.1  # violation of a start from which there is one way only
 # solution but for new rows, first: beyond them the objective leads where nothing leads back
 _MOST, _MOST_WARM = (1.5, 1.0), (3.0, 0.05)
 _PATIENCE = 40  # iterations without less violation, or a better objective
+_STATIONARY = 1e-3  # slope of the violation over the largest that there could be: no step lessens it
 _LESS, _BETTER = 0.97, 1e-3  # of a violation, of an objective
 _GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
 _BACK = 3  # steps back to the equalities, of a trial point
@@ -73,11 +81,11 @@ class ReducedRun(Run):
         self._determined, self._filter = determined, list[Pair]()
         self._radius = self._widest = self.options.radius
         self._price, self._raised = self.options.price, 0
-        self._patient = False
+        self._patient = self._creeps = self._proved = False
         self._start: float | None = None  # of a phase in which only the violation counts: where it began
 
     def iterate(self) -> Status:
-        """From the start, in one way after the other until one of them leads to a solution."""
+        """Run from the initial guess, in one way after the other until one of them leads to a solution."""
         self.point = self.program.point(self.point.x)
         if not self.point.differentiable:
             return Status.FAILED
@@ -141,6 +149,7 @@ class ReducedRun(Run):
                 if self._give_way() is not None:
                     return Status.FAILED
                 least, best, since = np.inf, np.inf, self.report.iterations
+            self._creeps = self.report.iterations > since + _PATIENCE
             found = self._advance(self.report.iterations)
             if isinstance(found, Status):
                 return found
@@ -155,6 +164,9 @@ class ReducedRun(Run):
             held = partial(self._qp.active, self.point)
             model = self._model.at(self.point, self.y, held, self._start is None)
             solved = self._solve(model, self.point.g)
+            self._proved = solved is not None
+            if solved is not None and self._creeps and self._is_stationary(solved):
+                return Status.INFEASIBLE
             if solved is None:
                 self._radius *= _SHORTER
             else:
@@ -218,7 +230,7 @@ class ReducedRun(Run):
         return trial
 
     def _judge(self, trial: Point, length: float, solved: Solved) -> bool | None:
-        """Whether a point is taken, and then whether for the objective's sake; None: it is not."""
+        """True if a point is taken for the objective's sake, False if for less violation; None: it is not."""
         verdict = self._verdict(trial, length, solved) if trial.finite else None
         return verdict if verdict is not None and trial.differentiable else None
 
@@ -245,7 +257,7 @@ class ReducedRun(Run):
         return False if less or met else None
 
     def _move(self, taken: Taken) -> str:
-        """To a point that is taken."""
+        """Move to a point that is taken."""
         h, before = taken.point.violation, self.point
         if not taken.for_objective and self._start is None:
             pair = Pair(before.violation, before.objective)
@@ -282,11 +294,11 @@ class ReducedRun(Run):
             self._radius = min(max(_REACHED * taken_length, 1e-3), self._radius)
 
     def _give_way(self) -> Status | None:
-        """Where no step is taken: only the violation counts from now on; or it is the end."""
+        """Give way where no step is taken: only the violation counts from now on; or it is the end."""
         if not self._excess():
             return Status.ACCEPTABLE if self._optimal(self.options.acceptable_tolerance) else Status.FAILED
-        if self._start is not None:
-            return Status.INFEASIBLE
+        if self._start is not None:  # where QPs have failed nothing is proved
+            return Status.INFEASIBLE if self._proved else Status.FAILED
         self._start = self.point.violation
         self._filter.append(Pair(self.point.violation, self.point.objective))
         self._radius, self._price = self._widest, self.options.price
@@ -331,6 +343,15 @@ class ReducedRun(Run):
 
     def _excess(self) -> bool:
         return self.point.max_violation > self.options.violation_tolerance
+
+    def _is_stationary(self, solved: Solved) -> bool:
+        """True if the violation, where only that counts, falls by next to nothing along a QP's step, beside
+        the slopes of the rows that are violated."""
+        if self._start is None:
+            return False
+        violated = row_violations(self.program, self.point.g) > self.options.violation_tolerance
+        steepest = float((self.program.weights * self.point.row_norms)[violated].sum())
+        return self.point.violation - solved.linear_violation <= _STATIONARY * solved.longest * steepest
 
     def _inside(self, x: Vector) -> Vector:
         return np.clip(x, self.program.x_lower, self.program.x_upper)

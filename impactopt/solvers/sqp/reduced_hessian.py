@@ -11,9 +11,9 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.point import Point, TimedProgram
 from impactopt.solvers.program import Matrix, Vector
-from impactopt.solvers.sqp.options import SQPOptions
-from impactopt.solvers.sqp.point import Point, TimedProgram
 from impactopt.solvers.sqp.reduction import Reduction
 
 _FLOOR = 1e-5  # least eigenvalue
@@ -50,12 +50,13 @@ class ModelRule(Protocol):
     """Makes the model at a point."""
 
     def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
-        """Of the Lagrangian with multipliers y (m,); active: gives the unit rows (a, r) that hold; objective:
-        whether it counts, or the violation alone."""
+        """Model of the Lagrangian with multipliers y (m,); active: gives the unit rows (a, r) that hold;
+        objective: whether it counts, or the violation alone.
+        """
         ...
 
     def forget(self) -> None:
-        """What was learned from earlier points."""
+        """Forget what was learned from earlier points."""
         ...
 
 
@@ -123,7 +124,7 @@ class BFGSModel:
         return ReducedModel(B, point.gradient, reduction.T, of_start)
 
     def _update(self, point: Point, y: Vector) -> None:
-        """With multipliers that are the same at both points: of rows, and of equalities that determine
+        """Update with multipliers that are the same at both points: of rows, and of equalities that determine
         nothing, which steps have to follow as they bend. What the others determine is in the gradients."""
         assert self._last is not None
         before, basis = self._last

@@ -8,9 +8,9 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from impactopt.solvers.point import Point, TimedProgram
 from impactopt.solvers.program import Matrix, Vector, row_violations
-from impactopt.solvers.sqp.point import Point, TimedProgram
-from impactopt.solvers.sqp.qp import QPSolver, QuadraticProgram
+from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
 from impactopt.solvers.sqp.reduced_hessian import ReducedModel
 from impactopt.solvers.sqp.reduction import Reduction
 
@@ -137,7 +137,7 @@ class ReducedQP:
                 unit[which],
                 np.concatenate([np.zeros(guess.size), held]),
             )
-            found = self._solver.solve(qp, start=start, time_limit=time_limit)
+            found = self._solver.solve(qp, start=start, time_limit=time_limit) if qp.n else _decided(qp)
             iterations += found.iterations
             if not found.usable:
                 return None
@@ -159,7 +159,14 @@ class ReducedQP:
         d, y, z = d0 + step, np.zeros(p.m), np.zeros(p.n)
         y[rows], z[bounded] = unit[: rows.size] / scale, unit[rows.size :]
         linear = float(p.weights @ row_violations(p, g + point.jacobian @ d))
-        return Solved(d, y, z, linear, which.size, qp.n - guess.size, iterations, float(np.abs(guess).max()))
+        return Solved(
+            d, y, z, linear, which.size, qp.n - guess.size, iterations, float(np.abs(guess).max(initial=0.0))
+        )
+
+
+def _decided(qp: QuadraticProgram) -> QPSolution:
+    """The solution of a QP without variables: the equalities leave no direction."""
+    return QPSolution(x=qp.q, y=np.zeros(qp.m), z=qp.q, status=QPStatus.SOLVED, iterations=0)
 
 
 def _elastic(

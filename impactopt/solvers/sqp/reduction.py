@@ -18,11 +18,11 @@ import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from impactopt.solvers.elimination.compiled import kernels
+from impactopt.solvers.elimination.condense import Condenser, find_eliminations
+from impactopt.solvers.elimination.patterns import Elimination
+from impactopt.solvers.point import Point, TimedProgram
 from impactopt.solvers.program import Determined, Matrix, Vector
-from impactopt.solvers.sqp.compiled import kernels
-from impactopt.solvers.sqp.condense import Condenser, find_eliminations
-from impactopt.solvers.sqp.patterns import Elimination
-from impactopt.solvers.sqp.point import Point, TimedProgram
 
 Index = npt.NDArray[np.intp]
 _KEPT = 4  # structures

@@ -1,4 +1,4 @@
-"""A nonlinear program by sequential quadratic programming: the way in."""
+"""Entry of our own solvers: the interior-point method, or SQP with a QP solver."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from impactopt.errors import check_array
+from impactopt.solvers.ipm.interior_point import InteriorRun
+from impactopt.solvers.options import SQPOptions
 from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, check_program
-from impactopt.solvers.sqp.interior import InteriorRun
-from impactopt.solvers.sqp.options import SQPOptions
+from impactopt.solvers.run import Path, Run, Task, Watch
 from impactopt.solvers.sqp.reduced import ReducedRun
-from impactopt.solvers.sqp.run import Path, Run, Task, Watch
-from impactopt.solvers.sqp.sl1qp import Sl1QPRun
 from impactopt.solvers.threads import threads
 
 
@@ -26,7 +25,7 @@ def solve_sqp(
     watch: Watch | None = None,
     path: Path | None = None,
 ) -> SolverResult:
-    """Solve a nonlinear program by sequential quadratic programming.
+    """Solve a nonlinear program by the interior-point method, or by SQP if the options name a QP solver.
 
     Parameters
     ----------
@@ -68,9 +67,8 @@ def solve_sqp(
     )
     interior = options.qp_solver == "interior"
     determined = getattr(program, "determined", ())
-    reduced = ReducedRun(task, determined) if determined and not interior else None
-    run: Run = reduced or (InteriorRun if interior else Sl1QPRun)(task)
-    with threads().limit(limits=1 if interior or determined else None, user_api="blas"):
+    run: Run = InteriorRun(task) if interior else ReducedRun(task, determined)
+    with threads().limit(limits=1, user_api="blas"):
         try:
             status = run.iterate()
         except KeyboardInterrupt:

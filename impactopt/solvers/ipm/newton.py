@@ -1,0 +1,255 @@
+"""The Newton system of one interior-point iteration, condensed and factored."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from impactopt.solvers.elimination.compiled import kernels as fastest
+from impactopt.solvers.elimination.condense import Condenser, Mask, find_eliminations
+from impactopt.solvers.elimination.kernels import Index, Kernels, Products
+from impactopt.solvers.ipm.cholesky import BlockCholesky
+from impactopt.solvers.program import Determined, Matrix, Vector
+
+_KEPT = 3  # structures
+_PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step
+_RANK = 1e-15  # singular values below this part of the largest are none
+_HELD = 1e15  # on the diagonal of variables that must not move
+_FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
+_SMALL = 1e-5  # none is tried before a shift that would be smaller
+_RELATIVE = 0.1  # the first shift is at most this part of the Hessian's largest entry
+_GROW, _GROW_FIRST, _SHRINK = 8.0, 100.0, 3.0
+
+
+class NewtonSystem:
+    """Minimize q.d + 1/2 d'(H + diag) d with rows y = w (J d + r), and J d + r = 0 for hard equalities.
+
+    The rows with weights enter the Hessian, W = H + diag + J' diag(w) J + shift I; then the eliminated
+    equalities are solved for their variables (`Condenser`), and the matrix left gets a Cholesky factor; hard
+    equalities that are left, by their Schur complement. The shift makes that matrix positive definite, and
+    with it the whole system's inertia right. What rounding leaves, all of the system's own equations tell.
+
+    Attributes
+    ----------
+    condenser : of this system; held : numbers of the free variables that do not move.
+    shift : the last.
+    """
+
+    def __init__(self, condenser: Condenser, held: Index, kernels: Kernels):
+        """held: numbers of the free variables that do not move."""
+        self.condenser, self.held = condenser, held
+        self._matrix = BlockCholesky(condenser.pattern, kernels)
+        self._from, i, j = condenser.at_free
+        places = self._matrix.places
+        self._to = places(i, j).astype(np.int32)
+        self._diagonal_to = places(np.arange(condenser.free.size), np.arange(condenser.free.size))
+        self._products, self._kernels = [], kernels
+        for row, (columns, at) in enumerate(condenser.left):
+            i, j = np.tril_indices(columns.size)
+            to = places(columns[i], columns[j]).astype(np.int32)
+            number, once = np.full(1, row, dtype=np.int32), np.ones(1, dtype=np.intp)
+            self._products.append(Products(counts=once, rows=number, values=at[None], to=to[None]))
+        self.begin(b"")
+
+    def begin(self, key: bytes) -> None:
+        """Forget the shifts of another program; key: of the structure."""
+        self.key = key
+        self._equal = self.condenser.rows[self.condenser.equal]  # numbers of the equalities left
+        self._last = self.shift = 0.0
+
+    def factor(
+        self,
+        jacobian: Matrix,
+        hessian: Matrix,
+        diagonal: Vector,
+        weights: Callable[[float], Vector],
+        *,
+        hard: bool,
+        proximal: float = 0.0,
+    ) -> bool:
+        """Factor, shifted as far as it takes.
+
+        diagonal : (f,) of the free variables; weights : gives those of the rows left (k,) for more curvature
+        of all variables and slacks: proximal and shift; hard : equalities among them have none.
+
+        False: nothing helps.
+        """
+        c = self.condenser
+        try:
+            c.load(jacobian, hessian)
+        except np.linalg.LinAlgError:
+            return False
+        self._jacobian, self._hessian, self._hard = jacobian, hessian, hard
+        self._transposed = jacobian.T
+        self._A = c.A
+        everywhere = np.zeros(c.n)
+        everywhere[c.free] = diagonal
+        penalty = self._penalty() if hard else None
+        self.shift = self._first()
+        while True:
+            more = proximal + self.shift
+            self._diagonal = everywhere + more
+            self._weights = np.zeros(c.m)
+            self._weights[c.rows] = weights(more)
+            if penalty is not None:
+                self._weights[self._equal] = penalty
+            if self._matrix.factor(self._values()):
+                break
+            self.shift = self._next()
+            if self.shift > _MOST:
+                return False
+        self._last = self.shift or self._last
+        if hard and self._equal.size:
+            self._spread = self._matrix.solve(self._A.T)
+            # of the Schur complement: pseudo, as rows may depend on each other
+            self._inverse = np.linalg.pinv(self._A @ self._spread, rcond=_RANK)
+        return True
+
+    def _penalty(self) -> Vector:
+        """Weights of the equalities left: far above the curvature along them, and no farther."""
+        squares = self._A**2
+        length = np.maximum(1e-30, squares.sum(axis=1))
+        curvature = squares @ np.abs(self.condenser.curvature) / length
+        out: Vector = _PENALTY * np.maximum(1.0, curvature) / np.maximum(1.0, length)
+        return out
+
+    def _first(self) -> float:
+        """The shift to try first: after an iteration that needed one, a smaller one instead of none."""
+        shift = self._smaller() if self.shift else 0.0
+        return shift if shift > _SMALL else 0.0
+
+    def _next(self) -> float:
+        """The shift to try where this one was not enough."""
+        if not self.shift:
+            return self._smaller() if self._last else _FIRST
+        return self.shift * (_GROW if self._last else _GROW_FIRST)
+
+    def _smaller(self) -> float:
+        """Than the last; what a far more curved Hessian needed is no guide."""
+        most = _RELATIVE * float(np.abs(self._hessian.data).max(initial=1.0))
+        return min(most, max(_LEAST, self._last / _SHRINK))
+
+    def _values(self) -> Vector:
+        """The matrix as `BlockCholesky` takes it."""
+        c = self.condenser
+        values = np.zeros(self._matrix.size)
+        W = c.reduce(self._weights, self._diagonal)
+        self._kernels.copy(W, self._from, values, self._to)
+        values[self._diagonal_to[self.held]] += _HELD
+        self._kernels.add_products(self._products, c.J, self._weights[self._equal], values)
+        return values
+
+    def solve(self, q: Vector, r: Vector, close: float = 0.0) -> tuple[Vector, Vector]:
+        """The step (n,) and the new multipliers (m,) of all rows, for a gradient (n,) and the rows' residuals
+        (m,): what they are off by, with weights.
+
+        close : what may be left of an equation.
+        """
+        c, w, equal = self.condenser, self._weights.copy(), self._equal
+        w[equal] = 0.0
+        exact = np.concatenate([c.eliminated, equal]) if self._hard else c.eliminated
+        d, y, rows, dual = self._respond(q + self._pulled(w * r), r, w)
+        # once more, with what is left of the equations: weights of ten decades cost digits
+        left, hard = np.zeros(c.m), np.zeros(c.m)
+        left[exact] = (rows + r)[exact]
+        hard[c.eliminated], hard[equal] = y[c.eliminated], y[equal]
+        dual += self._pulled(hard)
+        dual[c.free[self.held]] = 0.0
+        if max(np.abs(dual).max(initial=0.0), np.abs(left).max(initial=0.0)) > close:
+            more_d, more_y, _, _ = self._respond(dual, left, w)
+            d, y = d + more_d, y + more_y
+        return d, y + w * r
+
+    def _respond(self, g: Vector, r: Vector, w: Vector) -> tuple[Vector, Vector, Vector, Vector]:
+        """Step for a gradient and the residuals of equalities; multipliers, of rows with weights w what the
+        step changes; how all rows change; gradient of the Lagrangian without the equalities.
+        """
+        c, equal = self.condenser, self._equal
+        own = self._weights[equal]
+        by_free, off = c.forward(g, r)
+        by_free += self._A.T @ (own * off)
+        by_free[self.held] = 0.0
+        free = -self._matrix.solve(by_free)
+        extra = np.zeros(equal.size)
+        if self._hard and equal.size:
+            extra = self._inverse @ (self._A @ free + off)
+            free -= self._spread @ extra
+        free[self.held] = 0.0
+        d = c.expand(free)
+        rows = np.concatenate([self._jacobian @ d, d[c.bounded]])
+        y = w * rows
+        dual = g + self._hessian @ d + self._diagonal * d + self._pulled(y)
+        y[equal] = own * (self._A @ free + off) + extra
+        y[c.eliminated] = c.multipliers(dual, y[equal])
+        return d, y, rows, dual
+
+    def _pulled(self, y: Vector) -> Vector:
+        """Gradient of all rows with multipliers (m,)."""
+        m = self._jacobian.shape[0]
+        out: Vector = self._transposed @ y[:m]
+        out[self.condenser.bounded] += y[m:]
+        return out
+
+
+# ---------------------------------------------------------------- structures
+_structures: OrderedDict[bytes, NewtonSystem] = OrderedDict()
+
+
+def acquire(
+    jacobian: Matrix,
+    hessian: Matrix,
+    *,
+    determined: Sequence[Determined],
+    equal: Mask,
+    bounded: Mask,
+    moves: Mask,
+) -> NewtonSystem:
+    """The system for these patterns, for one who gives it back: its structure takes as long as 10 iterations
+    and serves all programs that differ in their numbers, or in inequalities that couple nothing new.
+
+    determined : what rows determine; equal (m,): which rows are equalities; bounded, moves (n,): which
+    variables have a finite bound, and which are not fixed.
+    """
+    mine = equal[jacobian.indices]
+    starts = np.append(0, np.cumsum(mine))[jacobian.indptr]
+    of_equalities = np.cumsum(equal)[jacobian.indices[mine]], starts
+    known = [variables for _, variables in determined]
+    structure = _digest([rank for rank, _ in determined], *of_equalities, *known, bounded, moves)
+    patterns = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
+    key = structure + _digest(None, *patterns, equal)
+    system = _structures.pop(key, None) or _alike(structure, jacobian, hessian, equal)
+    if system is None:
+        algebra = fastest()
+        eliminations = find_eliminations(jacobian, equal, determined)
+        condenser = Condenser(jacobian, hessian, eliminations, equal, bounded, algebra)
+        held = np.flatnonzero(~moves[condenser.free])
+        system = NewtonSystem(condenser, held, algebra)
+    system.begin(key)
+    return system
+
+
+def _alike(structure: bytes, jacobian: Matrix, hessian: Matrix, equal: Mask) -> NewtonSystem | None:
+    """One with the same equalities, made to be that of these patterns: other inequalities change little."""
+    for key, system in reversed(_structures.items()):
+        if key.startswith(structure) and system.condenser.take(jacobian, hessian, equal):
+            return _structures.pop(key)
+    return None
+
+
+def _digest(words: Any, *arrays: Index | Mask) -> bytes:
+    digest = hashlib.sha256(repr(words).encode())
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.digest()
+
+
+def release(system: NewtonSystem) -> None:
+    """Keep the structure for the next program that has it."""
+    _structures[system.key] = system
+    while len(_structures) > _KEPT:
+        _structures.popitem(last=False)

@@ -1,0 +1,55 @@
+"""The QP solvers by name; each is imported when it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from impactopt.errors import InputError, did_you_mean
+from impactopt.solvers.qp.quadratic_program import QPSolver
+
+
+def _active_set(_tolerance: float) -> QPSolver:
+    from impactopt.solvers.qp.active_set import ActiveSetSolver
+
+    return ActiveSetSolver()
+
+
+def _osqp(tolerance: float) -> QPSolver:
+    from impactopt.solvers.qp.osqp_solver import OsqpSolver
+
+    return OsqpSolver(tolerance=tolerance)
+
+
+QP_SOLVERS: dict[str, Callable[[float], QPSolver]] = {
+    "active_set": _active_set,
+    "osqp": _osqp,
+}
+"""Name of a QP solver -> what makes one, given the tolerance of its residuals. Add your own here.
+"""
+GONE = {"daqp": "osqp", "piqp": "osqp"}
+"""QP solvers that there were, and what to ask for in their place."""
+
+
+def make_qp_solver(name: str, tolerance: float = 1e-6) -> QPSolver:
+    """A new QP solver by its name in `QP_SOLVERS`.
+
+    Raises
+    ------
+    InputError : no such solver.
+    """
+    check_qp_solver(name, QP_SOLVERS)
+    return QP_SOLVERS[name](tolerance)
+
+
+def check_qp_solver(name: str, known: Iterable[str]) -> None:
+    """Refuse names that are not among the known ones.
+
+    Raises
+    ------
+    InputError : no such solver, or none any more.
+    """
+    known = sorted(known)
+    if name in GONE and name not in known:
+        raise InputError(f"qp_solver: {name!r} is no longer supported; give {GONE[name]!r}")
+    if name not in known:
+        raise InputError(f"qp_solver: no {name!r}{did_you_mean(name, known)}; there are: {', '.join(known)}")

@@ -66,7 +66,7 @@ _EXPORTS = {
     "load_problem": "files.problem_file",
     "load_record": "files.output",
     "load_robot": "robots.presets",
-    "moved_solution": "planning.bending",
+    "moved_solution": "planning.replanning",
     "optimize_strike": "files.entry_points",
     "planar_arm": "robots.presets",
     "plot": "report.pictures",

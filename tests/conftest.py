@@ -8,8 +8,8 @@ import pytest
 from support.small_plans import OPTIONS, Planned, arm_problem, biped_problem, planned, transcribed
 
 from impactopt.files.problem_file import load_problem
-from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.transcription.transcription import Transcription
 
 

@@ -130,7 +130,7 @@ def solve(
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.solution_library import SolvedFolder
-        from impactopt.planning.planner import solve as plan
+        from impactopt.planning.solve import solve as plan
         from impactopt.report.console import SolveConsole
 
         check_time_limit(time_limit)
@@ -232,7 +232,7 @@ def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Sol
     from impactopt.errors import InputError
     from impactopt.files.output import record_of
     from impactopt.files.replay import has_mujoco
-    from impactopt.planning.multistart import VIOLATED
+    from impactopt.planning.budget import VIOLATED
     from impactopt.solvers.program import Status
 
     done, violation = {}, solution.result.max_violation
@@ -264,7 +264,7 @@ def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Sol
 
 def _baseline(problem: ImpactProblem) -> dict[str, object]:
     from impactopt.errors import InputError
-    from impactopt.planning.baseline import minimum_jerk_baseline
+    from impactopt.planning.minimum_jerk import minimum_jerk_baseline
 
     try:
         return minimum_jerk_baseline(problem).describe()

@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 
 from impactopt.errors import InputError, NotSolvedWarning
 from impactopt.files.problem_file import read_problem_file
-from impactopt.planning import nail_driving, planner, strike
+from impactopt.planning import nail_driving, strike
+from impactopt.planning import solve as planning
 from impactopt.planning.solution import Solved
 from impactopt.problem.problem import ImpactProblem
 
@@ -66,6 +67,6 @@ def _told(found: R) -> R:
     return found
 
 
-solve = _or_file(planner.solve)
+solve = _or_file(planning.solve)
 optimize_strike = _or_file(strike.optimize_strike)
 drive_nail = _or_file(nail_driving.drive_nail)

@@ -15,9 +15,9 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
-from impactopt.planning.chosen_gains import with_chosen
-from impactopt.planning.gears import gear_caution
-from impactopt.planning.on_demand import with_rows
+from impactopt.planning.cautions import gear_caution
+from impactopt.planning.gain_selection import with_chosen
+from impactopt.planning.lazy_constraints import with_rows
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.controller import ControllerSettings, controller_of

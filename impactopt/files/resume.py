@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from impactopt.files.output import Record
-from impactopt.planning.chosen_gains import ChosenGains
-from impactopt.planning.made_again import planned_by, program_on
-from impactopt.planning.multistart import violations_of
-from impactopt.planning.planner import solve
+from impactopt.planning.gain_selection import ChosenGains
+from impactopt.planning.reconstruction import program_on, solution_of
+from impactopt.planning.refinement import Outcome
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, max_violation
 from impactopt.transcription.clearance import ApartRow, Held
@@ -80,15 +80,10 @@ def solution_of_record(record: Record, t: Transcription) -> Solution:
     numbers: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in given.items() if v is not None}
     status = Status(summary["status"])
     result = SolverResult(**numbers, status=status, message=str(summary["message"]))
-    return Solution(
-        problem=t.problem,
-        result=result,
+    return solution_of(
+        Outcome.of(t, result),
         solver=str(summary["solver"]),
-        build_seconds=float(summary["build_seconds"]),
-        solve_seconds=float(summary["solve_seconds"]),
-        violations=violations_of(t, result.x, t.program.constraints(result.x)),
-        objectives=t.achieved(result.x),
-        gains=tuple(map(ChosenGains.told, summary.get("gains", ()))),
+        seconds=(float(summary["build_seconds"]), float(summary["solve_seconds"])),
         statement=str(record.arrays["program_statement"]),
-        **planned_by(t, result),
+        gains=tuple(map(ChosenGains.told, summary.get("gains", ()))),
     )

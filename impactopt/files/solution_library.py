@@ -18,9 +18,9 @@ from impactopt.files.problem_file import ProblemFile
 from impactopt.files.problem_file.toml import read_toml
 from impactopt.files.replay import problem_of
 from impactopt.files.resume import resumed
-from impactopt.planning.multistart import one_after_the_other
-from impactopt.planning.planner import solve
+from impactopt.planning.budget import one_after_the_other
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from impactopt.errors import InputError
 from impactopt.live.requests import PlanRequest
-from impactopt.planning.changes import moved_problem
-from impactopt.planning.planner import solve
+from impactopt.planning.parameter_changes import moved_problem
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.report.tracks import Track, planned_track
 from impactopt.solvers.program import IterationRecord, Status
 from impactopt.transcription.plan import Plan, Trajectory

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from impactopt.contact.fields import abouts, snake_case
 from impactopt.errors import InputError
-from impactopt.planning.changes import changed
-from impactopt.planning.on_demand import program_for
+from impactopt.planning.parameter_changes import changed
+from impactopt.planning.refinement import program_for
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
@@ -237,7 +237,7 @@ def _fields(t: Transcription, x: Array, term: Term, chosen: Chosen) -> Iterator[
 
         def off_at(value: float, name: str = field.name) -> float:
             p = changed(t.problem, terms=_with(t.problem, replace(term, **{name: value})))
-            return _off(program_for(t.with_apart({}), p, None), x, chosen, torques=type(term) is TorqueLimit)
+            return _off(program_for(t.with_apart({}), p), x, chosen, torques=type(term) is TorqueLimit)
 
         needed = _where_met(off_at, old)
         if needed is None:

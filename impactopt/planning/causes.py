@@ -18,9 +18,10 @@ from impactopt.contact.fields import snake_case
 from impactopt.contact.laws import ContactLaw
 from impactopt.errors import InputError
 from impactopt.planning.bounds import MET, USUAL, Bound, Cause, bounds_of, changed_or_none
-from impactopt.planning.changes import changed
-from impactopt.planning.multistart import Budget
-from impactopt.planning.on_demand import program_for, with_rows
+from impactopt.planning.budget import Budget
+from impactopt.planning.lazy_constraints import with_rows
+from impactopt.planning.parameter_changes import changed
+from impactopt.planning.refinement import program_for
 from impactopt.problem.phase import LONGEST, SHORTEST, Phase
 from impactopt.solvers.program import NonlinearProgram, SolverResult, max_violation
 from impactopt.solvers.relaxed import RelaxedProgram
@@ -78,7 +79,7 @@ class _Relaxing:
         self._iterations = max(_LEAST, result.iterations)
         # a bound that has moved would else break what has no constraints yet
         p = with_rows(t.problem, [snake_case(type(term).__name__) for term in t.problem.on_demand])
-        self.t = program_for(t, p, None)
+        self.t = program_for(t, p)
         nothing = np.zeros(t.program.m), np.zeros(t.layout.n)
         own = carried_over(self.t, t, result.x, *nothing)[0]
         shortest, longest = p.contact_duration
@@ -88,12 +89,12 @@ class _Relaxing:
             follow=_loosened(p.follow),
             contact_duration=(shortest, max(_CONTACT, longest)),
         )
-        self.loose = program_for(self.t, loose, None)
+        self.loose = program_for(self.t, loose)
         once = (USUAL, USUAL)
         usual = changed(
             loose, swing=replace(loose.swing, duration=once), follow=replace(loose.follow, duration=once)
         )
-        self.starts = own, first_iterate(program_for(self.t, usual, None))
+        self.starts = own, first_iterate(program_for(self.t, usual))
         self.bounds = bounds_of(self.t)
 
     def found(self) -> Search:
@@ -136,7 +137,7 @@ class _Relaxing:
             one = cause if not again or cause.nearer is None else cause.nearer(again / _TRIES)
             if one.problem is None:
                 break
-            t = program_for(self.t, one.problem, None)
+            t = program_for(self.t, one.problem)
             self._iterations += _PLAIN
             if self._run(t.program, first_iterate(t), _PLAIN) is not None:
                 return replace(one, nearer=None)
@@ -155,7 +156,7 @@ class _Relaxing:
                 continue
             if self._budget.left == 0:
                 return
-            t = program_for(self.t.with_apart({}), new, None)
+            t = program_for(self.t.with_apart({}), new)
             if self._run(t.program, first_iterate(t), _STIFF) is not None:
                 words = f"stiffness of the contact: {value:.2g} N/m for {known:.2g} N/m"
                 kind = "a soft contact" if factor > 1 else "a stiff contact"

@@ -11,27 +11,43 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
-from impactopt.planning.multistart import VIOLATED
+from impactopt.planning.budget import VIOLATED
 from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.cases import errors_against
 from impactopt.simulation.pinocchio_engine import Followed, follow_contact
-from impactopt.simulation.reference.coasting import independent_rates
+from impactopt.simulation.reference.coasting import coasting_reference, independent_rates
 from impactopt.simulation.scene import scene_of
 from impactopt.solvers.program import SolverResult, Status
+from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.planned_strike import PlannedStrike
 
-__all__ = ["AGREED", "ContactReplay", "ModelError", "PlannedContact", "checked"]
+__all__ = [
+    "AGREED",
+    "ContactReplay",
+    "ModelError",
+    "PlannedContact",
+    "checked",
+    "collision_error",
+    "model_error",
+    "planned_contact",
+]
 
 Array = NDArray[np.float64]
 AGREED, REFUTED = 1.0, 5.0  # [%] of the impulse: a plan that is off by more is not solved; is none
 _STEP, _STEPS = 2e-4, 60  # [s] at most; of the planned contact, at least
 _LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that comes back, or goes on, is seen
 _SAMPLED = 1e-3  # [s] of a coasting reference
+# freezes of the SDC that stands for full dynamics
+_OFTEN, _MOST_FREEZES = 8, 64
+_HORIZON = 0.2  # [s] at least, of the collisions that a model is compared in
 _REPORTED_GAP = 1e-3  # of the planned contact's duration: a gap that is reported
 
 
@@ -200,3 +216,46 @@ def _coasting(problem: ImpactProblem, strike: PlannedStrike) -> Trajectory:
         contact_end=longest,
         end=longest,
     )
+
+
+def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = None) -> ModelError | None:
+    """Error of a program's collision model against full dynamics, for solver variables (n,).
+
+    problem : whose model it is, if not the program's problem's.
+    None where nothing is frozen; for an impact with a given restitution; and where a contact has no end.
+    """
+    problem, c = problem or t.problem, t.coordinates
+    if problem.collision in ("full", "auto", "rigid"):
+        return None
+    y, legs = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x)
+    q, v, _ = c.complete_motion(y, t.u0.read(x)[0], np.zeros(c.ny), legs)
+    torque = t.feedforward.read(x)[0] * problem.robot.torque_limit
+    return collision_error(problem, q, v, torque, max(sum(t.expected.durations(x)), 1e-2))
+
+
+def planned_contact(
+    t: ContactProgram, x: Array, planned: Plan | PlannedStrike, problem: ImpactProblem | None = None
+) -> PlannedContact:
+    """The contact that a program plans at solver variables (n,); ``problem``: as of `model_error`."""
+    error = model_error(t, x, problem)
+    return PlannedContact(problem=problem or t.problem, planned=planned, model_error=error)
+
+
+def collision_error(
+    problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: float
+) -> ModelError | None:
+    """Model error for a collision of about this duration [s]."""
+    names = ("robot", "striker", "normal", "law", "target", "stance")
+    scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
+    scene["horizon"] = max(_HORIZON, 4 * duration)
+    own = frozen_model(problem.collision, problem.freezes, **scene)
+    often = min(max(_OFTEN, 4 * problem.freezes), _MOST_FREEZES)
+    try:
+        bend: dict[str, Any] = {**coasting_reference(problem.coordinates, q, v, until=2 * duration)}
+        known = {name: x for name, x in bend.items() if name in own.settings}
+        alone = own.collide(q, v, torque, **known)
+        full = frozen_model("sdc", often, **scene).collide(q, v, torque, **bend)
+    except InputError:  # a contact that does not end
+        return None
+    told = errors_against(alone, full)
+    return ModelError(impulse_pct=float(told["impulse_error_pct"] or 0.0), zmp_mm=told["zmp_error_mm"])

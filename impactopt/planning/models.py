@@ -14,74 +14,26 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque
-from impactopt.planning.chosen_gains import with_factors_of
-from impactopt.planning.contact_replay import ModelError, PlannedContact
-from impactopt.planning.multistart import carried
-from impactopt.planning.on_demand import rows_on_demand
+from impactopt.planning.budget import Budget
+from impactopt.planning.contact_replay import ModelError, collision_error
+from impactopt.planning.gain_selection import with_factors_of
+from impactopt.planning.lazy_constraints import rows_on_demand
+from impactopt.planning.refinement import carried
 from impactopt.planning.solution import Solved
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import VelocityLimit
-from impactopt.simulation.cases import errors_against
-from impactopt.simulation.reference.coasting import coasting_reference
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.contact_guess import fastest
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.initial_guess import strike_rates
-from impactopt.transcription.plan import Plan
-from impactopt.transcription.planned_strike import PlannedStrike
 
 Array = NDArray[np.float64]
 AnySolution = TypeVar("AnySolution", bound=Solved)
-# freezes of the SDC that stands for full dynamics
-_OFTEN, _MOST = 8, 64
 _MODELS = ("sdc", "full")  # of "auto"; in a program a freeze on the way costs as much as full dynamics
-_HORIZON = 0.2  # [s] at least
 # of the fastest blow, or [m/s] where there is none: how the first model is chosen
 _SHARE, _GUESSED = 0.5, 1.0
-
-
-def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = None) -> ModelError | None:
-    """Error of a program's collision model against full dynamics, for solver variables (n,).
-
-    problem : whose model it is, if not the program's problem's.
-    None where nothing is frozen; for an impact with a given restitution; and where a contact has no end.
-    """
-    problem, c = problem or t.problem, t.coordinates
-    if problem.collision in ("full", "auto", "rigid"):
-        return None
-    y, legs = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x)
-    q, v, _ = c.complete_motion(y, t.u0.read(x)[0], np.zeros(c.ny), legs)
-    torque = t.feedforward.read(x)[0] * problem.robot.torque_limit
-    return _error(problem, q, v, torque, max(sum(t.expected.durations(x)), 1e-2))
-
-
-def planned_contact(
-    t: ContactProgram, x: Array, planned: Plan | PlannedStrike, problem: ImpactProblem | None = None
-) -> PlannedContact:
-    """The contact that a program plans at solver variables (n,); ``problem``: as of `model_error`."""
-    error = model_error(t, x, problem)
-    return PlannedContact(problem=problem or t.problem, planned=planned, model_error=error)
-
-
-def _error(problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: float) -> ModelError | None:
-    """Model error for a collision of about this duration [s]."""
-    names = ("robot", "striker", "normal", "law", "target", "stance")
-    scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
-    scene["horizon"] = max(_HORIZON, 4 * duration)
-    own = frozen_model(problem.collision, problem.freezes, **scene)
-    often = min(max(_OFTEN, 4 * problem.freezes), _MOST)
-    try:
-        bend: dict[str, Any] = {**coasting_reference(problem.coordinates, q, v, until=2 * duration)}
-        known = {name: x for name, x in bend.items() if name in own.settings}
-        alone = own.collide(q, v, torque, **known)
-        full = frozen_model("sdc", often, **scene).collide(q, v, torque, **bend)
-    except InputError:  # a contact that does not end
-        return None
-    told = errors_against(alone, full)
-    return ModelError(impulse_pct=float(told["impulse_error_pct"] or 0.0), zmp_mm=told["zmp_error_mm"])
 
 
 def carried_start(
@@ -102,23 +54,19 @@ def carried_start(
 
 def climbed(
     problem: ImpactProblem,
-    run: Callable[[ImpactProblem, AnySolution | None, float | None], AnySolution],
-    *,
-    time_limit: float | None,
-    report: Callable[[str], None] | None,
+    run: Callable[[ImpactProblem, AnySolution | None, Budget], AnySolution],
+    budget: Budget,
 ) -> AnySolution:
     """The solution of a problem by the cheapest model of the collision that is good enough for it.
 
-    run : solves a problem, from a solution by another model, or None: from the start asked for; within a time
-    [s].
+    run : solves a problem, from a solution by another model, or None: from the start asked for.
     """
-    began = time.perf_counter()
-    say = report if report is not None else _silent
-    models = _MODELS[1:] if _skips_first(problem, say) else _MODELS
+    began, limit = time.perf_counter(), budget.time_limit
+    models = _MODELS[1:] if _skips_first(problem, budget.say) else _MODELS
     done: AnySolution | None = None
     for model in models:
-        left = None if time_limit is None else max(time_limit - (time.perf_counter() - began), 1e-3)
-        new = run(replace(problem, collision=model), done, left)
+        left = None if limit is None else max(limit - (time.perf_counter() - began), 1e-3)
+        new = run(replace(problem, collision=model), done, replace(budget, time_limit=left))
         done = new if done is None else _both(done, new)
         error = done.model_error
         if (
@@ -128,7 +76,9 @@ def climbed(
         ):
             break
         # none: a contact that does not end by one of the models, so the plan's says nothing
-        say(f"{model}: {error or 'no estimate of its error'}, not what was asked for: on with full dynamics")
+        budget.say(
+            f"{model}: {error or 'no estimate of its error'}, not what was asked for: on with full dynamics"
+        )
     assert done is not None
     return done
 
@@ -136,10 +86,6 @@ def climbed(
 def good_enough(problem: ImpactProblem, error: ModelError) -> bool:
     """True if a model's error is within what the problem's "auto" tolerates."""
     return abs(error.impulse_pct) <= problem.auto_impulse_pct and (error.zmp_mm or 0.0) <= problem.auto_zmp_mm
-
-
-def _silent(_: str) -> None:
-    pass
 
 
 def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
@@ -159,7 +105,7 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
         torque = holding_torque(problem.robot, q, v, stance=problem.stance)
     except InputError:
         return False
-    error = _error(first, q, v, torque, 0.05)
+    error = collision_error(first, q, v, torque, 0.05)
     if error is not None and good_enough(problem, error):
         return False
     told = error or "no estimate of its error"

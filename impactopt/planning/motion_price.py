@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from impactopt.planning.multistart import carried, one_after_the_other
-from impactopt.planning.on_demand import program_for
+from impactopt.planning.refinement import Additions, Guess, Outcome, program_for
 from impactopt.problem.motion_style import MotionPrices
-from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["with_first_scale", "within_price"]
+__all__ = ["MotionPrice", "with_first_scale"]
 
-Array = NDArray[np.float64]
 _USUAL, _LEAST = (
     4.0,
     0.02,
@@ -38,32 +34,29 @@ def with_first_scale(t: Transcription) -> Transcription:
         return t
     worth = t.worth(first_iterate(t))
     scale = float(np.clip(worth / _USUAL, _LEAST, 1.0)) if np.isfinite(worth) else 1.0
-    return t if scale == 1.0 else program_for(t, replace(p, price_scale=scale), None)
+    return t if scale == 1.0 else program_for(t, replace(p, price_scale=scale))
 
 
-def within_price(
-    t: Transcription,
-    result: SolverResult,
-    solve: Callable[[Transcription, SolverResult | Array], tuple[Transcription, SolverResult]],
-    report: Callable[[str], None] | None = None,
-) -> tuple[Transcription, SolverResult]:
-    """The program and its result, with the prices of the motion style reduced until they take no more of the
-    objective than `ImpactProblem.motion_price`; solved again from where it is.
+class MotionPrice:
+    """Oracle for prices of the motion style: they take no more of the objective than
+    `ImpactProblem.motion_price`, or are reduced.
     """
-    for _ in range(_TRIES):
-        allowed = t.problem.motion_price
-        if not result.status.usable or not t.problem.price_scale:
-            break
-        share, style = t.price_shares(result.x)
+
+    most = _TRIES
+
+    def missing(self, outcome: Outcome[Transcription]) -> Additions[Transcription] | None:
+        """The program with reduced prices, from where the solution is."""
+        t, allowed = outcome.program, outcome.program.problem.motion_price
+        if not t.problem.price_scale:
+            return None
+        share, style = t.price_shares(outcome.result.x)
         if share <= allowed * (1 + _TOLERANCE):
-            break
+            return None
         left = max(_BELOW * allowed - (share - style), 0.0) if np.isfinite(share) else 0.0
         scale = t.problem.price_scale * left / style if style > 0 else 0.0
-        if report is not None:
-            report(f"the motion's style takes {100 * share:.1f} % of the objective: its prices are reduced")
-        cheaper = program_for(t, replace(t.problem, price_scale=scale), report)
-        found, new = solve(cheaper, carried(cheaper, t, result))
-        if not new.status.usable:
-            break
-        t, result = found, one_after_the_other(result, new)
-    return t, result
+
+        def guesses() -> Iterator[Guess[Transcription]]:
+            yield Guess.mapped(program_for(t, replace(t.problem, price_scale=scale)), t, outcome.result)
+
+        why = f"the motion's style takes {100 * share:.1f} % of the objective: its prices are reduced"
+        return Additions(name="lower prices of motion", why=why, guesses=guesses())

@@ -1,198 +1,49 @@
-"""One program from several starts: the problem has local optima, and the best of them is kept."""
+"""Solves from several initial guesses: the problem has local optima, and the best of them is kept."""
 
 from __future__ import annotations
 
+import contextlib
+import pickle
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.planning.stopping import Stop
-from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import (
-    Callback,
-    IterationRecord,
-    NonlinearProgram,
-    SolverResult,
-    Status,
-    Violation,
-    worst_rows,
-)
-from impactopt.solvers.run import Path, Watch
-from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.transcription.initial_guess import carried_over
+from impactopt.errors import InputError
+from impactopt.planning.budget import Budget, rank_of
+from impactopt.planning.gain_selection import roomy
+from impactopt.planning.models import climbed
+from impactopt.planning.refinement import Guess, Outcome, Program, Solve
+from impactopt.planning.solution import Solved
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.workers import Died, each_on_workers
+from impactopt.solvers.program import Status
+from impactopt.transcription.transcription import block_functions
 
-if TYPE_CHECKING:
-    from impactopt.transcription.contact_program import ContactProgram
+__all__ = ["best_of", "best_of_starts", "check_starts", "drawn_guesses"]
 
-Array = NDArray[np.float64]
-Program = TypeVar("Program", bound="ContactProgram")
-Starts = Iterable[tuple[str, Callable[[], Array | SolverResult]]]
-SOLVERS = ("sqp", "ipopt")
-EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
-VIOLATED = 1e-4  # larger violations are named; an iterate without any is a solution, if not an optimum
-NAMED = 20  # at most
-_PUSH = 1e-6  # into its bounds, of a start that is to stay where it is
+AnySolution = TypeVar("AnySolution", bound=Solved)
+# problem, start, budget, numbers of the starts, and before which number to end -> the best solution
+Run = Callable[[ImpactProblem, Any, Budget, range, int], AnySolution]
+Guesses = Iterable[tuple[str, Callable[[], Guess[Program]]]]
+MORE = 2  # starts, where all that were asked for end with solutions that are refused
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
 
 
-@dataclass(frozen=True, kw_only=True)
-class Attempt:
-    """Result of the solve from one initial guess.
-
-    start : its name; impulse [N s]; seconds: of the solver; kept: it is the one that was best.
+def check_starts(starts: int, seed: int, workers: int, callback: object, *, given: bool) -> None:
+    """InputError if these are no numbers of starts and processes, or no seed; if a given start is to be
+    several, or a callback would have to go to other processes.
     """
-
-    start: str
-    status: Status
-    impulse: float
-    objective: float
-    max_violation: float
-    iterations: int
-    seconds: float
-    kept: bool = False
-
-    def summary(self) -> dict[str, Any]:
-        """JSON form, as it stands in ``summary.json``."""
-        return {
-            "start": self.start,
-            "status": self.status.value,
-            "impulse_Ns": self.impulse,
-            "objective": self.objective,
-            "max_violation": self.max_violation,
-            "iterations": self.iterations,
-            "seconds": self.seconds,
-            "kept": self.kept,
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Budget:
-    """A solver with its options, and the time [s] that is left for all that it is given; None: any.
-
-    stop : what Ctrl-C asks.
-
-    Raises
-    ------
-    InputError : an unknown solver; a time that is none; options that the SQP does not have (IPOPT is asked
-        about its own when it starts).
-    """
-
-    solver: str
-    options: Mapping[str, Any] | None
-    time_limit: float | None
-    callback: Callback | None
-    since: float = field(default_factory=time.perf_counter)
-    stop: Stop = field(default_factory=Stop)
-
-    def __post_init__(self) -> None:
-        if self.solver not in SOLVERS:
-            raise InputError(
-                f"unknown solver {self.solver!r}{did_you_mean(self.solver, SOLVERS)}: there are "
-                f"{', '.join(SOLVERS)}"
-            )
-        if self.time_limit is not None and not check_array("time_limit [s]", self.time_limit, ()) > 0:
-            raise InputError(f"time_limit [s]: {self.time_limit:g}; give a number > 0")
-        if self.options is None:
-            return
-        if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):
-            raise InputError(f"options are those of the solver by name, not {self.options!r}")
-        if self.solver == "sqp":
-            known = [f.name for f in fields(SQPOptions)]
-            for name in self.options:
-                if name not in known:
-                    raise InputError(
-                        f"the solver 'sqp' has no option {name!r}{did_you_mean(name, known)}; it has "
-                        f"{', '.join(known)}"
-                    )
-            SQPOptions(**self.options)
-
-    def started(self) -> Budget:
-        """The same with all its time, which begins now; from here on an iterate is kept if it is stopped."""
-        self.stop.armed = True
-        return replace(self, since=time.perf_counter())
-
-    def near_by(self) -> Budget:
-        """The same, whose solver hardly moves a start off its bounds: it is a solution, or next to one, and
-        what is moved may come to another.
-        """
-        return (
-            replace(self, options={"push": _PUSH, **(self.options or {})}) if self.solver == "sqp" else self
-        )
-
-    @property
-    def interior(self) -> bool:
-        """True if the solver is the interior-point method."""
-        return self.solver == "sqp" and (self.options or {}).get("qp_solver", "interior") == "interior"
-
-    @property
-    def left(self) -> float | None:
-        """[s]; none where it has been stopped."""
-        if self.stop.asked:
-            return 0.0
-        if self.time_limit is None:
-            return None
-        return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
-
-    def _told(self, record: IterationRecord) -> bool:
-        """Reports an iteration to the caller; true if the solver is to stop after it."""
-        asked = self.callback is not None and self.callback(record) is True
-        return asked or self.stop.asked
-
-    def run(
-        self,
-        program: NonlinearProgram,
-        start: Array | SolverResult,
-        barrier: float | None = None,
-        most: int | None = None,
-        watch: Watch | None = None,
-        *,
-        path: Path | None = None,
-    ) -> SolverResult:
-        """Let the solver work on a program in the time that is left.
-
-        start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
-        barrier : the first of "sqp" from a result, where that is not as near as it looks.
-        most : iterations of "sqp", if the options do not say how many.
-        watch, path : as of `solve_sqp`, of the interior-point method.
-        """
-        left, y, z = None if self.stop.asked else self.left, None, None
-        if isinstance(start, SolverResult):
-            x0, y, z = start.x, start.multipliers, start.bound_multipliers
-        else:
-            x0 = start
-        if self.solver == "ipopt":
-            return solve_ipopt(program, x0, options=self.options, callback=self._told, time_limit=left)
-        settings = dict(self.options or {})
-        if most is not None:
-            settings.setdefault("max_iterations", most)
-        if barrier is not None and z is not None:
-            settings.setdefault("barrier_warm", barrier)
-        if left is not None:
-            settings["time_limit"] = max(left, 1e-9)
-        return solve_sqp(
-            program,
-            x0,
-            options=SQPOptions(**settings),
-            callback=self._told,
-            multipliers=y,
-            bound_multipliers=z,
-            watch=watch if self.interior else None,
-            path=path,
-        )
-
-
-def check_starts(starts: int, seed: int, *, given: bool) -> None:
-    """InputError if these are no number of starts, or no seed; ``given``: the one start is given."""
-    for name, value, least in (("starts", starts, 1), ("seed", seed, 0)):
+    for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise InputError(f"{name} is {value!r}; give a whole number >= {least}")
     if given and starts > 1:
         raise InputError(f"starts is {starts}, of one start that is given; leave one of the two out")
+    if workers > 1 and callback is not None:
+        raise InputError("callback is asked in this process alone: leave it out, or give workers=1")
 
 
 def drawn(starts: int, seed: int) -> list[dict[str, Any]]:
@@ -209,104 +60,123 @@ def drawn(starts: int, seed: int) -> list[dict[str, Any]]:
     return [{}, *others]
 
 
-def solve_from(
-    t: Program,
-    starts: Starts,
-    budget: Budget,
-    began: float,
-    work: Callable[[Program, Array | SolverResult], tuple[Program, SolverResult]] | None = None,
-) -> tuple[Program, dict[str, Any]]:
-    """The program of the best result from these starts, and the fields of its
-    :class:`impactopt.planning.solution.Solved`.
+def drawn_guesses(
+    name: str, make: Callable[[dict[str, Any]], Guess[Program]], which: range, seed: int
+) -> Guesses[Program]:
+    """Named initial guesses of drawn reaches, each made in its turn."""
+    draws = drawn(which.stop, seed)
+    return ((f"{name} {k + 1}", partial(make, draws[k])) for k in which)
 
-    starts : name, and what makes its x (n,) when its turn comes. An interrupted solve is the last one, and so
-    is one after which no time is left.  began [s] : when work on the problem did.
-    work : what is done from a start; None: the program is solved as it is. It may end with another program.
+
+def best_of_starts(
+    one: Run[AnySolution],
+    problem: ImpactProblem,
+    start: Any,
+    budget: Budget,
+    *,
+    starts: int,
+    workers: int,
+) -> AnySolution:
+    """The best solution from a problem's starts, by the cheapest model of the collision that is good enough.
+
+    one : a problem from some of the starts, in this process.  start : what it is started from.
+    """
+    if problem.collision == "auto":
+
+        def run(chosen: ImpactProblem, other: AnySolution | None, left: Budget) -> AnySolution:
+            given, count = (start, starts) if other is None else (other, 1)
+            return best_of_starts(one, chosen, given, left, starts=count, workers=workers)
+
+        return climbed(problem, run, budget)
+    if workers > 1 and starts > 1:
+        block_functions(roomy(problem), problem.coordinates, budget.report)  # compiled here, not by each
+        return _best_side_by_side(partial(one, problem, start), budget, starts=starts, workers=workers)
+    return one(problem, start, budget, range(starts), starts + MORE)
+
+
+def best_of(
+    guesses: Guesses[Program],
+    solve: Solve[Program],
+    budget: Budget,
+    count: int,
+) -> Outcome[Program]:
+    """The best outcome, with the attempts of all.
+
+    guesses : names, and what makes each when its turn comes. More than ``count`` are tried while each ends
+        with a solution that is refused, such as for penetration: where a motion passes bodies on the wrong
+        side, others may not. An interrupted solve is the last one, and so is one after which no time is left.
 
     Of those that meet their constraints the one of least objective is best, else the one of least violation.
     """
-    built = time.perf_counter()
-    found, attempts = list[tuple[Program, SolverResult]](), list[Attempt]()
-    for name, make in starts:
-        start = make()
-        program, result = (t, budget.run(t.program, start)) if work is None else work(t, start)
-        found.append((program, result))
-        attempts.append(attempt_of(program, name, result))
-        if result.status is Status.INTERRUPTED or budget.left == 0:
+    found = list[tuple[str, Outcome[Program]]]()
+    for k, (name, make) in enumerate(guesses):
+        if k >= count and not all(outcome.refused for _, outcome in found):
             break
-    order = [rank_of(result) for _, result in found]
-    best = order.index(min(order))
-    attempts[best] = replace(attempts[best], kept=True)
-    t, result = found[best]
-    solved, rows = time.perf_counter(), t.program.constraints(result.x)
-    return t, {
-        "problem": t.problem,
-        "result": result,
-        "solver": budget.solver,
-        "build_seconds": built - began,
-        "solve_seconds": solved - built,
-        "violations": violations_of(t, result.x, rows),
-        "objectives": t.achieved(result.x),
-        "attempts": tuple(attempts),
-    }
+        found.append((name, solve(make())))
+        if found[-1][1].result.status is Status.INTERRUPTED or budget.left == 0:
+            break
+    best = min((outcome for _, outcome in found), key=lambda outcome: rank_of(outcome.result))
+    attempts = [replace(outcome.attempt(name), kept=outcome is best) for name, outcome in found]
+    return replace(best, attempts=tuple(attempts))
 
 
-def attempt_of(t: ContactProgram, name: str, result: SolverResult) -> Attempt:
-    """Result of the solve, or of the refinement round, of that name."""
-    return Attempt(
-        start=name,
-        status=result.status,
-        impulse=t.impulse(result.x),
-        objective=result.objective,
-        max_violation=result.max_violation,
-        iterations=result.iterations,
-        seconds=result.seconds,
-    )
+def _best_side_by_side(
+    run: Callable[[Budget, range, int], AnySolution], budget: Budget, *, starts: int, workers: int
+) -> AnySolution:
+    """The best of the solutions from each start, with the attempts of all in their order.
 
+    run : picklable, and so are its solutions.  budget : of all together; what has not begun when its time is
+    over is left out. Ctrl-C keeps what is there.
 
-def violations_of(t: ContactProgram, x: Array, rows: Array) -> tuple[Violation, ...]:
-    """Violated constraints at solver variables (n,), worst first; their values are ``rows`` (m,)."""
-    return tuple(worst_rows(t.program, x, rows, tolerance=VIOLATED, count=NAMED))
-
-
-def rank_of(result: SolverResult) -> tuple[bool, float]:
-    """Less is better: those that meet their constraints by their objective, then the others by their
-    violation.
+    Raises
+    ------
+    InputError : the problem cannot go to other processes, or none of them has come back with a solution.
     """
-    met = result.status.usable or result.max_violation <= VIOLATED
-    return not met, result.objective if met else result.max_violation
-
-
-def one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
-    """The new result, with the effort of both."""
-    later = tuple(
-        replace(r, iteration=old.iterations + r.iteration, seconds=old.seconds + r.seconds)
-        for r in new.history
+    try:
+        pickle.dumps(run)
+    except Exception as error:  # whatever a law or target of the user's own raises
+        raise InputError(
+            f"the problem cannot go to other processes: {error}; define its own laws, targets and terms in a "
+            "module, or give workers=1"
+        ) from None
+    began = time.perf_counter()
+    ends = None if budget.time_limit is None else time.time() + budget.time_limit
+    found = dict[int, AnySolution]()
+    jobs = each_on_workers(
+        _one,
+        (run, replace(budget, report=None), ends),
+        enumerate(range(starts)),
+        workers=min(workers, starts),
     )
-    effort = {key: getattr(old, key) + getattr(new, key) for key in EFFORT}
-    return replace(new, history=old.history + later, **effort)
+    with contextlib.closing(jobs):  # type: ignore[type-var]
+        try:
+            for k, solution in jobs:
+                if isinstance(solution, Died):
+                    told = f"start {k + 1} has died (exit code {solution.code})"
+                elif solution is None:
+                    told = f"start {k + 1} is left out: no time is left"
+                else:
+                    found[k] = solution
+                    told = f"start {k + 1}: {solution.attempts[-1].impulse:.2f} N s, {solution.status.value}"
+                budget.say(told)
+        except KeyboardInterrupt:
+            if not found:
+                raise
+    if not found:
+        raise InputError("no start has come to an end: give more time, or workers=1 to see why")
+    best = min(found.values(), key=lambda solution: rank_of(solution.result))
+    attempts = [
+        replace(attempt, kept=attempt.kept and found[k] is best)
+        for k in sorted(found)
+        for attempt in found[k].attempts
+    ]
+    seconds = time.perf_counter() - began
+    return replace(best, attempts=tuple(attempts), solve_seconds=seconds - best.build_seconds)
 
 
-def with_effort_of(kept: SolverResult, last: SolverResult) -> SolverResult:
-    """A result that an earlier round had, with the effort until the last one."""
-    return replace(kept, history=last.history, **{key: getattr(last, key) for key in EFFORT})
-
-
-def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> SolverResult:
-    """A program's result as the start of another, see `carried_over`."""
-    if new is old:
-        return result
-    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
-    return replace(result, x=x, multipliers=y, bound_multipliers=z)
-
-
-def touching(result: SolverResult, depth: float, names: Iterable[str], what: str) -> SolverResult:
-    """A result whose bodies penetrate by so much [m]: no solution.  names : of the pairs of bodies.
-
-    Where nothing else is found it is still told, but goes before no start that is clean.
-    """
-    pairs = "; ".join(sorted(set(names))[:3])
-    found = f"no {what} was found in which they do not"
-    message = f"Bodies penetrate each other by {1e3 * depth:.1f} mm, and {found}: {pairs}."
-    worst = max(result.max_violation, depth, 2 * VIOLATED)
-    return replace(result, status=Status.FAILED, max_violation=worst, message=message)
+def _one(shared: tuple[Callable[..., Any], Budget, float | None], start: int) -> Any:
+    run, budget, ends = shared
+    left = None if ends is None else ends - time.time()
+    if left is not None and left <= 0:
+        return None
+    return run(replace(budget, time_limit=left), range(start, start + 1), start + 1)

@@ -9,8 +9,8 @@ from typing import Any
 
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError, check_array
-from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["Blow", "Series", "drive_nail"]

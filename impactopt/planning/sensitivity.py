@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.planning.bent_program import Bent, bent_of
-from impactopt.planning.changes import Parameter, parameter_of
+from impactopt.planning.parameter_changes import Parameter, parameter_of
+from impactopt.planning.parametric_program import Bent, bent_of
 from impactopt.planning.solution import Solution
 from impactopt.solvers.active import Offset
 

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.planning.causes import Cause
-from impactopt.planning.chosen_gains import ChosenGains
+from impactopt.planning.cautions import gear_caution, slide, slide_caution
 from impactopt.planning.contact_replay import AGREED, ContactReplay, ModelError, PlannedContact
-from impactopt.planning.gears import gear_caution
-from impactopt.planning.multistart import Attempt
-from impactopt.planning.on_demand import rows_on_demand
-from impactopt.planning.sliding import slide, slide_caution
+from impactopt.planning.gain_selection import ChosenGains
+from impactopt.planning.lazy_constraints import rows_on_demand
+from impactopt.planning.refinement import Attempt
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.actuator_loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation

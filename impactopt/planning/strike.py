@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -12,28 +12,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
-from impactopt.planning.chosen_gains import roomy, settled
-from impactopt.planning.contact_replay import checked
-from impactopt.planning.gears import gear_caution
-from impactopt.planning.keeping_apart import Margins, solved_apart
-from impactopt.planning.models import carried_start, climbed, planned_contact
+from impactopt.planning.budget import Budget, touching
+from impactopt.planning.cautions import gear_caution
+from impactopt.planning.clearance_constraints import Margins, solved_apart
+from impactopt.planning.clearance_violations import deepest_penetration
+from impactopt.planning.diagnosis import with_reason
+from impactopt.planning.gain_selection import chosen_of, roomy, settled
+from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, with_rows
+from impactopt.planning.models import carried_start
 from impactopt.planning.multistart import (
-    Budget,
-    Starts,
-    carried,
+    Guesses,
+    best_of,
+    best_of_starts,
     check_starts,
-    drawn,
-    one_after_the_other,
-    solve_from,
-    touching,
+    drawn_guesses,
 )
-from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
-from impactopt.planning.side_by_side import best_side_by_side, check_workers
+from impactopt.planning.refinement import Additions, Guess, Outcome, carried, program_for, refine
 from impactopt.planning.solution import Solved, impact_summary, versions
-from impactopt.planning.too_near import deepest_penetration
-from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.program import Callback, SolverResult, Status
+from impactopt.solvers.program import Callback, Status
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
@@ -41,12 +38,10 @@ from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
-ROUNDS = 10  # of freezes that come when they are to
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
 # solve that goes on with other constraints
 BARRIER_ARM, BARRIER_ON = 0.03, 1e-2
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
-Work = Callable[[StrikeTranscription, Array | SolverResult], tuple[StrikeTranscription, SolverResult]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -120,72 +115,66 @@ def optimize_strike(
     if method != "collocation":
         gone = "is no longer supported" if method == "shooting" else "is unknown"
         raise InputError(f'method {method!r} {gone}: give "collocation", or leave it out')
-    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
-    check_starts(starts, seed, given=start is not None)
-    check_workers(workers, callback)
+    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
+    check_starts(starts, seed, workers, callback, given=start is not None)
     if all(o.whole_motion for o in problem.objectives):
         raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
-    if problem.collision == "auto":
-        common: dict[str, Any] = {
-            "solver": solver,
-            "options": options,
-            "workers": workers,
-            "report": report,
-            "callback": callback,
-        }
-
-        def run(chosen: ImpactProblem, other: StrikeSolution | None, left: float | None) -> StrikeSolution:
-            if other is not None:
-                return optimize_strike(chosen, start=other, time_limit=left, **common)
-            return optimize_strike(chosen, start=start, starts=starts, seed=seed, time_limit=left, **common)
-
-        return climbed(problem, run, time_limit=time_limit, report=report)
-    if workers > 1 and starts > 1:
-        block_functions(roomy(problem), problem.coordinates, report)  # compiled here, not by each
-        run = partial(_optimized, problem, None, seed)
-        return best_side_by_side(run, budget, starts=starts, workers=workers, report=report)
-    return _optimized(problem, start, seed, budget, range(starts), report)
+    one = partial(_optimized, seed)
+    return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
 
 
 def _optimized(
+    seed: int,
     problem: ImpactProblem,
     start: ArrayLike | StrikeSolution | None,
-    seed: int,
     budget: Budget,
     which: range,
-    report: Callable[[str], None] | None,
+    _last: int,
 ) -> StrikeSolution:
     """The best strike from these starts, or from the given one."""
     began, problem = time.perf_counter(), roomy(problem)
     if isinstance(start, StrikeSolution):
         problem = with_rows(problem, rows_on_demand(start.problem))
     mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()
-    functions = block_functions(problem, problem.coordinates, report, *mesh[:1])
+    functions = block_functions(problem, problem.coordinates, budget.report, *mesh[:1])
     budget = budget.started()
     t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
         same = partial(_program_of, start)
         start = carried_start(t, same, start, start.apart).x
-    given = None if start is None else check_array("start", start, (t.program.n,))
-    if report is not None:
-        report(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
-    margins = Margins(problem) if problem.keeps_apart else None
-    work = partial(_bounded_strike, partial(_clean_strike, budget, margins), report)
-    t, fields = solve_from(t, _starts(t, given, which, seed), budget, began, work)
-    t, fields = settled(t, fields, budget, report)
-    result = fields["result"] = with_reason(t, fields["result"])
-    problem = fields["problem"]
-    strike, contact = t.decode(result.x), None
-    if result.status.usable:
-        contact = planned_contact(t, result.x, strike, problem)
-        fields["result"] = checked(result, contact.replay)
+    budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
+    solve = partial(_clean_strike, budget, Margins(problem) if problem.keeps_apart else None)
+
+    def bounded(guess: Guess[StrikeTranscription]) -> Outcome[StrikeTranscription]:
+        return refine(solve(guess), [LazyTerms(budget.report)], solve, budget)
+
+    def reach(draw: dict[str, Any]) -> Guess[StrikeTranscription]:
+        return Guess(program=t, start=strike_iterate(t, **draw))
+
+    built = time.perf_counter()
+    guesses: Guesses[StrikeTranscription] = drawn_guesses("reach", reach, which, seed)
+    if start is not None:
+        guesses = [("given", partial(Guess, program=t, start=check_array("start", start, (t.program.n,))))]
+    outcome = best_of(guesses, bounded, budget, len(which))
+    gains = chosen_of(outcome.program, outcome.result.x)
+    outcome = settled(outcome, gains, budget)
+    t, at, solved = outcome.program, outcome.at, time.perf_counter()
+    outcome = replace(outcome, result=with_reason(t, outcome.result)).checked()
     return StrikeSolution(
-        strike=strike,
-        contact=contact,
+        problem=t.problem,
+        result=outcome.result,
+        solver=budget.solver,
+        build_seconds=built - began,
+        solve_seconds=solved - built,
+        violations=outcome.violations,
+        objectives=t.achieved(at.x),
+        attempts=outcome.attempts,
+        gains=gains,
+        strike=at.planned,
+        contact=at.contact if outcome.usable else None,
         elements=t.hit.elements if t.hit.guarded else (),
         shares=t.hit.shares,
         apart=t.apart_rows,
-        **fields,
     )
 
 
@@ -197,72 +186,57 @@ def _program_of(solution: StrikeSolution) -> StrikeTranscription:
 
 
 def clear_strike(
-    budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
-) -> tuple[StrikeTranscription, SolverResult]:
-    """A strike whose bodies keep apart; its result has the effort of all.
+    budget: Budget, margins: Margins | None, guess: Guess[StrikeTranscription]
+) -> Outcome[StrikeTranscription]:
+    """A strike whose bodies keep apart.
 
-    start : variables (n,); or a result of this program but for other constraints, such as those on demand:
-        then it goes on from there, and begins anew only where that fails.
+    guess : if warm, the solve goes on from there, and begins anew only where that fails.
     """
-    x0 = start.x if isinstance(start, SolverResult) else start
-    goes_on = isinstance(start, SolverResult) and len(start.multipliers) == t.program.m
+    t = guess.program
     if budget.interior and not t.coordinates.soles:
         budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
-    found, result = solved_apart(budget, margins, t, start if goes_on else x0, BARRIER_ON)
-    found, result = _settled(budget, margins, found, result)
-    if goes_on and result.status in _STUCK and budget.left != 0:
-        before = result
-        found, result = _settled(budget, margins, *solved_apart(budget, margins, t.with_apart({}), x0))
-        result = one_after_the_other(before, result)
-    return found, result
+
+    def solve(guess: Guess[StrikeTranscription]) -> Outcome[StrikeTranscription]:
+        return refine(
+            solved_apart(budget, margins, guess), [Freezes()], partial(solved_apart, budget, margins), budget
+        )
+
+    outcome = solve(replace(guess, barrier=BARRIER_ON))
+    if guess.warm is not None and outcome.result.status in _STUCK and budget.left != 0:
+        outcome = outcome.then(solve(Guess(program=t.with_apart({}), start=guess.x)))
+    return outcome
 
 
 def _clean_strike(
-    budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
-) -> tuple[StrikeTranscription, SolverResult]:
+    budget: Budget, margins: Margins | None, guess: Guess[StrikeTranscription]
+) -> Outcome[StrikeTranscription]:
     """Strike without penetration (`clear_strike`); a result that still has some is no solution."""
-    t, result = clear_strike(budget, margins, t, start)
-    if margins is None or not result.status.usable:
-        return t, result
-    depth, pairs = deepest_penetration(t, result.x, margins)
+    outcome = clear_strike(budget, margins, guess)
+    if margins is None or not outcome.usable:
+        return outcome
+    depth, pairs = deepest_penetration(outcome.program, outcome.result.x, margins)
     if depth <= 0:
-        return t, result
+        return outcome
     names = (" and ".join(margins.bodies.names(pair)) for pair in pairs)
-    return t, touching(result, depth, names, "strike")
+    return replace(outcome, result=touching(outcome.result, depth, names, "strike"))
 
 
-def _bounded_strike(
-    work: Work, report: Callable[[str], None] | None, t: StrikeTranscription, start: Array | SolverResult
-) -> tuple[StrikeTranscription, SolverResult]:
-    """Solves a strike from one initial guess, adding the lazy constraints that it needs."""
-    found, result = work(t, start)
-    return kept_on_demand(found, result, (t, start), work, lambda *_: (), report)
+class Freezes:
+    """Oracle for freezes of the model during contact that do not come when they are to, by the time that the
+    contact takes.
+    """
 
+    most = 10
 
-def _settled(
-    budget: Budget, margins: Margins | None, t: StrikeTranscription, result: SolverResult
-) -> tuple[StrikeTranscription, SolverResult]:
-    """A strike whose freezes on the way come when they are to, by the time that its contact takes."""
-    for _ in range(ROUNDS):
-        shares = t.hit.drifted(result.x) if result.status.usable and budget.left != 0 else None
+    def missing(self, outcome: Outcome[StrikeTranscription]) -> Additions[StrikeTranscription] | None:
+        """The program with freezes at other shares of the contact."""
+        t, x = outcome.program, outcome.result.x
+        shares = t.hit.drifted(x)
         if shares is None:
-            break
-        elements = contact_elements(t.problem, shares)
-        functions = block_functions(t.problem, t.coordinates, None, elements)
-        finer = StrikeTranscription(t.problem, t.coordinates, functions, elements, shares)
-        finer = finer.with_apart(t.apart_rows)
-        finer, new = solved_apart(budget, margins, finer, carried(finer, t, result).x)
-        if not new.status.usable:
-            break
-        t, result = finer, one_after_the_other(result, new)
-    return t, result
+            return None
 
+        def guesses() -> Iterator[Guess[StrikeTranscription]]:
+            finer = program_for(t, elements=contact_elements(t.problem, shares), shares=shares)
+            yield Guess(program=finer, start=carried(finer, t, outcome.result).x)
 
-def _starts(t: StrikeTranscription, given: Array | None, which: range, seed: int) -> Starts:
-    """Names of the starts, and what makes them."""
-    if given is not None:
-        yield "given", lambda: given
-        return
-    draws = drawn(which.stop, seed)
-    for k in which:
-        yield f"reach {k + 1}", partial(strike_iterate, t, **draws[k])
+        return Additions(name="freezes", why="freezes come at other times", guesses=guesses())

@@ -8,8 +8,8 @@ from typing import Any
 from impactopt.files.output import Record, plain, record_of, record_of_strike, summary_of
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.files.solution_library import SolvedFolder
-from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike
 from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.collisions import Collisions

@@ -20,7 +20,7 @@ from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.contact_replay import AGREED
-from impactopt.planning.planner import solve
+from impactopt.planning.solve import solve
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status

@@ -113,7 +113,7 @@ def _plot(problem: str, say: Say) -> Maker:
     """Pictures of a problem's plan beside its replays."""
     from impactopt.files.output import record_of
     from impactopt.files.problem_file import load_problem
-    from impactopt.planning.planner import solve
+    from impactopt.planning.solve import solve
     from impactopt.report.pictures import PICTURES, overview
 
     solution = solve(load_problem(problem), report=say)

@@ -19,8 +19,8 @@ from benchmarks.planning import DEMO
 from benchmarks.report import Report, Say, columns_table
 from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
-from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import Balance, ContactWrenchCone, Term, TorqueLimit

@@ -9,8 +9,8 @@ from typing import Any
 from benchmarks.report import Say
 from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
-from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import ControllerSettings
 from impactopt.simulation.controller import controller_of

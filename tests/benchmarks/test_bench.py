@@ -36,7 +36,7 @@ runner = CliRunner()
 
 
 class Planner:
-    """Stands in for `impactopt.planning.planner.solve`."""
+    """Stands in for `impactopt.planning.solve.solve`."""
 
     def __init__(self) -> None:
         self.status, self.kind = Status.SOLVED, FakeSolution

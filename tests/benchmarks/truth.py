@@ -21,8 +21,8 @@ from benchmarks.report import Report, Say, columns_table
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
-from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.presets import talos
 from impactopt.simulation.perturbation import Perturbation

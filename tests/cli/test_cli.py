@@ -20,7 +20,7 @@ import impactopt
 from impactopt.cli.app import app
 from impactopt.files.output import Record, load_record
 from impactopt.files.problem_file import ProblemFile
-from impactopt.planning.multistart import Attempt
+from impactopt.planning.refinement import Attempt
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures import PICTURES
@@ -42,7 +42,7 @@ runner = CliRunner()
 
 
 class Planner:
-    """Stands in for `impactopt.planning.planner.solve`: remembers how it was called, and reports some
+    """Stands in for `impactopt.planning.solve.solve`: remembers how it was called, and reports some
     progress.
     """
 
@@ -80,7 +80,7 @@ def problem() -> ImpactProblem:
 def planner(monkeypatch: pytest.MonkeyPatch, problem: ImpactProblem) -> Planner:
     """No solver and no big robot: files are read, but the problem is a small one."""
     planner = Planner()
-    monkeypatch.setattr("impactopt.planning.planner.solve", planner)
+    monkeypatch.setattr("impactopt.planning.solve.solve", planner)
     monkeypatch.setattr("impactopt.files.replay.has_mujoco", lambda: True)
     monkeypatch.setattr(ProblemFile, "build", lambda self: problem)
     return planner
@@ -195,7 +195,7 @@ def test_the_baseline_is_reported_beside_the_plan(
         def describe(self) -> dict[str, object]:
             return {"method": "minimum jerk", "impulse_Ns": 1.5, "hand_speed_m_s": 0.4}
 
-    monkeypatch.setattr("impactopt.planning.baseline.minimum_jerk_baseline", lambda problem: Reach())
+    monkeypatch.setattr("impactopt.planning.minimum_jerk.minimum_jerk_baseline", lambda problem: Reach())
     out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
     assert "minimum-jerk reach inside the same limits: 1.50 N s at 0.40 m/s" in out
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["baseline"]["impulse_Ns"] == 1.5
@@ -203,7 +203,7 @@ def test_the_baseline_is_reported_beside_the_plan(
     def nothing(problem: ImpactProblem) -> Reach:
         raise impactopt.InputError("no reach keeps the limits")
 
-    monkeypatch.setattr("impactopt.planning.baseline.minimum_jerk_baseline", nothing)
+    monkeypatch.setattr("impactopt.planning.minimum_jerk.minimum_jerk_baseline", nothing)
     out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
     assert "no reach keeps the limits" in out
 

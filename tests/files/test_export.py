@@ -35,8 +35,8 @@ from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.names import problem_file
 from impactopt.files.replay import Planned
-from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.robot import Robot

@@ -13,8 +13,8 @@ from impactopt.errors import InputError
 from impactopt.files.output import NUMBERS
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.solution_library import SolvedFolder
-from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.progress import START, ProgressCounter

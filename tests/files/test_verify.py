@@ -16,7 +16,7 @@ from impactopt.cli.app import app
 from impactopt.files.output import Record, load_record, record_of, save_record
 from impactopt.files.problem_file import load_problem
 from impactopt.files.verify import motion_of_record
-from impactopt.planning.planner import solve
+from impactopt.planning.solve import solve
 
 ARM = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
 runner = CliRunner()

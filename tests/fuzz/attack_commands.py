@@ -83,7 +83,7 @@ def make_result(folder: Path) -> Path:
     """A saved result to damage: the plan of a small problem, replayed on held soles."""
     from impactopt.files.output import record_of, save_record
     from impactopt.files.problem_file import read_problem_file
-    from impactopt.planning.planner import solve
+    from impactopt.planning.solve import solve
 
     read = read_problem_file(_PROBLEM)
     solution = solve(read.build())

@@ -14,7 +14,7 @@ from support.small_plans import Planned, arm_problem, changed, transcribed
 
 from impactopt.contact import FreeMass
 from impactopt.files.problem_file import load_problem
-from impactopt.planning.keeping_apart import Margins, Watch
+from impactopt.planning.clearance_constraints import Margins, Watch
 from impactopt.problem.objectives import Effort
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario

@@ -12,7 +12,7 @@ from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.kinematics.stance import FixedBase
-from impactopt.planning.baseline import _holds, _profile, _wrenches_exist, minimum_jerk_baseline
+from impactopt.planning.minimum_jerk import _holds, _profile, _wrenches_exist, minimum_jerk_baseline
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.terms import TorqueLimit
 

@@ -23,7 +23,7 @@ from impactopt import (
     load_problem,
     solve,
 )
-from impactopt.planning.stopping import stopping
+from impactopt.planning.budget import stopping
 from impactopt.problem.feasibility import too_weak
 
 

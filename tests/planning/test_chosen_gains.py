@@ -29,9 +29,9 @@ from impactopt.files.problem_file import parse_problem_file
 from impactopt.files.replay import problem_of
 from impactopt.files.resume import resumed
 from impactopt.files.verify import verify
-from impactopt.planning.chosen_gains import roomy
-from impactopt.planning.made_again import program_of
+from impactopt.planning.gain_selection import roomy
 from impactopt.planning.models import carried_start
+from impactopt.planning.reconstruction import program_of
 from impactopt.report.result_rows import result_columns, result_rows
 from impactopt.robots.gains import with_room
 from impactopt.solvers.program import max_violation

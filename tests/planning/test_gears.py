@@ -26,8 +26,8 @@ from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file.writing import write_problem
 from impactopt.files.replay import load_planned
 from impactopt.files.resume import resumed
-from impactopt.planning.gears import gear_caution, gears_beyond
-from impactopt.planning.on_demand import rows_on_demand, with_rows
+from impactopt.planning.cautions import gear_caution, gears_beyond
+from impactopt.planning.lazy_constraints import rows_on_demand, with_rows
 from impactopt.report.report import report_of
 from impactopt.simulation import Perturbation
 

@@ -9,7 +9,7 @@ import pytest
 from impactopt import FreeMass, Robot, SpringDamper, Striker
 from impactopt.collision.effective_mass import effective_mass
 from impactopt.kinematics.stance import FixedBase
-from impactopt.planning.planner import solve
+from impactopt.planning.solve import solve
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.simulation import scene_of, simulate_pinocchio

@@ -12,7 +12,7 @@ import pytest
 
 from impactopt import ImpactProblem, load_problem, optimize_strike, solve
 from impactopt.errors import InputError
-from impactopt.planning import side_by_side
+from impactopt.planning import multistart
 from impactopt.planning.strike import StrikeSolution
 from impactopt.simulation.workers import Died
 from impactopt.solvers.program import Status
@@ -55,7 +55,7 @@ def given(monkeypatch: pytest.MonkeyPatch, *found: Any) -> None:
                 raise one
             yield k, one
 
-    monkeypatch.setattr(side_by_side, "each_on_workers", each)
+    monkeypatch.setattr(multistart, "each_on_workers", each)
 
 
 def test_what_dies_or_gets_no_time_is_told(

@@ -10,8 +10,8 @@ import pytest
 from support.small_plans import arm_problem, transcribed
 
 from impactopt import solve
-from impactopt.planning import on_demand
-from impactopt.planning.sliding import FAR, slide, slide_caution, slides_beyond
+from impactopt.planning import lazy_constraints
+from impactopt.planning.cautions import FAR, slide, slide_caution, slides_beyond
 from impactopt.problem import problem as problems
 from impactopt.problem.terms import GearLoad, Slide
 from impactopt.solvers.ipopt import solve_ipopt
@@ -65,7 +65,7 @@ def test_only_a_long_slide_is_told() -> None:
 def test_a_plan_that_slides_too_far_gets_rows(monkeypatch: pytest.MonkeyPatch, plan: Plan) -> None:
     """To the plan that rows from the start lead to; and none where it is switched off."""
     most = 0.3 * slide(plan.problem, plan)
-    monkeypatch.setattr(on_demand, "_KINDS", {"slide": Slide})
+    monkeypatch.setattr(lazy_constraints, "_KINDS", {"slide": Slide})
     monkeypatch.setattr(problems, "ON_DEMAND_TERMS", (GearLoad(), Slide(most=most)))
     kept = solve(plan.problem)
     assert kept.status.usable

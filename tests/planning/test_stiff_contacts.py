@@ -9,10 +9,10 @@ from impactopt import optimize_strike, solve
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, SpringDamper
 from impactopt.errors import NotSolvedWarning
 from impactopt.files.problem_file import load_problem
+from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.contact_replay import AGREED, PlannedContact, checked
-from impactopt.planning.multistart import VIOLATED, Budget
+from impactopt.planning.diagnosis import second_look
 from impactopt.planning.solution import Solution
-from impactopt.planning.verdict import second_look
 from impactopt.problem.objectives import Impulse, PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad

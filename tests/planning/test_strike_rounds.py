@@ -13,9 +13,10 @@ from support.small_plans import changed
 
 from impactopt.bodies.shapes import Obstacle
 from impactopt.planning import strike as strikes
-from impactopt.planning.keeping_apart import Margins
-from impactopt.planning.multistart import Budget
-from impactopt.planning.too_near import deepest_penetration
+from impactopt.planning.budget import Budget
+from impactopt.planning.clearance_constraints import Margins
+from impactopt.planning.clearance_violations import deepest_penetration
+from impactopt.planning.refinement import Guess, Outcome
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
@@ -81,7 +82,8 @@ def test_it_ends_with_bodies_apart_though_it_began_with_no_constraint_for_them(
     margins = Margins(t.problem)
     assert deepest_penetration(t, free, margins)[0] > 0
     budget = Budget(solver="sqp", options=solver, time_limit=None, callback=None)
-    t, result = strikes.clear_strike(budget, margins, t, strike_iterate(t))
+    outcome = strikes.clear_strike(budget, margins, Guess(program=t, start=strike_iterate(t)))
+    t, result = outcome.program, outcome.result
     assert result.status is Status.SOLVED and result.kkt <= 1e-6 and result.max_violation <= 1e-6
     assert t.apart_rows and deepest_penetration(t, result.x, margins)[0] <= 0
     assert result.multipliers.size == t.program.m
@@ -94,8 +96,9 @@ def test_a_strike_whose_bodies_stay_in_each_other_is_none(
     t, free = boxed(arm_transcription, strike)
     budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=(Status.SOLVED,))
     solved = budget.run(t.program, free)
-    monkeypatch.setattr(strikes, "clear_strike", lambda *_: (t, solved))
-    _, result = strikes._clean_strike(budget, Margins(t.problem), t, free)
+    guess = Guess(program=t, start=free)
+    monkeypatch.setattr(strikes, "clear_strike", lambda *_: Outcome.of(t, solved, guess))
+    result = strikes._clean_strike(budget, Margins(t.problem), guess).result
     assert result.status is Status.FAILED and "Bodies penetrate each other" in result.message
 
 
@@ -103,7 +106,8 @@ def test_with_rows_on_demand_it_goes_on_from_the_solution_without_them(strike: S
     ends = Status.SOLVED, Status.FAILED, Status.SOLVED
     budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
     solved = budget.run(strike.program, strike_iterate(strike))
-    _, result = strikes.clear_strike(budget, Margins(strike.problem), strike, solved)
+    guess = Guess(program=strike, start=solved)
+    result = strikes.clear_strike(budget, Margins(strike.problem), guess).result
     _, on, anew = budget.asked
     assert np.array_equal(on["given"].x, solved.x) and on["from"] == strikes.BARRIER_ON
     assert anew["given"] is None, "where that leads nowhere"

@@ -11,13 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from impactopt import Obstacle, load_problem, solve
-from impactopt.planning.keeping_apart import Margins, Watch, spots_of
-from impactopt.planning.multistart import Budget
-from impactopt.planning.rounds import Refining, Round
+from impactopt.planning import between_nodes
+from impactopt.planning.between_nodes import BetweenNodes
+from impactopt.planning.budget import Budget
+from impactopt.planning.clearance_constraints import Margins, Watch, spots_of
+from impactopt.planning.clearance_violations import clearance_violations
+from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.solution import Solution
-from impactopt.planning.too_near import clearance_violations
+from impactopt.planning.solve import PlanSolver
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.program import SolverResult, Status, max_violation
+from impactopt.solvers.program import Status, max_violation
 from impactopt.transcription.initial_guess import carried_over
 from impactopt.transcription.transcription import Transcription, block_functions
 
@@ -28,9 +31,7 @@ Array = NDArray[np.float64]
 def free() -> Solution:
     """A planar arm's blow, with few nodes: its hammer goes 5 cm from one to the next."""
     problem = load_problem("arm_planar")
-    return solve(
-        dataclasses.replace(problem, swing=dataclasses.replace(problem.swing, intervals=6), style="strongest")
-    )
+    return solve(dataclasses.replace(problem, swing=dataclasses.replace(problem.swing, intervals=6)))
 
 
 def with_peg(problem: ImpactProblem, x: float, z: float) -> ImpactProblem:
@@ -88,40 +89,37 @@ def test_rounds_end_with_bodies_that_are_apart(free: Solution, monkeypatch: pyte
     """
     nodes = free.plan.swing_nodes * free.plan.swing.duration
     x, _, z = hammer(free, (nodes[10] + nodes[11]) / 2)
-    problem, began, solved = with_peg(free.problem, x, z), list[float](), Round.solved
+    problem, began, solved = with_peg(free.problem, x, z), list[float](), between_nodes.solved_apart
 
-    def watched(self: Round, budget: Budget, margins: Margins) -> tuple[Transcription, SolverResult]:
-        start = self.starts[0]
-        x = start.x if isinstance(start, SolverResult) else start
-        rows = {**Watch(self.program, margins, x).rows(), **self.program.apart_rows}
-        began.append(violation(self.program.with_apart(rows), x))
-        return solved(self, budget, margins)
+    def watched(budget: Budget, margins: Margins, guess: Guess[Transcription]) -> Outcome[Transcription]:
+        t = guess.program
+        rows = {**Watch(t, margins, guess.x).rows(), **t.apart_rows}
+        began.append(violation(t.with_apart(rows), guess.x))
+        return solved(budget, margins, guess)
 
-    monkeypatch.setattr(Round, "solved", watched)
+    monkeypatch.setattr(between_nodes, "solved_apart", watched)
     solution = solve(problem)
     assert solution.status is Status.SOLVED and solution.nodes.total > 0
     assert solution.clearance()["clearance_mm"] > 0 and not solution.clearance()["contacts_besides"]
     assert began and min(began) > 1e-3
 
 
-def refining(problem: ImpactProblem, **options: int) -> Refining:
-    budget = Budget(solver="sqp", options=options or None, time_limit=None, callback=None)
-    return Refining(budget, Margins(problem), {}, None)
-
-
 def test_a_result_that_touches_nothing_goes_before_a_later_one_that_does(free: Solution) -> None:
     x, _, z = hammer(free, 0.9 * free.plan.swing.duration)
     problem = with_peg(free.problem, x, z)
-    t, later = program_of(free, problem), dataclasses.replace(free.result, iterations=1000)
-    rounds = refining(problem)
-    assert rounds.judged(t, later)[1].status is Status.FAILED
-    before = program_of(free, free.problem), free.result
-    rounds._apart = before
-    kept, result = rounds.judged(t, later)
-    assert kept is before[0] and result.status is Status.SOLVED and result.iterations == 1000
+    later = dataclasses.replace(free.result, iterations=1000)
+    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    budget.stop.asked = True  # so nothing is added
+    between, found = BetweenNodes(budget, Margins(problem)), Outcome.of(program_of(free, problem), later)
+    assert between.refined(found).result.status is Status.FAILED
+    before = between._clear = Outcome.of(program_of(free, free.problem), free.result)
+    kept = between.refined(found)
+    assert kept.program is before.program
+    assert kept.result.status is Status.SOLVED and kept.result.iterations == 1000
 
 
 def test_a_limit_of_iterations_that_nobody_has_set_is_no_answer(free: Solution) -> None:
     ended = dataclasses.replace(free.result, status=Status.ITERATION_LIMIT)
-    assert refining(free.problem)._stuck(ended)
-    assert not refining(free.problem, max_iterations=5)._stuck(ended)
+    for options, stuck in ((None, True), ({"max_iterations": 5}, False)):
+        budget = Budget(solver="sqp", options=options, time_limit=None, callback=None)
+        assert PlanSolver(budget=budget, margins=None, refined=True)._stuck(ended) is stuck

@@ -17,7 +17,7 @@ from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
 from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
-from impactopt.planning.planner import solve
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import (

@@ -12,7 +12,7 @@ from impactopt.contact import FreeMass, SpringDamper
 from impactopt.files.output import Record
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.statics import static_wrenches
-from impactopt.planning.multistart import Attempt
+from impactopt.planning.refinement import Attempt
 from impactopt.planning.solution import Solution
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem, Phase

@@ -44,7 +44,7 @@ NUMERIC = (
     "kinematics/statics.py",
     "kinematics/support.py",
     "kinematics/wrench_cone.py",
-    "planning/keeping_apart.py",
+    "planning/clearance_constraints.py",
     "planning/solution.py",
     "simulation",
     "solvers/elimination",

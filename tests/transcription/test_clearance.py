@@ -19,10 +19,11 @@ from impactopt import KeepOut, Obstacle, SelfCollision, load_problem, solve
 from impactopt.bodies.clearance import Places
 from impactopt.bodies.separation import THIN
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.planning.keeping_apart import Margins, Watch, solved_apart, spots_of
-from impactopt.planning.multistart import Budget
+from impactopt.planning.budget import Budget
+from impactopt.planning.clearance_constraints import Margins, Watch, solved_apart, spots_of
+from impactopt.planning.clearance_violations import clearance_violations, deepest_penetration
+from impactopt.planning.refinement import Guess
 from impactopt.planning.solution import Solution
-from impactopt.planning.too_near import clearance_violations, deepest_penetration
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos
@@ -344,8 +345,9 @@ def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, ba
     depth, pairs = deepest_penetration(t, x, margins)
     assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}
     budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
-    fixed, result = solved_apart(budget, margins, t, free.result)
-    assert result.status is Status.SOLVED and deepest_penetration(fixed, result.x, margins)[0] <= 0
+    fixed = solved_apart(budget, margins, Guess(program=t, start=free.result))
+    assert fixed.result.status is Status.SOLVED
+    assert deepest_penetration(fixed.program, fixed.result.x, margins)[0] <= 0
 
 
 def test_constraints_enter_before_bodies_can_touch(free: Solution, barred: Solution) -> None:

@@ -15,8 +15,9 @@ from support.small_robots import table
 
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.kinematics.stance import FixedBase
-from impactopt.planning import planner
+from impactopt.planning import reconstruction
 from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Status
@@ -90,7 +91,7 @@ def transcription() -> Transcription:
 
 @pytest.fixture
 def functions(transcription: Transcription, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planner, "block_functions", lambda *_: transcription.functions)
+    monkeypatch.setattr(reconstruction, "block_functions", lambda *_: transcription.functions)
 
 
 def off(solution: Solution) -> float:
@@ -100,7 +101,7 @@ def off(solution: Solution) -> float:
 
 def test_the_estimate_is_the_true_error(functions: None) -> None:
     for elements in (COARSE, halved(COARSE)):
-        solution = planner.solve(problem(collision_elements=elements), refine=False)
+        solution = solve(problem(collision_elements=elements), refine=False)
         assert solution.status.usable and solution.elements == ()
         assert solution.contact_error_pct == pytest.approx(off(solution), rel=0.3, abs=0.02)
         if elements == COARSE:
@@ -110,7 +111,7 @@ def test_the_estimate_is_the_true_error(functions: None) -> None:
 
 
 def test_a_coarse_contact_gets_finer_elements_until_it_is_right(functions: None) -> None:
-    solution = planner.solve(problem())
+    solution = solve(problem())
     assert solution.status is Status.SOLVED
     assert abs(off(solution)) < 0.6  # the estimate is a little low
     assert solution.contact_error_pct == pytest.approx(off(solution), abs=0.1)
@@ -119,12 +120,12 @@ def test_a_coarse_contact_gets_finer_elements_until_it_is_right(functions: None)
     assert solution.summary()["collision_error_pct"] == solution.contact_error_pct
     assert len(solution.attempts) > 1 and "contact elements" in solution.attempts[-1].start
     # a neighbour starts with the same elements
-    near = planner.solve(problem(target=FreeMass(mass=6.1)), start=solution)
+    near = solve(problem(target=FreeMass(mass=6.1)), start=solution)
     assert near.status is Status.SOLVED and near.elements and abs(off(near)) < 0.6
 
 
 def test_a_contact_that_is_right_is_left_alone(functions: None) -> None:
-    solution = planner.solve(problem(collision_elements=((0.25,) * 4, (0.25,) * 4)))
+    solution = solve(problem(collision_elements=((0.25,) * 4, (0.25,) * 4)))
     assert solution.elements == () and abs(off(solution)) < 0.6
     assert solution.contact_elements == [4, 4] and len(solution.attempts) == 1
 

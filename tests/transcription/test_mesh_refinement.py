@@ -16,7 +16,8 @@ from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.errors import InputError
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.statics import static_wrenches
-from impactopt.planning import planner, rounds
+from impactopt.planning import between_nodes, reconstruction
+from impactopt.planning.solve import solve
 from impactopt.problem.objectives import (
     OBJECTIVES,
     AngularMomentum,
@@ -306,7 +307,7 @@ def test_more_nodes_go_together_with_everything_on_two_legs(biped_transcription:
 @pytest.fixture
 def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A problem whose torques are a little over their limit between the nodes, where nothing is given up."""
-    monkeypatch.setattr(planner, "block_functions", lambda *_: arm_transcription.functions)
+    monkeypatch.setattr(reconstruction, "block_functions", lambda *_: arm_transcription.functions)
     monkeypatch.setattr(between, "_SHARE", 0.0)
     monkeypatch.setattr(between, "_TORQUE", 1e-6)
     return dataclasses.replace(
@@ -318,7 +319,7 @@ def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_solve_adds_nodes_where_they_are_missing(coarse: Any) -> None:
-    plain, better = planner.solve(coarse, refine=False), planner.solve(coarse)
+    plain, better = solve(coarse, refine=False), solve(coarse)
     assert plain.status is better.status is Status.SOLVED
     assert plain.nodes == NO_MORE and better.nodes.total > 0
     over = [
@@ -334,7 +335,7 @@ def test_solve_adds_nodes_where_they_are_missing(coarse: Any) -> None:
     assert better.summary()["nodes_added"] == better.nodes.total
     # a neighbour starts with the same nodes
     moved = dataclasses.replace(coarse, point=np.asarray(coarse.point) - np.array([0.0, 0.0, 0.005]))
-    again = planner.solve(moved, start=better)
+    again = solve(moved, start=better)
     assert again.status is Status.SOLVED and set(again.nodes.swing) >= set(better.nodes.swing)
 
 
@@ -344,8 +345,8 @@ def test_nodes_are_added_where_effort_counts(
     """Each node's effort is a variable, so there are more of them then."""
     objectives = (Impulse(), Effort(weight=0.1))
     functions = changed(arm_transcription, objectives=objectives).functions
-    monkeypatch.setattr(planner, "block_functions", lambda *_: functions)
-    solution = planner.solve(dataclasses.replace(coarse, objectives=objectives))
+    monkeypatch.setattr(reconstruction, "block_functions", lambda *_: functions)
+    solution = solve(dataclasses.replace(coarse, objectives=objectives))
     assert solution.status is Status.SOLVED and solution.nodes.total > 0
     assert len(solution.attempts) > 1 and solution.attempts[-1].kept
 
@@ -355,7 +356,7 @@ def test_nodes_and_rows_between_bodies_are_added_together(coarse: Any) -> None:
     post = Obstacle(name="post", start=(0.65, 0.14, 0.85), end=(0.65, 0.34, 0.85), radius=0.03)
     none = TargetBody(shape="none")  # before it the arm is nowhere over its limits
     near = dataclasses.replace(coarse, terms=coarse.terms[:1], body=none, obstacles=(post,))
-    solution = planner.solve(near)
+    solution = solve(near)
     assert solution.status is Status.SOLVED and solution.nodes.total > 0 and solution.apart
     assert [attempt.kept for attempt in solution.attempts] == [True]
 
@@ -368,15 +369,15 @@ def test_bodies_that_are_near_at_the_start_are_kept_apart(
     """
     objectives = (Impulse(), Effort(weight=0.1))
     functions = changed(arm_transcription, objectives=objectives).functions
-    monkeypatch.setattr(planner, "block_functions", lambda *_: functions)
+    monkeypatch.setattr(reconstruction, "block_functions", lambda *_: functions)
     problem = dataclasses.replace(coarse, objectives=objectives, terms=coarse.terms[:1])
-    solution = planner.solve(problem)
+    solution = solve(problem)
     assert solution.status is Status.SOLVED and solution.clearance()["contacts_besides"] == []
     assert solution.result.iterations == solution.result.history[-1].iteration
     # what no way leads out of says what is in the way
     post = Obstacle(name="post", size=(0.1, 0.1, 0.1), position=tuple(problem.point))
     told: list[str] = []
-    barred = planner.solve(dataclasses.replace(problem, obstacles=(post,)), report=told.append)
+    barred = solve(dataclasses.replace(problem, obstacles=(post,)), report=told.append)
     assert barred.status is Status.INFEASIBLE
     assert any("first without them" in line for line in told)
     assert "post" in barred.result.message or barred.causes
@@ -384,7 +385,7 @@ def test_bodies_that_are_near_at_the_start_are_kept_apart(
 
 def test_a_solution_that_keeps_its_limits_is_the_plain_one(coarse: Any) -> None:
     fine = dataclasses.replace(coarse, terms=(TorqueLimit(fraction=0.5),))
-    solution = planner.solve(fine)
+    solution = solve(fine)
     assert solution.nodes == NO_MORE and len(solution.attempts) == 1
 
 
@@ -392,5 +393,5 @@ def test_a_plan_that_cannot_be_looked_at_is_not_lost(coarse: Any, monkeypatch: p
     def unreachable(*_: Any) -> MoreNodes:
         raise InputError("a leg does not reach")
 
-    monkeypatch.setattr(rounds, "nodes_to_add", unreachable)
-    assert planner.solve(coarse).status is Status.SOLVED
+    monkeypatch.setattr(between_nodes, "nodes_to_add", unreachable)
+    assert solve(coarse).status is Status.SOLVED

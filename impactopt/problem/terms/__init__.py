@@ -3,8 +3,8 @@
 `base` says what a term has. DEFAULT_TERMS hold in every problem; the constraints of most of them are in the
 transcription, and all other terms bring their own. ON_DEMAND_TERMS hold in every problem too, but a program
 has their constraints only if they are given, or once a plan without them has broken them
-(`impactopt.planning.on_demand`). The rest hold where they are given. A new one is a file here, and its lines
-below.
+(`impactopt.planning.lazy_constraints`). The rest hold where they are given. A new one is a file here, and
+its lines below.
 """
 
 from impactopt.problem.terms.balance import Balance

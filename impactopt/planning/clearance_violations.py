@@ -1,8 +1,8 @@
 """Detects clearance violations of a solution and selects the constraints and nodes to add.
 
-At its nodes a program has constraints on the clearance of near bodies (`keeping_apart`). If two bodies
-violate their clearance between two nodes, a node is added at that instant, which gets constraints as its
-bodies are near there. Where nodes are too dense for another, or in contact, which has none, the required
+At its nodes a program has constraints on the clearance of near bodies (`clearance_constraints`). If two
+bodies violate their clearance between two nodes, a node is added at that instant, which gets constraints as
+its bodies are near there. Where nodes are too dense for another, or in contact, which has none, the required
 clearance at the adjacent nodes is raised.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import DEEPEST, MISSED, Places
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.bodies.separation import THIN
-from impactopt.planning.keeping_apart import AFTER, Margins, Rows, Spots, spots_of
+from impactopt.planning.clearance_constraints import AFTER, Margins, Rows, Spots, spots_of
 from impactopt.transcription.clearance import ApartRow
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.mesh_refinement import MoreNodes

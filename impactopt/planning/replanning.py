@@ -10,15 +10,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from impactopt.planning.bent_program import Bent, bent_of
-from impactopt.planning.changes import moved_problem
-from impactopt.planning.keeping_apart import Margins
-from impactopt.planning.made_again import planned_by
-from impactopt.planning.multistart import Attempt, Budget, attempt_of, one_after_the_other, violations_of
-from impactopt.planning.on_demand import kept_on_demand
-from impactopt.planning.rounds import Refining
+from impactopt.planning.between_nodes import BetweenNodes
+from impactopt.planning.budget import Budget, one_after_the_other
+from impactopt.planning.clearance_constraints import Margins
+from impactopt.planning.lazy_constraints import LazyTerms
+from impactopt.planning.parameter_changes import moved_problem
+from impactopt.planning.parametric_program import Bent, bent_of
+from impactopt.planning.reconstruction import solution_of
+from impactopt.planning.refinement import Guess, Outcome
+from impactopt.planning.refinement import refine as refine_with
 from impactopt.planning.solution import Solution
 from impactopt.solvers.active import Change
 from impactopt.solvers.predictor import Prediction
@@ -28,7 +29,6 @@ from impactopt.transcription.transcription import Transcription
 
 __all__ = ["moved_solution"]
 
-Array = NDArray[np.float64]
 _FIRST_ORDER = 1e-3  # of constraints: a first-order plan that is off by more is none
 _ENOUGH, _CORRECTIONS = 1e-4, 4  # of constraints: no more steps; and so many at most beside the first
 _BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near
@@ -49,7 +49,7 @@ def moved_solution(
 ) -> Solution:
     """The plan for a problem with other parameters: `Solution.moved`.
 
-    changes : as of `impactopt.planning.changes.moved_problem`.
+    changes : as of `impactopt.planning.parameter_changes.moved_problem`.
     """
     problem = moved_problem(solution.problem, **changes)
     bent = bent_of(solution)
@@ -60,27 +60,23 @@ def moved_solution(
     budget = Budget(solver="sqp", options=options, time_limit=time_limit, callback=callback).started()
     first = _first_order(solution, t, bent)
     if not polish:
-        return _solution(solution, t, first, (built - began, time.perf_counter() - built))
+        return _solution(solution, Outcome.of(t, first), (built - began, time.perf_counter() - built))
     margins = Margins(problem) if problem.keeps_apart else None
-    refining = Refining(budget, margins, solution.apart, None, mesh=refine)
-
-    def fixed(t: Transcription, result: SolverResult, x0: Array) -> tuple[Transcription, SolverResult]:
-        return refining.judged(*refining.rounds(t, result, x0)[:2])
-
-    old = solution.result
-    result = _polished(budget, t, first, old)
-    t, result = fixed(t, result, old.x)
-
+    origin = Guess(program=t, start=solution.result)
     # new constraints are farther off than what a tolerance for small moves makes up for
     given = {name: value for name, value in (options or {}).items() if not name.endswith("_tolerance")}
     exact = replace(budget, options=given)
 
-    def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
-        x0 = start.x if isinstance(start, SolverResult) else start
-        return fixed(other, exact.run(other.program, start), x0)
+    def refined(outcome: Outcome[Transcription]) -> Outcome[Transcription]:
+        return BetweenNodes(budget, margins, mesh=refine).refined(outcome)
 
-    t, result = kept_on_demand(t, result, (t, old), solve, lambda *_: ())
-    return _solution(solution, t, result, (built - began, time.perf_counter() - built))
+    def solve(guess: Guess[Transcription]) -> Outcome[Transcription]:
+        return refined(Outcome.of(guess.program, exact.run(guess.program.program, guess.start), guess))
+
+    first = _polished(budget, t, first, solution.result)
+    outcome = refined(Outcome.of(t, first, origin))
+    outcome = refine_with(outcome, [LazyTerms(finer=False)], solve, budget)
+    return _solution(solution, outcome, (built - began, time.perf_counter() - built))
 
 
 def _polished(budget: Budget, t: Transcription, first: SolverResult, old: SolverResult) -> SolverResult:
@@ -161,20 +157,12 @@ def _result(
     )
 
 
-def _solution(
-    old: Solution, t: Transcription, result: SolverResult, seconds: tuple[float, float]
-) -> Solution:
-    attempt: Attempt = replace(attempt_of(t, "moved", result), kept=True)
-    return Solution(
+def _solution(old: Solution, outcome: Outcome[Transcription], seconds: tuple[float, float]) -> Solution:
+    t = outcome.program
+    return solution_of(
+        replace(outcome, attempts=(outcome.attempt("moved"),)),
         solver=old.solver,
-        build_seconds=seconds[0],
-        solve_seconds=seconds[1],
-        violations=violations_of(t, result.x, t.program.constraints(result.x)),
-        objectives=t.achieved(result.x),
-        gains=old.gains,
-        attempts=(attempt,),
+        seconds=seconds,
         statement=statement_of(t) if len(t.rows.origins) == t.program.m else old.statement,
-        problem=t.problem,
-        result=result,
-        **planned_by(t, result),
+        gains=old.gains,
     )

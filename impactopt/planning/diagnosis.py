@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.causes import Cause
-from impactopt.planning.multistart import VIOLATED, Budget
 from impactopt.planning.solution import Solution
 from impactopt.problem.feasibility import too_weak
 from impactopt.robots.sole_margins import shortfalls
@@ -24,13 +24,7 @@ Array = NDArray[np.float64]
 TOLD = 3  # margins at most, in a message
 
 
-def second_look(
-    budget: Budget,
-    program: NonlinearProgram,
-    start: Array,
-    old: SolverResult,
-    report: Callable[[str], None] | None = None,
-) -> SolverResult:
+def second_look(budget: Budget, program: NonlinearProgram, start: Array, old: SolverResult) -> SolverResult:
     """The result that IPOPT comes to from the same start, where the SQP gave up, if it says more.
 
     It scales constraints, and restores them by another way, so it rarely fails on the same programs. A limit
@@ -42,8 +36,7 @@ def second_look(
     rows = max_violation(program, old.x, program.constraints(old.x))
     if old.status is Status.FAILED and rows <= VIOLATED < old.max_violation:
         return old  # it has been refused for what is no constraint
-    if report is not None:
-        report("our solver ends without a diagnosis: IPOPT tries once, from the same start")
+    budget.say("our solver ends without a diagnosis: IPOPT tries once, from the same start")
     new = replace(budget, solver="ipopt", options=None).run(program, start)
     if new.status is Status.INTERRUPTED or _rank(new) < _rank(old):
         return new

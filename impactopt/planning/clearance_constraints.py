@@ -9,7 +9,6 @@ on another side of each other. So a solution's bodies are on the side of each ot
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,8 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.bodies.separation import ROUNDING, Looked, Placed
-from impactopt.planning.multistart import Budget, one_after_the_other
+from impactopt.planning.budget import Budget, one_after_the_other
+from impactopt.planning.refinement import Guess, Outcome, Program
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import SolverResult
@@ -28,7 +28,6 @@ from impactopt.transcription.layout import stack
 
 Array = NDArray[np.float64]
 Rows = dict[ApartRow, Held]
-Program = TypeVar("Program", bound=ContactProgram)
 WITHIN, AFTER = 1, 2  # phases in and after contact
 # [m] nearer bodies get a constraint: when there are to be more of them, and what asks for more
 NEAR, ENTERS = 0.1, 0.03
@@ -239,33 +238,27 @@ class Watch:
         return bool((found.gaps[spot, pair] < deep).any())
 
 
-def solved_apart(
-    budget: Budget,
-    margins: Margins | None,
-    t: Program,
-    start: Array | SolverResult,
-    barrier: float | None = None,
-    most: int | None = None,
-) -> tuple[Program, SolverResult]:
-    """A program with constraints for bodies that come near at its start and on the way to its solution, and
-    its result with the effort of all.
+def solved_apart(budget: Budget, margins: Margins | None, guess: Guess[Program]) -> Outcome[Program]:
+    """Outcome of a program with constraints for bodies that come near in its initial guess and on the way to
+    its solution.
 
-    start, barrier, most : as of `Budget.run`; multipliers are those of ``t``.  margins : None: as it is.
+    margins : None: the program as it is.
     """
+    t, start = guess.program, guess.warm or guess.x
     if margins is None:
-        return t, budget.run(t.program, start, barrier, most)
-    watch = Watch(t, margins, start.x if isinstance(start, SolverResult) else start)
+        return Outcome.of(t, budget.run(t.program, start, guess.barrier, guess.most), guess)
+    watch = Watch(t, margins, guess.x)
     t, start = _with_more(t, watch, start)
-    result = budget.run(t.program, start, barrier, most, watch=watch)
+    result = budget.run(t.program, start, guess.barrier, guess.most, watch=watch)
     # other solvers do not ask on the way
     while watch.left or (not budget.interior and result.status.usable and watch.lacks(result.x)):
         last, before, path = result, t, watch.path
         t, start = _with_more(t, watch, last)
         if path is not None:
             path = replace(path, rows=_of_names(path.rows, before, t, np.nan))
-        new = budget.run(t.program, start, None, most, watch=watch, path=path)
+        new = budget.run(t.program, start, None, guess.most, watch=watch, path=path)
         result = one_after_the_other(last, new)
-    return t, result
+    return Outcome.of(t, result, guess)
 
 
 def _with_more(t: Program, watch: Watch, start: Array | SolverResult) -> tuple[Program, Array | SolverResult]:

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.planning.multistart import Budget, carried, one_after_the_other, violations_of
-from impactopt.planning.on_demand import program_for
+from impactopt.planning.budget import Budget, one_after_the_other
+from impactopt.planning.refinement import Evaluation, Outcome, Program, carried, program_for
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.gains import scaled_gains, with_room
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.contact_program import ContactProgram
-from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.transcription import Transcription
 
-__all__ = ["ChosenGains", "roomy", "settled", "with_chosen", "with_factors_of"]
+__all__ = ["ChosenGains", "chosen_of", "roomy", "settled", "with_chosen", "with_factors_of"]
 
 Array = NDArray[np.float64]
-Program = TypeVar("Program", Transcription, StrikeTranscription)
 _BARRIER = 1e-7  # of the settled program, whose start is a solution
 _AT_BOUND = 1e-3  # of a factor's logarithm
 
@@ -109,43 +106,39 @@ def _in_torques_of(t: ContactProgram, robot: Robot, start: SolverResult) -> Solv
     return replace(start, x=t.with_lifted(x))
 
 
-def settled(
-    t: Program, fields: dict[str, Any], budget: Budget, report: Callable[[str], None] | None
-) -> tuple[Program, dict[str, Any]]:
-    """The program of the robot with the gains that a result has chosen, and the fields of its solution.
-
-    Where gains are best, the same motion is best for them as they are: it is solved once more from there, to
-    be so to the last digit. What comes after, such as replays, knows of no choice.
-    """
+def chosen_of(t: ContactProgram, x: Array) -> tuple[ChosenGains, ...]:
+    """Gains that variables (n,) choose for what the problem leaves open."""
     if not t.problem.gains:
-        return t, fields
-    old: SolverResult = fields["result"]
-    factors = np.exp(t.hit.contact.gains.read(old.x)[0])
-    names, problem = t.robot.joint_names, with_chosen(t.problem, factors)
-    chosen = tuple(
+        return ()
+    factors = np.exp(t.hit.contact.gains.read(x)[0])
+    names, robot = t.robot.joint_names, with_chosen(t.problem, factors).robot
+    return tuple(
         ChosenGains(
             joints=tuple(names[k] for k in joints),
             factor=float(factor),
             between=gain.factor,
-            stiffness={names[k]: float(problem.robot.kp[k]) for k in joints},
-            damping={names[k]: float(problem.robot.kd[k]) for k in joints},
+            stiffness={names[k]: float(robot.kp[k]) for k in joints},
+            damping={names[k]: float(robot.kd[k]) for k in joints},
         )
         for factor, joints, gain in zip(factors, t.problem.gain_joints, t.problem.gains, strict=True)
     )
-    if report is not None:
-        said = "; ".join(f"{', '.join(c.joints)} x {c.factor:.3g}" for c in chosen)
-        report(f"gains are chosen: {said}; on with these")
-    new = program_for(t, problem, None)
+
+
+def settled(outcome: Outcome[Program], chosen: Sequence[ChosenGains], budget: Budget) -> Outcome[Program]:
+    """Outcome of the program of the robot with the gains that a solution has chosen.
+
+    Where gains are best, the same motion is best for them as they are: it is solved once more from there, to
+    be so to the last digit. What comes after, such as replays, knows of no choice.
+    """
+    if not chosen:
+        return outcome
+    t, old = outcome.program, outcome.result
+    words = "; ".join(f"{', '.join(c.joints)} x {c.factor:.3g}" for c in chosen)
+    budget.say(f"gains are chosen: {words}; on with these")
+    new = program_for(t, with_chosen(t.problem, [c.factor for c in chosen]))
     result = _in_torques_of(new, t.robot, carried(new, t, old))
     if old.status.usable and budget.left != 0:
         polished = budget.near_by().run(new.program, result, _BARRIER)
         if polished.status.usable:
             result = one_after_the_other(old, polished)
-    return new, {
-        **fields,
-        "problem": problem,
-        "result": result,
-        "violations": violations_of(new, result.x, new.program.constraints(result.x)),
-        "objectives": new.achieved(result.x),
-        "gains": chosen,
-    }
+    return replace(outcome, at=Evaluation(new, result.x), result=result)

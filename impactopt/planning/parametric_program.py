@@ -11,9 +11,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.planning.changes import changed
-from impactopt.planning.keeping_apart import same_bodies
-from impactopt.planning.made_again import program_on
+from impactopt.planning.clearance_constraints import same_bodies
+from impactopt.planning.parameter_changes import changed
+from impactopt.planning.reconstruction import program_on
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.active import ActiveSystem, Offset

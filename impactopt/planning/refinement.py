@@ -1,0 +1,316 @@
+"""Refinement loop: solve, ask oracles what the solution lacks, add it, solve again.
+
+An oracle checks one aspect of a solution (clearance, mesh and contact; gear loads and slips; prices of
+motion) and returns what the nonlinear program lacks there. Plans, strikes and re-planning all go through
+`refine`, with oracles of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.planning.budget import VIOLATED, Budget, one_after_the_other, rank_of, with_effort_of
+from impactopt.planning.contact_replay import ContactReplay, PlannedContact, checked, planned_contact
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import SolverResult, Status, Violation, max_violation, worst_rows
+from impactopt.transcription.clearance import ApartRow, Held
+from impactopt.transcription.contact_program import ContactProgram
+from impactopt.transcription.contact_refinement import ContactError, contact_error
+from impactopt.transcription.initial_guess import carried_over
+from impactopt.transcription.mesh import Elements, Shares
+from impactopt.transcription.mesh_refinement import MoreNodes
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import Transcription, block_functions
+
+__all__ = ["Additions", "Attempt", "Evaluation", "Guess", "Oracle", "Outcome", "program_for", "refine"]
+
+Array = NDArray[np.float64]
+Program = TypeVar("Program", Transcription, StrikeTranscription)
+NAMED = 20  # violated constraints at most
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """Result of the solve from one initial guess, or of one round of refinement.
+
+    start : its name; impulse [N s]; seconds: of the solver; kept: it is the one that was best.
+    """
+
+    start: str
+    status: Status
+    impulse: float
+    objective: float
+    max_violation: float
+    iterations: int
+    seconds: float
+    kept: bool = False
+
+    def summary(self) -> dict[str, Any]:
+        """JSON form, as it stands in ``summary.json``."""
+        return {
+            "start": self.start,
+            "status": self.status.value,
+            "impulse_Ns": self.impulse,
+            "objective": self.objective,
+            "max_violation": self.max_violation,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "kept": self.kept,
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Guess(Generic[Program]):
+    """Nonlinear program with an initial guess.
+
+    start : variables (n,), or the result of a neighbouring program with its multipliers: a warm start.
+    barrier, most : as of `Budget.run`.
+    """
+
+    program: Program
+    start: Array | SolverResult
+    barrier: float | None = None
+    most: int | None = None
+
+    @property
+    def x(self) -> Array:
+        return self.start.x if isinstance(self.start, SolverResult) else self.start
+
+    @property
+    def warm(self) -> SolverResult | None:
+        """Result that the solve goes on from; None if its multipliers are those of other constraints."""
+        fits = isinstance(self.start, SolverResult) and len(self.start.multipliers) == self.program.program.m
+        return self.start if fits and isinstance(self.start, SolverResult) else None
+
+    @classmethod
+    def mapped(cls, new: Program, old: Program, result: SolverResult, **more: Any) -> Guess[Program]:
+        """A program's result as the warm start of another one (`carried_over`)."""
+        return cls(program=new, start=carried(new, old, result), **more)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation(Generic[Program]):
+    """Values of a program at variables (n,), each computed once."""
+
+    program: Program
+    x: Array
+
+    @cached_property
+    def planned(self) -> Any:
+        """The `Plan`, or `PlannedStrike`."""
+        return self.program.decode(self.x)
+
+    @cached_property
+    def contact_error(self) -> ContactError | None:
+        """Discretization error of the contact; None of a strike, and of an impact without duration."""
+        return contact_error(self.program, self.x) if isinstance(self.program, Transcription) else None
+
+    @cached_property
+    def contact(self) -> PlannedContact | None:
+        """The planned contact; None while gains are open, as the robot is another one then."""
+        return None if self.program.problem.gains else planned_contact(self.program, self.x, self.planned)
+
+    @property
+    def replay(self) -> ContactReplay | None:
+        """Replay of the planned contact in full dynamics."""
+        return None if self.contact is None else self.contact.replay
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome(Generic[Program]):
+    """Result of a refinement.
+
+    at : the program that was solved last, at its solution.  result : with the effort of all rounds.
+    origin : the guess that the first round was solved from.  attempts : of all rounds, or all guesses.
+    """
+
+    at: Evaluation[Program]
+    result: SolverResult
+    origin: Guess[Program]
+    attempts: tuple[Attempt, ...] = ()
+
+    @classmethod
+    def of(
+        cls, program: Program, result: SolverResult, origin: Guess[Program] | None = None
+    ) -> Outcome[Program]:
+        """Outcome of one solve; ``origin``: its guess, if not the result itself."""
+        origin = Guess(program=program, start=result) if origin is None else origin
+        return cls(at=Evaluation(program, result.x), result=result, origin=origin)
+
+    @property
+    def program(self) -> Program:
+        return self.at.program
+
+    @property
+    def usable(self) -> bool:
+        return self.result.status.usable
+
+    @property
+    def own_violation(self) -> float:
+        """Largest violation of the program's own constraints."""
+        program = self.program.program
+        return max_violation(program, self.result.x, program.constraints(self.result.x))
+
+    @property
+    def refused(self) -> bool:
+        """True if the constraints are met, and the solution is refused for penetration or its replay."""
+        failed = self.result.status is Status.FAILED and self.result.max_violation > VIOLATED
+        return failed and self.own_violation <= VIOLATED
+
+    @property
+    def violations(self) -> tuple[Violation, ...]:
+        """Violated constraints, worst first."""
+        x, program = self.result.x, self.program.program
+        return tuple(worst_rows(program, x, program.constraints(x), tolerance=VIOLATED, count=NAMED))
+
+    def attempt(self, name: str) -> Attempt:
+        r = self.result
+        return Attempt(
+            start=name,
+            status=r.status,
+            impulse=self.program.impulse(r.x),
+            objective=r.objective,
+            max_violation=r.max_violation,
+            iterations=r.iterations,
+            seconds=r.seconds,
+            kept=True,
+        )
+
+    def then(self, new: Outcome[Program], name: str = "") -> Outcome[Program]:
+        """The new outcome with the effort of both, and one attempt more of this name."""
+        attempts = (*(replace(a, kept=False) for a in self.attempts), new.attempt(name))
+        result = one_after_the_other(self.result, new.result)
+        return replace(new, result=result, origin=self.origin, attempts=attempts)
+
+    def else_then(self, new: Outcome[Program]) -> Outcome[Program]:
+        """The same after a failure; this one if it has failed less far off, with the effort of both."""
+        both, ended = self.then(new), new.usable or new.result.status is Status.INTERRUPTED
+        if ended or not rank_of(self.result) < rank_of(new.result):
+            return both
+        return replace(self, result=with_effort_of(self.result, both.result))
+
+    def checked(self) -> Outcome[Program]:
+        """The same, solved only if its contact is what it says when followed in full dynamics."""
+        return replace(self, result=checked(self.result, self.at.replay)) if self.usable else self
+
+
+Solve = Callable[[Guess[Program]], Outcome[Program]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Additions(Generic[Program]):
+    """Additions that a solution calls for.
+
+    name : for the list of attempts.  why : for the report.
+    guesses : programs that have it, to be solved one after the other until one is; each made in its turn.
+    without : addition to the message of a failed solve, whose solution before it is none. "": then that
+        solution stays.
+    """
+
+    name: str
+    why: str
+    guesses: Iterable[Guess[Program]]
+    without: str = ""
+
+
+class Oracle(Protocol[Program]):
+    """One aspect that solutions are checked for.
+
+    most : rounds of one refinement.
+    """
+
+    most: int
+
+    def missing(self, outcome: Outcome[Program]) -> Additions[Program] | None:
+        """Additions that a solution calls for; None if it lacks nothing, or nothing that can be added."""
+
+
+def refine(
+    outcome: Outcome[Program], oracles: Sequence[Oracle[Program]], solve: Solve[Program], budget: Budget
+) -> Outcome[Program]:
+    """Outcome that lacks nothing by all oracles, or the last solution before additions failed.
+
+    Oracles are nested: what one has added is solved and refined by those before it, and then asked again.
+
+    outcome : of the initial guess.  solve : one program from one guess.
+    """
+    if not oracles:
+        return outcome
+    before: Sequence[Oracle[Program]] = oracles[:-1]
+    oracle = oracles[-1]
+    outcome = refine(outcome, before, solve, budget)
+
+    def refined(guess: Guess[Program]) -> Outcome[Program]:
+        return refine(solve(guess), before, solve, budget)
+
+    for _ in range(oracle.most):
+        lacks = oracle.missing(outcome) if outcome.usable else None
+        if lacks is None or (budget.left == 0 and not lacks.without):
+            break
+        budget.say(lacks.why)
+        new = _first_usable(lacks.guesses, refined, budget)
+        if not new.usable:
+            if not lacks.without:
+                break
+            if new.result.status is not Status.INTERRUPTED:
+                message = f"{new.result.message} {lacks.without}"
+                new = replace(new, result=replace(new.result, message=message))
+        outcome = outcome.then(new, lacks.name)
+    return outcome
+
+
+def _first_usable(
+    guesses: Iterable[Guess[Program]], solve: Solve[Program], budget: Budget
+) -> Outcome[Program]:
+    """The first outcome that is a solution, or the best of all, with the effort of all."""
+    done: Outcome[Program] | None = None
+    for guess in guesses:
+        new = solve(guess)
+        done = new if done is None else done.else_then(new)
+        if new.usable or new.result.status is Status.INTERRUPTED or budget.left == 0:
+            break
+    assert done is not None
+    return done
+
+
+def program_for(
+    t: Program,
+    problem: ImpactProblem | None = None,
+    *,
+    nodes: MoreNodes | None = None,
+    elements: Elements | None = None,
+    shares: Shares | None = None,
+    constraints: Mapping[ApartRow, Held] | None = None,
+    report: Callable[[str], None] | None = None,
+) -> Program:
+    """A program with another problem, or on another mesh, or with other clearance constraints."""
+    constraints = t.apart_rows if constraints is None else constraints
+    problem = problem or t.problem
+    elements = elements or (t.hit.elements if t.hit.guarded else ())
+    shares = t.hit.shares if shares is None else shares
+    functions = block_functions(problem, problem.coordinates, report, elements)
+    new: Program
+    if isinstance(t, StrikeTranscription):
+        new = type(t)(problem, problem.coordinates, functions, elements, shares)
+    else:
+        new = Transcription(problem, problem.coordinates, functions, nodes or t.nodes, elements, shares)
+    return new.with_apart(constraints) if constraints else new
+
+
+def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> SolverResult:
+    """A program's result mapped to another one, see `carried_over`."""
+    if new is old:
+        return result
+    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
+    return replace(result, x=x, multipliers=y, bound_multipliers=z)
+
+
+def start_of(new: Program, old: Program, x: Array) -> Array:
+    """Variables (n,) of a program mapped to another one."""
+    return carried_over(new, old, x, np.zeros(old.program.m), np.zeros(old.layout.n))[0]

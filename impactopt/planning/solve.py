@@ -1,0 +1,282 @@
+"""Solve: from a problem to its solution.
+
+`solve` checks what is asked; `_planned` goes from the problem to a nonlinear program (`Transcription`), its
+initial guesses, their refinement (`refine`), a diagnosis where none leads to a solution, and the `Solution`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.planning.between_nodes import BetweenNodes
+from impactopt.planning.budget import VIOLATED, Budget, stopping
+from impactopt.planning.causes import Cause, search
+from impactopt.planning.cautions import window_caution
+from impactopt.planning.clearance_constraints import Margins, same_bodies, solved_apart
+from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
+from impactopt.planning.gain_selection import chosen_of, roomy, settled
+from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, with_rows
+from impactopt.planning.models import carried_start
+from impactopt.planning.motion_price import MotionPrice, with_first_scale
+from impactopt.planning.multistart import (
+    Guesses,
+    best_of,
+    best_of_starts,
+    check_starts,
+    drawn_guesses,
+)
+from impactopt.planning.reconstruction import program_of, program_on, solution_of
+from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
+from impactopt.planning.solution import Solution
+from impactopt.planning.strike import clear_strike
+from impactopt.problem.feasibility import hopeless
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import Callback, SolverResult, Status
+from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
+from impactopt.transcription.mesh_refinement import NO_MORE
+from impactopt.transcription.program_summary import statement_of
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import Transcription
+
+Array = NDArray[np.float64]
+STARTS = ("reach", "strike")
+_STUCK = (Status.INFEASIBLE, Status.FAILED)
+
+
+def solve(
+    problem: ImpactProblem,
+    *,
+    solver: str = "sqp",
+    start: str | ArrayLike | Solution = "reach",
+    starts: int = 1,
+    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
+    time_limit: float | None = None,
+    workers: int = 1,
+    refine: bool = True,
+    report: Callable[[str], None] | None = None,
+    callback: Callback | None = None,
+) -> Solution:
+    """Plan the motion that maximizes the problem's objectives, by default the impulse, within its terms.
+
+    solver : "sqp", our own, or "ipopt". Ours is a primal-dual interior-point method: it takes one Newton step
+        on each quadratic model of the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which
+        solves its QPs to their end, for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
+    start : "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such
+        a reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables (n,); or
+        the solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
+    starts : number of starts. The first one is plain, the others have perturbed postures and other speeds,
+        drawn by ``seed``. The best motion is kept; ``Solution.attempts`` has all. Where all end with bodies
+        in each other, up to two more are tried.
+    options : the solver's own.  time_limit [s] : of all starts together, without compiling functions.
+    workers : processes that the starts are solved on, side by side. Then no callback is asked, and no more
+        starts are tried than were asked for.
+    refine : whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin
+        between two nodes, and it is solved again from the solution, at most three times (``Solution.nodes``).
+        The contact gets finer elements while theirs make an error of more than half a per cent of the impulse
+        (``Solution.elements``, ``Solution.contact_error``).
+    report : called with a line of text while functions are built.  callback : called with every iteration's
+        record; if it returns True, or on Ctrl-C, the solve stops with the best iterate.
+
+    An infeasible problem is a status with named constraints, not an exception.
+
+    Raises
+    ------
+    InputError : unknown solver, option or start, a start of the wrong length, several of a given start.
+    """
+    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
+    check_starts(starts, seed, workers, callback, given=not isinstance(start, str))
+    if isinstance(start, str) and start not in STARTS:
+        near = did_you_mean(start, STARTS)
+        raise InputError(
+            f"unknown start {start!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
+        )
+    one = partial(_planned, seed, refine)
+    with stopping() as stop:
+        budget = replace(budget, stop=stop)
+        return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
+
+
+def _planned(
+    seed: int,
+    refined: bool,
+    problem: ImpactProblem,
+    start: str | ArrayLike | Solution,
+    budget: Budget,
+    which: range,
+    last: int,
+) -> Solution:
+    """Solution from the given start, or the best from these starts.
+
+    last : number that further starts end before, if all are refused.
+    """
+    began = time.perf_counter()
+    t, given = _program(problem, start, budget)
+    budget = budget.started()
+    if isinstance(given, SolverResult) and Outcome.of(t, given).own_violation <= VIOLATED:
+        budget = budget.near_by()  # the start may be the optimum
+    budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
+    margins = Margins(t.problem) if t.problem.keeps_apart else None
+    # guesses compare only once their solutions are clear of bodies and within gears: each is refined; where
+    # no bodies are kept apart, refining the best one is enough
+    solver = PlanSolver(budget=budget, margins=margins, refined=refined and margins is not None)
+    if isinstance(start, Solution) and margins is not None and same_bodies(t.problem, start.problem):
+        t = t.with_apart(start.apart)
+    built, guesses = time.perf_counter(), _guesses(t, given, range(which.start, last), seed, solver)
+    outcome = best_of(guesses, solver.from_guess, budget, len(which))
+    if refined and margins is None:
+        outcome = solver.on(outcome)
+    known = hopeless(t.problem) if lacks_rows(outcome.program, outcome.result) else []
+    causes: tuple[Cause, ...] = ()
+    if not known:
+        outcome, causes = _diagnosed(outcome, solver)
+    gains = chosen_of(outcome.program, outcome.result.x)
+    outcome = settled(outcome, gains, budget)
+    t, solved = outcome.program, time.perf_counter()
+    outcome = replace(outcome, result=with_reason(t, outcome.result, causes, known=known)).checked()
+    usable = outcome.usable
+    solution = solution_of(
+        outcome,
+        solver=budget.solver,
+        seconds=(built - began, solved - built),
+        statement=statement_of(t),
+        gains=gains,
+        causes=tuple(cause for cause in causes if cause.problem is not None),
+        window=window_caution(t, outcome.result) if usable else "",
+        contact_error=outcome.at.contact_error if usable else None,
+    )
+    return with_soles_kept(solution) if refined else solution
+
+
+def _program(
+    problem: ImpactProblem, start: str | ArrayLike | Solution, budget: Budget
+) -> tuple[Transcription, str | Array | SolverResult]:
+    """A problem's nonlinear program, on the mesh of a given solution, and the given start on it."""
+    if not isinstance(start, Solution):
+        t = program_on(roomy(problem), NO_MORE, (), (), budget.report)
+        if isinstance(start, str):
+            return with_first_scale(t), start
+        return t, check_array("start", start, (t.program.n,))
+    # a neighbour is likely to need the same constraints and prices
+    problem = with_rows(problem, rows_on_demand(start.problem))
+    if problem.style == start.problem.style:
+        problem = replace(problem, price_scale=start.problem.price_scale)
+    t = program_on(roomy(problem), start.nodes, start.elements, start.shares, budget.report)
+    apart = start.apart if same_bodies(problem, start.problem) else {}
+    given = carried_start(t, partial(program_of, start), start, apart)
+    check_array("start", given.x, (t.program.n,))
+    return t, given
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanSolver:
+    """Solves plans from their initial guesses.
+
+    margins : required clearance; None where bodies are not kept apart.  refined : whether each is refined.
+    """
+
+    budget: Budget
+    margins: Margins | None
+    refined: bool
+
+    def from_guess(self, guess: Guess[Transcription]) -> Outcome[Transcription]:
+        """Outcome of an initial guess, with the lazy constraints that it needs and at its price of motion."""
+        oracles: list[Oracle[Transcription]] = [LazyTerms(self.budget.report), MotionPrice()]
+        return refine(self._solved(guess), oracles, self._solved, self.budget)
+
+    def on(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
+        """A solution refined further, where it has not been."""
+        own = replace(self, refined=True)
+
+        def solve(guess: Guess[Transcription]) -> Outcome[Transcription]:
+            return solved_apart(self.budget, self.margins, guess)
+
+        outcome = refine(outcome, [BetweenNodes(self.budget, self.margins)], solve, self.budget)
+        return refine(outcome, [LazyTerms(self.budget.report)], own._solved, self.budget)
+
+    def _solved(self, guess: Guess[Transcription]) -> Outcome[Transcription]:
+        """Outcome of an initial guess, refined between nodes; by a second solver where the first gives up."""
+        outcome = solved_apart(self.budget, self.margins, guess)
+        if not self.refined:
+            return outcome if self.margins is not None else self._looked_at(outcome)
+        if self._stuck(outcome.result) and outcome.program.apart_rows and self.budget.left != 0:
+            outcome = self._solved_without_clearance(outcome)
+        else:
+            outcome = self._between(outcome)
+        looked = self._looked_at(outcome)
+        return looked if looked is outcome or not looked.usable else self._between(looked)
+
+    def _between(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
+        return BetweenNodes(self.budget, self.margins).refined(outcome)
+
+    def _looked_at(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
+        """Outcome without a diagnosis, with that of another solver from the same guess."""
+        t, old = outcome.program, outcome.result
+        new = second_look(self.budget, t.program, outcome.origin.x, old)
+        return outcome if new is old else outcome.then(Outcome.of(t, new))
+
+    def _stuck(self, result: SolverResult) -> bool:
+        """True if the solver has ended without a solution, and not at a limit that the caller has set."""
+        if result.status is Status.ITERATION_LIMIT:
+            return "max_iterations" not in (self.budget.options or {})
+        return result.status in _STUCK
+
+    def _solved_without_clearance(self, stuck: Outcome[Transcription]) -> Outcome[Transcription]:
+        """Outcome of an initial guess with which the first clearance constraints lead nowhere.
+
+        A solver that stops there does not show that there is no motion: the constraints are linearized for
+        the bodies as they are in the guess. So the motion is first found without them and then moved out of
+        penetration; if that fails too, the violated constraints name the obstacle.
+        """
+        self.budget.say("no motion was found from there with clearance constraints: first without them")
+        free = stuck.program.with_apart({})
+        found = self._between(Outcome.of(free, self.budget.run(free.program, stuck.origin.x), stuck.origin))
+        return stuck.then(found) if found.usable else found.then(stuck)
+
+
+def _diagnosed(
+    outcome: Outcome[Transcription], solver: PlanSolver
+) -> tuple[Outcome[Transcription], tuple[Cause, ...]]:
+    """Diagnosis of a failed solve: the bounds that make it infeasible, or a solution from a feasible point
+    that the diagnosis has found.
+
+    A limit that the caller has set is an answer, and stays one.
+    """
+    budget, old = solver.budget, outcome.result
+    limited = old.status is Status.ITERATION_LIMIT and "max_iterations" in (budget.options or {})
+    if limited or not lacks_rows(outcome.program, old) or budget.left == 0:
+        return outcome, ()
+    budget.say("no motion meets all bounds: which one would have to move?")
+    found = search(outcome.program, old, budget)
+    if found.met is None or budget.left == 0:
+        return outcome, found.causes
+    budget.say("there is a motion that meets all bounds: on from there")
+    program, x = found.met
+    new = solver.from_guess(Guess(program=program, start=x))
+    return (outcome.then(new, "a motion within all bounds") if new.usable else outcome), ()
+
+
+def _guesses(
+    t: Transcription, start: str | Array | SolverResult, which: range, seed: int, solver: PlanSolver
+) -> Guesses[Transcription]:
+    """Named initial guesses: the given one, or drawn reaches, or the strikes that these lead to."""
+    if not isinstance(start, str):
+        return [("given", partial(Guess, program=t, start=start))]
+    strike = StrikeTranscription(t.problem, t.coordinates, t.functions) if start == "strike" else None
+
+    def guess(draw: dict[str, Any]) -> Guess[Transcription]:
+        if strike is None:
+            return Guess(program=t, start=first_iterate(t, **draw))
+        reach = Guess(program=strike, start=strike_iterate(strike, **draw))
+        found = clear_strike(solver.budget, solver.margins, reach)
+        return Guess(program=t, start=iterate_from_strike(t, found.program, found.result.x))
+
+    return drawn_guesses(start, guess, which, seed)

@@ -1,0 +1,92 @@
+"""Order of the oracles in the refinement loop, failed additions, and the effort of all rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impactopt.planning.budget import Budget
+from impactopt.planning.refinement import Additions, Guess, Outcome, refine
+from impactopt.solvers.program import SolverResult, Status
+
+FAILS = -1.0  # a guess from which there is no solution
+
+
+def solved(guess: Guess[Any]) -> Outcome[Any]:
+    """Ten iterations from any guess, to a solution at the guess itself."""
+    result = SolverResult(
+        x=guess.x,
+        multipliers=np.zeros(0),
+        bound_multipliers=np.zeros(0),
+        objective=0.0,
+        status=Status.INFEASIBLE if FAILS in guess.x else Status.SOLVED,
+        iterations=10,
+        seconds=0.1,
+        seconds_functions=0.0,
+        seconds_qp=0.0,
+        max_violation=float(FAILS in guess.x),
+        kkt=0.0,
+        message="Told.",
+        history=(),
+    )
+    return Outcome.of(guess.program, result, guess)
+
+
+PROGRAM: Any = SimpleNamespace(impulse=lambda x: float(x.sum()))
+
+
+class Lacking:
+    """Oracle that has one entry of x raised to a value, from guesses some of which fail."""
+
+    most = 5
+
+    def __init__(
+        self, entry: int, value: float, asked: list[int], *, fails: int = 0, without: str = ""
+    ) -> None:
+        self.entry, self.value, self.asked, self.fails, self.without = entry, value, asked, fails, without
+
+    def missing(self, outcome: Outcome[Any]) -> Additions[Any] | None:
+        self.asked.append(self.entry)
+        x = outcome.result.x
+        if x[self.entry] >= self.value:
+            return None
+
+        def guesses() -> Iterator[Guess[Any]]:
+            for k in range(2):
+                there = np.where(np.arange(2) == self.entry, x + 1, 0 * x)  # loses what others have added
+                yield Guess(program=PROGRAM, start=np.append(there, FAILS) if k < self.fails else there)
+
+        return Additions(name="more", why="more", guesses=guesses(), without=self.without)
+
+
+def refined(*oracles: Lacking) -> Outcome[Any]:
+    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    return refine(solved(Guess(program=PROGRAM, start=np.zeros(2))), oracles, solved, budget)
+
+
+def test_what_an_oracle_adds_is_refined_by_those_before_it() -> None:
+    asked = list[int]()
+    found = refined(Lacking(0, 1.0, asked), Lacking(1, 2.0, asked))
+    assert asked[:4] == [0, 0, 1, 0], "the second one is asked once the first lacks nothing"
+    assert found.result.x[0] == 1.0, "and the first one again, of what the second one has led to"
+
+
+@pytest.mark.parametrize("without", ["", "Without it there is a plan."])
+def test_a_failed_addition_is_an_answer_only_if_it_is_needed(without: str) -> None:
+    found = refined(Lacking(0, 1.0, [], fails=2, without=without))
+    assert found.usable is not bool(without)
+    assert found.result.message == f"Told. {without}".strip()
+
+
+def test_the_effort_of_all_guesses_and_rounds_is_counted() -> None:
+    found = refined(Lacking(0, 2.0, [], fails=1))
+    assert found.usable and found.result.x.tolist() == [2.0, 0.0]
+    assert found.result.iterations == 10 + 2 * (10 + 10)
+    assert [a.iterations for a in found.attempts] == [20, 20] and [a.kept for a in found.attempts] == [
+        False,
+        True,
+    ]

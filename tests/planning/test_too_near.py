@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 def free() -> Solution:
     """A planar arm's blow, with few nodes: its hammer goes 5 cm from one to the next."""
     problem = load_problem("arm_planar")
-    return solve(dataclasses.replace(problem, swing=dataclasses.replace(problem.swing, intervals=6)))
+    swing = dataclasses.replace(problem.swing, intervals=6)
+    return solve(dataclasses.replace(problem, swing=swing, style="strongest"))
 
 
 def with_peg(problem: ImpactProblem, x: float, z: float) -> ImpactProblem:

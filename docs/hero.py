@@ -47,7 +47,7 @@ def main(result: Path, out: Path) -> None:
     planned = load_planned(result)
     a = planned.record.arrays
     start, end = float(a["reference_contact_start"]), float(a["reference_contact_end"])
-    before, after = 0.4 * start, 0.06
+    before, after = 0.4 * start, 0.03
     instants = {
         "at rest": 0.0,
         f"{1e3 * before:.0f} ms before contact": start - before,

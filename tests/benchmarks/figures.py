@@ -30,6 +30,8 @@ FIGURES: dict[str, tuple[str, str]] = {
     "ellipsoid": ("plot", "punch"),
     "iterations": ("plot", "punch"),
     "replay": ("plot", "punch"),
+    "sheet_punch": ("sheet", "punch"),
+    "sheet_kick_talos": ("sheet", "kick_talos"),
     "fig3": ("reproduce", "fig3"),
     "fig4": ("reproduce", "fig4"),
     "fig7": ("reproduce", "fig7"),
@@ -123,6 +125,17 @@ def _plot(problem: str, say: Say) -> Maker:
     return lambda name: {"overview": overview, **PICTURES}[name](record)
 
 
+def _sheet(problem: str, say: Say) -> Maker:
+    """A problem's planned motion from three sides."""
+    from impactopt.files.output import record_of
+    from impactopt.files.problem_file import load_problem
+    from impactopt.planning.solve import solve
+    from impactopt.report.pictures.sheet import sheet
+
+    solution = solve(load_problem(problem), report=say)
+    return lambda _: sheet(record_of(solution), solution.problem)
+
+
 def _reproduce(name: str, say: Say) -> Maker:
     from benchmarks.registry import reproduce
 
@@ -151,6 +164,7 @@ def _sweep(name: str, say: Say) -> Maker:
 
 _MAKERS: dict[str, Callable[[str, Say], Maker]] = {
     "plot": _plot,
+    "sheet": _sheet,
     "reproduce": _reproduce,
     "bench": _bench,
     "sweep": _sweep,

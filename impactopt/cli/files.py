@@ -29,7 +29,7 @@ def check(
     with plain_errors("interrupted", verbose=verbose):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.feasibility import hopeless, too_weak
+        from impactopt.problem.feasibility import hopeless, sticks_out, too_weak
         from impactopt.problem.plausibility import doubts
 
         try:
@@ -37,7 +37,9 @@ def check(
             found = Mistakes()
             found.found += hopeless(problem)
             found.raise_if_any(str(file))
-            doubtful = [text for text in (too_weak(problem), *doubts(problem.robot)) if text]
+            doubtful = [
+                text for text in (too_weak(problem), *sticks_out(problem), *doubts(problem.robot)) if text
+            ]
         except InputError as error:
             if not as_json:
                 raise

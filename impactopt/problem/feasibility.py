@@ -14,14 +14,16 @@ from impactopt.kinematics.striking_point import striking_point
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.plausibility import giant_soles
 from impactopt.problem.terms import TorqueLimit
+from impactopt.problem.terms.first_touch import face_of
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["hopeless", "too_weak"]
+__all__ = ["hopeless", "sticks_out", "too_weak"]
 
 Array = NDArray[np.float64]
 LEANS = 0.05  # [m] a motion may take the centre of mass so far out of the soles, and back in time
+AHEAD = 2e-3  # [m] that a link may stick out beyond its striking point without a word
 OFF = 0.005  # [m] of a posture that counts as one
 _ROUNDED = 1e-6
 PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers
@@ -80,6 +82,17 @@ def too_weak(problem: ImpactProblem) -> str:
         f"{share.max():.3g} of its limit, and [terms.torque_limit] fraction lets it bear {limit:.3g}; "
         "raise the limits or the fraction, or start from another posture"
     )
+
+
+def sticks_out(problem: ImpactProblem) -> list[str]:
+    """Messages about strikers whose link sticks out beyond the striking point, and so touches first."""
+    faces = {striker: face_of(problem, striker) for striker in problem.strikers}
+    return [
+        f"the link of the striker {striker!r} sticks out {1e3 * face.ahead:.0f} mm beyond it, and touches "
+        "first: contact begins earlier than planned; move the striking point to the link's outermost part"
+        for striker, face in faces.items()
+        if face is not None and face.ahead > AHEAD
+    ]
 
 
 def _out_of_balance(problem: ImpactProblem) -> str:

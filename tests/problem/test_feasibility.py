@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -15,9 +16,10 @@ from impactopt.cli.app import app
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.files.draft.drafting import draft_problem
+from impactopt.files.problem_file import load_problem
 from impactopt.kinematics.stance import FixedBase
 from impactopt.kinematics.support import margin, support_polygon
-from impactopt.problem.feasibility import hopeless
+from impactopt.problem.feasibility import hopeless, sticks_out
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
 
@@ -121,3 +123,13 @@ def test_check_refuses_what_no_solve_can_fix(tmp_path: Path) -> None:
     soft = ["--set", "robot.kp_N_m_rad=100.0", "--set", "robot.kd_N_m_s_rad=5.0"]
     bare = runner.invoke(app, ["check", str(file), "--set", "robot.armature_kg_m2=0.0", *soft])
     assert bare.exit_code == 0 and "no joint has armature" in bare.output
+
+
+def test_a_link_that_touches_before_its_striking_point_is_told() -> None:
+    problem = load_problem("punch")
+    assert sticks_out(problem) == []
+    hand = problem.robot.striker("right_hand")
+    behind = dataclasses.replace(hand, point=np.asarray(hand.point) + [0.0, 0.0, 0.027])
+    robot = dataclasses.replace(problem.robot, strikers={**problem.robot.strikers, "right_hand": behind})
+    (said,) = sticks_out(dataclasses.replace(problem, robot=robot))
+    assert "sticks out 27 mm" in said and "'right_hand'" in said

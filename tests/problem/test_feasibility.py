@@ -129,7 +129,7 @@ def test_a_link_that_touches_before_its_striking_point_is_told() -> None:
     problem = load_problem("punch")
     assert sticks_out(problem) == []
     hand = problem.robot.striker("right_hand")
-    behind = dataclasses.replace(hand, point=np.asarray(hand.point) + [0.0, 0.0, 0.027])
+    behind = dataclasses.replace(hand, point=hand.point + np.array([0.0, 0.0, 0.027]))
     robot = dataclasses.replace(problem.robot, strikers={**problem.robot.strikers, "right_hand": behind})
     (said,) = sticks_out(dataclasses.replace(problem, robot=robot))
     assert "sticks out 27 mm" in said and "'right_hand'" in said

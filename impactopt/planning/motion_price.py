@@ -12,7 +12,7 @@ from impactopt.problem.motion_style import MotionPrices
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["MotionPrice", "with_first_scale"]
+__all__ = ["MotionPrice", "unpriced", "with_first_scale"]
 
 _USUAL, _LEAST = (
     4.0,
@@ -35,6 +35,11 @@ def with_first_scale(t: Transcription) -> Transcription:
     worth = t.worth(first_iterate(t))
     scale = float(np.clip(worth / _USUAL, _LEAST, 1.0)) if np.isfinite(worth) else 1.0
     return t if scale == 1.0 else program_for(t, replace(p, price_scale=scale))
+
+
+def unpriced(t: Transcription) -> Transcription:
+    """The same program without prices of the motion style."""
+    return program_for(t, replace(t.problem, price_scale=0.0))
 
 
 class MotionPrice:

@@ -25,7 +25,7 @@ from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, w
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
 from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, with_rows
 from impactopt.planning.models import carried_start
-from impactopt.planning.motion_price import MotionPrice, with_first_scale
+from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
     best_of,
@@ -38,6 +38,7 @@ from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import hopeless
+from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
@@ -254,6 +255,12 @@ def _diagnosed(
     limited = old.status is Status.ITERATION_LIMIT and "max_iterations" in (budget.options or {})
     if limited or not lacks_rows(outcome.program, old) or budget.left == 0:
         return outcome, ()
+    if outcome.origin.program.problem.style_prices != MotionPrices():
+        budget.say("no motion was found from there: again without prices on motion")
+        free = unpriced(outcome.origin.program)
+        new = solver.from_guess(Guess(program=free, start=outcome.origin.x))
+        if new.usable:
+            return outcome.then(new, "no prices on motion"), ()
     budget.say("no motion meets all bounds: which one would have to move?")
     found = search(outcome.program, old, budget)
     if found.met is None or budget.left == 0:

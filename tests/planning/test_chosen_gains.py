@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.small_plans import rod_hammer
 
 from impactopt import (
     FreeMass,
@@ -43,7 +44,7 @@ HAND, BETWEEN = "hammer_grip", (0.1, 10.0)
 
 
 def _soft() -> ImpactProblem:
-    firm = load_problem("arm_planar")
+    firm = rod_hammer(load_problem("arm_planar"))
     return replace(
         firm,
         robot=firm.robot.with_grip("hammer", GRIP),

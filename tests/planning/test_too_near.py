@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
+from support.small_plans import rod_hammer
 
 from impactopt import Obstacle, load_problem, solve
 from impactopt.planning import between_nodes
@@ -30,7 +31,7 @@ Array = NDArray[np.float64]
 @pytest.fixture(scope="module")
 def free() -> Solution:
     """A planar arm's blow, with few nodes: its hammer goes 5 cm from one to the next."""
-    problem = load_problem("arm_planar")
+    problem = rod_hammer(load_problem("arm_planar"))
     swing = dataclasses.replace(problem.swing, intervals=6)
     return solve(dataclasses.replace(problem, swing=swing, style="strongest"))
 

@@ -132,3 +132,9 @@ def planned(transcription: Transcription, options: dict[str, Any], scene: Scene 
     trajectory = plan.trajectory()
     simulation = simulate_pinocchio(problem.robot, trajectory, scene or scene_of(problem), settle=0.0)
     return Planned(problem, transcription, start, result, plan, trajectory, simulation)
+
+
+def rod_hammer(problem: ImpactProblem) -> ImpactProblem:
+    """The problem with a hammer that is a rod, without the bar across its end."""
+    tools = tuple(dataclasses.replace(tool, bar=None) for tool in problem.robot.tools)
+    return dataclasses.replace(problem, robot=dataclasses.replace(problem.robot, tools=tools))

@@ -253,7 +253,11 @@ def _with_missed(found: dict[str, Any], solution: Solution, **options: Any) -> d
     """A replay's numbers with those of the soles in a replay of the missed blow, if the plan has one."""
     if solution.plan.abort is None:
         return found
-    miss = solution.summary(solution.validate(missing=True, **options))["simulated"]
+    if options.get("engine") == "mujoco":  # which takes it as a perturbation of its world
+        options |= {"perturbation": Perturbation(missing=True)}
+    else:
+        options |= {"missing": True}
+    miss = solution.summary(solution.validate(**options))["simulated"]
     for key in ("sole_cop_margin_mm", "sole_force_N"):
         for sole, phases in (miss.get(key) or {}).items():
             found[key][sole] |= {phase: kept for phase, kept in phases.items() if phase == "missed"}

@@ -295,7 +295,8 @@ def test_every_figure_has_a_source_that_exists() -> None:
     from benchmarks.registry import BENCHES, REPRODUCED
 
     studies = {path.stem for path in (ROOT / "problems" / "sweeps").glob("*.toml")}
-    known = {"plot": DRAWS, "reproduce": REPRODUCED, "bench": BENCHES, "sweep": studies}
+    problems = {path.stem for path in (ROOT / "problems").glob("*.toml")}
+    known = {"plot": DRAWS, "sheet": problems, "reproduce": REPRODUCED, "bench": BENCHES, "sweep": studies}
     assert chosen(FIGURES) == list(FIGURES)
     for name, (how, source) in FIGURES.items():
         assert (name if how == "plot" else source) in known[how]

@@ -267,8 +267,7 @@ class Program:
             # the face that the hand is turned by, or else the one about its striking point
             by_axis = striker == p.striker and turned is not None and turned.direction is None
             axis = np.array(turned.axis) if turned and by_axis else None
-            asked = p.extra(FirstTouch) is not None
-            face = striker_face(p.robot, striker, axis, assumed=asked)
+            face = striker_face(p.robot, striker, axis, assumed=term.assumed)
             if face is None:
                 continue
             names = [f"{striker}, corner {i}" for i in range(len(face.corners))]

@@ -31,8 +31,8 @@ class FirstTouch(Term):
     Up to contact no corner of the link's hull is farther than `depth` beyond the target's plane, besides what
     it sticks out beyond the striking point, and at contact the link's face looks along the normal. The face
     is the one about the striking point, or the one that `HandOrientation` turns to the target. Links without
-    a known shape have such constraints only if this term is given: then it is about boxes of their inertia.
-    There are none where bodies may pass through the world.
+    a known shape have such constraints only with `assumed`. There are none where bodies may pass through the
+    world.
     """
 
     name: ClassVar[str] = "first touch"
@@ -45,7 +45,10 @@ class FirstTouch(Term):
         default=0.6,
         metadata=about("largest angle between the link's face and the normal", unit="rad", above=0),
     )
-
+    assumed: bool = field(
+        default=False,
+        metadata=about("true: of links without a known shape, too, by the boxes of their inertia"),
+    )
     enabled: bool = field(default=True, metadata=about("false: other parts of the link may touch first"))
 
     def __post_init__(self) -> None:
@@ -105,8 +108,7 @@ def face_of(problem: Any, striker: str) -> StrikerFace | None:
         return None
     turned = problem.extra(HandOrientation) if striker == problem.striker else None
     axis = np.array(turned.axis) if turned is not None and turned.direction is None else None
-    given = problem.extra(FirstTouch) is not None  # of a guessed shape only what is asked for
-    return striker_face(problem.robot, striker, axis, assumed=given)
+    return striker_face(problem.robot, striker, axis, assumed=problem.term(FirstTouch).assumed)
 
 
 def late_spots(program: Any) -> list[Any]:

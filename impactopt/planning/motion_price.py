@@ -14,10 +14,8 @@ from impactopt.transcription.transcription import Transcription
 
 __all__ = ["MotionPrice", "unpriced", "with_first_scale"]
 
-_USUAL, _LEAST = (
-    4.0,
-    0.02,
-)  # [N s] of an initial guess (of `punch`) for which prices are as they are; least factor
+_USUAL = 4.0  # [N s] of an initial guess, that of `punch`: prices are chosen for it
+_LEAST = 0.02  # factor on prices, where a guess is worth next to nothing
 _TRIES = 3  # reductions: with lower prices there is more to be priced, so one may not be enough
 _TOLERANCE = 0.02  # of the share: a plan that is within it is not solved again
 _BELOW = 0.9  # of the allowed share is aimed at

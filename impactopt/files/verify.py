@@ -25,6 +25,7 @@ from impactopt.files.output import LARGEST, NUMBERS, SUMMARY, Record, load_recor
 from impactopt.files.replay import problem_of
 from impactopt.files.resume import program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.sole_margins import weight_of
 from impactopt.solvers.program import bound_violations, complementarity, row_violations, scaled_residual
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.program_summary import statement_of
@@ -265,7 +266,7 @@ def motion_of_record(
         yield f"{prefix}: rates", off - beyond, f"{time[k]:.4g} s"
     legs = [(leg, model.getFrameId(leg.frame)) for leg in c.legs]
     limit, still = robot.torque_limit, np.zeros(robot.nv - robot.n)
-    scale = np.concatenate([np.full(len(still), max(1.0, _weight(model))), limit])
+    scale = np.concatenate([np.full(len(still), max(1.0, weight_of(robot))), limit])
     for i, instant in enumerate(time):
         where = f"{instant:.4g} s"
         tau = np.array(pin.rnea(model, data, q[i], v[i], a[i]))
@@ -289,8 +290,3 @@ def motion_of_record(
             pin.framesForwardKinematics(model, data, q[end])
             at = data.oMf[model.getFrameId(f"striker:{striker}")].translation
             yield "reference: hit point", float(np.abs(at - point).max()), striker
-
-
-def _weight(model: Any) -> float:
-    """Weight [N] of a model."""
-    return float(np.linalg.norm(model.gravity.linear) * sum(inertia.mass for inertia in model.inertias))

@@ -173,7 +173,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         out["impulse_planned_Ns"] = solution.impulse
         replay = solution.validate()
         told = solution.summary(replay)
-        held = _with_missed(told["simulated"], solution)
+        held = _with_missed(told["simulated"], _miss(solution, missing=True))
         out |= {
             "clearance_mm": _least(told["clearance_mm"], held["clearance_mm"]),
             "touches": len([*told["contacts_besides"], *(held["contacts_besides"] or ())]),
@@ -201,9 +201,10 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         return out
     try:
         replay = solution.validate(engine="mujoco", controller=controller)
-        free = _with_missed(
-            solution.summary(replay)["simulated"], solution, engine="mujoco", controller=controller
+        missed = _miss(
+            solution, engine="mujoco", controller=controller, perturbation=Perturbation(missing=True)
         )
+        free = _with_missed(solution.summary(replay)["simulated"], missed)
     except InputError as error:
         out |= {"standing": None, "reason": str(error)}
         return out
@@ -221,20 +222,18 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         "standing": free["standing"],
         "reason": free["reason"],
     }
-    return out | _missed(solution, controller)
+    return out | ({} if missed is None else _missed(solution, missed))
 
 
-def _missed(solution: Solution, controller: str) -> dict[str, Any]:
-    """The replay on free soles where the target is missing, of a plan that has a motion for that."""
+def _miss(solution: Solution, **options: Any) -> dict[str, Any] | None:
+    """Numbers of the replay where the target is missing, of a plan that has a motion for that."""
     if solution.plan.abort is None:
-        return {}
-    try:
-        replay = solution.validate(
-            engine="mujoco", controller=controller, perturbation=Perturbation(missing=True)
-        )
-    except InputError as error:
-        return {"missed_standing": None, "missed_reason": str(error)}
-    free = solution.summary(replay)["simulated"]
+        return None
+    return dict(solution.summary(solution.validate(**options))["simulated"])
+
+
+def _missed(solution: Solution, free: Mapping[str, Any]) -> dict[str, Any]:
+    """The columns of a replay on free soles where the target is missing."""
     return {
         "missed_torque_planned": solution.margins()["torque_ratio"].get("missed"),
         "missed_torque": max(free["torque_ratio"].values()),
@@ -249,15 +248,10 @@ def _missed(solution: Solution, controller: str) -> dict[str, Any]:
     }
 
 
-def _with_missed(found: dict[str, Any], solution: Solution, **options: Any) -> dict[str, Any]:
-    """A replay's numbers with those of the soles in a replay of the missed blow, if the plan has one."""
-    if solution.plan.abort is None:
+def _with_missed(found: dict[str, Any], miss: Mapping[str, Any] | None) -> dict[str, Any]:
+    """A replay's numbers with those of the soles in the replay of the missed blow, if there is one."""
+    if miss is None:
         return found
-    if options.get("engine") == "mujoco":  # which takes it as a perturbation of its world
-        options |= {"perturbation": Perturbation(missing=True)}
-    else:
-        options |= {"missing": True}
-    miss = solution.summary(solution.validate(**options))["simulated"]
     for key in ("sole_cop_margin_mm", "sole_force_N"):
         for sole, phases in (miss.get(key) or {}).items():
             found[key][sole] |= {phase: kept for phase, kept in phases.items() if phase == "missed"}

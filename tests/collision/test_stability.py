@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from benchmarks import stability
+from benchmarks.__main__ import app
 from benchmarks.stability import judge_rig
 from benchmarks.stability_cases import RIGS, Rig
 from benchmarks.stability_others import freezes_of, refusals
 from benchmarks.stability_robots import make_robot
 from support import small_robots
+from typer.testing import CliRunner
 
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, RigidWall, SpringDamper
@@ -121,8 +124,10 @@ def test_the_command_counts_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stability, "MASSES", ())
     monkeypatch.setattr(stability, "FREEZES", ())
     monkeypatch.setattr(stability, "CASES", 80)
-    numbers = stability.run(lambda _: None, quick=True, workers=1).numbers
-    assert numbers.keys() >= {"cases", "agree", "refused", "nan", "wrong", "reasons"}
+    result = CliRunner().invoke(app, ["stability", "--quick", "--workers", "1", "--json", "-q"])
+    assert result.exit_code == 0, result.output
+    numbers = json.loads(result.stdout)
+    assert numbers.keys() >= {"cases", "agree", "refused", "nan", "wrong", "seconds", "reasons"}
     assert numbers["cases"] == numbers["agree"] + numbers["refused"]
     assert sum(numbers["reasons"].values()) == numbers["cases"]
 

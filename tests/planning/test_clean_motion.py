@@ -11,7 +11,7 @@ import pytest
 from support.meshes import Meshes
 from support.small_plans import BODILESS
 
-from impactopt import Solution, load_problem, solve
+from impactopt import Solution, load_problem, solve, talos
 from impactopt.problem.terms import GroundForce
 
 
@@ -56,9 +56,12 @@ def test_the_summary_says_so(punch: Solution) -> None:
     assert np.isfinite(said["clearance_mm"]) and len(punch.apart) > 0
 
 
-def test_what_is_switched_off_is_told(punch: Solution) -> None:
-    """The same punch without these terms: its limbs pass through each other in many places."""
-    terms = (*punch.problem.terms, *BODILESS, GroundForce(enabled=False))
-    said = solve(dataclasses.replace(punch.problem, terms=terms, style="strongest")).clearance()
+def test_what_is_switched_off_is_told() -> None:
+    """A punch without these terms: another's count of the pairs that pass through each other was 29."""
+    problem = load_problem("punch")
+    hand = dataclasses.replace(problem.robot.striker("right_hand"), point=[0.0, 0.0, -0.125])
+    robot = talos(strikers=[hand])
+    terms = (*problem.terms, *BODILESS, GroundForce(enabled=False))
+    said = solve(dataclasses.replace(problem, robot=robot, terms=terms, style="strongest")).clearance()
     assert said["clearance_mm"] < -50
-    assert len({(touch["one"], touch["other"]) for touch in said["contacts_besides"]}) > 10
+    assert len({(touch["one"], touch["other"]) for touch in said["contacts_besides"]}) > 20

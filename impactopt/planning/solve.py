@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
-from impactopt.planning.budget import VIOLATED, Budget, stopping
+from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
 from impactopt.planning.causes import Cause, search
 from impactopt.planning.cautions import window_caution
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solved_apart
@@ -258,9 +258,14 @@ def _diagnosed(
     if outcome.origin.program.problem.style_prices != MotionPrices():
         budget.say("no motion was found from there: again without prices on motion")
         free = unpriced(outcome.origin.program)
-        new = solver.from_guess(Guess(program=free, start=outcome.origin.x))
-        if new.usable:
-            return outcome.then(new, "no prices on motion"), ()
+        both = outcome.then(
+            solver.from_guess(Guess(program=free, start=outcome.origin.x)), "no prices on motion"
+        )
+        if both.usable:
+            return both, ()
+        outcome = replace(outcome, result=with_effort_of(old, both.result))
+        if budget.left == 0:
+            return outcome, ()
     budget.say("no motion meets all bounds: which one would have to move?")
     found = search(outcome.program, old, budget)
     if found.met is None or budget.left == 0:

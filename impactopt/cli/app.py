@@ -127,8 +127,10 @@ def solve(
     """
     said = "interrupted before there was a plan to keep"
     with plain_errors(said, verbose=verbose, keeps=True) as console:
+        from impactopt.errors import printable
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.files.result_folder import keep_record, set_aside
         from impactopt.files.solution_library import SolvedFolder
         from impactopt.planning.solve import solve as plan
         from impactopt.report.console import SolveConsole
@@ -159,8 +161,18 @@ def solve(
             if baseline:
                 progress.say("looking for the hardest minimum-jerk reach inside the same limits")
                 record.summary["baseline"] = _baseline(problem)
-            written = _write(record, directory, progress)
-        _show(record, written, as_json)
+            written = [*keep_record(record, directory)]
+        _show(record, as_json)
+        from impactopt.report.pictures import save_pictures  # matplotlib only now
+
+        with progress:
+            progress.say("drawing pictures")
+            written += save_pictures(record, written[0].parent)
+        if not as_json:
+            names = ", ".join(path.name for path in written)
+            typer.echo(printable(f"{written[0].parent}: {names}"))
+            if aside := set_aside(record.summary):
+                typer.echo(printable(aside))
         if not solution.status.usable:
             raise typer.Exit(NOT_SOLVED)
 
@@ -272,24 +284,13 @@ def _baseline(problem: ImpactProblem) -> dict[str, object]:
         return {"method": "minimum jerk", "error": str(error)}
 
 
-def _write(record: Record, directory: Path, progress: SolveConsole) -> list[Path]:
-    from impactopt.files.result_folder import keep_record
-
-    written = [*keep_record(record, directory)]
-    progress.say("drawing pictures")
-    from impactopt.report.pictures import save_pictures
-
-    return written + save_pictures(record, written[0].parent)
-
-
-def _show(record: Record, written: list[Path], as_json: bool) -> None:
+def _show(record: Record, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(record.summary, indent=2))
         return
     from rich.console import Console
 
     from impactopt.errors import printable
-    from impactopt.files.result_folder import set_aside
     from impactopt.report.console import (
         multistart_table,
         result_table,
@@ -323,10 +324,6 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
         highlight=False,
     )
-    names = ", ".join(path.name for path in written)
-    console.print(printable(f"{written[0].parent}: {names}"), markup=False, highlight=False, soft_wrap=True)
-    if aside := set_aside(summary):
-        console.print(printable(aside), markup=False, highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

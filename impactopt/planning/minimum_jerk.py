@@ -10,6 +10,7 @@ in full dynamics with the same servo, ZMP and torque stay inside while and after
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,6 +57,8 @@ class Baseline:
 
 
 DURATIONS = (0.6, 0.8, 1.0, 1.3, 1.7)  # [s] of the swing that are tried
+SLOWEST = 0.01  # [m/s] that is tried
+SLOWER = 0.93  # factor from a speed whose replay does not keep the limits to the next
 
 
 def minimum_jerk_baseline(
@@ -63,38 +66,55 @@ def minimum_jerk_baseline(
 ) -> Baseline:
     """The hardest minimum-jerk reach; ``tolerance``: of its speed, relative; ``fastest`` [m/s] that is tried.
 
+    All reaches strike in one posture and direction, so that the impulse grows with the speed: they are taken
+    by descending speed, and the first whose replay keeps the limits is the hardest.
+
     Raises
     ------
     InputError : not even a touch at 1 cm/s keeps the limits.
     """
-    found = [b for b in (_hardest(problem, d, fastest, tolerance) for d in DURATIONS) if b is not None]
-    if not found:
-        raise InputError("not even a minimum-jerk reach that hits at 0.01 m/s keeps the limits")
-    return max(found, key=lambda b: b.impulse)
+    # (-speed, bound, duration): the fastest reach without contact, or where `bound` is 1 no more than a bound
+    reaches = [(-fastest, 1, duration) for duration in DURATIONS]
+    heapq.heapify(reaches)
+    while reaches:
+        negative, bound, duration = heapq.heappop(reaches)
+        speed = -negative
+        if bound:
+            best = max((-other for other, unknown, _ in reaches if not unknown), default=0.0)
+            slow = max(best, SLOWEST)
+            if _holds(problem, duration, slow):
+                heapq.heappush(reaches, (-_fastest(problem, duration, slow, speed, tolerance), 0, duration))
+            elif best:
+                heapq.heappush(reaches, (-slow, 1, duration))
+        elif (found := _replayed(problem, duration, speed)) is not None:
+            return found
+        elif SLOWER * speed >= SLOWEST:
+            heapq.heappush(reaches, (-SLOWER * speed, 0, duration))
+    raise InputError(f"not even a minimum-jerk reach that hits at {SLOWEST} m/s keeps the limits")
 
 
-def _hardest(problem: ImpactProblem, duration: float, fastest: float, tolerance: float) -> Baseline | None:
-    slow, fast = 0.01, fastest
-    if not _holds(problem, duration, slow):
-        return None
+def _fastest(problem: ImpactProblem, duration: float, slow: float, fast: float, tolerance: float) -> float:
+    """Speed [m/s] of the fastest reach without contact between one that keeps the limits and a bound."""
     while fast > (1 + tolerance) * slow:
         middle = float(np.sqrt(fast * slow))
         slow, fast = (middle, fast) if _holds(problem, duration, middle) else (slow, middle)
-    speed, scene = slow, scene_of(problem)
-    while speed >= 0.01:
-        reference = _reference(problem, duration, speed)
-        simulation = simulate_pinocchio(problem.robot, reference, scene, step=2e-4)
-        summary = simulation.summary(
-            torque_limit=problem.robot.torque_limit, polygon=scene.polygon, planned_impulse=np.nan
-        )
-        del summary["impulse_error_pct"]  # nothing was planned
-        margins, ratios = summary.get("zmp_margin_m", {"": 0.0}), summary["torque_ratio"]
-        if min(margins.values()) >= 0 and max(ratios.values()) <= 1.0:
-            return Baseline(
-                duration=duration, speed=speed, reference=reference, simulation=simulation, summary=summary
-            )
-        speed *= 0.93
-    return None
+    return slow
+
+
+def _replayed(problem: ImpactProblem, duration: float, speed: float) -> Baseline | None:
+    """The reach in full dynamics; None if it does not keep the limits there."""
+    scene, reference = scene_of(problem), _reference(problem, duration, speed)
+    simulation = simulate_pinocchio(problem.robot, reference, scene)
+    summary = simulation.summary(
+        torque_limit=problem.robot.torque_limit, polygon=scene.polygon, planned_impulse=np.nan
+    )
+    del summary["impulse_error_pct"]  # nothing was planned
+    margins, ratios = summary.get("zmp_margin_m", {"": 0.0}), summary["torque_ratio"]
+    if min(margins.values()) < 0 or max(ratios.values()) > 1.0:
+        return None
+    return Baseline(
+        duration=duration, speed=speed, reference=reference, simulation=simulation, summary=summary
+    )
 
 
 def _phases(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.problem.problem import ImpactProblem
@@ -13,7 +14,9 @@ from impactopt.simulation.result import Simulation
 
 __all__ = ["with_clearance"]
 
+Array = NDArray[np.float64]
 STEP = 1e-3  # [s] at which a replay is looked at
+MOVED = 5e-4  # [rad, m] by which a coordinate has moved since the last look, as at 0.5 rad/s in such a step
 
 
 def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation:
@@ -21,7 +24,7 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
     itself.
     """
     time = simulation.time
-    _, chosen = np.unique(np.floor(time / STEP), return_index=True)
+    chosen = _instants(time, simulation.q, simulation.travel())
     phase = np.full(len(time), MISSED) if simulation.missed else simulation.phase()
     bodies = problem.bodies
     at = Places.of(problem.robot, simulation.q[chosen], simulation.travel()[chosen], phase[chosen])
@@ -37,3 +40,14 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
         nearest=found.nearest,
         touched=touched,
     )
+
+
+def _instants(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
+    """Indices of the instants at which bodies have moved since the one before, `STEP` apart; first and last."""
+    _, every = np.unique(np.floor(time / STEP), return_index=True)
+    places = np.column_stack([q, travel])
+    chosen = [0]
+    for k in map(int, every[1:]):
+        if np.abs(places[k] - places[chosen[-1]]).max() > MOVED:
+            chosen.append(k)
+    return np.unique([*chosen, len(time) - 1])

@@ -22,13 +22,19 @@ def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any)
     """The simulation by an engine, with how far off its impulse is by its steps, as an estimate.
 
     It is compared up to the end of the blow with one of twice the step, or where that was given longer than
-    the engine's own with one of that. Where more than 1 % is left, and the step is not longer, it is halved,
-    twice at most.
+    the engine's own with one of that. Where more than 1 % is left, or it diverges, and the step is not longer,
+    it is halved, twice at most.
     """
     own = float((run.__kwdefaults__ or {})["step"])
     step = float(options.pop("step", own))
-    for _ in range(HALVINGS + 1):
-        found = run(*given, **options, step=step)
+    for left in range(HALVINGS, -1, -1):
+        try:
+            found = run(*given, **options, step=step)
+        except InputError:  # light links on stiff servos need shorter steps
+            if step > own or not left:
+                raise
+            step /= 2
+            continue
         found = replace(found, step_error=_error(run, given, options, found, step, own))
         if not found.step_error > ALLOWED or step > own:
             break

@@ -33,7 +33,7 @@ def check(
         from impactopt.problem.plausibility import doubts
 
         try:
-            problem = read_problem_file(file, parse_settings(settings or ())).build()
+            problem = read_problem_file(file, parse_settings(settings or ()), names=True).build()
             found = Mistakes()
             found.found += hopeless(problem)
             found.raise_if_any(str(file))

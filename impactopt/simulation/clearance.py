@@ -43,7 +43,7 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
 
 
 def _instants(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
-    """Indices of the instants at which bodies have moved since the one before, `STEP` apart; first and last."""
+    """Indices of the first and last instant, and of those at which bodies have moved since the one before."""
     _, every = np.unique(np.floor(time / STEP), return_index=True)
     places = np.column_stack([q, travel])
     chosen = [0]

@@ -22,7 +22,7 @@ def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any)
     """The simulation by an engine, with how far off its impulse is by its steps, as an estimate.
 
     It is compared up to the end of the blow with one of twice the step, or where that was given longer than
-    the engine's own with one of that. Where more than 1 % is left, or it diverges, and the step is not longer,
+    the engine's own with one of that. Where more than 1 % is left, or it diverges, and the step is no longer,
     it is halved, twice at most.
     """
     own = float((run.__kwdefaults__ or {})["step"])

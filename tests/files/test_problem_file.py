@@ -573,6 +573,17 @@ def test_unknown_names_of_a_robots_parts_are_named_at_once(tmp_path: Path) -> No
     assert "3 mistakes" in text
 
 
+def test_names_of_a_robots_parts_are_looked_up_beside_other_mistakes(tmp_path: Path) -> None:
+    text = GOOD.replace("right_hand", "right_hnd").replace("normal", 'start = "half_siting"\nnormal')
+    text = text.replace("mass_kg = 5.0", "mass_kg = nan").replace("300.0", "-1").replace("[contact]", "[law]")
+    with pytest.raises(InputError) as caught:
+        read_problem_file(write(tmp_path, text), names=True)
+    found = str(caught.value)
+    for part in ("did you mean 'right_hand'", "did you mean 'half_sitting'", "mass_kg: nan", "law: unknown"):
+        assert part in found
+    assert "5 mistakes" in found  # [contact] is missing
+
+
 def test_a_point_out_of_reach_is_one_clear_message(tmp_path: Path) -> None:
     text = message(write(tmp_path, GOOD.replace("[0.6, -0.25, 1.1]", "[3.0, -0.25, 1.1]")))
     assert "out of reach" in text and "right_hand" in text and "problem.toml" in text

@@ -40,13 +40,14 @@ class Mistake:
     """A mistake at a place in the file.
 
     place : path of keys and indices; the first `sections` of them name the table.  first : it is to be fixed
-    before the others.
+    before the others.  meant : the key that a misspelt one probably is, or "".
     """
 
     place: Place
     sections: int
     text: str
     first: bool = False
+    meant: str = ""
 
     def __str__(self) -> str:
         table = ".".join(str(part) for part in self.place[: self.sections] if isinstance(part, str))
@@ -84,10 +85,11 @@ def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]
             section, sections = section_at(model, e["loc"][:-1])
             key, known = str(e["loc"][-1]), [_key(section, name) for name in section.model_fields]
             near = did_you_mean(key, known)
-            meant |= {(e["loc"][:-1], name) for name in known if near and repr(name) in near}
+            name = next((name for name in known if near and repr(name) in near), "")
+            meant.add((e["loc"][:-1], name))
             what = "section" if isinstance(e["input"], Mapping) else "key"
             text = f"unknown {what}{near or '; known are ' + ', '.join(known)}"
-            out.append(Mistake(place=e["loc"], sections=sections, text=text))
+            out.append(Mistake(place=e["loc"], sections=sections, text=text, meant=name))
         elif e["type"] != "missing":
             out.append(_mistake(model, e))
     for e in error.errors(include_url=False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -29,9 +30,11 @@ from impactopt.files.problem_file.toml import (
     text_with_control,
     write_toml,
 )
+from impactopt.kinematics.stance import Stance
 from impactopt.problem.checks import MANY, check_names
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.checks import check_legs
+from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
 
 __all__ = [
@@ -54,6 +57,16 @@ _LISTS = (
     ("robot", "tools"),
 )
 
+# what stands for required keys that are missing or wrong, while the others' names are looked up
+_STAND_INS: Mapping[str, dict[str, Any]] = {
+    "problem": {"striker": "-", "point_m": [0.0, 0.0, 0.0], "normal": [1.0, 0.0, 0.0]},
+    "contact": {"stiffness_N_m": 1.0, "damping_N_s_m": 1.0},
+    "target": {"mass_kg": 1.0},
+    "swing": {"duration_s": 1.0},
+    "follow": {"duration_s": 1.0},
+}
+_ROUNDS = 4  # of mending what was found and looking again
+
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemFile:
@@ -71,8 +84,8 @@ class ProblemFile:
     content: File = field(repr=False)
     lines: Mapping[Place, int] = field(repr=False, default_factory=dict)
 
-    def changed(self, settings: Mapping[str, Any]) -> ProblemFile:
-        """The file with other values, by key paths (`change_data`).
+    def changed(self, settings: Mapping[str, Any], *, names: bool = False) -> ProblemFile:
+        """The file with other values, by key paths (`change_data`); names : as of `read_problem_file`.
 
         Raises
         ------
@@ -85,7 +98,7 @@ class ProblemFile:
             text = write_toml(data)
         except (InputError, TOMLError) as error:
             raise InputError(f"{self.path}: {error}") from error
-        return _checked(data, self.path, text, {**self.lines, **dict.fromkeys(places, 0)})
+        return _checked(data, self.path, text, {**self.lines, **dict.fromkeys(places, 0)}, names)
 
     def build(self) -> ImpactProblem:
         """The problem, with its robot.
@@ -96,30 +109,10 @@ class ProblemFile:
             frame; then an unknown striker, posture and sole, all at once; then a point out of reach.
         """
         content, mistakes = self.content, _Collector(self.lines)
-        try:
-            robot = content.make_robot(self.path.parent)
-        except InputError as error:
-            legs = content.leg_mistake(self.path.parent)
-            if legs is not None:
-                mistakes.add(("robot", "soles"), legs, first=True)
-            for place, wrong in content.robot_mistakes(self.path.parent, error):
-                mistakes.add(place, wrong)
-            raise InputError(mistakes.report(self.path)) from error
-        mistakes.attempt(("problem", "striker"), lambda: robot.striker(content.problem.striker))
-        mistakes.attempt(("problem", "start"), lambda: content.make_start(robot))
-        stance = mistakes.attempt(("stance", "soles"), lambda: content.make_stance(robot))
+        robot, stance = _named(content, self.path.parent, mistakes)
+        mistakes.raise_if_any(self.path)
+        assert robot is not None and stance is not None
         given = content.arguments()
-        if stance is not None:
-            try:
-                check_legs(robot.model, [(sole.name, sole.frame) for sole in stance.soles(robot)])
-            except InputError as error:
-                mistakes.add(("robot", "soles"), error, first=True)
-        if mistakes or stance is None:
-            # the rest of the problem cannot be put together, but what its terms name can be looked at
-            for name, term in content.given_terms():
-                mistakes.attempt(("terms", name), partial(check_names, robot, term))
-            mistakes.raise_if_any(self.path)
-        assert stance is not None
         try:
             return ImpactProblem(robot=robot, stance=stance, **given)
         except InputError as error:
@@ -160,20 +153,26 @@ def problem_file_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[
     return _checked(data, Path(where), text, {})
 
 
-def read_problem_file(path: str | os.PathLike[str], settings: Mapping[str, Any] | None = None) -> ProblemFile:
+def read_problem_file(
+    path: str | os.PathLike[str], settings: Mapping[str, Any] | None = None, *, names: bool = False
+) -> ProblemFile:
     """A problem file, by path or name, checked as far as that is possible without its robot.
 
     settings : values by key path, in place of the file's (`change_data`).
+    names : build the robot of a file with mistakes, too, so that names of its parts that are wrong are among
+        them.
 
     Raises
     ------
     InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
     """
     path = problem_file(path)
-    return parse_problem_file(_read(path), path, settings)
+    return parse_problem_file(_read(path), path, settings, names=names)
 
 
-def parse_problem_file(text: str, path: Path, settings: Mapping[str, Any] | None = None) -> ProblemFile:
+def parse_problem_file(
+    text: str, path: Path, settings: Mapping[str, Any] | None = None, *, names: bool = False
+) -> ProblemFile:
     """A problem file's text, checked like the file; `path` is where it was: the place of the files it names.
 
     Raises
@@ -184,10 +183,12 @@ def parse_problem_file(text: str, path: Path, settings: Mapping[str, Any] | None
         data = read_toml(text)
     except TOMLError as error:
         raise InputError(f"{path} is not TOML: {error}") from error
-    return _checked(data, path, text, key_lines(text)).changed(settings or {})
+    return _checked(data, path, text, key_lines(text), names).changed(settings or {}, names=names)
 
 
-def _checked(data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Place, int]) -> ProblemFile:
+def _checked(
+    data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Place, int], names: bool = False
+) -> ProblemFile:
     for place in _LISTS:
         there: Any = data
         for key in place:
@@ -201,6 +202,7 @@ def _checked(data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Plac
         content = model.model_validate(data)
     except ValidationError as error:
         mistakes += mistakes_of(error, model)
+        mistakes += _besides(data, mistakes, _Collector(lines), path.parent if names else None)
     if mistakes:
         raise InputError(report_mistakes(str(path), lines, mistakes))
     given = content.solver.model_dump(exclude_unset=True) if content.solver else {}
@@ -214,18 +216,88 @@ def _checked(data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Plac
     )
 
 
+def _named(content: File, folder: Path, mistakes: _Collector) -> tuple[Robot | None, Stance | None]:
+    """The robot and its stance; mistakes that only show with them: in it, and in names of its parts."""
+    try:
+        robot = content.make_robot(folder)
+    except InputError as error:
+        legs = content.leg_mistake(folder)
+        if legs is not None:
+            mistakes.add(("robot", "soles"), legs, first=True)
+        for place, wrong in content.robot_mistakes(folder, error):
+            mistakes.add(place, wrong)
+        return None, None
+    mistakes.attempt(("problem", "striker"), lambda: robot.striker(content.problem.striker))
+    mistakes.attempt(("problem", "start"), lambda: content.make_start(robot))
+    stance = mistakes.attempt(("stance", "soles"), lambda: content.make_stance(robot))
+    if stance is not None:
+        try:
+            check_legs(robot.model, [(sole.name, sole.frame) for sole in stance.soles(robot)])
+        except InputError as error:
+            mistakes.add(("robot", "soles"), error, first=True)
+    if mistakes or stance is None:
+        # the rest of the problem cannot be put together, but what its terms name can be looked at
+        for name, term in content.given_terms():
+            mistakes.attempt(("terms", name), partial(check_names, robot, term))
+    return robot, stance
+
+
+def _besides(
+    data: Mapping[str, Any], mistakes: list[Mistake], found: _Collector, folder: Path | None
+) -> list[Mistake]:
+    """Further mistakes of a file, which show once the others are mended: checks of whole sections, and with a
+    folder names of the robot's parts, where neither robot nor stance is wrong.
+
+    For that, misspelt keys get their probable names, wrong ones are left out, and what is missing and required
+    has a stand-in.
+    """
+    rest: Any = {"problem": {}, **copy.deepcopy(dict(data))}
+    further: list[Mistake] = []
+    for _ in range(_ROUNDS):
+        for mistake in [*mistakes, *further]:
+            table, (*above, key) = rest, mistake.place
+            for part in above:
+                inside = part in table if isinstance(table, dict) else part in range(len(table))
+                table = table[part] if inside else {}
+            if isinstance(table, dict) and key in table:
+                value = table.pop(key)
+                table |= {mistake.meant: value} if mistake.meant and mistake.meant not in table else {}
+        places = {mistake.place for mistake in (*mistakes, *further)}
+        for section, values in _STAND_INS.items():
+            known = section in data and isinstance(data[section], dict)
+            needed = {k: v for k, v in values.items() if not known or (section, k) in places}
+            rest[section] = needed | rest.get(section, {})
+        model = with_kinds(File, rest)
+        try:
+            content = model.model_validate(rest)
+        except ValidationError as error:
+            found_now = mistakes_of(error, model)
+            new = [m for m in found_now if m.text != "missing" and m.place not in places]
+            if not new:
+                return further
+            further += new
+            continue
+        wrong = {m.place[: 1 + (m.place[0] == "problem")] for m in [*mistakes, *further]}
+        if folder is not None and not wrong & {("robot",), ("stance",), ("problem", "robot")}:
+            _named(content, folder, found)
+            if rest["problem"]["striker"] == _STAND_INS["problem"]["striker"]:
+                found.mistakes = [m for m in found.mistakes if m.place != ("problem", "striker")]
+        break
+    return further + found.mistakes
+
+
 class _Collector:
     """Gathers the mistakes of several attempts."""
 
     def __init__(self, lines: Mapping[Place, int]) -> None:
-        self._lines, self._mistakes = lines, list[Mistake]()
+        self._lines, self.mistakes = lines, list[Mistake]()
 
     def __bool__(self) -> bool:
-        return bool(self._mistakes)
+        return bool(self.mistakes)
 
     def add(self, place: tuple[str, ...], error: InputError, *, first: bool = False) -> None:
         sections = max(1, len(place) - 1) if place[:1] != ("terms",) else len(place)
-        self._mistakes += [
+        self.mistakes += [
             Mistake(place=place, sections=sections, text=text, first=first) for text in error.mistakes
         ]
 
@@ -238,10 +310,10 @@ class _Collector:
             return None
 
     def report(self, path: Path) -> str:
-        return report_mistakes(str(path), self._lines, self._mistakes)
+        return report_mistakes(str(path), self._lines, self.mistakes)
 
     def raise_if_any(self, path: Path) -> None:
-        if self._mistakes:
+        if self.mistakes:
             raise InputError(self.report(path))
 
 

@@ -13,10 +13,28 @@ from impactopt.planning.solve import solve
 from impactopt.transcription.transcription import Transcription
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Workers of `-n auto --dist loadgroup` take whole files, so that no plan is made twice; those tests that
+    need the demo's plan go to one of them.
+    """
+    if not config.pluginmanager.hasplugin("xdist"):
+        return
+    for item in items:
+        own = hasattr(getattr(item, "module", None), "punch")  # another plan, by the same name
+        demo = "punch" in getattr(item, "fixturenames", ()) and not own
+        item.add_marker(pytest.mark.xdist_group("demo" if demo else str(item.path)))
+
+
 @pytest.fixture(scope="session")
 def punch() -> Solution:
     """The plan of `make demo`; its functions come from the cache after the first time."""
     return solve(load_problem(Path(__file__).resolve().parents[1] / "problems" / "punch.toml"))
+
+
+@pytest.fixture(scope="session")
+def hammered() -> Solution:
+    """The plan of `arm_planar`: a blow on a nail, quickly solved."""
+    return solve(load_problem("arm_planar"))
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import logging
 import os
 import warnings
@@ -22,16 +23,17 @@ R = TypeVar("R")
 
 _log = logging.getLogger("impactopt")  # its lines are seen by who asks for level INFO
 
-_ABOUT = """
+_GIVEN = """problem : an :class:`impactopt.ImpactProblem`; or the path of a problem file, or the name of one that
+    comes with the package (`impactopt problems`), whose [solver] section then holds where nothing else is
+    given.
+report : where it is None, its lines go to the logger "impactopt", with level INFO.
 
-    problem : an :class:`impactopt.ImpactProblem`; or the path of a problem file, or the name of one that
-        comes with the package (`impactopt problems`), whose [solver] section then holds where nothing else is
-        given.
-    report : where it is None, its lines go to the logger "impactopt", with level INFO.
+"""
+_WARNS = """
 
-    Warns
-    -----
-    NotSolvedWarning : the result is no solution; it is of the best iterate.
+Warns
+-----
+NotSolvedWarning : the result is no solution; it is of the best iterate.
 """
 
 
@@ -52,7 +54,9 @@ def _or_file(run: Callable[..., R]) -> Callable[..., R]:
         given = {k: v for k, v in options.items() if v is not None}
         return _told(run(read.build(), *args, **(chosen | given)))
 
-    of_either.__doc__ = (run.__doc__ or "").rstrip() + _ABOUT
+    about, raises, errors = inspect.cleandoc(run.__doc__ or "").partition("Raises\n")
+    given = "" if "Parameters\n" in about else _GIVEN
+    of_either.__doc__ = f"{about}{given}{raises}{errors}{_WARNS}"
     return of_either
 
 

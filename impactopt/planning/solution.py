@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.errors import InputError, missing_package
 from impactopt.planning.causes import Cause
 from impactopt.planning.cautions import gear_caution, slide, slide_caution
 from impactopt.planning.contact_replay import AGREED, ContactReplay, ModelError, PlannedContact
@@ -34,6 +35,7 @@ from impactopt.transcription.planned_loads import motion_loads
 from impactopt.transcription.planned_strike import PlannedStrike
 
 Array = NDArray[np.float64]
+GROUND = ("fx", "fy", "fz", "mx", "my", "mz")  # of the ground's wrench
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -272,15 +274,48 @@ class Solution(Solved):
         return Path(report_page(self, simulation=simulation, replay=replay).save(path))
 
     def plot(
-        self, what: str = "overview", *, simulation: Any | None = None, replay: Any | None = None
+        self,
+        what: str = "overview",
+        *,
+        ax: Any | None = None,
+        simulation: Any | None = None,
+        replay: Any | None = None,
     ) -> Any:
         """Poses, contact force, ZMP and torque as one picture, or another one by name; a matplotlib figure.
 
-        what, simulation, replay : as of :func:`impactopt.plot`, such as ``solution.plot("strobe")``.
+        what, ax, simulation, replay : as of :func:`impactopt.plot`, such as ``solution.plot("strobe")``, or
+        ``solution.plot("force", ax=ax)``, which draws in your axes and returns them.
         """
         from impactopt import plot
 
-        return plot(self, what, simulation=simulation, replay=replay)
+        return plot(self, what, ax=ax, simulation=simulation, replay=replay)
+
+    def to_frame(self, *, missed: bool = False) -> Any:
+        """The planned motion as a pandas table, by time [s]: ``solution.to_frame()["q leg_left_4_joint"]``.
+
+        Columns are phase (0 swing, 1 collision, 2 follow-through); of every joint its position q [rad],
+        velocity v, acceleration a and torque [N m]; and of the ground its force fx, fy, fz [N] and moment
+        mx, my, mz [N m] about the world's origin.
+        missed : the motion that follows a blow that has hit nothing.
+
+        Raises
+        ------
+        InputError : pandas is not installed; of a missed blow, the plan has no such motion.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise missing_package("a table of a motion", "pandas", "frame") from error
+        if missed and self.plan.abort is None:
+            raise InputError("the plan has no motion that follows a missed blow; leave `missed` out")
+        way, robot = self.missed_trajectory if missed else self.trajectory, self.problem.robot
+        angles = np.array([robot.joint_positions(q) for q in way.q])
+        columns: dict[str, Any] = {"phase": way.phase}
+        joints = {"q": angles, "v": way.v[:, -robot.n :], "a": way.a[:, -robot.n :], "torque": way.torque}
+        for what, values in joints.items():
+            columns |= {f"{what} {n}": c for n, c in zip(robot.joint_names, values.T, strict=True)}
+        columns |= {f"ground {n}": c for n, c in zip(GROUND, way.ground.T, strict=True)}
+        return pandas.DataFrame(columns, index=pandas.Index(way.time, name="time [s]"))
 
     def export(
         self,

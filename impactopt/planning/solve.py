@@ -68,30 +68,56 @@ def solve(
 ) -> Solution:
     """Plan the motion that maximizes the problem's objectives, by default the impulse, within its terms.
 
-    solver : "sqp", our own, or "ipopt". Ours is a primal-dual interior-point method: it takes one Newton step
-        on each quadratic model of the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which
-        solves its QPs to their end, for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
-    start : "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such
-        a reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables (n,); or
-        the solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
-    starts : number of starts. The first one is plain, the others have perturbed postures and other speeds,
-        drawn by ``seed``. The best motion is kept; ``Solution.attempts`` has all. Where all end with bodies
-        in each other, up to two more are tried.
-    options : the solver's own.  time_limit [s] : of all starts together, without compiling functions.
-    workers : processes that the starts are solved on, side by side. Then no callback is asked, and no more
-        starts are tried than were asked for.
-    refine : whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin
-        between two nodes, and it is solved again from the solution, at most three times (``Solution.nodes``).
-        The contact gets finer elements while theirs make an error of more than half a per cent of the impulse
-        (``Solution.elements``, ``Solution.contact_error``).
-    report : called with a line of text while functions are built.  callback : called with every iteration's
-        record; if it returns True, or on Ctrl-C, the solve stops with the best iterate.
-
     An infeasible problem is a status with named constraints, not an exception.
+
+    Parameters
+    ----------
+    problem : ImpactProblem
+        Robot, striker, target and contact law, limits and objectives. :func:`impactopt.solve` also takes the
+        path of a problem file, or the name of one that comes with the package (`impactopt problems`); its
+        [solver] section then holds where nothing else is given.
+    solver : {"sqp", "ipopt"}
+        "sqp" is our own primal-dual interior-point method: it takes one Newton step on each quadratic model of
+        the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which solves its QPs to their end,
+        for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
+    start : str, array_like (n,) or Solution
+        "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such a
+        reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables; or the
+        solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
+    starts : int
+        Number of starts. The first one is plain, the others have perturbed postures and other speeds, drawn
+        by `seed`. The best motion is kept; ``Solution.attempts`` has all. Where all end with bodies in each
+        other, up to two more are tried.
+    seed : int
+        Seed of the starts that are drawn.
+    options : mapping, optional
+        The solver's own.
+    time_limit : float, optional
+        Time [s] of all starts together, without compiling functions.
+    workers : int
+        Processes that the starts are solved on, side by side. Then no callback is asked, and no more starts
+        are tried than were asked for.
+    refine : bool
+        Whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin between
+        two nodes, and it is solved again from the solution, at most three times (``Solution.nodes``). The
+        contact gets finer elements while theirs make an error of more than half a per cent of the impulse
+        (``Solution.elements``, ``Solution.contact_error``).
+    report : callable, optional
+        Called with a line of text while functions are built; by default the logger "impactopt", with level
+        INFO, has them.
+    callback : callable, optional
+        Called with every iteration's record; if it returns True, or on Ctrl-C, the solve stops with the best
+        iterate.
+
+    Returns
+    -------
+    Solution
+        The plan, with the solver's result; its status says whether it is solved.
 
     Raises
     ------
-    InputError : unknown solver, option or start, a start of the wrong length, several of a given start.
+    InputError
+        Unknown solver, option or start, a start of the wrong length, several of a given start.
     """
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
     check_starts(starts, seed, workers, callback, given=not isinstance(start, str))

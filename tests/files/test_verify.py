@@ -16,6 +16,7 @@ from impactopt.cli.app import app
 from impactopt.files.output import Record, load_record, record_of, save_record
 from impactopt.files.problem_file import load_problem
 from impactopt.files.verify import motion_of_record
+from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 
 ARM = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
@@ -23,8 +24,8 @@ runner = CliRunner()
 
 
 @pytest.fixture(scope="module")
-def record() -> Record:
-    return record_of(solve(load_problem(ARM)), problem=ARM.read_text("utf-8"), problem_path=ARM)
+def record(hammered: Solution) -> Record:
+    return record_of(hammered, problem=ARM.read_text("utf-8"), problem_path=ARM)
 
 
 # The hammer in a soft grip, gears' loads, and a price on effort.

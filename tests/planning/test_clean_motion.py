@@ -42,7 +42,7 @@ def test_nor_when_it_is_bent(punch: Solution, aside: tuple[float, float, float])
 
 def test_nor_in_another_problem() -> None:
     """All of them: `python -m benchmarks truth`."""
-    solution = solve(load_problem("door"))
+    solution = solve(load_problem("kick_talos"))
     assert solution.status.usable, solution.result.message
     meshes = Meshes(solution.problem.robot, solution.problem.start_posture)
     assert meshes.known

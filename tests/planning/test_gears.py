@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,12 @@ def _weak(limit: float = LIMIT) -> ImpactProblem:
     return replace(problem, robot=robot)
 
 
+@cache
+def _free(weak: bool) -> Solution:
+    """The plan that does not look at its gears."""
+    return solve(_with(_weak() if weak else load_problem("arm_planar"), OFF))
+
+
 def _on_gears(problem: ImpactProblem) -> bool:
     return "gear_load" in rows_on_demand(problem)
 
@@ -61,7 +68,7 @@ def bounded() -> Solution:
 def test_a_plan_that_goes_beyond_gets_rows_and_goes_on(bounded: Solution) -> None:
     """To the plan that rows from the start lead to."""
     problem = _weak()
-    free, own = solve(_with(problem, OFF)), solve(_with(problem, GearLoad()))
+    free, own = _free(True), solve(_with(problem, GearLoad()))
     assert free.loads.gear.max() > 1.03 * LIMIT
     assert bounded.loads.gear.max() == pytest.approx(LIMIT, rel=0.03)
     assert bounded.impulse == pytest.approx(own.impulse, rel=1e-4) and bounded.impulse < free.impulse
@@ -75,9 +82,8 @@ def test_it_holds_in_replays(bounded: Solution, engine: str) -> None:
     assert found.loads.gear.max() == pytest.approx(bounded.loads.gear.max(), rel=0.05)
 
 
-def test_a_plan_that_does_not_is_the_one_without_a_bound() -> None:
-    problem = load_problem("arm_planar")
-    free, kept = (solve(p) for p in (_with(problem, OFF), problem))
+def test_a_plan_that_does_not_is_the_one_without_a_bound(hammered: Solution) -> None:
+    free, kept = _free(False), hammered
     np.testing.assert_array_equal(kept.result.x, free.result.x)
     assert not _on_gears(kept.problem) and not kept.summary()["rows_on_demand"]
 
@@ -120,8 +126,7 @@ def test_a_neighbour_goes_on_with_the_rows(bounded: Solution) -> None:
     found = solve(nearer, start=bounded)
     assert found.status.usable and _on_gears(found.problem)
     assert found.result.iterations < bounded.result.iterations
-    free = solve(_with(_weak(), OFF))
-    kept = solve(_with(_weak(), GearLoad()), start=free)
+    kept = solve(_with(_weak(), GearLoad()), start=_free(True))
     assert kept.impulse == pytest.approx(bounded.impulse, rel=1e-3)
 
 
@@ -158,8 +163,7 @@ def test_what_is_off_is_said(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["problem"]["off"] == ["gear load"]
     assert summary["gear_caution"].endswith("bound it with [terms.gear_load]")
-    free = solve(_with(load_problem("arm_planar"), OFF))
-    assert ">gear load</td>" in report_of(record_of(free)).html
+    assert ">gear load</td>" in report_of(record_of(_free(False))).html
 
 
 def test_what_gears_bear_at_most_is_part_of_the_problem() -> None:

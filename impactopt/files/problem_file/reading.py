@@ -248,8 +248,8 @@ def _besides(
     """Further mistakes of a file, which show once the others are mended: checks of whole sections, and with a
     folder names of the robot's parts, where neither robot nor stance is wrong.
 
-    For that, misspelt keys get their probable names, wrong ones are left out, and what is missing and required
-    has a stand-in.
+    For that, misspelt keys get their probable names, wrong ones are left out, and what is required and not
+    there has a stand-in.
     """
     rest: Any = {"problem": {}, **copy.deepcopy(dict(data))}
     further: list[Mistake] = []

@@ -11,20 +11,24 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
+from matplotlib.figure import FigureBase
+
 from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import Record, record_of, write_file
 from impactopt.planning.solution import Solution
-from impactopt.report.pictures.ellipsoid import ellipsoid
-from impactopt.report.pictures.force import force
+from impactopt.report.pictures.ellipsoid import draw_ellipsoid, ellipsoid
+from impactopt.report.pictures.force import draw_force, force
 from impactopt.report.pictures.hierarchy import hierarchy
-from impactopt.report.pictures.iterations import iterations
-from impactopt.report.pictures.motion import motion
-from impactopt.report.pictures.overview import overview
+from impactopt.report.pictures.iterations import draw_iterations, iterations
+from impactopt.report.pictures.motion import draw_motion, motion
+from impactopt.report.pictures.overview import draw_overview, overview
+from impactopt.report.pictures.replay import draw_replay
 from impactopt.report.pictures.replay import replay as _replay
-from impactopt.report.pictures.strobe import strobe
-from impactopt.report.pictures.style import Picture
-from impactopt.report.pictures.torque import torque
-from impactopt.report.pictures.zmp import zero_moment_point
+from impactopt.report.pictures.strobe import draw_strobe, strobe
+from impactopt.report.pictures.style import Picture, styled
+from impactopt.report.pictures.torque import draw_torque_and_gears, torque
+from impactopt.report.pictures.zmp import draw_zmp, zero_moment_point
 
 __all__ = [
     "PICTURES",
@@ -53,6 +57,18 @@ PICTURES: Mapping[str, Callable[[Record], Picture | None]] = {
     "iterations": iterations,
     "replay": _replay,
 }
+# the same, into a figure or a part of one
+DRAWN: Mapping[str, Callable[[Any, Record], None]] = {
+    "overview": draw_overview,
+    "force": draw_force,
+    "zmp": draw_zmp,
+    "torque": draw_torque_and_gears,
+    "strobe": draw_strobe,
+    "motion": draw_motion,
+    "ellipsoid": draw_ellipsoid,
+    "iterations": draw_iterations,
+    "replay": draw_replay,
+}
 # why a picture may be None
 _WHY = {
     "zmp": "the robot stands on no soles",
@@ -65,19 +81,22 @@ def plot(
     solution: Solution,
     what: str = "overview",
     *,
+    ax: Axes | None = None,
     simulation: Any | None = None,
     replay: Any | None = None,
-) -> Picture:
+) -> Picture | Axes | list[Axes]:
     """A picture of a solution, which a notebook shows, and ``savefig`` writes: ``Solution.plot``.
 
     what : "overview", the four that matter (poses, force, ZMP, torque), or one of PICTURES.
+    ax : matplotlib axes of your own figure to draw in; the panels of a picture that has several take their
+        place. Then the axes are returned, or the list of them.
     simulation : of ``solution.validate()``, drawn beside the plan.  replay : of
         ``solution.validate(engine="mujoco")``, which "replay" draws.
 
     Raises
     ------
     InputError : an unknown picture; one of what the solution has not, such as the ZMP of an arm; a plan whose
-        motion cannot be completed.
+        motion cannot be completed; axes that are no part of a grid, for several panels.
     """
     draws = {"overview": overview, **PICTURES}
     if what not in draws:
@@ -89,7 +108,29 @@ def plot(
     picture = draws[what](record)
     if picture is None:
         raise InputError(f"of this solution there is nothing to draw as {what!r}: {_WHY[what]}")
-    return picture
+    return picture if ax is None else _drawn_in(ax, what, record)
+
+
+@styled
+def _drawn_in(ax: Axes, what: str, record: Record) -> Axes | list[Axes]:
+    """The picture in the place of axes, and its own."""
+    if what == "force":
+        draw_force(ax, record)
+        return ax
+    grid, figure = ax.get_subplotspec(), ax.figure
+    if grid is None:
+        raise InputError(f"ax is no part of a grid, which {what!r} needs: make it with plt.subplots()")
+    ax.remove()
+    part = figure.add_subfigure(grid)
+    DRAWN[what](part, record)
+    panels = _panels(part)
+    return panels[0] if len(panels) == 1 else panels
+
+
+def _panels(part: FigureBase) -> list[Axes]:
+    """Axes of a part of a figure and of its parts."""
+    inner: list[FigureBase] = part.subfigs
+    return list(part.axes) + [axes for one in inner for axes in _panels(one)]
 
 
 def save_pictures(record: Record, directory: Path, names: Iterable[str] = tuple(PICTURES)) -> list[Path]:

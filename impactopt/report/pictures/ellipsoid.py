@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from impactopt.files.output import Record
@@ -40,13 +41,19 @@ def ellipsoid(record: Record) -> Picture:
     held, joints free. (An ellipsoid proper has its square root for a radius; a mass is easier to read.) It is
     open where the mass is beyond what the scale holds, as across an arm that moves in a plane.
     """
+    figure = Picture(PAGE, 2.8)
+    draw_ellipsoid(figure, record)
+    return figure
+
+
+def draw_ellipsoid(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
     a = record.arrays
     inverse, normal = a["pose_inverse_mass"], a["pose_normal"]
     mass = float(effective_masses(inverse, normal[None])[0])
     largest = min(float(np.concatenate([_curve(inverse, view) for view, *_ in VIEWS]).max()), MOST * mass)
     views = [v for v in VIEWS if np.isfinite(_within(_curve(inverse, v[0]), largest)).any()]
-    figure = Picture(PAGE, 2.8)
-    panels = figure.subplots(1, len(views) + 1, width_ratios=[1.0] * len(views) + [1.2])
+    panels: Any = figure.subplots(1, len(views) + 1, width_ratios=[1.0] * len(views) + [1.2])
     for axes, (view, across, up, place) in zip(panels, views, strict=False):
         _robot(axes, record, view, largest)
         axes.set(xlabel=across, ylabel=up, title=place)
@@ -54,7 +61,6 @@ def ellipsoid(record: Record) -> Picture:
     panels[-1].plot(0.0, mass, "o", color=VERMILION, markersize=4, zorder=4)
     figure.legend(*panels[-1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     figure.suptitle(title(record, f"{mass:.1f} kg meet the target along the blow"))
-    return figure
 
 
 def _over_angle(axes: Any, inverse: Array, normal: Array, largest: float) -> None:
@@ -116,6 +122,6 @@ def _robot(axes: Any, record: Record, view: Array, largest: float) -> None:
     axes.set_aspect("equal")
     # one length between ticks on both axes: those of a narrow view alone would run into each other
     largest_span = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
-    spacing = np.diff(MaxNLocator(6).tick_values(0.0, largest_span))[0]
+    spacing = np.diff(MaxNLocator(4).tick_values(0.0, largest_span))[0]
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(spacing))

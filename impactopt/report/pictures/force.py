@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from impactopt.files.output import Record
@@ -21,10 +22,10 @@ def force(record: Record) -> Picture:
     return figure
 
 
-def draw_force(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+def draw_force(place: FigureBase | Axes, record: Record) -> None:
+    """The same into a figure, a part of one, or axes."""
     a, summary = record.arrays, record.summary
-    axes = figure.subplots()
+    axes: Any = place if isinstance(place, Axes) else place.subplots()
     label = f"planned: {_impulse(summary)}"
     style: Any = {"color": PLANNED, "markersize": 4, "label": label, "zorder": 3}
     axes.plot(1e3 * a["collision_time"], a["collision_force"], "o", **style)
@@ -42,8 +43,11 @@ def draw_force(figure: FigureBase, record: Record) -> None:
         axes.plot(shown, value, color=SIMULATED, label=label)
     axes.set(xlabel="time since contact [ms]", ylabel="force on the target [N]")
     axes.set_ylim(bottom=0.0)
+    if isinstance(place, Axes):
+        place.legend(title="impulse")
+        return
     # below, as no corner of the axes is free of force for every contact
-    figure.legend(title="impulse", loc="outside lower center", ncols=2)
+    place.legend(title="impulse", loc="outside lower center", ncols=2)
 
 
 def _impulse(summary: Mapping[str, Any]) -> str:

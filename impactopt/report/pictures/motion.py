@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 
 from impactopt.files.output import Record
@@ -27,12 +28,18 @@ COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 @styled
 def motion(record: Record) -> Picture:
     """Angles and velocities of the joints that move most."""
+    figure = Picture(PAGE, 4.6)
+    draw_motion(figure, record)
+    return figure
+
+
+def draw_motion(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
     a = record.arrays
     names, time, angle = a["joints"], a["reference_time"], a["reference_angle"]
     until = float(a["reference_end"])
     chosen = np.argsort(-np.ptp(angle, axis=0))[: len(COLOURS)]
     rate = a["reference_v"][:, -len(names) :] / a["velocity_limit"]
-    figure = Picture(PAGE, 4.6)
     top, bottom = figure.subplots(2, 1, sharex=True)
     for j, colour in zip(chosen, COLOURS, strict=False):
         top.plot(time, angle[:, j], color=colour, label=joint_label(names[j]))
@@ -50,4 +57,3 @@ def motion(record: Record) -> Picture:
     handles.append(Line2D([], [], color="#bbbbbb", linewidth=6))
     labels.append("contact")
     top.legend(handles, labels, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)
-    return figure

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 
 from impactopt.files.output import Record
@@ -36,7 +37,14 @@ def replay(record: Record) -> Picture | None:
     if not record.replayed or not len(a["replayed_soles"]):
         return None
     figure = Picture(PAGE, 4.2)
-    places = figure.subplot_mosaic([["cop", "force"], ["cop", "move"]], width_ratios=[2, 3])
+    draw_replay(figure, record)
+    return figure
+
+
+def draw_replay(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
+    a = record.arrays
+    places: Any = figure.subplot_mosaic([["cop", "force"], ["cop", "move"]], width_ratios=[2, 3])
     _centres(figure, places["cop"], a)
     time, start = a["replayed_time"], float(a["replayed_contact_start"])
     names = [str(name).replace("_", " ") for name in a["replayed_soles"]]
@@ -57,7 +65,6 @@ def replay(record: Record) -> Picture | None:
     places["force"].set(ylabel="normal force [N]", title="force on each sole; grey: contact")
     places["move"].set(xlabel="time [s]", ylabel="slip, lift [mm]", title="the corner that moved most")
     figure.suptitle(title(record, f"soles in the replay ({_verdict(record)})"))
-    return figure
 
 
 def _verdict(record: Record) -> str:
@@ -66,7 +73,7 @@ def _verdict(record: Record) -> str:
     return "stands at the end" if stands else str(reason).split(":")[0] if stands is None else str(reason)
 
 
-def _centres(figure: Picture, axes: Any, a: Any) -> None:
+def _centres(figure: FigureBase, axes: Any, a: Any) -> None:
     """Paths of the centres of pressure by phase, from above: forward is up, left is left."""
     time, start, end = a["replayed_time"], a["replayed_contact_start"], a["replayed_contact_end"]
     phase = (time >= start).astype(int) + (time >= end).astype(int)  # nan compares false

@@ -31,19 +31,23 @@ GEARS = 2.0  # [in] of the panel of gears
 @styled
 def torque(record: Record) -> Picture:
     """Torque demand over limit, joints by time; contact has a panel of its own, at a larger scale."""
-    gears = _gears(record)
-    height = torque_height(record) + 0.2
-    figure = Picture(PAGE, height + (GEARS if gears else 0.0))
+    figure = Picture(PAGE, torque_height(record) + 0.2 + (GEARS if _gears(record) else 0.0))
     kind = "simulated, before saturation" if record.simulated else "planned"
     figure.suptitle(title(record, f"torque over limit ({kind})"))
+    draw_torque_and_gears(figure, record)
+    return figure
+
+
+def draw_torque_and_gears(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
+    gears = _gears(record)
     if not gears:
         draw_torque(figure, record)
-        return figure
-    parts: Any = figure.subfigures(2, 1, height_ratios=[height, GEARS])
+        return
+    parts: Any = figure.subfigures(2, 1, height_ratios=[torque_height(record) + 0.2, GEARS])
     above, below = parts
     draw_torque(above, record)
     _draw_gears(below, record, gears)
-    return figure
 
 
 def _gears(record: Record) -> dict[str, tuple[Array, Array]]:
@@ -85,7 +89,7 @@ def torque_height(record: Record) -> float:
 
 
 def draw_torque(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+    """Torque demand alone, into a figure, or a part of one."""
     a = record.arrays
     names = [joint_label(name) for name in a["joints"]]
     histories = _demand(record)

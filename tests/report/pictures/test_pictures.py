@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.figures import FIGURES, app, chosen, drawn
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.figure import Figure
 from PIL import Image
 from support.fake_solution import MissingSolution, still_problem, still_solution
 from support.picture_checks import frowns
@@ -305,3 +307,36 @@ def test_every_figure_has_a_source_that_exists() -> None:
 def test_figures_of_the_formulas_are_drawn() -> None:
     ((name, picture),) = drawn(["fig3"], lambda text: None)
     assert name == "fig3" and frowns(picture) == []
+
+
+# ---------------------------------------------------------------- in axes of one's own
+def test_a_picture_of_one_panel_is_drawn_in_given_axes(biped_plan: Planned) -> None:
+    figure = Figure()
+    left, right = figure.subplots(1, 2)
+    left.plot([0.0, 10.0], [0.0, 5.0])
+    found = solution_of(biped_plan).plot("force", ax=left)
+    assert found is left and figure.axes == [left, right]
+    assert len(left.lines) == 2 and not right.lines
+    np.testing.assert_array_equal(left.lines[1].get_ydata(), biped_plan.plan.collision.force)
+
+
+@pytest.mark.parametrize("name", ["overview", "zmp", "torque", "strobe", "motion", "ellipsoid", "iterations"])
+def test_panels_of_others_take_the_place_of_given_axes(biped_plan: Planned, name: str) -> None:
+    """As many as in a picture of their own, within the place, whatever is drawn beside."""
+    solution, figure = solution_of(biped_plan), Figure(figsize=(14, 14), layout="constrained")
+    (above, below), _ = figure.subplots(2, 2)
+    found = solution.plot(name, ax=below)
+    panels = [found] if isinstance(found, Axes) else found
+    assert below not in figure.axes and above in figure.axes
+    assert len(panels) == len(solution.plot(name).axes)
+    figure.canvas.draw()
+    for axes in panels:
+        box = axes.get_position().transformed(axes.figure.transSubfigure)
+        box = box.transformed(figure.transFigure.inverted())
+        assert box.x0 >= 0.49 and box.y0 >= 0.49, name
+
+
+def test_axes_without_a_grid_are_refused(biped_plan: Planned) -> None:
+    free = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
+    with pytest.raises(InputError, match="no part of a grid"):
+        solution_of(biped_plan).plot("motion", ax=free)

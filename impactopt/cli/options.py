@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import hashlib
 import shlex
+import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,18 +39,40 @@ def _complete(incomplete: str, folder: str) -> list[str]:
 
 
 def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
-    """Keys of the problem that the command names, or of any, that begin like this."""
-    from impactopt.errors import InputError
+    """Keys of the problem that the command names, or of any, that begin like this.
+
+    To know all keys takes seconds of imports: those of a file are kept in the cache, as long as it and our
+    sources stay as they are.
+    """
+    from impactopt.codegen.directory import kept
+    from impactopt.files.folders import named_files
+
+    # where the option's value is still to come, click has not made arguments of the words before it
+    name = str(context.params.get("file") or next(iter(context.args), ""))
+    text = ""
+    with contextlib.suppress(OSError, UnicodeDecodeError, ValueError):
+        text = named_files().get(name, Path(name)).read_text(encoding="utf-8") if name else ""
+    sources = sorted(Path(__file__).parents[1].rglob("*.py"))
+    known = "\0".join([text, *(f"{path} {path.stat().st_mtime_ns}" for path in sources)])
+
+    def make() -> bytes:
+        return "\n".join(_setting_keys(text)).encode()
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a cache that cannot be used
+        paths = kept("keys", hashlib.sha256(known.encode()).hexdigest(), make).decode().splitlines()
+    return [f"{path}=" for path in paths if path.startswith(incomplete)]
+
+
+def _setting_keys(text: str) -> list[str]:
+    """Key paths of a problem file's text; of any problem where that is none."""
     from impactopt.files.problem_file.changes import key_paths
-    from impactopt.files.problem_file.names import problem_file
     from impactopt.files.problem_file.toml import TOMLError, read_toml
 
     data: dict[str, Any] = {}
-    with contextlib.suppress(InputError, OSError, UnicodeDecodeError, TOMLError):
-        # where the option's value is still to come, click has not made arguments of the words before it
-        name = context.params.get("file") or next(iter(context.args), "")
-        data = read_toml(problem_file(name).read_text(encoding="utf-8"))
-    return [f"{path}=" for path in key_paths(data) if path.startswith(incomplete)]
+    with contextlib.suppress(TOMLError):
+        data = read_toml(text)
+    return list(key_paths(data))
 
 
 ProblemPath = Annotated[

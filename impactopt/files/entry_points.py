@@ -23,9 +23,9 @@ R = TypeVar("R")
 
 _log = logging.getLogger("impactopt")  # its lines are seen by who asks for level INFO
 
-_GIVEN = """problem : an :class:`impactopt.ImpactProblem`; or the path of a problem file, or the name of one that
-    comes with the package (`impactopt problems`), whose [solver] section then holds where nothing else is
-    given.
+_GIVEN = """problem : an :class:`impactopt.ImpactProblem`; or the path of a problem file, or the name of one
+    that comes with the package (`impactopt problems`), whose [solver] section then holds where nothing else
+    is given.
 report : where it is None, its lines go to the logger "impactopt", with level INFO.
 
 """

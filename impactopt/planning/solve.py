@@ -73,9 +73,9 @@ def solve(
     Parameters
     ----------
     problem : ImpactProblem
-        Robot, striker, target and contact law, limits and objectives. :func:`impactopt.solve` also takes the
-        path of a problem file, or the name of one that comes with the package (`impactopt problems`); its
-        [solver] section then holds where nothing else is given.
+        Robot, striker, target and contact law, limits and objectives. :func:`impactopt.solve` also takes
+        the path of a problem file, or the name of one that comes with the package (`impactopt problems`);
+        its [solver] section then holds where nothing else is given.
     solver : {"sqp", "ipopt"}
         "sqp" is our own primal-dual interior-point method: it takes one Newton step on each quadratic model of
         the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which solves its QPs to their end,

@@ -129,8 +129,8 @@ def _drawn_in(ax: Axes, what: str, record: Record) -> Axes | list[Axes]:
 
 def _panels(part: FigureBase) -> list[Axes]:
     """Axes of a part of a figure and of its parts."""
-    inner: list[FigureBase] = part.subfigs
-    return list(part.axes) + [axes for one in inner for axes in _panels(one)]
+    whole: Any = part  # matplotlib has no type for what a part of a figure has
+    return [*whole.axes, *(axes for inner in whole.subfigs for axes in _panels(inner))]
 
 
 def save_pictures(record: Record, directory: Path, names: Iterable[str] = tuple(PICTURES)) -> list[Path]:

@@ -34,8 +34,8 @@ BEGIN = f"""(() => {{
   [v.canvas.width, v.canvas.height] = [{2 * PANEL[0]}, {2 * PANEL[1]}];
   v.look("3/4");
   v.yaw += 0.3;
-  v.distance = 3.2 * v.size;
-  v.centre[0] += 0.04;
+  v.distance = 3.5 * v.size;
+  v.centre[0] += 0.1;
   return true;
 }})()"""
 # drawn and read at once: a canvas keeps nothing until later

@@ -8,7 +8,6 @@ fault of ours; 130 Ctrl-C.
 from __future__ import annotations
 
 import enum
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +22,8 @@ from impactopt.cli.identify import identify
 from impactopt.cli.options import (
     NOT_SOLVED,
     AsJson,
+    PlainCommand,
+    PlainGroup,
     ProblemPath,
     Quiet,
     Seed,
@@ -36,6 +37,7 @@ from impactopt.cli.options import (
     check_time_limit,
     command_line,
     examples,
+    print_json,
 )
 from impactopt.cli.show import show
 from impactopt.cli.strike import strike
@@ -55,6 +57,7 @@ __all__ = ["app", "main"]
 
 app = typer.Typer(
     name="impactopt",
+    cls=PlainGroup,
     help="Impact motions of humanoid robots: planned by the impulse they deliver, checked in full dynamics.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -157,12 +160,12 @@ def solve(
             if solution.caution:
                 progress.say(solution.caution)
             record = _record(solution, read, validate, progress)
-            record.summary["command"] = command_line(context)
+            record.summary.update(command=command_line(context), ok=solution.status.usable)
             if baseline:
                 progress.say("looking for the hardest minimum-jerk reach inside the same limits")
-                record.summary["baseline"] = _baseline(problem)
+                record.summary["baseline"] = _baseline(problem, progress)
             written = [*keep_record(record, directory)]
-        _show(record, as_json)
+        _show(record, as_json, solution.status.usable)
         from impactopt.report.pictures import save_pictures  # matplotlib only now
 
         with progress:
@@ -237,6 +240,8 @@ app.command(epilog=examples("impactopt check my.toml", "impactopt check punch --
 )
 app.command(epilog=examples("impactopt problems --json"))(problems)
 app.command(epilog=examples("impactopt robots --json"))(robots)
+for _registered in app.registered_commands:
+    _registered.cls = PlainCommand
 
 
 def _record(solution: Solution, read: ProblemFile, validate: bool, progress: SolveConsole) -> Record:
@@ -274,7 +279,7 @@ def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Sol
     )
 
 
-def _baseline(problem: ImpactProblem) -> dict[str, object]:
+def _baseline(problem: ImpactProblem, progress: SolveConsole) -> dict[str, object]:
     from impactopt.errors import InputError
     from impactopt.planning.minimum_jerk import minimum_jerk_baseline
 
@@ -282,24 +287,26 @@ def _baseline(problem: ImpactProblem) -> dict[str, object]:
         return minimum_jerk_baseline(problem).describe()
     except InputError as error:
         return {"method": "minimum jerk", "error": str(error)}
+    except KeyboardInterrupt:
+        progress.say("interrupted; the plan is kept without a baseline")
+        return {"method": "minimum jerk", "error": "interrupted"}
 
 
-def _show(record: Record, as_json: bool) -> None:
+def _show(record: Record, as_json: bool, ok: bool) -> None:
     if as_json:
-        typer.echo(json.dumps(record.summary, indent=2))
+        print_json(record.summary, ok)
         return
-    from rich.console import Console
-
     from impactopt.errors import printable
     from impactopt.report.console import (
         multistart_table,
+        output,
         result_table,
         switched_off_message,
         touches_message,
         violation_table,
     )
 
-    console, summary = Console(), record.summary
+    console, summary = output(), record.summary
     if record.completed:
         console.print(result_table(summary))
     reach = summary.get("baseline", {})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import json
 import math
 import os
 from pathlib import Path
@@ -11,7 +10,15 @@ from typing import Annotated, Any
 
 import typer
 
-from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, check_loudness, complete_problem
+from impactopt.cli.options import (
+    AsJson,
+    Quiet,
+    Settings,
+    Verbose,
+    check_loudness,
+    complete_problem,
+    print_json,
+)
 from impactopt.report.plain_errors import plain_errors
 
 NO_COLLISION = 1  # exit code
@@ -99,16 +106,14 @@ def collide(
             at_contact |= {} if speed is None else {"speed_m_s": speed}
             found = collide_once(read, at_contact, accuracy=accuracy / 100)
         if as_json:
-            typer.echo(json.dumps(found, indent=2))
+            print_json(found, "reason" not in found)
         else:
-            from rich.console import Console
-
-            from impactopt.report.console import collision_table, torques_table
+            from impactopt.report.console import collision_table, output, torques_table
 
             if "reason" in found:
                 typer.echo(f"no collision: {found['reason']}")
             else:
-                shown = Console()
+                shown = output()
                 shown.print(collision_table(found))
                 if found["joints"]:
                     shown.print(torques_table(found["joints"]))

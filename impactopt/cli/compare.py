@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson
+from impactopt.cli.options import AsJson, print_json
 from impactopt.report.plain_errors import plain_errors
 
 FILES = ("compare.json", "compare.png", "compare.html")
@@ -49,13 +49,11 @@ def compare(
             write_file(written[1], picture.write)
             page.save(written[2])
         if as_json:
-            typer.echo(text)
+            print_json(found.describe(), True)
             return
-        from rich.console import Console
+        from impactopt.report.console import comparison_tables, output
 
-        from impactopt.report.console import comparison_tables
-
-        console = Console()
+        console = output()
         for table in comparison_tables(found):
             console.print(table)
         for path in written:

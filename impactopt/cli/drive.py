@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import (
-    AsJson,
-    ProblemPath,
-    Quiet,
-    Settings,
-    Verbose,
-    check_loudness,
-)
+from impactopt.cli.options import AsJson, ProblemPath, Quiet, Settings, Verbose, check_loudness, print_json
 from impactopt.report.plain_errors import plain_errors
 
 NOT_IN = 1  # exit code
@@ -43,7 +35,7 @@ def drive(
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.result_folder import keep_series, set_aside
         from impactopt.planning.nail_driving import drive_nail
-        from impactopt.report.console import SolveConsole, nail_driving_table
+        from impactopt.report.console import SolveConsole, nail_driving_table, output
 
         check_loudness(quiet, verbose)
         read = read_problem_file(problem, parse_settings(settings or ()))
@@ -60,11 +52,9 @@ def drive(
         if directory is not None:
             keep_series(done, directory)
         if as_json:
-            typer.echo(json.dumps(done, indent=2))
+            print_json(done, series.done)
         else:
-            from rich.console import Console
-
-            Console().print(nail_driving_table(done))
+            output().print(nail_driving_table(done))
             typer.echo(series.reason or f"the nail is in after {len(series.blows)} blows")
             if aside := set_aside(done):
                 typer.echo(aside)

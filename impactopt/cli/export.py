@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import enum
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem
+from impactopt.cli.options import AsJson, OtherProblem, print_json
 from impactopt.report.plain_errors import plain_errors
 
 # what is done with the files where they go, said when they are written
@@ -78,7 +77,7 @@ def export(
         written = export_planned(planned, to.value, directory, rate=rate, joints=names)
         if as_json:
             told = {"to": to.value, "directory": str(directory), "files": [str(path) for path in written]}
-            typer.echo(json.dumps(told, indent=2))
+            print_json(told, True)
             return
         for path in written:
             typer.echo(printable(str(path)))

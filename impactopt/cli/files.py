@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem
+from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem, print_json
 from impactopt.report.plain_errors import BAD_INPUT, plain_errors
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def check(
 ) -> None:
     """Say whether a problem file is sound and its target within reach; else every mistake, and its fix.
 
-    What to fix first stands first. With --json {"sound", "file", "hash", "problem", "doubts"}, or {"sound",
+    What to fix first stands first. With --json {"ok", "file", "hash", "problem", "doubts"}, or {"ok",
     "file", "mistakes"}. Exit code: 0 sound, 2 not.
     """
     with plain_errors("interrupted", verbose=verbose):
@@ -45,11 +45,11 @@ def check(
                 raise
             first, *rest = str(error).splitlines()
             told = {"sound": False, "file": str(file), "mistakes": [m.strip() for m in rest] or [first]}
-            typer.echo(json.dumps(told, indent=2))
+            print_json(told, False)
             raise typer.Exit(BAD_INPUT) from None
         if as_json:
             told = {"sound": True, "file": str(file), "hash": problem.hash, "problem": problem.describe()}
-            typer.echo(json.dumps(told | {"doubts": doubtful}, indent=2))
+            print_json(told | {"doubts": doubtful}, True)
             return
         typer.echo(printable(f"{file} is sound:"))
         plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
@@ -145,32 +145,34 @@ def new(
 ) -> None:
     """Print a problem file to start from, with a comment to each key; without a name, list the problems.
 
-    Keys that the problem leaves out stand there as comments with their defaults. --json is for the list. With
-    --urdf or --mjcf the file is drafted for that robot: soles, strikers, a posture, a target, and guesses of
-    what its description lacks.
+    Keys that the problem leaves out stand there as comments with their defaults. With --urdf or --mjcf the
+    file is drafted for that robot: soles, strikers, a posture, a target, and guesses of what its description
+    lacks. --json prints the file as `toml` and its tables as `data`, or the list.
     """
     with plain_errors("interrupted"):
         if sum(x is not None for x in (name, urdf, mjcf)) + reference > 1:
             raise typer.BadParameter("give one of NAME, --urdf, --mjcf and --reference")
         if bolted and urdf is None and mjcf is None:
             raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint="--bolted")
+        if reference and as_json:
+            raise typer.BadParameter("the reference is Markdown; leave --json out", param_hint="--json")
         if reference:
             from impactopt.files.problem_file.reference import reference as page
 
             _give(page(), out)
         elif urdf is not None or mjcf is not None:
-            _draft(str(mjcf if urdf is None else urdf), urdf is None, bolted, out)
+            _draft(str(mjcf if urdf is None else urdf), urdf is None, bolted, out, as_json)
         elif name is not None:
             from impactopt.files.problem_file.template import problem_template
 
-            _give(problem_template(name), out)
+            _give(problem_template(name), out, as_json)
         elif out is not None:
             raise typer.BadParameter("name what to write: NAME, --urdf or --mjcf", param_hint="--out")
         else:
             problems(as_json)
 
 
-def _draft(given: str, mjcf: bool, bolted: bool, out: Path | None) -> None:
+def _draft(given: str, mjcf: bool, bolted: bool, out: Path | None, as_json: bool) -> None:
     from impactopt.errors import printable
     from impactopt.files.draft.description import find_description
     from impactopt.files.draft.drafting import draft_problem
@@ -178,27 +180,31 @@ def _draft(given: str, mjcf: bool, bolted: bool, out: Path | None) -> None:
     path = Path(given) if mjcf else find_description(given)
     folder = Path() if out is None else out.parent
     draft = draft_problem(path, folder=folder, mjcf=mjcf, bolted=bolted)
-    _give(draft.text, out)
+    _give(draft.text, out, as_json)
     for line in draft.said:
         typer.echo(printable(line), err=True)
     if out is not None:
         typer.echo(f"next: impactopt check {out}; then impactopt solve {out}", err=True)
 
 
-def _give(text: str, out: Path | None) -> None:
-    """Print a file's text, or write it where there is none yet."""
+def _give(text: str, out: Path | None, as_json: bool = False) -> None:
+    """Print a file's text, or write it where there is none yet; as JSON what is in it, too."""
     from impactopt.codegen.files import write_atomically
     from impactopt.errors import InputError
+    from impactopt.files.problem_file.toml import read_toml
 
-    if out is None:
+    if out is not None:
+        if out.exists():
+            raise InputError(f"there is a file {out} already; give another --out, or delete it")
+        try:
+            write_atomically(out, lambda file: file.write(text.encode()))
+        except OSError as error:
+            raise InputError(f"cannot write {out}: {error.strerror}") from error
+    if as_json:
+        place = None if out is None else str(out)
+        print_json({"file": place, "toml": text, "data": read_toml(text)}, True)
+    elif out is None:
         typer.echo(text, nl=False)
-        return
-    if out.exists():
-        raise InputError(f"there is a file {out} already; give another --out, or delete it")
-    try:
-        write_atomically(out, lambda file: file.write(text.encode()))
-    except OSError as error:
-        raise InputError(f"cannot write {out}: {error.strerror}") from error
 
 
 def problems(as_json: AsJson = False) -> None:

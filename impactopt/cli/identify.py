@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, Verbose, complete_problem
+from impactopt.cli.options import AsJson, Verbose, complete_problem, print_json
 from impactopt.report.plain_errors import plain_errors
 
 
@@ -78,13 +77,11 @@ def identify(
             text = found.best.toml()
             write_file(out, lambda file: file.write(text.encode()))
         if as_json:
-            typer.echo(json.dumps(found.describe(), indent=2))
+            print_json(found.describe(), True)
             return
-        from rich.console import Console
+        from impactopt.report.console import identified_table, output
 
-        from impactopt.report.console import identified_table
-
-        console = Console()
+        console = output()
         console.print(identified_table(found.describe()))
         for caution in found.cautions:
             console.print(printable(f"caution: {caution}"), markup=False, highlight=False, soft_wrap=True)

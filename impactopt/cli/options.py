@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import enum
 import hashlib
+import json
 import shlex
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 NOT_SOLVED = 1  # exit code
 
@@ -123,6 +126,30 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="A line for every iteration, and the traceback of an error.")
 ]
+
+
+def print_json(told: Mapping[str, Any], ok: bool) -> None:
+    """Prints what a command has to tell, as JSON; its first key is `ok` for every command: exit code 0."""
+    typer.echo(json.dumps({"ok": ok} | {key: value for key, value in told.items() if key != "ok"}, indent=2))
+
+
+class _Plain:
+    """Mixin of commands in whose help flags have no type beside them."""
+
+    def get_params(self, context: Any) -> Any:
+        found = super().get_params(context)  # type: ignore[misc]
+        for parameter in found:
+            if getattr(parameter, "is_flag", False):
+                parameter.metavar = ""
+        return found
+
+
+class PlainCommand(_Plain, TyperCommand):
+    """Command with flags without a type."""
+
+
+class PlainGroup(_Plain, TyperGroup):
+    """Commands together, with flags without a type."""
 
 
 def check_loudness(quiet: bool, verbose: bool) -> None:

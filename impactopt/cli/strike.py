@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +22,7 @@ from impactopt.cli.options import (
     check_loudness,
     check_time_limit,
     command_line,
+    print_json,
 )
 from impactopt.report.plain_errors import plain_errors
 
@@ -83,21 +83,20 @@ def strike(
             if solution.caution:
                 progress.say(solution.caution)
         record = record_of_strike(solution, problem=read.text, problem_path=read.path)
-        record.summary["command"] = command_line(context)
+        record.summary.update(command=command_line(context), ok=solution.status.usable)
         written = [] if directory is None else keep_record(record, directory)
         if as_json:
-            typer.echo(json.dumps(record.summary, indent=2))
+            print_json(record.summary, solution.status.usable)
         else:
-            from rich.console import Console
-
             from impactopt.report.console import (
                 multistart_table,
+                output,
                 strike_table,
                 switched_off_message,
                 violation_table,
             )
 
-            shown = Console()
+            shown = output()
             shown.print(strike_table(record.summary))
             for text in filter(
                 None, (record.summary.get("gear_caution"), switched_off_message(record.summary))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, check_loudness, complete_sweep
+from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, check_loudness, complete_sweep, print_json
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
@@ -74,7 +73,7 @@ def sweep(
             told: dict[str, Any] = {"report": shown.say, "progress": shown.progress}
             result = run(chosen, out, workers=workers, scheduler=scheduler, again=again, **told)
         if as_json:
-            typer.echo(json.dumps(result.summary()))
+            print_json(result.summary(), result.failed < result.done)
         else:
             _show(result)
         if result.failed == result.done:
@@ -88,10 +87,10 @@ def sweep(
 
 
 def _show(result: SweepResult) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     from impactopt.errors import printable
+    from impactopt.report.console import output
     from impactopt.sweeps.console import words_for_time
 
     table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
@@ -107,7 +106,7 @@ def _show(result: SweepResult) -> None:
         rows["iterations"] = ", ".join(f"{n:.0f} from a {start}" for start, n in result.iterations.items())
     for name, value in rows.items():
         table.add_row(name, value)
-    console = Console()
+    console = output()
     console.print(table)
     for reason, count in result.reasons.items():
         console.print(printable(f"{count} x {reason}"), markup=False, highlight=False)

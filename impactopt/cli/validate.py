@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, Quiet, Settings, Verbose, check_loudness
+from impactopt.cli.options import AsJson, OtherProblem, Quiet, Settings, Verbose, check_loudness, print_json
 from impactopt.report.plain_errors import plain_errors
 
 
@@ -141,13 +141,11 @@ def validate(
 
                 written.append(save_animation(done, animation))
         if as_json:
-            typer.echo(json.dumps(done.report, indent=2))
+            print_json(done.report, done.report["standing"] is not False)
         else:
-            from rich.console import Console
+            from impactopt.report.console import output, replay_table
 
-            from impactopt.report.console import replay_table
-
-            console = Console()
+            console = output()
             console.print(replay_table(done.report, planned.record.summary))
             if beyond := done.record.summary.get("gear_caution"):
                 console.print(printable(str(beyond)), markup=False, highlight=False)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, Quiet, Verbose, check_loudness, examples
+from impactopt.cli.options import AsJson, Quiet, Verbose, check_loudness, examples, print_json
 from impactopt.report.plain_errors import plain_errors
 
 NOT_OK = 1  # exit code
@@ -44,13 +43,12 @@ def verify(
             progress.say(f"{result}: computing its constraints, and their slopes by differences")
             verdict = verified(result, problem_file=problem)
         if as_json:
-            typer.echo(json.dumps(plain(verdict.describe()), indent=2))
+            print_json(plain(verdict.describe()), verdict.ok)
         else:
-            from rich.console import Console
-
             from impactopt.errors import printable
+            from impactopt.report.console import output
 
-            console = Console()
+            console = output()
             console.print(verdict_table(verdict.describe()))
             if verdict.reason:
                 console.print(printable(verdict.reason), markup=False, highlight=False)

@@ -77,9 +77,9 @@ def solve(
         the path of a problem file, or the name of one that comes with the package (`impactopt problems`);
         its [solver] section then holds where nothing else is given.
     solver : {"sqp", "ipopt"}
-        "sqp" is our own primal-dual interior-point method: it takes one Newton step on each quadratic model of
-        the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which solves its QPs to their end,
-        for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
+        "sqp" is our own primal-dual interior-point method: it takes one Newton step on each quadratic model
+        of the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which solves its QPs to their
+        end, for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
     start : str, array_like (n,) or Solution
         "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such a
         reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables; or the

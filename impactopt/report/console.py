@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
@@ -35,6 +36,7 @@ __all__ = [
     "identified_table",
     "multistart_table",
     "nail_driving_table",
+    "output",
     "replay_table",
     "result_table",
     "strike_table",
@@ -45,12 +47,21 @@ __all__ = [
 ]
 
 PHASES_OF_STRIKE = ("contact", "collision")
+PIPED = 500  # columns of what is no terminal
 QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot be rewritten
 
 
 def _plain(text: str) -> str:
     """Text that comes from files, for a console: neither markup nor control characters are obeyed."""
     return escape(printable(text))
+
+
+def output() -> Console:
+    """Console on stdout; where that is no terminal and nobody says how wide it is, lines are as long as they
+    need to be.
+    """
+    console = Console()
+    return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=PIPED)
 
 
 class SolveConsole:

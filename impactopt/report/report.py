@@ -18,6 +18,15 @@ from impactopt.robots.sole_margins import shortfalls
 
 __all__ = ["Report", "report_of"]
 
+COLUMN_NOTES = {
+    "simulated": "Simulated: replayed in Pinocchio's full dynamics, with the soles fixed.",
+    "held soles": "Held soles: replayed in Pinocchio's full dynamics, with the soles fixed.",
+    "free soles": "Free soles: replayed in MuJoCo, with nothing fixed.",
+}
+BAD_NOTE = (
+    "! is outside a limit, or has less than half of the margin that is asked of the plan; a robot that uses "
+    "up a margin may stand all the same."
+)
 NARROW = "\u202f"  # between a number and its unit: no line ends there
 
 
@@ -124,7 +133,11 @@ def _table(s: Mapping[str, Any]) -> str:
         )
         rows.append(f'<tr><th scope="row">{escape(row.label)}</th>{cells}</tr>')
     table = f"<thead><tr><td></td>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
-    return f'<div class="scroll" tabindex="0"><table>{table}</table></div>'
+    notes = " ".join(text for name, text in COLUMN_NOTES.items() if name in columns)
+    if any(not cell.good for row in result_rows(columns) for cell in row.cells):
+        notes = f"{notes} {BAD_NOTE}"
+    about = f'<p class="about">{escape(notes.strip())}</p>' if notes.strip() else ""
+    return f'<div class="scroll" tabindex="0"><table>{table}</table>{about}</div>'
 
 
 def _violations(s: Mapping[str, Any]) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
 import subprocess
@@ -11,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.table import Table
 from support.fake_solution import strike_record
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -29,6 +32,7 @@ from impactopt.files.problem_file import (
     write_toml,
 )
 from impactopt.files.problem_file.names import problem_file
+from impactopt.report.console import output
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
 
@@ -304,3 +308,54 @@ def test_the_page_about_the_command_line_names_every_command_and_code() -> None:
     assert [name for name in commands if f"`{name}`" not in page] == []
     for code in ("0", "1", "2", "70", "130"):
         assert re.search(rf"(?m)^\| {code} \|", page), code
+
+
+# ---------------------------------------------------------------- what scripts read
+def test_success_has_one_key_in_json() -> None:
+    sound = json.loads(run("check", "arm_planar", "--json")[0])
+    assert sound["ok"] is True and sound["sound"] is True
+    wrong = json.loads(run("check", "arm_planar", "--set", "target.mass=-1", "--json", code=2)[0])
+    assert wrong["ok"] is False and "mass" in wrong["mistakes"][0]
+    found = json.loads(run("collide", "arm_planar", "--speed", "0.5", "--model", "virtual-mass", "--json")[0])
+    assert found["ok"] is True
+
+
+def test_a_new_file_as_json_is_its_text_and_its_tables(tmp_path: Path) -> None:
+    text = run("new", "arm_planar")[0]
+    told = json.loads(run("new", "arm_planar", "--json")[0])
+    assert told == {"ok": True, "file": None, "toml": text, "data": read_toml(text)}
+    path = tmp_path / "arm.toml"
+    assert json.loads(run("new", "arm_planar", "--json", "--out", path)[0])["file"] == str(path)
+    assert path.read_text(encoding="utf-8") == text
+    run("new", "--reference", "--json", code=2)
+
+
+def test_tables_in_a_pipe_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    table = Table("name")
+    table.add_row("x" * 300)
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown):
+        output().print(table)
+    assert "x" * 300 in shown.getvalue()
+
+
+def test_flags_have_no_type() -> None:
+    for command in ("solve", "check", "show"):
+        assert "bool" not in run(command, "--help")[0]
+
+
+def test_keys_that_are_offered_come_from_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second time nothing heavy is loaded."""
+    monkeypatch.setenv("IMPACTOPT_CACHE", str(tmp_path / "cache"))
+    code = (
+        "import sys\n"
+        "from types import SimpleNamespace\n"
+        "from impactopt.cli.options import complete_setting\n"
+        "print(complete_setting(SimpleNamespace(params={'file': 'punch'}, args=[]), 'target.m'))\n"
+        "print([m for m in ('pydantic', 'scipy', 'casadi', 'pinocchio') if m in sys.modules])"
+    )
+    done = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True) for _ in range(2)]
+    first, second = (each.stdout.splitlines() for each in done)
+    assert first[0] == second[0] == "['target.mass_kg=']"
+    assert second[1] == "[]" != first[1]

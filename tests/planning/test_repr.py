@@ -1,6 +1,10 @@
 """What an interpreter prints of a result is a line, not its arrays."""
 
-from impactopt import Solution
+import sys
+
+import pytest
+
+from impactopt import InputError, Solution
 from impactopt.files.output import record_of
 
 
@@ -12,3 +16,18 @@ def test_a_solution_is_one_line(hammered: Solution) -> None:
     for thing in (solution.trajectory, solution.plan.collision, solution.plan.motion()):
         assert type(thing).__name__ in repr(thing) and len(repr(thing)) < 130
     assert len(repr(solution.validate())) < 600
+
+
+def test_a_motion_is_a_table_of_pandas(hammered: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pandas")
+    table, way, robot = hammered.to_frame(), hammered.trajectory, hammered.problem.robot
+    assert table.index.name == "time [s]" and list(table.index) == list(way.time)
+    for k, name in enumerate(robot.joint_names):
+        assert list(table[f"torque {name}"]) == list(way.torque[:, k])
+        assert list(table[f"v {name}"]) == list(way.v[:, k])
+    assert table.notna().all().all() and {*table.phase} == {0, 1, 2}
+    with pytest.raises(InputError, match="no motion that follows a missed blow"):
+        hammered.to_frame(missed=True)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match=r"pandas.*\[frame\]"):
+        hammered.to_frame()

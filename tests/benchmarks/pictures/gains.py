@@ -23,7 +23,7 @@ def gains_picture(rows: Sequence[Row]) -> Picture:
         axes.plot([r["factor"] for r in own], [r["share"] for r in own], color=colour, label=label)
     axes.axvline(1.0, color="0.6", linewidth=0.8, linestyle="--")
     axes.set_xscale("log")
-    axes.set_yticks([0.0, 0.5, 1.0], ["free joints", "", "locked"])
+    axes.set_yticks([0.0, 0.5, 1.0], ["0\nfree joints", "0.5", "1\nlocked"])
     axes.set(xlabel="servo gains / own", ylabel="impulse")
     axes.legend(fontsize=6.5)
     return figure

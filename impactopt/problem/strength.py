@@ -158,7 +158,7 @@ def drawn_blows(strength: Strength, q: Array, normals: Sequence[Array] = NORMALS
         if met == DRAWN:
             break
     reach = max((float(np.linalg.norm(blow.point[:2])) for blow in blows), default=0.0)
-    front = [blow for blow in blows if blow.point[0] > AHEAD * reach]
+    front = [b for b in blows if b.point[0] > AHEAD * reach and b.impulse > 0]
     return sorted(front, key=lambda blow: -blow.impulse)
 
 

@@ -151,6 +151,14 @@ def test_fingers_and_wheels_are_locked_and_a_cart_is_bolted(tmp_path: Path) -> N
     assert data["robot"]["floating"] is False
 
 
+def test_a_robot_that_is_a_finger_moves(tmp_path: Path) -> None:
+    named = urdfs.arm()
+    for joint in re.findall(r'<joint name="(\w+)" type="revolute"', named):
+        named = named.replace(f'"{joint}"', f'"finger_{joint}"')
+    data = read_toml(_drafted(tmp_path, named).text)
+    assert not any("finger_" in joint for joint in data["robot"].get("locked_rad", ()))
+
+
 def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
     data = read_toml(_drafted(tmp_path, urdfs.arm()).text)
     (striker,) = data["robot"]["strikers"]

@@ -129,16 +129,19 @@ def _solved(matrix: Array, n: Array) -> Array:
     return np.asarray(np.linalg.lstsq(matrix, n, rcond=1e-9)[0])
 
 
-def drawn_blows(strength: Strength, q: Array, normals: Sequence[Array] = NORMALS) -> list[Blow]:
+def drawn_blows(
+    strength: Strength, q: Array, normals: Sequence[Array] = NORMALS, *, with_face: bool = True
+) -> list[Blow]:
     """Estimated blows ahead of the base, the hardest first: in `DRAWN` postures, along each normal.
 
     The joints that move the striker are anywhere inside their limits, and the others as in q (nq,). A striker
-    whose face is known meets the target with it, as `FirstTouch` asks by default.
+    whose face is known meets the target with it, as `FirstTouch` asks by default; not if not `with_face`.
     """
     robot = strength.robot
     model, data = robot.model, robot.model.createData()
     frame = model.getFrameId(robot.striker(strength.striker).model_frame)
-    face, square = striker_face(robot, strength.striker), float(np.cos(FirstTouch().angle))
+    face = striker_face(robot, strength.striker) if with_face else None
+    square = float(np.cos(FirstTouch().angle))
     rng, limb = np.random.default_rng(0), np.array(robot.limb(robot.striker(strength.striker).model_frame))
     low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
     low, high = low + INSIDE * (high - low), high - INSIDE * (high - low)
@@ -179,7 +182,7 @@ def best_share(problem: ImpactProblem) -> tuple[float, Blow] | None:
         with suppress(InputError):
             postures.append(inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1))
     own = [blow.impulse for q in postures for blow in strength.at(q, [p.normal])]
-    drawn = drawn_blows(strength, p.start_posture, (*NORMALS, p.normal))
+    drawn = drawn_blows(strength, p.start_posture, (*NORMALS, p.normal), with_face=p.term(FirstTouch).enabled)
     near = [blow for blow in drawn if np.linalg.norm(blow.point - p.point) < NEARBY]
     if not near or not own or not near[0].impulse > 0:
         return None

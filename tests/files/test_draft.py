@@ -194,6 +194,18 @@ def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
     assert found is not None and found[0] > 0.6
 
 
+@pytest.mark.parametrize("still", [("turn", "wrist"), ("wrist",)])
+def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) -> None:
+    """It cannot turn its hand at will: with the hand's face, or else with what comes first."""
+    text = urdfs.arm()
+    for name in still:
+        text = text.replace(f'<joint name="{name}" type="revolute">', f'<joint name="{name}" type="fixed">')
+    draft = _drafted(tmp_path, text)
+    assert any("the hardest of the strikes tried" in line for line in draft.said)
+    off = "first_touch" in read_toml(draft.text).get("terms", {})
+    assert off == any("first_touch" in line for line in draft.said)
+
+
 def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:
     problem = _problem(tmp_path, urdfs.arm())
     strong = best_share(problem)

@@ -20,6 +20,7 @@ from impactopt.planning.strike import optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import Blow, Strength, drawn_blows
+from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 
 __all__ = ["Strong", "duration", "strongest"]
@@ -49,14 +50,17 @@ class Strong:
     impulse: float
 
 
-def strongest(robot: Robot, arm: Arm, q: Array, **given: Any) -> Strong | None:
-    """The best strike of the blows that are estimated best; None: check finds a fault with all of them.
+def strongest(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True, **given: Any) -> Strong | None:
+    """The best strike of the blows that are estimated best; None: check finds a fault with all of them, or
+    none of the strikes is solved.
 
-    q (nq,) : what does not strike stays as in it.  given : law, target and terms, as of `ImpactProblem`.
+    q (nq,) : what does not strike stays as in it.  with_face : the link's face meets the target; else any
+    part of it may touch first.  given : law and target, as of `ImpactProblem`.
     """
+    given["terms"] = () if with_face else (FirstTouch(enabled=False),)
     strength = Strength(robot=robot, striker=arm.name, law=given["law"], target=given["target"])
     best: Strong | None = None
-    for problem, blow in _sound(robot, arm, drawn_blows(strength, q), given):
+    for problem, blow in _sound(robot, arm, drawn_blows(strength, q, with_face=with_face), given):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
             solved = optimize_strike(problem, time_limit=SECONDS)

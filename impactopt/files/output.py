@@ -51,10 +51,10 @@ __all__ = [
 FORMAT = 1  # of solution.npz; raised when a reader of the old one would go wrong
 LARGEST, MOST_ARRAYS = 1 << 29, 1000  # bytes and arrays of solution.npz; ours have some MB, and a hundred
 NUMBERS, SUMMARY = "solution.npz", "summary.json"
-# Bits that histories are kept with, by prefix, of the largest value of each channel: 22 of what a servo is to
-# follow (at 2 rad 2.4e-7 rad, a hundredth of what `verify` allows), 16 of what a replay has measured (1.5e-5
-# rad, 10 mN of 1 kN): less than any picture shows or anybody measures.
-BITS = {"reference": 22, "missed": 22, "pose": 22, "simulated": 16, "replayed": 16}
+# Bits that histories are kept with, by prefix, of the largest value of each channel: 24, all that single
+# precision has, of what a servo is to follow (at 2 rad 6e-8 rad, a hundredth of what `verify` allows); 15 of
+# what a replay has measured (3e-5 rad, 15 mN of 1 kN): less than any picture shows or anybody measures.
+BITS = {"reference": 24, "missed": 24, "pose": 24, "simulated": 15, "replayed": 15}
 SMALLEST = 1e-30  # of a channel that is zero
 # what is made of the numbers beside them: by `impactopt show`, by `impactopt validate`, pictures
 DERIVED = (

@@ -66,7 +66,8 @@ def simulate(
 
 def _check_times(options: Mapping[str, Any], end: float) -> None:
     """InputError for a step or a time to settle that is out of its range."""
-    step, settle = (float(check_array(f"{name} [s]", options[name], ())) for name in ("step", "settle"))
+    given = {name: 0.0 if options[name] is None else options[name] for name in ("step", "settle")}
+    step, settle = (float(check_array(f"{name} [s]", value, ())) for name, value in given.items())
     if not STEPS[0] <= step <= STEPS[1]:
         raise InputError(f"step [s]: {step:g}; give a number of {STEPS[0]:g} to {STEPS[1]:g}")
     if not 0 <= settle <= LONGEST:

@@ -36,6 +36,7 @@ THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after 
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
+SETTLES, SETTLES_BOLTED = 2.0, 0.3  # [s] beyond the motion: a robot on its feet may fall late
 SLID = 0.05  # [m] of a sole along the floor, about half of one's width: it stands where it was not to
 
 
@@ -265,7 +266,7 @@ def simulate_mujoco(
     step: float = 2e-4,
     iterations: int = 100,
     tolerance: float = 1e-10,
-    settle: float = 2.0,
+    settle: float | None = None,
     record: int = 5,
     perturbation: Perturbation | None = None,
     missed: Any = None,
@@ -273,6 +274,8 @@ def simulate_mujoco(
     until: float = np.inf,
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
+
+    settle : by default 2 s, in which it can fall, and 0.3 s for a robot that is bolted down.
 
     reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of
     :class:`impactopt.transcription.plan.Trajectory`. step [s], iterations, tolerance : of MuJoCo
@@ -292,6 +295,7 @@ def simulate_mujoco(
     if not step > 0:
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
     world = perturbation if perturbation is not None else Perturbation()
+    beyond = settle if settle is not None else SETTLES if robot.floating else SETTLES_BOLTED
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller)
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
@@ -316,7 +320,7 @@ def simulate_mujoco(
     # given to the target [N s] by each striker, and its state when it was last touched
     impulses, left = np.zeros(len(scene.strikers)), replay.target
     with no_log_file():
-        for k in range(round(min(float(reference.end) + settle, until) / step)):
+        for k in range(round(min(float(reference.end) + beyond, until) / step)):
             t = k * step
             mujoco.mj_step1(model, data)
             if (now := followed.at(t, bool(touches.intervals))) is not replay.followed:

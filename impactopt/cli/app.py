@@ -137,6 +137,7 @@ def solve(
         from impactopt.files.solution_library import SolvedFolder
         from impactopt.planning.solve import solve as plan
         from impactopt.report.console import SolveConsole
+        from impactopt.solvers.program import Status
 
         check_time_limit(time_limit)
         check_loudness(quiet, verbose)
@@ -161,7 +162,7 @@ def solve(
                 progress.say(solution.caution)
             record = _record(solution, read, validate, progress)
             record.summary.update(command=command_line(context), ok=solution.status.usable)
-            if baseline:
+            if baseline and solution.status is not Status.INTERRUPTED:
                 progress.say("looking for the hardest minimum-jerk reach inside the same limits")
                 record.summary["baseline"] = _baseline(problem, progress)
             written = [*keep_record(record, directory)]

@@ -276,7 +276,6 @@ def simulate_mujoco(
     """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
 
     settle : by default 2 s, in which it can fall, and 0.3 s for a robot that is bolted down.
-
     reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of
     :class:`impactopt.transcription.plan.Trajectory`. step [s], iterations, tolerance : of MuJoCo
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is

@@ -322,6 +322,21 @@ def test_sigterm_is_as_ctrl_c(planner: Planner, file: Path, tmp_path: Path) -> N
     assert signal.getsignal(signal.SIGTERM) is before
 
 
+def test_what_was_interrupted_gets_no_baseline_and_an_interrupted_baseline_keeps_the_plan(
+    planner: Planner, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def reach(problem: ImpactProblem) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("impactopt.planning.minimum_jerk.minimum_jerk_baseline", reach)
+    out, err = run("solve", file, "--out", tmp_path / "out", "--baseline")
+    assert "kept without a baseline" in err and load_record(tmp_path / "out").completed
+    planner.solution = {"status": Status.INTERRUPTED}
+    _, err = run("solve", file, "--out", tmp_path / "cut", "--baseline", code=1)
+    assert "baseline" not in err
+    assert "baseline" not in json.loads((tmp_path / "cut" / "summary.json").read_text())
+
+
 @pytest.mark.parametrize(
     ("status", "off", "told"),
     [

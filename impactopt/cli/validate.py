@@ -127,10 +127,11 @@ def validate(
             done = replay(
                 planned, engine=engine.value, perturbation=world, controller=controller.value, **options
             )
+            ok = done.report["standing"] is not False
             if directory is not None:
                 from impactopt.report.pictures import save_pictures
 
-                text = f"{json.dumps(done.report, indent=2)}\n".encode()
+                text = f"{json.dumps({'ok': ok, **done.report}, indent=2)}\n".encode()
                 written.append(directory / "replay.json")
                 drawn = directory / "replay.png"  # of another replay, or of none
                 write_file(written[0], lambda file: file.write(text), before=lambda: remove_file(drawn))
@@ -141,7 +142,7 @@ def validate(
 
                 written.append(save_animation(done, animation))
         if as_json:
-            print_json(done.report, done.report["standing"] is not False)
+            print_json(done.report, ok)
         else:
             from impactopt.report.console import output, replay_table
 
@@ -151,5 +152,5 @@ def validate(
                 console.print(printable(str(beyond)), markup=False, highlight=False)
             for path in written:
                 console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
-        if done.report["standing"] is False:
+        if not ok:
             raise typer.Exit(FELL)

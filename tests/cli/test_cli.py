@@ -329,7 +329,7 @@ def test_what_was_interrupted_gets_no_baseline_and_an_interrupted_baseline_keeps
         raise KeyboardInterrupt
 
     monkeypatch.setattr("impactopt.planning.minimum_jerk.minimum_jerk_baseline", reach)
-    out, err = run("solve", file, "--out", tmp_path / "out", "--baseline")
+    _, err = run("solve", file, "--out", tmp_path / "out", "--baseline")
     assert "kept without a baseline" in err and load_record(tmp_path / "out").completed
     planner.solution = {"status": Status.INTERRUPTED}
     _, err = run("solve", file, "--out", tmp_path / "cut", "--baseline", code=1)

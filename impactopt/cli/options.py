@@ -76,8 +76,9 @@ OtherProblem = Annotated[
 
 
 class SolverChoice(str, enum.Enum):
-    ipopt = "ipopt"
+    ipm = "ipm"
     sqp = "sqp"
+    ipopt = "ipopt"
 
 
 SolverName = Annotated[

@@ -22,6 +22,7 @@ from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.refinement import refine as refine_with
 from impactopt.planning.solution import Solution
 from impactopt.solvers.active import Change
+from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.predictor import Prediction
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.program_summary import statement_of
@@ -57,7 +58,8 @@ def moved_solution(
     began = time.perf_counter()
     t = bent.program_for(problem, anew=polish)
     built = time.perf_counter()
-    budget = Budget(solver="sqp", options=options, time_limit=time_limit, callback=callback).started()
+    solver, options = with_todays_name("ipm", options)
+    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback).started()
     first = _first_order(solution, t, bent)
     if not polish:
         return _solution(solution, Outcome.of(t, first), (built - began, time.perf_counter() - built))

@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 
 from impactopt.solvers.ipm.newton import acquire
 from impactopt.solvers.program import Matrix, NonlinearProgram, Vector, max_violation
-from impactopt.solvers.threads import threads
+from impactopt.solvers.run import threads
 
 __all__ = ["Prediction", "Predictor"]
 

@@ -17,7 +17,7 @@ from impactopt.problem.problem import ImpactProblem
 FILE = """
 [solver]
 time_limit_s = 7
-[solver.sqp]
+[solver.ipm]
 max_iterations = 5
 """
 

@@ -285,8 +285,8 @@ def test_a_solve_without_a_verdict_gets_another_solvers() -> None:
     problem = dataclasses.replace(load_problem("arm_planar"), target=FreeMass(mass=1.0), objectives=PUSH)
     t = contact_of(problem)
     start = strike_iterate(t)
-    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
-    stopped = Budget(solver="sqp", options={"max_iterations": 1}, time_limit=None, callback=None)
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
+    stopped = Budget(solver="ipm", options={"max_iterations": 1}, time_limit=None, callback=None)
     old = stopped.run(t.program, start)
     assert old.status is Status.ITERATION_LIMIT
     assert second_look(stopped, t.program, start, old) is old  # a limit that was asked for is an answer

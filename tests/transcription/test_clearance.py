@@ -344,7 +344,7 @@ def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, ba
     assert clearance_violations(program_of(barred, problem), barred.result.x, margins) is None
     depth, pairs = deepest_penetration(t, x, margins)
     assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}
-    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
     fixed = solved_apart(budget, margins, Guess(program=t, start=free.result))
     assert fixed.result.status is Status.SOLVED
     assert deepest_penetration(fixed.program, fixed.result.x, margins)[0] <= 0

@@ -18,7 +18,7 @@ from impactopt.files.problem_file.contacts import with_kinds
 from impactopt.files.problem_file.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.files.problem_file.names import problem_file
 from impactopt.files.problem_file.sections import File
-from impactopt.files.problem_file.solver_sections import SolverSettings
+from impactopt.files.problem_file.solver_sections import SolverSettings, with_todays_names
 from impactopt.files.problem_file.toml import (
     LONGEST_TEXT,
     Place,
@@ -196,16 +196,17 @@ def _checked(data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Plac
             raise InputError(f"{path}: there are {len(there)} [[{'.'.join(place)}]]; give at most {MANY}")
     if found := text_with_control(data):
         raise InputError(f"{path}: the text {shortened(repr(found))} has control characters; take them out")
-    mistakes, model = _robot_given_once(data), with_kinds(File, data)
+    today, lines = with_todays_names(data, lines)
+    mistakes, model = _robot_given_once(today), with_kinds(File, today)
     try:
-        content = model.model_validate(data)
+        content = model.model_validate(today)
     except ValidationError as error:
         mistakes += mistakes_of(error, model)
     if mistakes:
         raise InputError(report_mistakes(str(path), lines, mistakes))
     given = content.solver.model_dump(exclude_unset=True) if content.solver else {}
     options: dict[str, Any] = {}
-    for solver in {"ipopt", "sqp"} & given.keys():
+    for solver in {"ipm", "sqp", "ipopt"} & given.keys():
         options[solver] = given.pop(solver)
     settings = SolverSettings(**given, options=options)
     controller = content.controller.build() if content.controller else ControllerSettings()

@@ -24,15 +24,18 @@ def required(about: str, key: str | None = None) -> Any:
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """Description of each attribute in a class's docstring, on one line; `a, b : text` describes both."""
-    said = inspect.cleandoc(kind.__doc__ or "")  # Python 3.13 takes the margin away, older ones keep it
-    section = re.split(r"\nAttributes\n-+\n", said)[-1]
-    entries = re.split(r"\n(?=[a-z_]+(?: \[\w+\])?(?:, [a-z_]+(?: \[\w+\])?)* : )", "\n" + section)
+    """Description of each attribute in the docstrings of a class and its bases, on one line; `a, b : text`
+    describes both.
+    """
     out: dict[str, str] = {}
-    for entry in entries[1:]:
-        names, _, text = entry.partition(" : ")
-        for name in names.split(","):
-            out[name.split()[0]] = " ".join(text.split()).rstrip(".")
+    for each in reversed(kind.__mro__):
+        said = inspect.cleandoc(each.__doc__ or "")  # Python 3.13 takes the margin away, older ones keep it
+        section = re.split(r"\nAttributes\n-+\n", said)[-1]
+        entries = re.split(r"\n(?=[a-z_]+(?: \[\w+\])?(?:, [a-z_]+(?: \[\w+\])?)* : )", "\n" + section)
+        for entry in entries[1:]:
+            names, _, text = entry.partition(" : ")
+            for name in names.split(","):
+                out[name.split()[0]] = " ".join(text.split()).rstrip(".")
     return out
 
 

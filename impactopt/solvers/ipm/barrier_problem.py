@@ -18,7 +18,7 @@ from impactopt.solvers.ipm.barrier import Bounded
 from impactopt.solvers.ipm.elastic_constraints import Elastic
 from impactopt.solvers.ipm.filter import SearchStart
 from impactopt.solvers.ipm.newton import acquire, release
-from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.options import IPMOptions
 from impactopt.solvers.point import Point, TimedProgram
 from impactopt.solvers.program import Determined, Vector, scaled_residual
 from impactopt.solvers.run import Path
@@ -74,7 +74,7 @@ class BarrierProblem:
     def __init__(
         self,
         program: TimedProgram,
-        options: SQPOptions,
+        options: IPMOptions,
         point: Point,
         y: Vector,
         z: Vector,

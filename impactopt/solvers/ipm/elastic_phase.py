@@ -8,7 +8,7 @@ gone or least. So an infeasible program ends at a point of least violation.
 from __future__ import annotations
 
 from impactopt.solvers.ipm.barrier_problem import BarrierProblem
-from impactopt.solvers.options import SQPOptions
+from impactopt.solvers.options import IPMOptions
 from impactopt.solvers.program import Status, Vector, is_stationary_violation
 
 # violation from which on elastic rows are made hard again where they do not get further, or this part of what
@@ -26,7 +26,7 @@ class ElasticPhase:
     Where one of its methods changes that, a line search has to forget what it knows.
     """
 
-    def __init__(self, options: SQPOptions):
+    def __init__(self, options: IPMOptions):
         self._options = options
         self._price = options.price  # of elastic rows
         self._met = 0  # iterations of elastic rows that are met

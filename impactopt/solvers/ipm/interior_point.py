@@ -15,28 +15,73 @@ aimed at where that finds nothing an `ElasticPhase`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from impactopt.solvers.ipm.barrier_problem import BarrierProblem
 from impactopt.solvers.ipm.elastic_phase import ElasticPhase
 from impactopt.solvers.ipm.line_search import LineSearch
-from impactopt.solvers.program import Determined, Status, Vector, complementarity, stationarity
-from impactopt.solvers.run import Run, Task
+from impactopt.solvers.options import IPMOptions
+from impactopt.solvers.program import (
+    Callback,
+    NonlinearProgram,
+    SolverResult,
+    Status,
+    Vector,
+    complementarity,
+    stationarity,
+)
+from impactopt.solvers.run import Path, Run, Watch
 
 _ABSURD = 1e12  # multipliers beyond this come from rows that have none
 _RESTARTS = 2  # where nothing is progress any more
 
 
-class InteriorRun(Run):
-    """One solve with `qp_solver="interior"`: the loop over `BarrierProblem`, `LineSearch`, `ElasticPhase`."""
+def solve_ipm(
+    program: NonlinearProgram,
+    x0: npt.ArrayLike,
+    *,
+    options: IPMOptions | None = None,
+    callback: Callback | None = None,
+    multipliers: npt.ArrayLike | None = None,
+    bound_multipliers: npt.ArrayLike | None = None,
+    watch: Watch | None = None,
+    path: Path | None = None,
+) -> SolverResult:
+    """Solve a nonlinear program by the interior-point method.
 
-    def __init__(self, task: Task):
-        super().__init__(task)
-        self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
-        self._search, self._phase = LineSearch(task.watch), ElasticPhase(self.options)
-        self._watch, self._path = task.watch, task.path
+    Parameters
+    ----------
+    program : the program; its constraints and variables should be of order one.
+    x0 : initial guess (n,); moved into the variables' bounds, where every iterate stays.
+    options : see `IPMOptions`.
+    callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
+    multipliers, bound_multipliers : guess of the multipliers (m,), (n,), from a similar program.
+    watch : asked at every iterate whether the program lacks constraints there, which ends the solve with the
+        status `ACCEPTABLE`, and before every step how far it may go.
+    path : where a solve was left that x0 and the multipliers are of: it goes on as that would have.
+
+    Returns
+    -------
+    The result; infeasible programs, interruption (Ctrl-C) and limits are statuses, not exceptions.
+
+    Raises
+    ------
+    InputError : wrong shapes, NaN, crossing bounds.
+    """
+    given = program, x0, options or IPMOptions(), callback, multipliers, bound_multipliers
+    return InteriorRun(*given, watch=watch, path=path).solve()
+
+
+class InteriorRun(Run[IPMOptions]):
+    """One solve: the loop over `BarrierProblem`, `LineSearch`, `ElasticPhase`."""
+
+    def __init__(self, *given: Any, watch: Watch | None, path: Path | None):
+        super().__init__(*given)
+        self._watch, self._path = watch, path
+        self._search, self._phase = LineSearch(watch), ElasticPhase(self.options)
 
     def iterate(self) -> Status:
         self.point = self.program.point(self.point.x)
@@ -83,7 +128,7 @@ class InteriorRun(Run):
             self.z,
             warm=self._warm,
             path=self._path,
-            determined=self._determined,
+            determined=self.determined,
         )
         self.point, self._path = self._problem.point, None
         self._phase.begin()

@@ -17,11 +17,11 @@ from support.fake_solution import PROBLEM_FILE, FakeSolution, MissingSolution, s
 from typer.testing import CliRunner
 
 import impactopt
+from impactopt import Solution
 from impactopt.cli.app import app
 from impactopt.files.output import Record, load_record
 from impactopt.files.problem_file import ProblemFile
 from impactopt.planning.refinement import Attempt
-from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures import PICTURES
 from impactopt.solvers.program import IterationRecord, Status, Violation

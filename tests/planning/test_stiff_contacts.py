@@ -5,14 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from impactopt import optimize_strike, solve
+from impactopt import Solution, optimize_strike, solve
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, SpringDamper
 from impactopt.errors import NotSolvedWarning
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.contact_replay import AGREED, PlannedContact, checked
 from impactopt.planning.diagnosis import second_look
-from impactopt.planning.solution import Solution
 from impactopt.problem.objectives import Impulse, PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad

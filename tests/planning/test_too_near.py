@@ -11,14 +11,13 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
-from impactopt import Obstacle, load_problem, solve
+from impactopt import Obstacle, Solution, load_problem, solve
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import Margins, Watch, spots_of
 from impactopt.planning.clearance_violations import clearance_violations
 from impactopt.planning.refinement import Guess, Outcome
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import PlanSolver
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status, max_violation

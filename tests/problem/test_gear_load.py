@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from support.small_motions import strike
 from support.small_plans import changed, struck
 
-from impactopt import Actuator, Scenario, load_problem, solve
+from impactopt import Actuator, Scenario, Solution, load_problem, solve
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError
-from impactopt.planning.solution import Solution
 from impactopt.problem.terms import GearLoad, HandOrientation, MotorCurve, PowerLimit, VelocityJump
 from impactopt.robots.actuator_loads import motor_power, motor_use
 from impactopt.simulation import simulate_mujoco, simulate_pinocchio

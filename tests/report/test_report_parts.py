@@ -13,6 +13,7 @@ import pytest
 from scipy.integrate import trapezoid
 from support.fake_solution import still_problem, still_solution
 
+from impactopt import Solution
 from impactopt.bodies.convex_hulls import pieces_of
 from impactopt.bodies.meshes import find_mesh, read_mesh
 from impactopt.bodies.robot_visuals import visuals_of
@@ -23,7 +24,6 @@ from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of
-from impactopt.planning.solution import Solution
 from impactopt.report.charts import charts_of
 from impactopt.report.pack import pack, unpack
 from impactopt.report.stage import stage_of

@@ -30,6 +30,7 @@ ROOMS_IN_ORDER = (
     "sweeps",
     "identification",
     "report",
+    "api",
     "live",
     "cli",
     "__main__",
@@ -97,16 +98,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ROOMS = {room(file) for file in FILES}
 
 
-# methods of a solution that are made above it, imported by the package's own names when they are called
-REACHES_UP = PACKAGE / "planning" / "solution.py"
-
-
 def modules_imported(file: Path) -> set[str]:
     """Modules of the package that a file imports: in functions, for types alone, by its own names too."""
     found = set[str]()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module == "impactopt":
-            found |= set() if file == REACHES_UP else {own_name(alias.name) for alias in node.names}
+            found |= {own_name(alias.name) for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             names = {f"{node.module}.{alias.name}" for alias in node.names}
             # a name of a package is a module in it, or the package's own

@@ -15,7 +15,7 @@ from support.derivative_checks import check_derivatives
 from support.small_plans import BODILESS, changed, rod_hammer
 from support.small_robots import arm, biped, table
 
-from impactopt import KeepOut, Obstacle, SelfCollision, load_problem, solve
+from impactopt import KeepOut, Obstacle, SelfCollision, Solution, load_problem, solve
 from impactopt.bodies.clearance import Places
 from impactopt.bodies.separation import THIN
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -23,7 +23,6 @@ from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import Margins, Watch, solved_apart, spots_of
 from impactopt.planning.clearance_violations import clearance_violations, deepest_penetration
 from impactopt.planning.refinement import Guess
-from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos

@@ -13,10 +13,10 @@ from scipy.integrate import solve_ivp
 from support.small_plans import BODILESS, Planned, changed, transcribed
 from support.small_robots import table
 
+from impactopt import Solution
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.kinematics.stance import FixedBase
 from impactopt.planning import reconstruction
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario

@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from impactopt.bodies.mjcf import geoms_of
 from impactopt.bodies.solids import Solid, cylinder, rounded_box
 from impactopt.bodies.urdf import lost_meshes, shapes_of, urdf_root
-from impactopt.codegen.directory import kept
+from impactopt.codegen.files import kept
 from impactopt.robots.robot import Robot, Tool
 from impactopt.robots.tools import without
 

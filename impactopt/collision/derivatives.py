@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.codegen.library import NativeCode
+from impactopt.codegen.compiler import NativeCode
 from impactopt.collision.native import native_differences, native_gradient, native_jacobian
 from impactopt.collision.native.sizes import directions, shapes_out
 from impactopt.collision.native.source import least_size

@@ -8,8 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impactopt.codegen.cache import cached
-from impactopt.codegen.hashing import model_hash
+from impactopt.codegen.cache import cached, model_hash
 from impactopt.collision.frozen import FrozenDynamics
 from impactopt.errors import check_direction
 from impactopt.kinematics.stance import Stance, usual_stance

@@ -10,7 +10,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from impactopt.codegen.hashing import model_hash
+from impactopt.codegen.cache import model_hash
 from impactopt.collision.contact_slopes import law_is_linear, target_is_linear
 from impactopt.collision.effects import Effects, JointFriction
 from impactopt.collision.interface import CollisionModel

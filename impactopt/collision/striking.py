@@ -12,8 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.codegen.cache import cached
-from impactopt.codegen.hashing import model_hash
+from impactopt.codegen.cache import cached, model_hash
 from impactopt.collision.frozen import _inverse_of_cholesky
 from impactopt.kinematics.stance import Stance
 from impactopt.robots.rigid_body import RigidBody

@@ -25,7 +25,7 @@ from impactopt.files.output import LARGEST, NUMBERS, SUMMARY, Record, load_recor
 from impactopt.files.replay import problem_of
 from impactopt.files.resume import program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.sole_margins import weight_of
+from impactopt.robots.loads import weight_of
 from impactopt.solvers.program import bound_violations, complementarity, row_violations, scaled_residual
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.program_summary import statement_of

@@ -6,11 +6,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from impactopt.kinematics.directions import across
-from impactopt.kinematics.striking_point import striking_point
+from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Slide
-from impactopt.robots.actuator_loads import DriveLoads
+from impactopt.robots.loads import DriveLoads
 from impactopt.simulation.target_dynamics import FACE
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.collision import Collision

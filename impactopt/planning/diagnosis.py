@@ -14,7 +14,7 @@ from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.causes import Cause
 from impactopt.planning.solution import Solution
 from impactopt.problem.feasibility import too_weak
-from impactopt.robots.sole_margins import shortfalls
+from impactopt.robots.loads import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import Parting, fastest, parting

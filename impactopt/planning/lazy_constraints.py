@@ -17,7 +17,7 @@ from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import Additions, Guess, Outcome, Program, program_for, start_of
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, Slide, Term
-from impactopt.robots.actuator_loads import DriveLoads
+from impactopt.robots.loads import DriveLoads
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Plan, PlannedCollision
 from impactopt.transcription.planned_loads import plan_loads, strike_loads

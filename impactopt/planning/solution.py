@@ -21,7 +21,7 @@ from impactopt.planning.gain_selection import ChosenGains
 from impactopt.planning.lazy_constraints import rows_on_demand
 from impactopt.planning.refinement import Attempt
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.actuator_loads import DriveLoads
+from impactopt.robots.loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_refinement import ContactError
 from impactopt.transcription.mesh import Elements, Shares, contact_elements

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
-from impactopt.contact.factors import scaled_numbers
 from impactopt.contact.fields import Described, about, abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
+from impactopt.contact.targets.base import scaled_numbers
 from impactopt.errors import MOST, InputError, check_array, check_name
 
 

@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.robots.actuator_loads import DriveLoads
+from impactopt.robots.loads import DriveLoads
 from impactopt.robots.robot import Robot
 from impactopt.simulation.contact_times import Touches
 from impactopt.simulation.result import Scene, Simulation

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.robots.loads import BEARS, weight_of
 from impactopt.robots.robot import Robot
-from impactopt.robots.sole_margins import BEARS, weight_of
 from impactopt.simulation.contact_times import FollowedReference, Touches
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
 from impactopt.simulation.gears import GearWatch

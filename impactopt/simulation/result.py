@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
-from impactopt.robots.actuator_loads import DriveLoads
-from impactopt.robots.sole_margins import least_margins
+from impactopt.robots.loads import DriveLoads, least_margins
 from impactopt.simulation.collision_geometry import Solids, Touched
 from impactopt.simulation.motors import MotorCut
 
@@ -104,7 +103,7 @@ class Simulation:
     servo torque before saturation; torque (k, n) after it; sole_ground (k, soles, 6) wrench of the ground on
     each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; soles:
     their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, as
-    of :func:`impactopt.robots.sole_margins.cop_margin`; slip, lift (k, soles) [m]: how far the corner of a
+    of :func:`impactopt.robots.loads.cop_margin`; slip, lift (k, soles) [m]: how far the corner of a
     sole that moved most went along the ground, and rose.
     contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
     integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.

@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.robots.loads import cop_margin
 from impactopt.robots.robot import Robot
-from impactopt.robots.sole_margins import cop_margin
 from impactopt.simulation.result import Scene
 
 Array = NDArray[np.float64]

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from impactopt.kinematics.support import support_polygon
-from impactopt.kinematics.wrench_cone import inward_edges
+from impactopt.kinematics.support import inward_edges, support_polygon
 from impactopt.problem.objectives import AngularMomentum
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision

@@ -14,9 +14,8 @@ import casadi as ca
 from impactopt.collision.effects import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.kinematics.stages import Stage, motion_in_stages, velocity_in_stages
-from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, make_block
 from impactopt.transcription.contact_blocks import (
     SECOND,

@@ -11,8 +11,8 @@ from typing import Any
 
 import casadi as ca
 
+from impactopt.kinematics.coordinates import solve_in_order
 from impactopt.kinematics.stages import Stage
-from impactopt.kinematics.symbolic_elimination import solve_in_order
 
 __all__ = ["derivatives"]
 

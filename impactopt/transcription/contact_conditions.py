@@ -10,8 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from impactopt.kinematics.directions import across
-from impactopt.kinematics.striking_point import striking_point
+from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.problem.terms import HitCone, HitRegion, TargetSpeed
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.constraints import Measure, Place, millimetres

@@ -12,8 +12,8 @@ from scipy.optimize import lsq_linear
 
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
-from impactopt.kinematics.statics import static_wrenches
 from impactopt.problem.terms import TargetSpeed
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.constraints import Row

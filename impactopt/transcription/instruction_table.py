@@ -20,8 +20,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from impactopt.codegen.compiler import find_compiler
-from impactopt.codegen.library import address, native_library
+from impactopt.codegen.compiler import address, find_compiler, native_library
 
 __all__ = ["LESS_PRODUCT", "PRODUCT_LESS", "SUM_OF_PRODUCT", "Arranged", "arranged"]
 

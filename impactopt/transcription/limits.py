@@ -18,7 +18,7 @@ from impactopt.problem.terms import (
     VelocityLimit,
 )
 from impactopt.problem.terms.grip import WRENCH
-from impactopt.robots.hinges import inside
+from impactopt.robots.tools import inside
 from impactopt.transcription.constraints import Measure
 
 GRAVITY = 9.81

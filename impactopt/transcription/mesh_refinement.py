@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.kinematics.wrench_cone import contact_wrench_cone
+from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
-from impactopt.robots.sole_margins import cop_margin, least_kept, weight_of
+from impactopt.robots.loads import cop_margin, least_kept, weight_of
 from impactopt.transcription.plan import Plan, sampled
 from impactopt.transcription.planned_loads import gear_share
 from impactopt.transcription.reference import complete_reference

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from impactopt.kinematics.wrench_cone import contact_wrench_cone
+from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.constraints import Index, Measure, Place, along, percent
 from impactopt.transcription.layout import Affine, Array

@@ -18,7 +18,7 @@ from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone
-from impactopt.robots.sole_margins import cop_margin, least_margins
+from impactopt.robots.loads import cop_margin, least_margins
 from impactopt.transcription.reference import Completed, complete_reference
 
 Array = NDArray[np.float64]
@@ -391,7 +391,7 @@ class Plan:
         """Planned margins of each sole by itself, and what is asked of them, as ``summary.json`` has them.
 
         ``sole_cop_margin_mm`` and ``sole_force_N`` by sole and phase: the least distance of its centre of
-        pressure from its own edges (:func:`impactopt.robots.sole_margins.cop_margin`) and its least normal
+        pressure from its own edges (:func:`impactopt.robots.loads.cop_margin`) and its least normal
         force, every millisecond of swing and follow-through, at the instants of the collision that are known,
         and after a blow that meets nothing. ``sole_cop_margin_asked_mm`` by phase, ``sole_force_asked_N``.
         Nothing of a robot without soles.

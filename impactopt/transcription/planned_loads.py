@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
-from impactopt.robots.actuator_loads import DriveLoads, gear_torque
+from impactopt.robots.loads import DriveLoads, gear_torque
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.actuator_loads import DriveLoads
+from impactopt.robots.loads import DriveLoads
 from impactopt.transcription.plan import PlannedCollision, PlannedScenario
 from impactopt.transcription.planned_loads import strike_loads
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.sole_margins import BEARS, weight_of
+from impactopt.robots.loads import BEARS, weight_of
 
 __all__ = ["Completed", "complete_reference", "total_ground_wrench"]
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from impactopt.codegen.library import address, native_library
+from impactopt.codegen.compiler import address, native_library
 from impactopt.transcription.constraints import Index
 from impactopt.transcription.layout import Array
 

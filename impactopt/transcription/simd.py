@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 import numpy as np
 
-from impactopt.codegen.library import NativeCode
+from impactopt.codegen.compiler import NativeCode
 from impactopt.problem.block import LANES
 from impactopt.transcription.instruction_table import (
     LESS_PRODUCT,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from impactopt.kinematics.statics import static_wrenches
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.constraints import Place
 from impactopt.transcription.layout import Affine, Array

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.codegen.cache import FunctionGroup, cached_groups
-from impactopt.codegen.hashing import model_hash
+from impactopt.codegen.cache import FunctionGroup, cached_groups, model_hash
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.statics import static_wrenches
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined

@@ -26,7 +26,7 @@ from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import record_of
 from impactopt.files.problem_file import load_problem, read_problem_file
-from impactopt.kinematics.directions import across
+from impactopt.kinematics.operational_space import across
 from impactopt.planning.solve import solve
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem

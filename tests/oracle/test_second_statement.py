@@ -33,7 +33,7 @@ from oracle.verdict import claims_of
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
 ALLOWED = {"bodies", "contact", "errors", "kinematics", "problem", "robots"}
 # those of `kinematics` that are numbers alone
-NUMBERS = {"impactopt.kinematics.splines", "impactopt.kinematics.support", "impactopt.kinematics.wrench_cone"}
+NUMBERS = {"impactopt.kinematics.splines", "impactopt.kinematics.support"}
 
 
 def test_it_shares_no_code_with_program_and_solver() -> None:

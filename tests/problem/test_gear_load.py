@@ -16,7 +16,7 @@ from impactopt import Actuator, Scenario, Solution, load_problem, solve
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError
 from impactopt.problem.terms import GearLoad, HandOrientation, MotorCurve, PowerLimit, VelocityJump
-from impactopt.robots.actuator_loads import motor_power, motor_use
+from impactopt.robots.loads import motor_power, motor_use
 from impactopt.simulation import simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
@@ -152,7 +152,7 @@ def test_a_strike_keeps_its_gears_too(bounded: Any) -> None:
 
 @pytest.mark.parametrize("term", [MotorCurve(fraction=0.2), PowerLimit(limit=30.0)])
 def test_motors_keep_to_their_line_and_their_power(arm_transcription: Transcription, term: Any) -> None:
-    """In the formulas of `impactopt.robots.actuator_loads`, friction included."""
+    """In the formulas of `impactopt.robots.loads`, friction included."""
     t = changed(arm_transcription, terms=(term,))
     result = solve_ipopt(t.program, first_iterate(t))
     assert result.status is Status.SOLVED

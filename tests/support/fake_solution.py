@@ -11,8 +11,8 @@ import pinocchio as pin
 from impactopt import Solution
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.files.output import Record
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
-from impactopt.kinematics.statics import static_wrenches
 from impactopt.planning.refinement import Attempt
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem, Phase

@@ -14,8 +14,8 @@ from support.term_cases import MILD
 
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.errors import InputError
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
-from impactopt.kinematics.statics import static_wrenches
 from impactopt.planning import between_nodes, reconstruction
 from impactopt.planning.solve import solve
 from impactopt.problem.objectives import (

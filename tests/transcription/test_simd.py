@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from support.small_plans import arm_problem, transcribed
 
 from impactopt.codegen.cache import cached
-from impactopt.codegen.compiler import find_compiler
-from impactopt.codegen.library import NativeCode
+from impactopt.codegen.compiler import NativeCode, find_compiler
 from impactopt.errors import NoCompilerWarning
 from impactopt.transcription import instruction_table, simd
 from impactopt.transcription.batched import BatchedFunction

@@ -17,8 +17,7 @@ from support.derivative_checks import check_derivatives
 from support.small_plans import LAW, Planned, changed
 
 from impactopt.kinematics.splines import Radau
-from impactopt.kinematics.support import zmp
-from impactopt.kinematics.wrench_cone import contact_wrench_cone
+from impactopt.kinematics.support import contact_wrench_cone, zmp
 from impactopt.problem.problem import Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import ContactWrenchCone, Incidence, TorqueLimit, VelocityLimit

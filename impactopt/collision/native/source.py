@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.codegen.library import NativeCode
+from impactopt.codegen.compiler import NativeCode
 from impactopt.collision.checks import LEAST_PIVOT
 from impactopt.collision.graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
 from impactopt.collision.native.generated import (

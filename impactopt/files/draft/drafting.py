@@ -30,9 +30,9 @@ from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import far_shapes
 from impactopt.robots.attachments import Sole, Striker
-from impactopt.robots.inertias import REPAIRED
+from impactopt.robots.checks import REPAIRED
+from impactopt.robots.gains import USUAL_ROTOR
 from impactopt.robots.robot import Robot
-from impactopt.robots.rotors import USUAL_ROTOR
 
 __all__ = ["Draft", "draft_problem"]
 

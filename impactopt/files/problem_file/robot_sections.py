@@ -30,10 +30,10 @@ from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.build import add_frame, check_count, lock_joints
 from impactopt.robots.checks import check_legs
 from impactopt.robots.gains import GainFactor, scaled_gains
-from impactopt.robots.hinges import hinged
 from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
+from impactopt.robots.tools import hinged
 from impactopt.robots.urdf import read_urdf
 
 

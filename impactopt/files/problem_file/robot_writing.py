@@ -14,7 +14,7 @@ from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.toml import plain_value
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip
-from impactopt.robots.inertias import GIVEN
+from impactopt.robots.checks import GIVEN
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 __all__ = ["robot_data", "sole_data", "striker_data"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from impactopt.bodies.shapes import face_axes
 from impactopt.contact.fields import about
-from impactopt.kinematics.striking_point import striker_kinematics
+from impactopt.kinematics.coordinates import striker_kinematics
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import Measure

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import cython_blas, cython_lapack
 
-from impactopt.codegen.library import address, native_library
+from impactopt.codegen.compiler import address, native_library
 from impactopt.solvers.elimination.kernels import (
     EliminationStep,
     Index,

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.collision.virtual_mass import VirtualMass
+from impactopt.collision.sdc import VirtualMass
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass
 from impactopt.robots.robot import Robot, Striker

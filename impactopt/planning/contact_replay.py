@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.frozen_models import frozen_model
+from impactopt.collision.sdc import frozen_model
 from impactopt.errors import InputError
 from impactopt.planning.budget import VIOLATED
 from impactopt.problem.problem import ImpactProblem

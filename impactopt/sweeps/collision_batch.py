@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collide.at_contact import NOT_ENDED, AtContact
 from impactopt.collide.contact_states import ContactStates, Posture, States
-from impactopt.collide.measures import Blow, Measure
+from impactopt.collide.single_collision import NOT_ENDED, AtContact, Blow, Measure
 from impactopt.collision import Collision, CollisionModel
-from impactopt.collision.checks import too_large
-from impactopt.collision.freezing import FREEZE_ERROR
+from impactopt.collision.checks import FREEZE_ERROR, too_large
 from impactopt.collision.outputs import HISTORIES
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError

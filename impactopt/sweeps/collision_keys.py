@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from impactopt.collide.at_contact import AtContact
+from impactopt.collide.single_collision import AtContact
 from impactopt.errors import InputError, did_you_mean
 from impactopt.files.problem_file import key_place
 from impactopt.files.problem_file.toml import Place

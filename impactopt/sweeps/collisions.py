@@ -14,10 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.collide.at_contact import AtContact, check_at_contact, collision_model, full_names
 from impactopt.collide.contact_states import ContactStates
-from impactopt.collide.measures import chosen
-from impactopt.collision.freezing import FREEZE_ERROR
+from impactopt.collide.single_collision import (
+    AtContact,
+    check_at_contact,
+    chosen,
+    collision_model,
+    full_names,
+)
+from impactopt.collision.checks import FREEZE_ERROR
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError, raw_array
 from impactopt.files.problem_file import ProblemFile, read_problem_file

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import casadi as ca
 
-from impactopt.collision.effects import Effects
+from impactopt.collision.settings import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics

@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.collision.effects import Effects
+from impactopt.collision.settings import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from impactopt import coasting_reference, load_problem, optimize_strike, solve
 from impactopt.cli.app import app
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision.frozen_models import FROZEN, frozen_model
+from impactopt.collision.sdc import FROZEN, frozen_model
 from impactopt.contact import FreeMass, HertzDamped, HuntCrossley, KelvinVoigt, RigidWall, SpringDamper
 from impactopt.errors import InputError
 from impactopt.planning.models import good_enough

@@ -10,10 +10,8 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.collision.effects import Effects, JointFriction
-from impactopt.collision.interface import CollisionModel
-from impactopt.collision.result import Collision
-from impactopt.collision.settings import Settings, no_bend, servo_settings
+from impactopt.collision.interface import Collision, CollisionModel
+from impactopt.collision.settings import Effects, JointFriction, Settings, no_bend, servo_settings
 from impactopt.errors import InputError, check_array
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference.forces import Forces

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.collision.result import Collision
+from impactopt.collision.interface import Collision
 from impactopt.errors import InputError, did_you_mean
 from impactopt.simulation.pinocchio_robot import FORMS
 from impactopt.simulation.reference.base import ReferenceModel, converge

@@ -8,7 +8,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.result import Collision
+from impactopt.collision.interface import Collision
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.mujoco_robot import MujocoRobot

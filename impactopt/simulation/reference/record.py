@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.result import Collision
+from impactopt.collision.interface import Collision
 from impactopt.simulation.reference.equations_of_motion import Instant
 from impactopt.simulation.reference.forces import Forces
 

@@ -21,7 +21,7 @@ from impactopt.planning.lazy_constraints import with_rows
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.controller import ControllerSettings, controller_of
-from impactopt.simulation.step_error import check_steps
+from impactopt.simulation.engines import check_steps
 from impactopt.transcription.plan import Trajectory
 
 __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "problem_of", "replay"]

@@ -16,9 +16,9 @@ from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.solution_library import SolvedFolder
 from impactopt.planning.solve import solve
 from impactopt.sweeps import sweep_from_data
+from impactopt.sweeps.design import Unit, Work
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.progress import START, ProgressCounter
-from impactopt.sweeps.units import Unit, Work
 
 ARM = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
 

@@ -20,13 +20,13 @@ def complete_problem(incomplete: str) -> list[str]:
 
 def complete_sweep(incomplete: str) -> list[str]:
     """The same of sweeps."""
-    from impactopt.files.folders import SWEEPS
+    from impactopt.files.problem_file.names import SWEEPS
 
     return _complete(incomplete, SWEEPS)
 
 
 def _complete(incomplete: str, folder: str) -> list[str]:
-    from impactopt.files.folders import named_files
+    from impactopt.files.problem_file.names import named_files
 
     typed = Path(incomplete)
     inside = typed if incomplete.endswith("/") else typed.parent

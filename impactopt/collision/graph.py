@@ -30,6 +30,7 @@ __all__ = [
     "frozen_dynamics",
     "gradient_graph",
     "independent_joints",
+    "instructions",
     "joint_space_model",
     "target_start",
 ]

@@ -55,6 +55,8 @@ __all__ = [
     "first_negative",
     "gamma",
     "largest",
+    "node_tables",
+    "polynomials",
     "tables",
 ]
 

@@ -13,7 +13,7 @@ from impactopt.contact import ContactLaw, Target
 from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, raw_array
 from impactopt.robots.robot import Robot
 
-__all__ = ["REFERENCE_ORDER", "Effects", "JointFriction", "Settings", "no_bend", "servo_settings"]
+__all__ = ["NO_LIMIT", "REFERENCE_ORDER", "Effects", "JointFriction", "Settings", "no_bend", "servo_settings"]
 
 
 @dataclass(frozen=True, kw_only=True)

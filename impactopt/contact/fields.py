@@ -1,7 +1,7 @@
 """Fields of laws and targets: their metadata, values, factors, and functions that are written of them.
 
 It is said once, in the field's own metadata. The class checks its numbers by it, its docstring lists it, and
-the sections of problem files are made of it (`impactopt.files.problem_file.field_sections`).
+the sections of problem files are made of it (`impactopt.files.problem_file.section`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,19 @@ import numpy as np
 
 from impactopt.errors import MOST, InputError, check_array
 
-__all__ = ["About", "Described", "about", "abouts", "snake_case"]
+__all__ = [
+    "About",
+    "Described",
+    "Parameters",
+    "about",
+    "abouts",
+    "check_numbers",
+    "choose",
+    "numbers_of",
+    "power",
+    "snake_case",
+    "text_of",
+]
 
 
 _METADATA = "about"

@@ -34,7 +34,16 @@ from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.tools import check_held
 
-__all__ = ["Closing", "Limb", "base_motion", "striker_kinematics"]
+__all__ = [
+    "Closing",
+    "Index",
+    "Limb",
+    "StanceCoordinates",
+    "base_motion",
+    "elimination_order",
+    "solve_in_order",
+    "striker_kinematics",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -17,7 +17,7 @@ from impactopt.kinematics.support import inward_edges, margin
 from impactopt.robots.robot import Robot
 from impactopt.robots.tools import inside
 
-__all__ = ["Reach", "reach"]
+__all__ = ["Reach", "inverse_kinematics", "reach"]
 
 Array = NDArray[np.float64]
 FARAWAY = 50.0  # [rad], [m] bound of what has none

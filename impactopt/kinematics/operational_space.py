@@ -19,7 +19,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.robot import Robot
 
-__all__ = ["Held", "across", "holding_torque", "striking_point", "striking_velocity"]
+__all__ = ["Held", "across", "holding_torque", "static_wrenches", "striking_point", "striking_velocity"]
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from impactopt.bodies.scene_visuals import Part, surroundings_of
-from impactopt.bodies.shapes import face_axes
 from impactopt.bodies.solids import cylinder
+from impactopt.bodies.visuals import Part, surroundings_of
+from impactopt.bodies.world import face_axes
 from impactopt.live.motion import Moment
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.stage import bodies_drawn

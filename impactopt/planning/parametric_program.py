@@ -16,8 +16,7 @@ from impactopt.planning.parameter_changes import changed
 from impactopt.planning.reconstruction import program_on
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.active import ActiveSystem, Offset
-from impactopt.solvers.predictor import Predictor
+from impactopt.solvers.predictor import ActiveSystem, Offset, Predictor
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["Bent", "bent_of"]

@@ -21,9 +21,8 @@ from impactopt.planning.reconstruction import solution_of
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.refinement import refine as refine_with
 from impactopt.planning.solution import Solution
-from impactopt.solvers.active import Change
 from impactopt.solvers.options import with_todays_name
-from impactopt.solvers.predictor import Prediction
+from impactopt.solvers.predictor import Change, Prediction
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.program_summary import statement_of
 from impactopt.transcription.transcription import Transcription

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from impactopt.planning.parameter_changes import Parameter, parameter_of
 from impactopt.planning.parametric_program import Bent, bent_of
 from impactopt.planning.solution import Solution
-from impactopt.solvers.active import Offset
+from impactopt.solvers.predictor import Offset
 
 __all__ = ["Binding", "Sensitivity", "sensitivity_of"]
 

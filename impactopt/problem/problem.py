@@ -11,8 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Bodies
-from impactopt.bodies.shapes import Ground, Obstacle, TargetBody
-from impactopt.bodies.world import WorldBody, body_message, ground_body, obstacle_bodies, target_bodies
+from impactopt.bodies.world import (
+    Ground,
+    Obstacle,
+    TargetBody,
+    WorldBody,
+    body_message,
+    ground_body,
+    obstacle_bodies,
+    target_bodies,
+)
 from impactopt.collision.settings import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target

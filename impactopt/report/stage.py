@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.robot_visuals import Visual, visuals_of
-from impactopt.bodies.scene_visuals import surroundings_of
 from impactopt.bodies.solids import Solid, joined, simplified
+from impactopt.bodies.visuals import Visual, surroundings_of, visuals_of
 from impactopt.bodies.world import WorldBody
 from impactopt.files.output import Record
 from impactopt.problem.problem import ImpactProblem

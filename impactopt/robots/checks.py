@@ -12,7 +12,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, did_you_mean
 
-__all__ = ["GIVEN", "INERTIAS", "REPAIRED", "check_inertias", "reduced", "repair_inertias", "tell_apart"]
+__all__ = [
+    "GIVEN",
+    "HEAVIEST",
+    "INERTIAS",
+    "LEG",
+    "REPAIRED",
+    "STRONGEST",
+    "check_arms",
+    "check_choice",
+    "check_configuration",
+    "check_frame",
+    "check_inertias",
+    "check_legs",
+    "reduced",
+    "repair_inertias",
+    "tell_apart",
+]
 
 _MARK = "\x00"  # in no name of a file
 

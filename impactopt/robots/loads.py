@@ -14,6 +14,7 @@ from impactopt.robots.robot import Robot
 
 __all__ = [
     "BEARS",
+    "SHARE",
     "DriveLoads",
     "cop_margin",
     "gear_torque",

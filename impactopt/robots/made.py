@@ -32,6 +32,7 @@ __all__ = [
     "GRIPPER_LENGTH",
     "LINKS",
     "PELVIS",
+    "PLANAR",
     "SOLE_CORNERS",
     "SOLE_HEIGHT",
     "TOE",

@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-__all__ = ["FLOOR", "Solid", "Solids", "Touched"]
+__all__ = ["FLOOR", "Besides", "Solid", "Solids", "Touched"]
 
 Array = NDArray[np.float64]
 FLOOR = -1  # in place of a solid's number

@@ -18,7 +18,7 @@ from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.result import Scene, Simulation
 
-__all__ = ["ALLOWED", "check_steps", "with_clearance", "with_step_error"]
+__all__ = ["ALLOWED", "ENGINES", "check_steps", "scene_of", "simulate", "with_clearance", "with_step_error"]
 
 
 def scene_of(problem: ImpactProblem) -> Scene:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from impactopt.robots.actuators import numbers_of
 from impactopt.robots.robot import Robot
 
-__all__ = ["CutWatch", "Delay", "MotorCut", "Motors"]
+__all__ = ["CutWatch", "Delay", "GearWatch", "MotorCut", "Motors"]
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,21 @@ from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
 
-__all__ = ["MujocoRobot", "Welds"]
+__all__ = [
+    "MujocoOptions",
+    "MujocoRobot",
+    "Welds",
+    "add_welds",
+    "build_world",
+    "mujoco_module",
+    "no_log_file",
+    "primitive",
+    "quaternion",
+    "robot_bodies",
+    "robot_on_floor",
+    "site_name",
+    "spec_of",
+]
 
 Array = NDArray[np.float64]
 # of a weld, MuJoCo's own limits: impedance, and time constant in steps

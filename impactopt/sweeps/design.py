@@ -22,6 +22,7 @@ __all__ = [
     "GRACE",
     "METHODS",
     "Axis",
+    "Column",
     "Columns",
     "Design",
     "Draws",

@@ -18,7 +18,7 @@ from impactopt.errors import printable
 from impactopt.sweeps.design import Columns
 from impactopt.sweeps.table import merge_kinds
 
-__all__ = ["ProgressCounter", "SweepConsole", "SweepProgress", "told", "words_for_time"]
+__all__ = ["START", "ProgressCounter", "SweepConsole", "SweepProgress", "told", "words_for_time"]
 
 BEST = "impulse_Ns"
 START = "started_from"  # a case; "": none

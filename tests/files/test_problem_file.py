@@ -15,7 +15,7 @@ from support.problem_texts import ARM, write
 
 import impactopt.files.problem_file.robot_sections as robot_sections
 import impactopt.files.problem_file.sections as sections
-from impactopt.bodies.shapes import Obstacle, TargetBody
+from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.contact import (
     Board,
     FreeMass,

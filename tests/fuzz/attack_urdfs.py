@@ -85,7 +85,7 @@ def attack_urdf(text: str, folder: Path, rng: Generator) -> Found:
     floating = bool(rng.random() < 0.2)
 
     def work() -> str:
-        from impactopt.bodies.robot_visuals import visuals_of
+        from impactopt.bodies.visuals import visuals_of
 
         robot = Robot.from_urdf(path, floating=floating, urdf=path)
         for shown in visuals_of(robot):

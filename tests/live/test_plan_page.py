@@ -31,8 +31,7 @@ from impactopt.cli.app import app
 from impactopt.contact.targets import RigidWall
 from impactopt.errors import InputError
 from impactopt.files.output import load_record, record_of, save_record
-from impactopt.files.replay import problem_of
-from impactopt.files.resume import resumed
+from impactopt.files.replay import problem_of, resumed
 from impactopt.live import plan_page as look_module
 from impactopt.live.motion import moment_of
 from impactopt.live.plan_page import LiveLook

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.striker_face import striker_face
+from impactopt.bodies.robot_bodies import striker_face
 from impactopt.kinematics.support import inward_edges, support_polygon
 from impactopt.problem.objectives import (
     AngularMomentum,

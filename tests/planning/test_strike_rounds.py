@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import changed
 
-from impactopt.bodies.shapes import Obstacle
+from impactopt.bodies.world import Obstacle
 from impactopt.planning import strike as strikes
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import Margins

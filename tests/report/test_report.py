@@ -18,9 +18,8 @@ from typer.testing import CliRunner
 
 from impactopt import Solution
 from impactopt.bodies.robot_bodies import bodies_of
-from impactopt.bodies.robot_visuals import visuals_of
-from impactopt.bodies.scene_visuals import surroundings_of
-from impactopt.bodies.shapes import Obstacle
+from impactopt.bodies.visuals import surroundings_of, visuals_of
+from impactopt.bodies.world import Obstacle
 from impactopt.cli.app import app
 from impactopt.contact import Board, KelvinVoigt
 from impactopt.errors import InputError

@@ -15,11 +15,20 @@ from support.fake_solution import still_problem, still_solution
 
 from impactopt import Solution
 from impactopt.bodies.convex_hulls import pieces_of
-from impactopt.bodies.meshes import find_mesh, read_mesh
-from impactopt.bodies.robot_visuals import visuals_of
-from impactopt.bodies.scene_visuals import surroundings_of
-from impactopt.bodies.shapes import Obstacle, TargetBody
-from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
+from impactopt.bodies.solids import (
+    Solid,
+    box,
+    capsule,
+    cylinder,
+    find_mesh,
+    joined,
+    read_mesh,
+    rounded_box,
+    simplified,
+    sphere,
+)
+from impactopt.bodies.visuals import surroundings_of, visuals_of
+from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError

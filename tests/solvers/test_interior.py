@@ -15,7 +15,7 @@ from support.textbook import CASES, INF, Textbook, assert_optimal
 from impactopt import load_problem
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipm import interior_point as interior
-from impactopt.solvers.ipm import line_search as search
+from impactopt.solvers.ipm import interior_point as search
 from impactopt.solvers.program import Status
 from impactopt.transcription.initial_guess import first_iterate
 

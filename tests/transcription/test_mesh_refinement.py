@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from support.small_plans import BODILESS, Planned, changed
 from support.term_cases import MILD
 
-from impactopt.bodies.shapes import Obstacle, TargetBody
+from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline

@@ -1,16 +1,14 @@
 """Problem files: an `impactopt.problem.problem.ImpactProblem` written in TOML, in SI units.
 
 * section.py    what all sections have in common
-* contacts.py   [target] and [contact], of which there are several kinds
-* robot_sections.py, term_sections.py, solver_sections.py   [robot]; [terms]; [solver]
-* sections.py   the other sections and keys of a file, and what they make
+* robot_sections.py, solver_sections.py   [robot]; [solver]
+* sections.py   the other sections and keys of a file, what they make, and what they are in words
 * values.py     ranges of the keys' values
 * diagnostics.py   what is wrong in a file, in words: where, what was meant, what is allowed
-* reading.py    from file to problem
+* reading.py    from file to problem; writing.py: back
 * changes.py    other values by key paths
 * toml.py       text from and to plain data
-* robot_writing.py, writing.py   from problem to file
-* key_docs.py, reference.py, template.py   keys in words: comments, docs/problem_files.md, `impactopt new`
+* reference.py  docs/problem_files.md, and the comments of `impactopt new`
 * names.py      the files that come with the package, by name
 """
 

@@ -12,9 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, get_args, get_origin
 
 from impactopt.errors import InputError, did_you_mean, shortened
-from impactopt.files.problem_file.contacts import with_kinds
 from impactopt.files.problem_file.section import Section
-from impactopt.files.problem_file.sections import File
+from impactopt.files.problem_file.sections import File, with_kinds
 from impactopt.files.problem_file.toml import Place, TOMLError, plain_value, read_toml
 
 __all__ = ["change_data", "key_paths", "key_place", "parse_settings"]

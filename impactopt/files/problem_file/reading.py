@@ -14,10 +14,9 @@ from pydantic import ValidationError
 from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.problem_file.changes import change_and_place
-from impactopt.files.problem_file.contacts import with_kinds
 from impactopt.files.problem_file.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.files.problem_file.names import problem_file
-from impactopt.files.problem_file.sections import File
+from impactopt.files.problem_file.sections import File, with_kinds
 from impactopt.files.problem_file.solver_sections import SolverSettings, with_todays_names
 from impactopt.files.problem_file.toml import (
     LONGEST_TEXT,

@@ -10,8 +10,7 @@ import pinocchio as pin
 from pydantic import model_validator
 
 from impactopt.errors import InputError
-from impactopt.files.problem_file.field_sections import section_of
-from impactopt.files.problem_file.section import Section, optional, required
+from impactopt.files.problem_file.section import Section, optional, required, section_of
 from impactopt.files.problem_file.values import (
     Factor,
     Inertia,

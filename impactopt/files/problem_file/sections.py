@@ -7,23 +7,25 @@ stand nowhere twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, fields
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from impactopt.bodies.shapes import Ground, Obstacle
+from impactopt.bodies.world import Ground, Obstacle, TargetBody
+from impactopt.contact import laws, targets
+from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
-from impactopt.files.problem_file.contacts import Contact, Target
-from impactopt.files.problem_file.field_sections import section_of
+from impactopt.files.problem_file.diagnostics import section_at
 from impactopt.files.problem_file.robot_sections import RobotSection
-from impactopt.files.problem_file.section import Section, optional, required
+from impactopt.files.problem_file.section import Section, one_of, optional, required, section_of, sections_of
 from impactopt.files.problem_file.solver_sections import SolverSection
-from impactopt.files.problem_file.term_sections import ObjectiveSections, TermSections
+from impactopt.files.problem_file.toml import Place
 from impactopt.files.problem_file.values import (
     AtLeastOne,
     ContactDuration,
@@ -40,11 +42,124 @@ from impactopt.files.problem_file.values import (
     Vector,
 )
 from impactopt.kinematics.stance import BothSoles, FixedBase, Free, OneSole, Stance
+from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.second_striker import SecondStriker
+from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS, TERMS
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
+
+__all__ = [
+    "ELEMENTS",
+    "LAWS",
+    "TARGETS",
+    "Body",
+    "CollisionSection",
+    "File",
+    "FollowSection",
+    "GroundSection",
+    "ObjectiveSection",
+    "ObjectiveSections",
+    "ObstacleSection",
+    "ProblemSection",
+    "ScenarioSection",
+    "SecondSection",
+    "SwingSection",
+    "TermSections",
+    "about_section",
+    "comment_at",
+    "with_kinds",
+]
+
+_TERMS = {snake_case(kind.__name__): kind for kind in TERMS}
+_FIRST, *_, _LAST = list(_TERMS)[: len(DEFAULT_TERMS)]
+_ON_DEMAND = " and ".join(snake_case(type(term).__name__) for term in ON_DEMAND_TERMS)
+
+TermSections: Any = sections_of(
+    "TermSections",
+    f"Constraints. Those from {_FIRST} to {_LAST}, and {_ON_DEMAND}, hold with their defaults if they are "
+    "left out.",
+    _TERMS,
+)
+ObjectiveSections: Any = sections_of(
+    "ObjectiveSections",
+    "What is maximized: the impulse, or if there are sections here, only these.",
+    {snake_case(kind.__name__): kind for kind in OBJECTIVES},
+)
+
+
+_FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # of a file that names none
+TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)
+LawKind: Any = one_of(kind.word for kind in laws.LAWS)
+
+
+Body: Any = section_of(TargetBody)
+
+
+class Target(Section):
+    """Target of the impact; the keys depend on its kind."""
+
+    model_config = ConfigDict(extra="ignore")
+    choice: ClassVar[str] = "target_kind"
+    apart: ClassVar[tuple[str, ...]] = ("body",)
+    target_kind: TargetKind = Field(default=_FIRST_TARGET, alias="kind", description="what it is")
+    body: Body = optional("")
+
+
+class _KnownTarget(Target):
+    """One whose keys are its own."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Contact(Section):
+    """Contact between hand and target; the keys depend on the law."""
+
+    model_config = ConfigDict(extra="ignore")
+    choice: ClassVar[str] = "law"
+    law: LawKind = Field(default=_FIRST_LAW, description="what gives the force")
+
+
+class _KnownContact(Contact):
+    """One whose keys are its own."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+TARGETS: dict[str, type[Target]] = {kind.word: section_of(kind, _KnownTarget) for kind in targets.TARGETS}
+LAWS: dict[str, type[Contact]] = {kind.word: section_of(kind, _KnownContact) for kind in laws.LAWS}
+
+AnyFile = TypeVar("AnyFile", bound=Section)
+
+
+def with_kinds(file: type[AnyFile], data: Mapping[str, Any]) -> type[AnyFile]:
+    """The model of a file whose [target] and [contact] are of the kinds that its data name."""
+    found = {
+        "target": _chosen(data, "target", "kind", TARGETS, Target, _FIRST_TARGET),
+        "contact": _chosen(data, "contact", "law", LAWS, Contact, _FIRST_LAW),
+    }
+    return cast(type[AnyFile], _file_with(file, found["target"], found["contact"]))
+
+
+@cache  # a sweep reads thousands
+def _file_with(file: type[Section], target: type[Section], contact: type[Section]) -> type[Section]:
+    fields: dict[str, Any] = {"target": (target, ...), "contact": (contact, ...)}
+    return create_model(file.__name__, __base__=file, **fields)
+
+
+def _chosen(
+    data: Mapping[str, Any],
+    section: str,
+    key: str,
+    kinds: Mapping[str, type[Section]],
+    unknown: type[Section],
+    default: str,
+) -> type[Section]:
+    given = data.get(section)
+    name = given.get(key, default) if isinstance(given, Mapping) else default
+    return kinds.get(name, unknown) if isinstance(name, str) else unknown
+
 
 ELEMENTS = ("compression", "restitution")  # keys of ImpactProblem.collision_elements
 
@@ -276,3 +391,19 @@ class File(Section):
                 found = (getattr(section, field) for field in type(section).model_fields)
                 out[name] = tuple(part.build() for part in found if part is not None)
         return out
+
+
+def about_section(section: type[BaseModel]) -> str:
+    """Description of a section: its docstring's first sentence."""
+    return " ".join((section.__doc__ or "").split("\n\n")[0].split()).rstrip(".")
+
+
+def comment_at(data: Mapping[str, Any], place: Place) -> str:
+    """The comment to a key or a section of a file with these data; "" where there is nothing to say."""
+    section, sections = section_at(with_kinds(File, data), place)
+    if sections == len(place):
+        return about_section(section)
+    for name, info in section.model_fields.items():
+        if len(place) == sections + 1 and place[-1] in (info.alias, name):
+            return info.description or ""
+    return ""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from impactopt.bodies.shapes import face_axes
+from impactopt.bodies.world import face_axes
 from impactopt.contact.fields import about
 from impactopt.kinematics.coordinates import striker_kinematics
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 from scipy.spatial import ConvexHull
 
-from impactopt.bodies.scene_visuals import surroundings_of
+from impactopt.bodies.visuals import surroundings_of
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
 from impactopt.files.replay import Replay

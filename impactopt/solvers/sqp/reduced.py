@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from impactopt.solvers.options import SQPOptions
-from impactopt.solvers.point import Point
 from impactopt.solvers.program import (
     Callback,
     NonlinearProgram,
+    Point,
     SolverResult,
     Status,
     Vector,
@@ -29,9 +29,7 @@ from impactopt.solvers.program import (
 )
 from impactopt.solvers.qp.registry import make_qp_solver
 from impactopt.solvers.run import Run
-from impactopt.solvers.sqp.reduced_hessian import ReducedModel, make_model
-from impactopt.solvers.sqp.reduced_qp import ReducedQP, Solved
-from impactopt.solvers.sqp.reduction import Reduction
+from impactopt.solvers.sqp.reduced_qp import ReducedModel, ReducedQP, Reduction, Solved, make_model
 
 _HALVINGS = 12  # of a step
 _ARMIJO = 1e-4

@@ -76,7 +76,7 @@ _EXPORTS = {
     "scaled_gains": "robots.gains",
     "report_page": "report.solutions",
     "robot_names": "robots.presets",
-    "sensitivity_of": "planning.sensitivity",
+    "sensitivity_of": "planning.replanning",
     "solve": "api",
     "standin": "robots.presets",
     "striking_velocity": "kinematics.operational_space",

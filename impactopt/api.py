@@ -16,7 +16,7 @@ from impactopt.errors import InputError, NotSolvedWarning
 from impactopt.files.problem_file import read_problem_file
 from impactopt.planning import nail_driving, replanning, solution, strike
 from impactopt.planning import solve as planning
-from impactopt.planning.sensitivity import Sensitivity, sensitivity_of
+from impactopt.planning.replanning import Sensitivity, sensitivity_of
 from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["Solution", "drive_nail", "moved_solution", "optimize_strike", "solve"]

@@ -16,9 +16,8 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
-from impactopt.planning.cautions import gear_caution
 from impactopt.planning.gain_selection import ChosenGains, with_chosen
-from impactopt.planning.lazy_constraints import with_rows
+from impactopt.planning.lazy_constraints import gear_caution, with_rows
 from impactopt.planning.reconstruction import program_on, solution_of
 from impactopt.planning.refinement import Outcome
 from impactopt.planning.solution import Solution
@@ -29,8 +28,7 @@ from impactopt.simulation.controller import ControllerSettings, controller_of
 from impactopt.simulation.engines import check_steps
 from impactopt.solvers.program import SolverResult, Status, max_violation
 from impactopt.transcription.clearance import ApartRow, Held
-from impactopt.transcription.mesh import Elements
-from impactopt.transcription.mesh_refinement import MoreNodes
+from impactopt.transcription.mesh import Elements, MoreNodes
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.transcription import Transcription
 

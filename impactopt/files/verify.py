@@ -27,8 +27,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import weight_of
 from impactopt.solvers.program import bound_violations, complementarity, row_violations, scaled_residual
 from impactopt.transcription.contact_refinement import contact_error
-from impactopt.transcription.program_summary import statement_of
-from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.transcription import Transcription, statement_of
 
 __all__ = ["KKT", "VIOLATION", "Verdict", "motion_of_record", "verify", "verify_record"]
 

@@ -22,7 +22,7 @@ from impactopt.planning.budget import Budget
 from impactopt.planning.lazy_constraints import with_rows
 from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import program_for
-from impactopt.problem.phase import LONGEST, SHORTEST, Phase
+from impactopt.problem.scenario import LONGEST, SHORTEST, Phase
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.program import NonlinearProgram, SolverResult, max_violation
 from impactopt.solvers.relaxed import RelaxedProgram

@@ -26,8 +26,7 @@ from impactopt.simulation.pinocchio_engine import Followed, follow_contact
 from impactopt.simulation.reference.coasting import coasting_reference, independent_rates
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.contact_program import ContactProgram
-from impactopt.transcription.plan import Plan, Trajectory
-from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.plan import Plan, PlannedStrike, Trajectory
 
 __all__ = [
     "AGREED",

@@ -27,8 +27,7 @@ from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, Torq
 from impactopt.robots.tools import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.transcription.initial_guess import strike_rates
-from impactopt.transcription.plan import Trajectory
-from impactopt.transcription.reference import complete_reference
+from impactopt.transcription.plan import Trajectory, complete_reference
 
 Array = NDArray[np.float64]
 

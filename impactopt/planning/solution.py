@@ -15,21 +15,17 @@ from numpy.typing import NDArray
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.planning.causes import Cause
-from impactopt.planning.cautions import gear_caution, slide, slide_caution
 from impactopt.planning.contact_replay import AGREED, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
-from impactopt.planning.lazy_constraints import rows_on_demand
+from impactopt.planning.lazy_constraints import gear_caution, rows_on_demand, slide, slide_caution
 from impactopt.planning.refinement import Attempt
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_refinement import ContactError
-from impactopt.transcription.mesh import Elements, Shares, contact_elements
-from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
+from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares, contact_elements
 from impactopt.transcription.motion_measures import first_touch, motion_measures
-from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
-from impactopt.transcription.planned_loads import motion_loads
-from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, Trajectory, motion_loads
 
 Array = NDArray[np.float64]
 
@@ -132,7 +128,7 @@ class Solution(Solved):
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
-    statement : names of the program's variables and constraints, as `impactopt.transcription.program_summary`
+    statement : names of the program's variables and constraints, as `impactopt.transcription.transcription`
     writes them.
     causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
         cheapest first. Each has the ``problem`` with that value. Empty where none is known to.

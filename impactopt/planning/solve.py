@@ -19,11 +19,10 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
 from impactopt.planning.causes import Cause, search
-from impactopt.planning.cautions import window_caution
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solved_apart
 from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, with_rows
+from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, window_caution, with_rows
 from impactopt.planning.models import carried_start
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
@@ -43,10 +42,9 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
-from impactopt.transcription.mesh_refinement import NO_MORE
-from impactopt.transcription.program_summary import statement_of
+from impactopt.transcription.mesh import NO_MORE
 from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.transcription import Transcription, statement_of
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")

@@ -13,12 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
 from impactopt.planning.budget import Budget, touching
-from impactopt.planning.cautions import gear_caution
-from impactopt.planning.clearance_constraints import Margins, solved_apart
-from impactopt.planning.clearance_violations import deepest_penetration
+from impactopt.planning.clearance_constraints import Margins, deepest_penetration, solved_apart
 from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, with_rows
+from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, rows_on_demand, with_rows
 from impactopt.planning.models import carried_start
 from impactopt.planning.multistart import (
     Guesses,
@@ -34,7 +32,7 @@ from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Callback, Status
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.mesh import contact_elements
-from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 

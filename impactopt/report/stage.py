@@ -26,7 +26,7 @@ GRID = 65535  # steps of a vertex's coordinate in its solid's bounds
 
 
 def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Arrays]:
-    """Header and arrays, for :func:`impactopt.report.pack.pack`, of the record's motions."""
+    """Header and arrays, for :func:`impactopt.report.page.pack`, of the record's motions."""
     arrays: Arrays = {}
     bodies = pack_robot(problem.robot, arrays)
     world = pack_world(problem.world, arrays)

@@ -37,7 +37,7 @@ from impactopt.files.problem_file.changes import parse_settings
 from impactopt.files.problem_file.diagnostics import key_lines
 from impactopt.files.problem_file.names import problem_file
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
-from impactopt.problem.phase import FINEST
+from impactopt.problem.scenario import FINEST
 from impactopt.report.page import html_page
 from impactopt.simulation import simulate
 from impactopt.solvers.ipm.newton import elimination_blocks

@@ -33,7 +33,7 @@ from impactopt.errors import InputError
 from impactopt.files.output import load_record, record_of, save_record
 from impactopt.files.replay import problem_of, resumed
 from impactopt.live import plan_page as look_module
-from impactopt.live.motion import moment_of
+from impactopt.live.drawing import moment_of
 from impactopt.live.plan_page import LiveLook
 from impactopt.live.replanning import Replanning
 from impactopt.live.requests import PlanRequest, numbers_of, request_of

@@ -22,8 +22,7 @@ from impactopt.problem.terms import ContactWrenchCone, FirstTouch, GearLoad, Gro
 from impactopt.robots.attachments import SoftGrip
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Trajectory
-from impactopt.transcription.program_summary import statement_of
-from impactopt.transcription.transcription import Transcription, block_functions
+from impactopt.transcription.transcription import Transcription, block_functions, statement_of
 from oracle.kkt import lagrangian_gradient
 from oracle.program import Program
 from oracle.recorded import off_in_record

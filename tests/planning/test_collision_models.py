@@ -25,7 +25,7 @@ from impactopt.problem.scenario import Scenario
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.mesh import contact_elements, guessed_shares, place_of
-from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
 
 pytestmark = [

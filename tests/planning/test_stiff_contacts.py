@@ -19,8 +19,8 @@ from impactopt.simulation.reference.full import FullDynamics
 from impactopt.solvers.program import Status
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, fastest, parting
-from impactopt.transcription.contact_parameters import shortest_phases
 from impactopt.transcription.contact_refinement import ASKED
+from impactopt.transcription.contact_state import shortest_phases
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions

@@ -14,8 +14,7 @@ from support.small_plans import changed
 from impactopt.bodies.world import Obstacle
 from impactopt.planning import strike as strikes
 from impactopt.planning.budget import Budget
-from impactopt.planning.clearance_constraints import Margins
-from impactopt.planning.clearance_violations import deepest_penetration
+from impactopt.planning.clearance_constraints import Margins, deepest_penetration
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.initial_guess import strike_iterate

@@ -15,8 +15,7 @@ from impactopt import Obstacle, Solution, load_problem, solve
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget
-from impactopt.planning.clearance_constraints import Margins, Watch, spots_of
-from impactopt.planning.clearance_violations import clearance_violations
+from impactopt.planning.clearance_constraints import Margins, Watch, clearance_violations, spots_of
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.solve import PlanSolver
 from impactopt.problem.problem import ImpactProblem

@@ -20,9 +20,9 @@ from impactopt.robots.loads import motor_power, motor_use
 from impactopt.simulation import simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.transcription.impact_onset import jump
+from impactopt.transcription.collision import jump
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
-from impactopt.transcription.planned_loads import motion_loads
+from impactopt.transcription.plan import motion_loads
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

@@ -21,12 +21,11 @@ from impactopt.problem.terms import Gaze, Term, TorqueLimit
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.transcription.blocks import make_block
-from impactopt.transcription.constraints import millimetres
+from impactopt.transcription.blocks import key_of, make_block
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
+from impactopt.transcription.layout import millimetres
 from impactopt.transcription.objective import Quantity
 from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.term_blocks import key_of
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

@@ -27,7 +27,7 @@ from impactopt.files.output import Record, record_of, save_record
 from impactopt.files.problem_file.names import problem_file
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report import animation_of, bodies_page, report_of
-from impactopt.report.pack import unpack
+from impactopt.report.page import unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
 from impactopt.robots.presets import load_robot

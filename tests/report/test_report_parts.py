@@ -34,9 +34,9 @@ from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of
 from impactopt.report.charts import charts_of
-from impactopt.report.pack import pack, unpack
+from impactopt.report.histories import thinned
+from impactopt.report.page import pack, unpack
 from impactopt.report.stage import stage_of
-from impactopt.report.thinning import thinned
 from impactopt.report.tracks import FAR, tracks_of
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot

@@ -58,7 +58,7 @@ NUMERIC = (
     "solvers/run.py",
     "solvers/sqp",
     "transcription/plan.py",
-    "transcription/planned_strike.py",
+    "transcription/plan.py",
 )
 # What an engine may know of this package, so that it can contradict the rest of it.
 ENGINE = {"contact", "errors", "robots", "simulation"}

@@ -20,8 +20,14 @@ from impactopt.bodies.clearance import Places
 from impactopt.bodies.separation import THIN
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.planning.budget import Budget
-from impactopt.planning.clearance_constraints import Margins, Watch, solved_apart, spots_of
-from impactopt.planning.clearance_violations import clearance_violations, deepest_penetration
+from impactopt.planning.clearance_constraints import (
+    Margins,
+    Watch,
+    clearance_violations,
+    deepest_penetration,
+    solved_apart,
+    spots_of,
+)
 from impactopt.planning.refinement import Guess
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term

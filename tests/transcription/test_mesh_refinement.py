@@ -45,11 +45,10 @@ from impactopt.problem.terms import (
 from impactopt.simulation.result import distance_inside
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.program import Status
-from impactopt.transcription import mesh_refinement as between
+from impactopt.transcription import mesh as between
 from impactopt.transcription.initial_guess import carried_over, first_iterate
-from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes, nodes_to_add
-from impactopt.transcription.plan import Plan
-from impactopt.transcription.reference import complete_reference
+from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.transcription.plan import Plan, complete_reference
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from impactopt.solvers.program import Status, check_program
 from impactopt.transcription.contact_conditions import rotation_rows
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import collision_mesh, with_middles
-from impactopt.transcription.reference import total_ground_wrench
+from impactopt.transcription.plan import total_ground_wrench
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

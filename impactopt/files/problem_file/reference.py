@@ -26,7 +26,7 @@ from impactopt.files.problem_file.sections import (
 )
 from impactopt.files.problem_file.toml import DEEPEST, LONGEST_TEXT, Place, plain_value, write_toml
 from impactopt.problem.checks import LONGEST_CONTACT, MANY, MOST_ELEMENTS
-from impactopt.problem.phase import FINEST, LONGEST, SHORTEST, STEEPEST
+from impactopt.problem.scenario import FINEST, LONGEST, SHORTEST, STEEPEST
 from impactopt.robots.checks import HEAVIEST
 
 __all__ = ["problem_template", "reference"]

@@ -1,6 +1,6 @@
 """Sequential quadratic programming in few variables: reduced QPs, solved to their end, and a filter.
 
-What rows determine is eliminated from every QP (`reduction`), the rows that a QP needs are added to it when
+What rows determine is eliminated from every QP (`reduced_qp`), the rows that a QP needs are added to it when
 they are missed, and what cannot be met is elastic. Its step is shortened until a filter takes it (Waechter
 and Biegler 2006, section 2.3, with a QP's step in the place of a barrier problem's); where none is taken, and
 rows are violated, only these count for a while.

@@ -1,6 +1,7 @@
 """Joints that no motor moves, and the torque profiles of the others.
 
-Of a spring and a damper, the torque that the motion needs is that of the two; of a sole's hinge it is none."""
+Of a spring and a damper, the torque that the motion needs is that of the two; of a sole's hinge it is none.
+"""
 
 from __future__ import annotations
 

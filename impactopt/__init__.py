@@ -36,7 +36,7 @@ _EXPORTS = {
     "Robustness": "simulation.robustness",
     "SDC": "collision",
     "Scenario": "problem.scenario",
-    "SecondStriker": "problem.second_striker",
+    "SecondStriker": "problem.scenario",
     "Sole": "robots.robot",
     "Solution": "api",
     "PerturbationRanges": "simulation.robustness",

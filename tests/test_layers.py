@@ -64,7 +64,7 @@ def test_what_follows_the_transcription_is_without_casadi(name: str) -> None:
 def test_engines_share_no_code_with_the_planner() -> None:
     engines = sorted((PACKAGE / "simulation").glob("*_engine.py"))
     assert engines
-    names = ("result", "servo", "target_dynamics", "histories", "perturbation", "motors")
+    names = ("result", "target_dynamics", "perturbation", "motors")
     robots = ("mujoco_world", "pinocchio_robot")
     shared = [PACKAGE / "simulation" / f"{name}.py" for name in (*names, *robots)]
     shared += sorted((PACKAGE / "simulation" / "controller").glob("*.py"))

@@ -39,8 +39,8 @@ def _complete(incomplete: str, folder: str) -> list[str]:
 def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
     """Keys of the problem that the command names, or of any, that begin like this."""
     from impactopt.errors import InputError
-    from impactopt.files.problem_file.changes import key_paths
     from impactopt.files.problem_file.names import problem_file
+    from impactopt.files.problem_file.reading import key_paths
     from impactopt.files.problem_file.toml import TOMLError, read_toml
 
     data: dict[str, Any] = {}

@@ -21,9 +21,8 @@ from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import Record, load_record, plain
 from impactopt.files.problem_file import ProblemFile, parse_problem_file
 from impactopt.files.problem_file.diagnostics import mistakes_of, report_mistakes
-from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import File
-from impactopt.files.problem_file.values import Positive
+from impactopt.files.problem_file.values import Positive, Section
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.robot import Robot

@@ -1,7 +1,7 @@
 """Fields of laws and targets: their metadata, values, factors, and functions that are written of them.
 
 It is said once, in the field's own metadata. The class checks its numbers by it, its docstring lists it, and
-the sections of problem files are made of it (`impactopt.files.problem_file.section`).
+the sections of problem files are made of it (`impactopt.files.problem_file.values`).
 """
 
 from __future__ import annotations

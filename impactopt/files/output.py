@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from impactopt.codegen.files import read_archive, read_plain, write_atomically
 from impactopt.errors import InputError
-from impactopt.files.problem_file.changes import change_data
+from impactopt.files.problem_file.reading import change_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.toml import read_toml, write_toml
 from impactopt.files.record_schema import check_arrays, check_summary

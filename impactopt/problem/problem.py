@@ -52,8 +52,7 @@ from impactopt.problem.checks import (
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
-from impactopt.problem.scenario import Phase, Scenario
-from impactopt.problem.second_striker import SecondStriker, check_second
+from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,

@@ -19,14 +19,7 @@ from impactopt.robots.loads import BEARS, weight_of
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import Besides
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
-from impactopt.simulation.histories import (
-    FollowedReference,
-    Touches,
-    check_not_diverged,
-    posture_error,
-    simulation_of,
-)
-from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors
+from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
 from impactopt.simulation.mujoco_world import (
     MujocoOptions,
     MujocoRobot,
@@ -36,8 +29,15 @@ from impactopt.simulation.mujoco_world import (
     site_name,
 )
 from impactopt.simulation.perturbation import Perturbation
-from impactopt.simulation.result import Scene, Simulation
-from impactopt.simulation.servo import Servo
+from impactopt.simulation.result import (
+    FollowedReference,
+    Scene,
+    Simulation,
+    Touches,
+    check_not_diverged,
+    posture_error,
+    simulation_of,
+)
 from impactopt.simulation.target_dynamics import Push, Struck
 
 Array = NDArray[np.float64]
@@ -288,7 +288,7 @@ def simulate_mujoco(
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
     missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
-        :class:`impactopt.simulation.histories.FollowedReference`); default: it does not notice.
+        :class:`impactopt.simulation.result.FollowedReference`); default: it does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 

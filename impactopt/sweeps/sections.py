@@ -8,8 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from impactopt.files.problem_file.diagnostics import Mistake
-from impactopt.files.problem_file.section import Section, optional, required
-from impactopt.files.problem_file.values import Positive
+from impactopt.files.problem_file.values import Positive, Section, optional, required
 
 __all__ = ["CaseKind", "Figure", "SpanSection", "SweepFile", "flat", "of_other_kinds", "put"]
 

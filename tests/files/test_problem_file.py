@@ -31,7 +31,7 @@ from impactopt.contact.targets import TARGETS
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.files.problem_file.diagnostics import key_lines
-from impactopt.files.problem_file.section import Section, attribute_docs
+from impactopt.files.problem_file.values import Section, attribute_docs
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem import objectives, terms
 from impactopt.problem.problem import COLLISIONS, ImpactProblem, Phase

@@ -10,7 +10,7 @@ import pytest
 
 from impactopt import FixedBase, FreeMass, ImpactProblem, Scenario, Solution, SpringDamper, planar_arm, solve
 from impactopt.robots.robot import Robot
-from impactopt.simulation.histories import FollowedReference
+from impactopt.simulation.result import FollowedReference
 from impactopt.transcription.plan import Trajectory
 
 LATE = 0.06  # [s] after the planned contact that the robot notices

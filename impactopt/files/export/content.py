@@ -29,7 +29,7 @@ from impactopt.files.output import plain
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
-from impactopt.simulation.histories import parts_from
+from impactopt.simulation.result import parts_from
 from impactopt.solvers.program import Status
 
 __all__ = ["META", "Export", "body_name", "check_export", "export_of", "joint_order", "write_directory"]

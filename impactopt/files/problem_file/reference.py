@@ -10,11 +10,9 @@ from pydantic import AfterValidator, BaseModel, PlainValidator
 from pydantic.fields import FieldInfo
 
 from impactopt.errors import FARTHEST, MOST
-from impactopt.files.problem_file.changes import LONGEST_KEY
 from impactopt.files.problem_file.diagnostics import range_of, section_at
 from impactopt.files.problem_file.names import problem_file, problem_summary
-from impactopt.files.problem_file.reading import read_problem_file
-from impactopt.files.problem_file.section import Section
+from impactopt.files.problem_file.reading import LONGEST_KEY, read_problem_file
 from impactopt.files.problem_file.sections import (
     LAWS,
     TARGETS,
@@ -25,6 +23,7 @@ from impactopt.files.problem_file.sections import (
     with_kinds,
 )
 from impactopt.files.problem_file.toml import DEEPEST, LONGEST_TEXT, Place, plain_value, write_toml
+from impactopt.files.problem_file.values import Section
 from impactopt.problem.checks import LONGEST_CONTACT, MANY, MOST_ELEMENTS
 from impactopt.problem.scenario import FINEST, LONGEST, SHORTEST, STEEPEST
 from impactopt.robots.checks import HEAVIEST

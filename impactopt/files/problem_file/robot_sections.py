@@ -10,7 +10,6 @@ import pinocchio as pin
 from pydantic import model_validator
 
 from impactopt.errors import InputError
-from impactopt.files.problem_file.section import Section, optional, required, section_of
 from impactopt.files.problem_file.values import (
     Factor,
     Inertia,
@@ -22,7 +21,11 @@ from impactopt.files.problem_file.values import (
     Preset,
     Range,
     Rotation,
+    Section,
     Vector,
+    optional,
+    required,
+    section_of,
 )
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip

@@ -15,7 +15,6 @@ from impactopt.contact.fields import abouts
 from impactopt.errors import InputError
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_sections import RobotSection
-from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import (
     ELEMENTS,
     LAWS,
@@ -31,12 +30,13 @@ from impactopt.files.problem_file.sections import (
     ProblemSection,
     ScenarioSection,
     SecondSection,
+    SolverSettings,
     SwingSection,
     TermSections,
     comment_at,
 )
-from impactopt.files.problem_file.solver_sections import SolverSettings
 from impactopt.files.problem_file.toml import plain_value, write_toml
+from impactopt.files.problem_file.values import Section
 from impactopt.kinematics.stance import OneSole
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS

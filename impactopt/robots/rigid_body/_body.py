@@ -11,8 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import InputError
 from impactopt.robots.rigid_body import _dynamics
 from impactopt.robots.rigid_body import _dynamics as _momentum
-from impactopt.robots.rigid_body._dynamics import Factor, add_to_diagonal, tree_entries
-from impactopt.robots.rigid_body._kinematics import Accelerations, Kinematics, Velocities
+from impactopt.robots.rigid_body._dynamics import (
+    Accelerations,
+    Factor,
+    Kinematics,
+    Velocities,
+    add_to_diagonal,
+    tree_entries,
+)
 from impactopt.robots.rigid_body._spatial import (
     Scalar,
     Vector,

@@ -26,8 +26,8 @@ from impactopt.simulation.controller.clearance import MOST, Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.controller.tracking_reference import Aim, Recovery, Target
+from impactopt.simulation.motors import Servo
 from impactopt.simulation.result import Scene
-from impactopt.simulation.servo import Servo
 
 __all__ = ["Cones", "HeldDynamics", "Tasks", "TorqueQP", "WholeBodyController", "cone_of"]
 

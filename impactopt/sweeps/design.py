@@ -20,7 +20,6 @@ from impactopt.files.output import Record
 
 __all__ = [
     "GRACE",
-    "METHODS",
     "Axis",
     "Column",
     "Columns",
@@ -36,8 +35,6 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Column = Sequence[Any] | NDArray[Any]
-
-METHODS = ("random", "sobol", "latin hypercube")
 
 
 def column(values: Sequence[Any]) -> Column:

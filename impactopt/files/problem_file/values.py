@@ -250,7 +250,6 @@ def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
 Positive = Annotated[float, Field(gt=0)]
 Freezes = Annotated[int, Field(ge=0, le=MOST_FREEZES)]
 NotNegative = Annotated[float, Field(ge=0)]
-NotNegativeOrAny = Annotated[float, Field(ge=0, allow_inf_nan=True)]  # inf: any; nan is refused by ge
 AtLeastOne = Annotated[float, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Restitution = Annotated[float, Field(ge=0, le=1)]

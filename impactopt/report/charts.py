@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from impactopt.files.output import Record
 from impactopt.kinematics.support import margin
 from impactopt.problem.problem import ImpactProblem
-from impactopt.report.histories import at_contact, ground_wrenches, planned_torque
+from impactopt.report.histories import BUCKETS, at_contact, ground_wrenches, planned_torque, thinned
 from impactopt.report.result_rows import replay_name
-from impactopt.report.thinning import BUCKETS, thinned
 from impactopt.report.tracks import planned_hand_speed
 from impactopt.simulation.result import centre_of_pressure
 

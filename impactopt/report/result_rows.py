@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.robots.sole_margins import SHARE, least_kept
+from impactopt.robots.loads import SHARE, least_kept
 from impactopt.solvers.program import MINOR
 
 __all__ = [

@@ -24,6 +24,7 @@ from support.small_plans import BODILESS, rod_hammer
 from typer.testing import CliRunner
 
 import impactopt
+from impactopt import Solution, solve
 from impactopt.cli.app import app
 from impactopt.cli.export import Target as Choice
 from impactopt.contact import Board, FreeMass, HertzDamped, HuntCrossley, KelvinVoigt, RigidWall, SpringDamper
@@ -35,8 +36,6 @@ from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.names import problem_file
 from impactopt.files.replay import Planned
-from impactopt.planning.solution import Solution
-from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import FirstTouch
 from impactopt.robots.attachments import SoftGrip

@@ -23,16 +23,16 @@ from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_striker
 from impactopt.files.draft.strong import Strong, duration, strongest
 from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
-from impactopt.files.problem_file.key_docs import comment_at
 from impactopt.files.problem_file.reading import problem_file_from_data
-from impactopt.files.problem_file.robot_writing import sole_data, striker_data
+from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
+from impactopt.files.problem_file.writing import sole_data, striker_data
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import far_shapes
 from impactopt.robots.attachments import Sole, Striker
-from impactopt.robots.inertias import REPAIRED
+from impactopt.robots.checks import REPAIRED
+from impactopt.robots.gains import USUAL_ROTOR
 from impactopt.robots.robot import Robot
-from impactopt.robots.rotors import USUAL_ROTOR
 
 __all__ = ["Draft", "draft_problem"]
 

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from impactopt.errors import InputError, did_you_mean
-from impactopt.files.export.content import check_export, export_of
-from impactopt.files.export.directory import write_directory
+from impactopt.files.export.content import check_export, export_of, write_directory
 from impactopt.files.output import record_of
 from impactopt.files.replay import Planned
 from impactopt.planning.solution import Solution

@@ -295,8 +295,8 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
             yield f"guessed, as the {robot_kind(drafted)} has none: {what} of {count} joints"
     if guessed := int(_guessed_gains(robot).sum()):
         yield (
-            f"guessed: servo gains of {guessed} joints, kd = 1.5 s x torque limit, at most 150, and kp = 30/s "
-            "x kd; give kp_N_m_rad and kd_N_m_s_rad"
+            f"guessed: servo gains of {guessed} joints, kd = 1.5 s x torque limit, at most 150, and kp = "
+            "30/s x kd; give kp_N_m_rad and kd_N_m_s_rad"
         )
     yield from drafted.drives.said[:3]
     if len(drafted.drives.said) > 3:

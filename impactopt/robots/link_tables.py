@@ -222,8 +222,8 @@ def planar_arm(**overrides: Any) -> Robot:
 def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
     """An arm of seven joints on a fixed base, of the class of KUKA's LBR iiwa 7; it needs no files.
 
-    Lengths, limits and the whole arm's mass are that arm's (source in `robots/link_tables.py`); the distribution
-    of mass, inertias, gears and rotors are *ours*.
+    Lengths, limits and the whole arm's mass are that arm's (source at the top of this file); the
+    distribution of mass, inertias, gears and rotors are *ours*.
 
     * Joints `joint_1` to `joint_7` about z, y, z, y, z, y, z, straight up at zero angles; 19 kg move.
     * Armature: 0.51 kg m2 in the first two joints, 0.31 in the next three, 0.1 in the last two.

@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,13 @@ from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.toml import read_toml, write_toml
 from impactopt.files.record_schema import check_arrays, check_summary
 from impactopt.kinematics.support import support_polygon
-from impactopt.planning.solution import Solution
-from impactopt.planning.strike import StrikeSolution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
 from impactopt.solvers.program import SolverResult, Status
+
+if TYPE_CHECKING:  # who only reads a record loads no planner
+    from impactopt.planning.solution import Solution
+    from impactopt.planning.strike import StrikeSolution
 
 __all__ = [
     "DERIVED",
@@ -176,6 +178,8 @@ def _settled(problem: str, solution: Solution | StrikeSolution) -> str:
 
 def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:
     """Summary of a solution's record; made without the record's arrays, if nothing else of it is kept."""
+    from impactopt.planning.strike import StrikeSolution
+
     return plain(
         solution.summary() if isinstance(solution, StrikeSolution) else _summary(solution, None, None)
     )

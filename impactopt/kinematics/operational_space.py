@@ -1,7 +1,7 @@
 """Striking point of a constrained robot: place, effective mass, mobility, coasting torque; wrenches at rest.
 
 In numbers for one configuration, by Pinocchio and least squares. For many of them, and for gradients,
-there are compiled graphs, `impactopt.collision.frozen` and `impactopt.collide.contact_states`; tests
+there are compiled graphs, `impactopt.collision.effective_mass` and `impactopt.collide.contact_states`; tests
 hold them to this.
 """
 

@@ -31,7 +31,7 @@ from impactopt.files.problem_file import names as folders
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.robots.made import ARM7, arm_model
+from impactopt.robots.link_tables import ARM7, arm_model
 from impactopt.robots.robot import Robot
 from impactopt.simulation import simulate
 

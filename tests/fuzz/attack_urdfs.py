@@ -12,7 +12,7 @@ import numpy as np
 from fuzz.attack_cases import Found, Generator, attempt, odd_number, pick
 from fuzz.attack_files import odd_text, spoil_bytes
 from fuzz.attack_sound import wrong_with_robot
-from impactopt.robots.made import ARM7, PLANAR, Link
+from impactopt.robots.link_tables import ARM7, PLANAR, Link
 from impactopt.robots.robot import Robot
 
 __all__ = ["URDFS", "attack_urdf", "mutated_urdf", "urdf_of_links"]

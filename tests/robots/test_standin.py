@@ -18,7 +18,7 @@ from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.robots import presets
-from impactopt.robots.made import LINKS, PELVIS
+from impactopt.robots.link_tables import LINKS, PELVIS
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]

@@ -133,7 +133,7 @@ def _of_equal_size(blocks: list[_Block], sizes: Index) -> list[_Block]:
 class BlockCholesky:
     """L L' = K for matrices whose pattern does not change.
 
-    Variables come in blocks (`ordering`); of each block of columns the blocks of rows that become nonzero are
+    Variables come in blocks; of each block of columns the blocks of rows that become nonzero are
     kept as one panel, so that the work is a few dense products a panel (Davis, Direct Methods for Sparse
     Linear Systems, 2006, chapter 4: a supernodal factorization).
 

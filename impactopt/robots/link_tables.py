@@ -1,4 +1,4 @@
-"""Robots made of tables of links and drives: two arms on a fixed base, and the stand-in for HRP-2.
+"""Tables of links and drives, and robots made of them: two arms on a fixed base, the stand-in for HRP-2.
 
 The planar arm is made up. Of the seven-joint arm these are public, KUKA's for the LBR iiwa 7 R800: the
 distances between its axes (0.34, 0.4, 0.4 and 0.126 m, straight up at zero angles), limits of position (170
@@ -222,8 +222,8 @@ def planar_arm(**overrides: Any) -> Robot:
 def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
     """An arm of seven joints on a fixed base, of the class of KUKA's LBR iiwa 7; it needs no files.
 
-    Lengths, limits and the whole arm's mass are that arm's (source in `robots/made.py`); the distribution
-    of mass, inertias, gears and rotors are *ours*.
+    Lengths, limits and the whole arm's mass are that arm's (source at the top of this file); the
+    distribution of mass, inertias, gears and rotors are *ours*.
 
     * Joints `joint_1` to `joint_7` about z, y, z, y, z, y, z, straight up at zero angles; 19 kg move.
     * Armature: 0.51 kg m2 in the first two joints, 0.31 in the next three, 0.1 in the last two.

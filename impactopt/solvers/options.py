@@ -36,7 +36,8 @@ class SQPOptions:
     barrier : of "interior", first barrier parameter of a start without multipliers.
     barrier_warm : the same of a start with multipliers. Below 5e-3 it falls at once where the start is near a
         solution.
-    push : of "interior", how far the start is moved inside its bounds.
+    push : of "interior", how far the start is moved inside its bounds; with multipliers no farther than its
+        barrier.
     """
 
     qp_solver: str = "interior"

@@ -131,9 +131,8 @@ def solve(
     said = "interrupted before there was a plan to keep"
     with plain_errors(said, verbose=verbose, keeps=True) as console:
         from impactopt.errors import printable
-        from impactopt.files.output import make_directory
+        from impactopt.files.output import keep_record, make_directory, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.files.result_folder import keep_record, set_aside
         from impactopt.files.solution_library import SolvedFolder
         from impactopt.planning.solve import solve as plan
         from impactopt.report.console import SolveConsole

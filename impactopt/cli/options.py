@@ -47,7 +47,7 @@ def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
     To know all keys takes seconds of imports: those of a file are kept in the cache, as long as it and our
     sources stay as they are.
     """
-    from impactopt.codegen.directory import kept
+    from impactopt.codegen.files import kept
     from impactopt.files.folders import named_files
 
     # where the option's value is still to come, click has not made arguments of the words before it
@@ -69,7 +69,7 @@ def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
 
 def _setting_keys(text: str) -> list[str]:
     """Key paths of a problem file's text; of any problem where that is none."""
-    from impactopt.files.problem_file.changes import key_paths
+    from impactopt.files.problem_file.reading import key_paths
     from impactopt.files.problem_file.toml import TOMLError, read_toml
 
     data: dict[str, Any] = {}
@@ -103,8 +103,9 @@ OtherProblem = Annotated[
 
 
 class SolverChoice(str, enum.Enum):
-    ipopt = "ipopt"
+    ipm = "ipm"
     sqp = "sqp"
+    ipopt = "ipopt"
 
 
 SolverName = Annotated[

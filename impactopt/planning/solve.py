@@ -19,11 +19,10 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
 from impactopt.planning.causes import Cause, search
-from impactopt.planning.cautions import window_caution
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solved_apart
 from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, with_rows
+from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, window_caution, with_rows
 from impactopt.planning.models import carried_start
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
@@ -40,12 +39,12 @@ from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
-from impactopt.transcription.mesh_refinement import NO_MORE
-from impactopt.transcription.program_summary import statement_of
+from impactopt.transcription.mesh import NO_MORE
 from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.transcription import Transcription, statement_of
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
@@ -55,7 +54,7 @@ _STUCK = (Status.INFEASIBLE, Status.FAILED)
 def solve(
     problem: ImpactProblem,
     *,
-    solver: str = "sqp",
+    solver: str = "ipm",
     start: str | ArrayLike | Solution = "reach",
     starts: int = 1,
     seed: int = 0,
@@ -76,10 +75,9 @@ def solve(
         Robot, striker, target and contact law, limits and objectives. :func:`impactopt.solve` also takes
         the path of a problem file, or the name of one that comes with the package (`impactopt problems`);
         its [solver] section then holds where nothing else is given.
-    solver : {"sqp", "ipopt"}
-        "sqp" is our own primal-dual interior-point method: it takes one Newton step on each quadratic model
-        of the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which solves its QPs to their
-        end, for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
+    solver : {"ipm", "sqp", "ipopt"}
+        "ipm" is our primal-dual interior-point method; "sqp" with ``options={"qp_solver": "osqp"}`` our SQP,
+        which solves its QPs to their end, for small programs.
     start : str, array_like (n,) or Solution
         "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such a
         reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables; or the
@@ -91,7 +89,8 @@ def solve(
     seed : int
         Seed of the starts that are drawn.
     options : mapping, optional
-        The solver's own.
+        The solver's own: those of :class:`impactopt.solvers.ipm.IPMOptions`,
+        :class:`impactopt.solvers.sqp.SQPOptions`, or IPOPT's.
     time_limit : float, optional
         Time [s] of all starts together, without compiling functions.
     workers : int
@@ -119,6 +118,7 @@ def solve(
     InputError
         Unknown solver, option or start, a start of the wrong length, several of a given start.
     """
+    solver, options = with_todays_name(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
     check_starts(starts, seed, workers, callback, given=not isinstance(start, str))
     if isinstance(start, str) and start not in STARTS:

@@ -1,4 +1,4 @@
-"""Problems and sweeps by name: the files that come with the package."""
+"""Problems, robots and sweeps by name: the files that come with the package."""
 
 from __future__ import annotations
 
@@ -8,9 +8,18 @@ from pathlib import Path
 
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
-from impactopt.files.folders import SWEEPS, named_files
+from impactopt.files.folders import FOLDERS, SWEEPS, named_files
 
-__all__ = ["problem_file", "problem_names", "problem_summary", "sweep_file", "sweep_names"]
+__all__ = [
+    "FOLDERS",
+    "SWEEPS",
+    "named_files",
+    "problem_file",
+    "problem_names",
+    "problem_summary",
+    "sweep_file",
+    "sweep_names",
+]
 
 
 def problem_names() -> tuple[str, ...]:

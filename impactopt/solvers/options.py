@@ -12,16 +12,15 @@ HESSIANS = ("exact", "bfgs")
 
 @dataclass(frozen=True, kw_only=True)
 class SQPOptions:
-    """Options of `solve_sqp`; the defaults suit variables and rows of order one.
+    """Options of `solve_sqp`; the defaults suit variables and constraints of order one.
 
     Attributes
     ----------
-    qp_solver : "interior": a primal-dual interior-point method, which takes one Newton step on each quadratic
-        model; or a name in `QP_SOLVERS`, which solves every QP to its end (SQP in the strict sense). Options
-        of only one of the two say so.
+    qp_solver : "interior": a primal-dual interior-point method, one Newton step on each quadratic model; or a
+        name in `QP_SOLVERS`: an SQP that solves every QP to its end.
     hessian : with QP solvers, "exact" (made convex) or "bfgs" (damped; dense, for some hundred free
         variables at most).
-    violation_tolerance : largest violation of a row or bound at a solution.
+    violation_tolerance : largest violation of a constraint or bound at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
     complementarity_tolerance : of "interior", largest product of a multiplier and the distance to its bound
         at a solution. The objective's error is at most this times the number of active bounds.
@@ -30,13 +29,12 @@ class SQPOptions:
     time_limit : [s]; then the best iterate is returned.
     radius : with QP solvers, largest radius of the trust region |d|_inf <= radius.
     price : first price of violations: with QP solvers in the merit function f + price * sum of violations,
-        with "interior" in its elastic phase. It rises by itself; if it is too low, it takes more iterations.
-    price_max : largest price of violations. If it is too low, the end may be infeasible.
-    second_order_correction : whether a refused step is corrected for the curvature of the rows.
-    barrier : of "interior", first barrier parameter of a start without multipliers.
-    barrier_warm : the same of a start with multipliers. Below 5e-3 it falls at once where the start is near a
-        solution.
-    push : of "interior", how far the start is moved inside its bounds.
+        with "interior" in its elastic phase. It rises by itself.
+    price_max : largest price of violations; if it is too low, the end may be infeasible.
+    second_order_correction : whether a refused step is corrected for the constraints' curvature.
+    barrier : of "interior", first barrier parameter of an initial guess without multipliers.
+    barrier_warm : the same of a warm start, which has multipliers.
+    push : of "interior", how far the initial guess is moved inside its bounds.
     """
 
     qp_solver: str = "interior"

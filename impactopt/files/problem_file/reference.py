@@ -87,16 +87,18 @@ def reference() -> str:
     """The page, in Markdown."""
     limits = "\n".join(f"| {' | '.join(row)} |" for row in _LIMITS)
     parts = [_INTRODUCTION.replace("{limits}", limits)]
+    seen: dict[tuple[str, ...], str] = {}
     several: dict[str, Mapping[str, type[Section]]] = {"target": TARGETS, "contact": LAWS}
     for name, info in File.model_fields.items():
         kinds = several.get(name, {})
         for kind, section in kinds.items():
             (choice,) = (i.alias or n for n, i in section.model_fields.items() if n == section.choice)
-            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section))
+            usual = ". The default" if kind == section.model_fields[section.choice].default else ""
+            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, seen, usual))
         below = _sections(name, info)
         if kinds:
             next(below)  # the section itself, which its kinds have said all of
-        parts += [_part(header, section) for header, section in below]
+        parts += [_part(header, section, seen) for header, section in below]
     return "\n".join(parts)
 
 
@@ -119,21 +121,30 @@ def _inner(info: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
     return (kind, many) if isinstance(kind, type) and issubclass(kind, BaseModel) else (None, many)
 
 
-def _part(header: str, section: type[BaseModel]) -> str:
-    keys = {n: i for n, i in section.model_fields.items() if _inner(i)[0] is None}
-    lines = [f"## `{header}`", "", f"{about_section(section)}.", ""]
-    if keys:
-        lines += ["| key | | value | default |", "|---|---|---|---|"]
+def _part(header: str, section: type[BaseModel], seen: dict[tuple[str, ...], str], usual: str = "") -> str:
+    """A section and its keys; `seen` has those of earlier sections, so that none is listed twice."""
+    lines = [f"## `{header}`", "", f"{about_section(section)}{usual}."]
+    keys = tuple(_keys(section))
+    if len(keys) > 1 and keys in seen:
+        lines[-1] += f" Keys: as in `{seen[keys]}`."
+    elif keys:
+        seen[keys] = header
+        lines += ["", *keys]
+    return "\n".join([*lines, ""])
+
+
+def _keys(section: type[BaseModel]) -> Iterator[str]:
+    """A line for each key that stands in the section itself."""
     usual = section.defaults() if issubclass(section, Section) else {}
-    for name, info in keys.items():
+    for name, info in section.model_fields.items():
+        if _inner(info)[0] is not None or name == getattr(section, "choice", ""):
+            continue  # a section of its own; or the header has it
         if info.is_required():
-            default = "**needed**"
+            default = ", **needed**"
         else:
             value = usual.get(name, info.default)
-            default = "" if value is None or np.size(value) == 0 else f"`{_show(value)}`"
-        about = (info.description or "").replace("|", "\\|")
-        lines.append(f"| `{info.alias or name}` | {about} | {_allowed(info)} | {default} |")
-    return "\n".join([*lines, ""] if keys else lines)
+            default = "" if value is None or np.size(value) == 0 else f", default `{_show(value)}`"
+        yield f"- `{info.alias or name}` ({_allowed(info)}{default}): {info.description}"
 
 
 def _allowed(info: FieldInfo) -> str:

@@ -51,11 +51,10 @@ class SoleSection(Section):
     rotation: Rotation = optional("rotation of a new frame in its parent: a matrix by rows; left out: none")
 
     hinge: Literal["x", "y", "z"] = optional(
-        "axis of the frame about which the foot may turn on the sole, where five joints hold it: the sole "
-        "bears no moment about it"
+        "axis of the frame about which the foot may turn on the sole, of a leg of five joints"
     )
     hinge_range: Positive = optional(
-        "how far a plan may turn the foot so, either way; left out: 0.005 [rad]", "hinge_range_rad"
+        "how far a plan may turn the foot so, either way [rad]", "hinge_range_rad"
     )
 
     @model_validator(mode="after")
@@ -88,10 +87,10 @@ class GripSection(Section):
 
     kind = SoftGrip
     axis: Vector = required("unit vector in the frame that the tool turns about")
-    stiffness: Positive = required("of the spring [N m/rad]", "stiffness_N_m_rad")
-    damping: Positive = required("of the damper [N m s/rad]", "damping_N_m_s_rad")
-    point: Vector = optional("on the axis, in the frame; left out: its origin [m]", "point_m")
-    range: Positive = optional("how far the tool may turn either way; left out: 1 [rad]", "range_rad")
+    stiffness: Positive = required("stiffness of the spring [N m/rad]", "stiffness_N_m_rad")
+    damping: Positive = required("damping of the damper [N m s/rad]", "damping_N_m_s_rad")
+    point: Vector = optional("a point on the axis, in the frame [m]", "point_m")
+    range: Positive = optional("how far the tool may turn either way [rad]", "range_rad")
 
 
 class ToolSection(Section):

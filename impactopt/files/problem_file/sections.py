@@ -155,8 +155,8 @@ class ObjectiveSection(Section):
     """The motion's style, and small prices that make the optimum unique."""
 
     style: Literal["natural", "strongest"] = optional(
-        '"natural": prices on jerk, on the travel of joints, above all of idle ones, and on ending away from '
-        'the start posture; "strongest": none'
+        '"natural": prices on jerk, on the travel of joints and on ending away from the start posture; '
+        '"strongest": none'
     )
     motion_price: NotNegative = optional("largest share of the objective that the style's prices may take")
     price_scale: NotNegative = optional("factor on the style's prices, as a plan has reduced them")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, get_args, get_origin
 
@@ -26,9 +27,9 @@ __all__ = ["reference"]
 _INTRODUCTION = """\
 # Problem files
 
-A problem file has all arguments of `impactopt.ImpactProblem`, in [TOML](https://toml.io). It is data: nothing
-in it is executed. Units are SI; the unit of a quantity is part of its key's name. Keys and sections that are
-left out keep their defaults.
+A problem file has all arguments of `impactopt.ImpactProblem`, in [TOML](https://toml.io); nothing
+in it is executed. Units are SI, and part of a key's name. Keys and sections that are left out keep their
+defaults.
 
 ```sh
 impactopt new                                 # lists the problems that come with the package
@@ -37,48 +38,38 @@ impactopt check my.toml                       # names all mistakes: where, what 
 impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit may be left out
 ```
 
-`--set` takes a key path and a value as in TOML, and can be repeated. An entry of a list has its index from 0
+`--set` takes a key path and a value as in TOML. An entry of a list has its index from 0
 (`--set problem.point.1=-0.2`); one of several sections has its index or its name
 (`--set scenarios.missing.abort_after=0.03`).
 
 In Python `impactopt.load_problem("my.toml")` reads a file, and `impactopt.write_problem(problem)` writes one
-without defaults. `problem.hash` does not depend on how a problem was written. A contact law, target, term or
-robot that is made in Python, of functions or models, cannot be written to a file.
+without defaults. What is made in Python, of functions or models, cannot be written to a file.
 
 ## Limits
 
-Larger values are mistakes in a unit or a key, or would keep a machine busy for hours. They are refused before
-work starts, and the message names the limit.
+Larger values are refused before work starts: they are mistakes in a unit or a key, or would take hours.
 
-| what | at most | why |
-|---|---|---|
+| | at most |
+|---|---|
 {limits}
 
 This page is made by `impactopt new --reference`.
 """
-# what, how much, and why
+# what, and how much at most
 _LIMITS = (
-    ("a file", f"{LONGEST_TEXT / 2**20:g} MiB", "400 times the longest of the package's; read in seconds"),
-    (
-        "tables and lists in each other",
-        f"{DEEPEST} deep",
-        "files are five deep; parsers end at some hundred",
-    ),
-    ("a key of `--set`", f"{LONGEST_KEY} characters", "the longest has 50"),
-    ("any number", f"{MOST:g}", "products of three such numbers are still numbers"),
-    ("numbers of law and target, where not 0", f"at least {1 / MOST:g}", "likewise, of quotients"),
-    ("a place or a length [m]", f"{FARTHEST:g}", "farther from the robot no rounding is small beside a gap"),
-    ("a mass [kg] or an inertia [kg m2] of the robot", f"{HEAVIEST:g}", "a ship"),
-    (
-        "a phase's duration [s]",
-        f"{SHORTEST:g} to {LONGEST:g}",
-        "no servo is faster, no blow takes longer",
-    ),
-    ("a phase's `intervals`", f"{FINEST}", "at 1 s as often as a servo of 4 kHz samples"),
-    ("a phase's `grading`", f"1 to {STEEPEST:g}", "steeper ones leave intervals of no length"),
-    ("`[collision] duration_s` [s]", f"{LONGEST_CONTACT:g}", "a blow takes some milliseconds"),
-    ("`[collision] elements`", f"{MOST_ELEMENTS} a phase", "two are within a few per mille"),
-    ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each", "each is part of the program"),
+    ("a file", f"{LONGEST_TEXT / 2**20:g} MiB"),
+    ("tables and lists in each other", f"{DEEPEST} deep"),
+    ("a key of `--set`", f"{LONGEST_KEY} characters"),
+    ("any number", f"{MOST:g}"),
+    ("parameters of law and target, where not 0", f"at least {1 / MOST:g}"),
+    ("a position or a length [m]", f"{FARTHEST:g}"),
+    ("a mass [kg] or an inertia [kg m2] of the robot", f"{HEAVIEST:g}"),
+    ("a phase's duration [s]", f"{SHORTEST:g} to {LONGEST:g}"),
+    ("a phase's `intervals`", f"{FINEST}"),
+    ("a phase's `grading`", f"1 to {STEEPEST:g}"),
+    ("`[collision] duration_s` [s]", f"{LONGEST_CONTACT:g}"),
+    ("`[collision] elements`", f"{MOST_ELEMENTS} a phase"),
+    ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each"),
 )
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
@@ -155,7 +146,10 @@ def _allowed(info: FieldInfo) -> str:
     if get_origin(info.annotation) is Literal:
         return ", ".join(f"`{_show(choice)}`" for choice in get_args(info.annotation))
     if info.annotation in _TYPES:
-        return f"{_TYPES[info.annotation]} {range_of(info)}".strip()
+        limits = re.sub(r"^>= (\S+) and <= (\S+)$", r"\1 to \2", range_of(info))
+        return (
+            limits if limits and info.annotation is float else f"{_TYPES[info.annotation]} {limits}".strip()
+        )
     if get_origin(info.annotation) is dict:
         return "table by name" if str in get_args(info.annotation) else "table"
     length = next((m.min_length for m in info.metadata if hasattr(m, "min_length")), None)

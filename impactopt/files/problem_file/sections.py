@@ -59,12 +59,12 @@ class ProblemSection(Section):
     """The robot, its striker, and where it hits."""
 
     name: str = optional("what reports call the problem")
-    robot: Preset = optional("a preset: see `impactopt robots`; or there is a section [robot]")
+    robot: Preset = optional("see `impactopt robots`; or there is a section [robot]")
     striker: str = required("name of the robot's striker that hits")
     point: Vector = required(
         "where the striking point meets the target: x forward, y left, z up from the ground [m]", "point_m"
     )
-    normal: UnitVector = required("direction in which the target is pushed: a unit vector")
+    normal: UnitVector = required("direction in which the target is pushed")
     start: Posture = Field(
         default=ImpactProblem.start,
         description="posture to start from, at rest: its name, or a configuration, as Pinocchio has them",

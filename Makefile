@@ -14,7 +14,7 @@ STUDY  := PYTHONPATH=tests $(BIN)/python -m
 named = $(if $(filter-out -%,$(firstword $(ARGS))),,$(1)) $(ARGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint types format bench attack reproduce figures docs notebooks clean distclean
+.PHONY: help venv demo test lint types format bench attack robots reproduce figures docs notebooks clean distclean
 
 help: ## list the targets
 	@echo "make <target>"
@@ -79,6 +79,9 @@ bench: $(STAMP) ## run every benchmark, about an hour (ARGS=NAME for one); table
 
 attack: $(STAMP) ## attack it at length: files, URDFs, commands, calls, collisions (ARGS='--seed 7'); faults in results/attack
 	@$(STUDY) benchmarks attack --out results/attack $(ARGS)
+
+robots: $(STAMP) ## draft, plan and replay the arms and bipeds of example-robot-data, half an hour (ARGS='--resume' goes on); results/robots
+	@$(STUDY) benchmarks robots --out results/bench $(ARGS)
 
 reproduce: $(STAMP) ## the paper's tables and figures beside ours, some minutes (ARGS=fig7 for one); results/reproduce
 	@$(STUDY) benchmarks.paper $(call named,all) --out results/reproduce

@@ -28,6 +28,8 @@ __all__ = ["Piece", "bare_joints", "convex", "inertia_box", "pieces_of", "tool_s
 Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
 SIDE = 0.02  # [m] least side of a box of inertia
+NEIGHBOURS = 200  # of a vertex at most: coal counts them in a byte
+THINNED = 1e-4  # [m] vertices nearer to each other become one, twice as far each time, where there are more
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -172,7 +174,7 @@ def _rod(start: Array, end: Array, radius: float) -> Solid:
 
 def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
     """The hull of a solid, from disk if it was made before; None where it has no volume."""
-    digest = hashlib.sha256(np.round(solid.vertices, 9).tobytes()).hexdigest()
+    digest = hashlib.sha256(np.round(solid.vertices, 9).tobytes() + b"thinned").hexdigest()
 
     def make() -> bytes:
         file = io.BytesIO()
@@ -187,10 +189,16 @@ def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
 
 def _hull_of(points: Array) -> tuple[Array, NDArray[np.intp]]:
     """Vertices and triangles of the hull of points (k, 3), none where it has no volume."""
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):
-        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp)
+    near = THINNED
+    while True:
+        try:
+            hull = ConvexHull(points)
+        except (QhullError, ValueError):
+            return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp)
+        if np.bincount(hull.simplices.ravel()).max() <= NEIGHBOURS:
+            break
+        points = points[np.unique(np.round(points / near), axis=0, return_index=True)[1]]
+        near *= 2
     place = np.full(len(points), -1)
     place[hull.vertices] = np.arange(len(hull.vertices))
     triangles = place[hull.simplices]

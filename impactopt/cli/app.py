@@ -292,6 +292,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     from impactopt.files.result_folder import set_aside
     from impactopt.report.console import (
         multistart_table,
+        reason_message,
         result_table,
         switched_off_message,
         touches_message,
@@ -311,7 +312,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     error = summary.get("simulated", {}).get("error")
     beyond = summary.get("gear_caution")
     cautions = (summary.get("caution"), touches_message(summary), beyond, switched_off_message(summary))
-    for text in (summary.get("note"), error, reach.get("error"), *cautions):
+    for text in (reason_message(summary), summary.get("note"), error, reach.get("error"), *cautions):
         if text:
             console.print(printable(str(text)), markup=False, highlight=False)
     if len(summary["starts"]) > 1:

@@ -92,6 +92,7 @@ def strike(
 
             from impactopt.report.console import (
                 multistart_table,
+                reason_message,
                 strike_table,
                 switched_off_message,
                 violation_table,
@@ -99,9 +100,8 @@ def strike(
 
             shown = Console()
             shown.print(strike_table(record.summary))
-            for text in filter(
-                None, (record.summary.get("gear_caution"), switched_off_message(record.summary))
-            ):
+            s = record.summary
+            for text in filter(None, (reason_message(s), s.get("gear_caution"), switched_off_message(s))):
                 shown.print(printable(str(text)), highlight=False, markup=False)
             shown.print(multistart_table(record.summary["starts"]))
             if record.summary["violations"]:

@@ -11,11 +11,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.striker_face import striker_face
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
-from impactopt.problem.terms import TorqueLimit
+from impactopt.problem.terms import FirstTouch, TorqueLimit
 from impactopt.robots.robot import Robot
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ __all__ = ["Blow", "Strength", "best_share", "drawn_blows"]
 Array = NDArray[np.float64]
 SWING = 1.2  # [rad], [m] of a joint's way from rest to contact at most
 INSIDE = 0.05  # of a joint's range that a posture at contact keeps off its limits
-DRAWN = 600
+DRAWN, REFUSED = 600, 6000  # postures in which blows are estimated, and that are drawn for them at most
 TRIED = 8  # postures at the point of a problem
 NEARBY = 0.4  # [m] from a problem's point
 AHEAD = 0.25  # of the reach: a target stands so far ahead of the base at least
@@ -128,23 +129,40 @@ def _solved(matrix: Array, n: Array) -> Array:
     return np.asarray(np.linalg.lstsq(matrix, n, rcond=1e-9)[0])
 
 
-def drawn_blows(strength: Strength, q: Array, normals: Sequence[Array] = NORMALS) -> list[Blow]:
+def drawn_blows(
+    strength: Strength, q: Array, normals: Sequence[Array] = NORMALS, *, with_face: bool = True
+) -> list[Blow]:
     """Estimated blows ahead of the base, the hardest first: in `DRAWN` postures, along each normal.
 
-    The joints that move the striker are anywhere inside their limits, and the others as in q (nq,).
+    The joints that move the striker are anywhere inside their limits, and the others as in q (nq,). A striker
+    whose face is known meets the target with it, as `FirstTouch` asks by default; not if not `with_face`.
     """
     robot = strength.robot
+    model, data = robot.model, robot.model.createData()
+    frame = model.getFrameId(robot.striker(strength.striker).model_frame)
+    face = striker_face(robot, strength.striker) if with_face else None
+    square = float(np.cos(FirstTouch().angle))
     rng, limb = np.random.default_rng(0), np.array(robot.limb(robot.striker(strength.striker).model_frame))
     low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
     low, high = low + INSIDE * (high - low), high - INSIDE * (high - low)
     own, blows = robot.joint_positions(q)[limb], list[Blow]()
-    for _ in range(DRAWN):
+    met = 0
+    for _ in range(REFUSED):
         step = np.zeros(robot.nv)
         step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own
-        blows += strength.at(np.array(pin.integrate(robot.model, q, step)), normals)
+        posture, ways = np.array(pin.integrate(model, q, step)), normals
+        if face is not None:
+            pin.framesForwardKinematics(model, data, posture)
+            ahead = data.oMf[frame].rotation @ face.normal
+            ways = [n for n in normals if n @ ahead >= square]
+        if ways:
+            blows += strength.at(posture, ways)
+            met += 1
+        if met == DRAWN:
+            break
     reach = max((float(np.linalg.norm(blow.point[:2])) for blow in blows), default=0.0)
-    ahead = [blow for blow in blows if blow.point[0] > AHEAD * reach]
-    return sorted(ahead, key=lambda blow: -blow.impulse)
+    front = [b for b in blows if b.point[0] > AHEAD * reach and b.impulse > 0]
+    return sorted(front, key=lambda blow: -blow.impulse)
 
 
 def best_share(problem: ImpactProblem) -> tuple[float, Blow] | None:
@@ -164,7 +182,7 @@ def best_share(problem: ImpactProblem) -> tuple[float, Blow] | None:
         with suppress(InputError):
             postures.append(inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1))
     own = [blow.impulse for q in postures for blow in strength.at(q, [p.normal])]
-    drawn = drawn_blows(strength, p.start_posture, (*NORMALS, p.normal))
+    drawn = drawn_blows(strength, p.start_posture, (*NORMALS, p.normal), with_face=p.term(FirstTouch).enabled)
     near = [blow for blow in drawn if np.linalg.norm(blow.point - p.point) < NEARBY]
     if not near or not own or not near[0].impulse > 0:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
@@ -35,6 +36,7 @@ __all__ = [
     "identified_table",
     "multistart_table",
     "nail_driving_table",
+    "reason_message",
     "replay_table",
     "result_table",
     "strike_table",
@@ -247,6 +249,13 @@ def touches_message(summary: Mapping[str, Any]) -> str:
         f"{count} each other, {worst['one']} and {worst['other']} by {worst['depth_mm']:.0f} mm; "
         "[terms.self_collision] and [terms.keep_out] keep them apart"
     )
+
+
+def reason_message(summary: Mapping[str, Any]) -> str:
+    """Sentences about why a plan is not called solved, without its violations; "" of one that is."""
+    if summary["status"] == "solved":
+        return ""
+    return re.split(r" Constraints (?:that cannot be|not) met: ", str(summary["message"]))[0]
 
 
 def switched_off_message(summary: Mapping[str, Any]) -> str:

@@ -335,7 +335,7 @@ def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, 
     # constraints are of order one, so what is off by so much less only follows from the others
     rows = [violation for violation in rows if violation.amount >= MINOR * rows[0].amount]
     listed = "; ".join(str(violation) for violation in rows)
-    heading = "Rows that cannot be met" if status is Status.INFEASIBLE else "Rows not met"
+    heading = "Constraints that cannot be met" if status is Status.INFEASIBLE else "Constraints not met"
     more = int(
         np.sum(~(row_violations(program, g) <= tolerance))
         + np.sum(~(bound_violations(program, x) <= tolerance))

@@ -27,6 +27,7 @@ from impactopt.transcription.transcription import Transcription
 
 # ends of names of variables that models of the collision have each for itself
 OF_MODEL = ("coasting legs", "coasting leg rates")
+_SLOW = 2.0  # [s] of a swing: a guess that is slower has the robot nearly still at contact
 
 
 def strike_rates(
@@ -238,8 +239,12 @@ def _finished(t: ContactProgram, x: Array) -> Array:
 
 
 def _durations(t: Transcription) -> tuple[float, float]:
-    """Durations of swing and follow-through [s]."""
-    return float(np.mean(t.problem.swing.duration)), float(np.mean(t.problem.follow.duration))
+    """Durations of swing and follow-through [s]: the middle of their ranges, where that is not slow."""
+    swing, follow = (
+        max(phase.duration[0], min(float(np.mean(phase.duration)), _SLOW))
+        for phase in (t.problem.swing, t.problem.follow)
+    )
+    return swing, follow
 
 
 def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:

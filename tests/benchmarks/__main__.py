@@ -294,6 +294,22 @@ def _zoo(
     """Problems that nobody has tuned, drawn at random: solved from one start, do they stand on free soles?"""
 
 
+@_command("robots")
+def _robots(
+    names: Annotated[
+        list[str] | None,
+        typer.Option("--robot", metavar="NAME", help="One of the robots; several times for several."),
+    ] = None,
+    targets: Annotated[
+        int,
+        typer.Option(min=0, metavar="N", help="Compare an arm's strike with the best on N random targets."),
+    ] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume from results/bench/robots.jsonl.")] = False,
+    seed: Seed = 0,
+) -> None:
+    """Robots of example-robot-data, from the file to a plan and its replays without an edit."""
+
+
 @app.command("all")
 def _all(
     draws: Annotated[int, typer.Option(min=1, help="Number of draws, as of the bench robustness.")] = 200,

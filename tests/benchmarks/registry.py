@@ -39,6 +39,7 @@ BENCHES = {
     "attack": "fuzz.attack",
     "solve": "benchmarks.solve",
     "zoo": "benchmarks.zoo",
+    "robots": "benchmarks.robots",
 }
 # modules in `paper`; `python -m benchmarks.paper all` runs them in this order
 REPRODUCED = ("table1", "table2", "table3", "fig3", "fig4", "fig7")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 from support import urdfs
 from support.small_plans import arm_problem, biped_problem
 
@@ -129,6 +131,28 @@ def test_the_box_of_inertia_is_the_box_that_has_it(sides: tuple[float, float, fl
     local = (inertia_box(body).vertices - body.lever) @ turn
     np.testing.assert_allclose(local.max(axis=0), np.array(sides) / 2, rtol=1e-6)
     np.testing.assert_allclose(local.min(axis=0), -np.array(sides) / 2, rtol=1e-6)
+
+
+def test_a_disc_of_many_corners_is_a_body(tmp_path: Path) -> None:
+    """The fan of triangles on its face has one corner in all of them, more than coal counts."""
+    turn = np.linspace(0.0, 2 * np.pi, 900, endpoint=False)
+    rim = np.stack([0.05 * np.cos(turn), 0.05 * np.sin(turn)], axis=1)
+    points = np.vstack([np.column_stack([rim, np.full(900, z)]) for z in (-0.01, 0.01)])
+    faces = ConvexHull(points).simplices
+    text = "\n".join(
+        [*(f"v {x} {y} {z}" for x, y, z in points), *(f"f {a} {b} {c}" for a, b, c in faces + 1)]
+    )
+    (tmp_path / "disc.obj").write_text(text)
+    plain = urdfs.arm()
+    shape = re.search(r'<link name="wrist_link">.*?</inertial>', plain, re.DOTALL)
+    assert shape is not None
+    disc = '<collision><geometry><mesh filename="disc.obj"/></geometry></collision>'
+    (tmp_path / "robot.urdf").write_text(plain.replace(shape[0], shape[0] + disc))
+    robot = Robot.from_urdf(tmp_path / "robot.urdf", floating=False)
+    (found,) = (p for p in pieces_of(robot)[0] if p.link == "wrist_link" and len(p.vertices) > 100)
+    wide = np.linalg.norm(found.vertices[:, :2], axis=1)
+    assert wide.max() == pytest.approx(0.05) and wide.min() > 0.0499
+    assert found.shape.num_points == len(found.vertices)
 
 
 def test_a_tool_is_a_rod_to_its_head() -> None:

@@ -252,6 +252,7 @@ def test_an_infeasible_problem_names_its_rows_and_exits_1(
     assert row in out and "406 % over its limit" in out and "infeasible" in out
     assert "(and 1 more)" in " ".join(out.split()) and "333 %" not in out, "one row a term"
     assert "200 mm away" in out
+    assert Status.INFEASIBLE.message in " ".join(out.split()), "the reason"
     assert "velocity limit" not in out, "what is off by little only follows from the others"
     assert len(json.loads((tmp_path / "out" / "summary.json").read_text())["violations"]) == 4
     assert "no replay" in err

@@ -151,6 +151,14 @@ def test_fingers_and_wheels_are_locked_and_a_cart_is_bolted(tmp_path: Path) -> N
     assert data["robot"]["floating"] is False
 
 
+def test_a_robot_that_is_a_finger_moves(tmp_path: Path) -> None:
+    named = urdfs.arm()
+    for joint in re.findall(r'<joint name="(\w+)" type="revolute"', named):
+        named = named.replace(f'"{joint}"', f'"finger_{joint}"')
+    data = read_toml(_drafted(tmp_path, named).text)
+    assert not any("finger_" in joint for joint in data["robot"].get("locked_rad", ()))
+
+
 def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
     data = read_toml(_drafted(tmp_path, urdfs.arm()).text)
     (striker,) = data["robot"]["strikers"]
@@ -184,6 +192,18 @@ def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
     assert drafted > 0.8 * max(elsewhere) > 0
     found = best_share(problem)
     assert found is not None and found[0] > 0.6
+
+
+@pytest.mark.parametrize("still", [("turn", "wrist"), ("wrist",)])
+def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) -> None:
+    """It cannot turn its hand at will: with the hand's face, or else with what comes first."""
+    text = urdfs.arm()
+    for name in still:
+        text = text.replace(f'<joint name="{name}" type="revolute">', f'<joint name="{name}" type="fixed">')
+    draft = _drafted(tmp_path, text)
+    assert any("the hardest of the strikes tried" in line for line in draft.said)
+    off = "first_touch" in read_toml(draft.text).get("terms", {})
+    assert off == any("first_touch" in line for line in draft.said)
 
 
 def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:

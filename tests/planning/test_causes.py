@@ -138,3 +138,9 @@ def test_a_second_signal_ends_at_once() -> None:
             signal.raise_signal(signal.SIGTERM)
     with stopping(), pytest.raises(KeyboardInterrupt):  # nothing is there yet
         signal.raise_signal(signal.SIGINT)
+
+
+def test_a_wide_range_of_durations_starts_from_a_usual_one(arm: ImpactProblem) -> None:
+    """From the middle of 0.4 to 50 s the arm would be guessed nearly still at contact."""
+    wide = dataclasses.replace(arm.swing, duration=(0.4, 50.0))
+    assert solve(dataclasses.replace(arm, swing=wide)).status.usable

@@ -81,7 +81,7 @@ def test_a_contact_too_soft_for_its_nail_is_named(stiffness: float) -> None:
         assert solution.result.message.startswith(
             "Infeasible: a soft contact. stiffness of the contact: 1e+05 N/m"
         )
-        assert "Rows that cannot be met: " in solution.result.message
+        assert "Constraints that cannot be met: " in solution.result.message
     assert "takes 33 ms" not in solution.result.message  # 0.2 s are enough for that
 
 

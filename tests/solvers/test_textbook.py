@@ -116,7 +116,7 @@ def test_rows_that_contradict_each_other_are_named(name, way):
     case, rows = INFEASIBLE[name]
     result = solve_sqp(case.build(), case.x0, options=WAYS[way])
     assert result.status is Status.INFEASIBLE
-    listed = result.message.split("Rows that cannot be met: ")[1].split("; ")
+    listed = result.message.split("Constraints that cannot be met: ")[1].split("; ")
     named = {part.split(":")[0] for part in listed}
     assert named
     assert named <= set(rows)

@@ -382,7 +382,7 @@ def test_what_cannot_be_met_is_named(arm_plan: Planned) -> None:
     transcription = Transcription(slow, slow.coordinates, arm_plan.transcription.functions)
     result = solve_ipopt(transcription.program, first_iterate(transcription))
     assert result.status is Status.INFEASIBLE
-    assert "Rows that cannot be met" in result.message
+    assert "Constraints that cannot be met" in result.message
     assert "hit point" in result.message or "velocity limit" in result.message
 
 

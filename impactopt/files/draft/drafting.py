@@ -71,7 +71,10 @@ def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, bolted: bool 
     legs = tuple(renumbered(leg, model, robot.model) for leg in drafted.legs)
     arms = [replace(arm, limb=renumbered(arm.limb, model, robot.model)) for arm in arms]
     q = half_sitting(robot, legs, soles, forward) if soles else rested(robot)
-    strong = None if soles else _strong(drafted, robot, arms[0], q)
+    strong = None if soles else _strong(robot, arms[0], q)
+    edgewise = strong is None and not soles
+    if edgewise:  # an arm of few joints cannot turn the link's face to where it moves
+        strong = _strong(robot, arms[0], q, with_face=False)
     if strong is None:
         q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
         data = _data(drafted, robot, soles, strikers, q, folder)
@@ -81,15 +84,22 @@ def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, bolted: bool 
         way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
         for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
             data[phase]["duration_s"] = duration(robot, way, usual)
+        if edgewise:
+            data["terms"] = {"first_touch": {"enabled": False}}
         data = _aimed(data, robot, arms[0], iter([strong.point]), strong.normal, folder)
     said = [*_said(data, drafted, robot), *([_strike_message(strong)] if strong else [])]
+    if strong and edgewise:
+        said.append(
+            "no strike with the striking link's face to the target is found: [terms.first_touch] is off, so "
+            "another part of the link may touch first"
+        )
     return Draft(text=_text(data, drafted, robot), said=tuple(said))
 
 
-def _strong(drafted: Drafted, robot: Robot, arm: Arm, q: Array) -> Strong | None:
+def _strong(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True) -> Strong | None:
     """The hardest blow that is found for an arm on a fixed base."""
-    target = FreeMass(mass=_target_mass(robot))
-    return strongest(robot, arm, q, law=SpringDamper(stiffness=STIFFNESS, damping=DAMPING), target=target)
+    law, target = SpringDamper(stiffness=STIFFNESS, damping=DAMPING), FreeMass(mass=_target_mass(robot))
+    return strongest(robot, arm, q, with_face=with_face, law=law, target=target)
 
 
 def _strike_message(strong: Strong) -> str:

@@ -84,6 +84,8 @@ def to_lock(model: pin.Model) -> dict[str, str]:
         small = [c for c in children[j] if mass[c] < LIGHT * total and reach[c] < SHORT]
         if len(small) > 1 and len(small) == len(children[j]):
             out |= {str(model.names[i]): "a finger" for c in small for i in _below(c, children)}
+    if len(out) == model.njoints - first:  # a finger that is the whole robot
+        out = {name: why for name, why in out.items() if not _FINGERS.search(name)}
     return out
 
 

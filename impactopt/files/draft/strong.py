@@ -20,6 +20,7 @@ from impactopt.planning.strike import optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import Blow, Strength, drawn_blows
+from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 
 __all__ = ["Strong", "duration", "strongest"]
@@ -31,7 +32,7 @@ ALIKE = 0.2  # of the reach: how far apart points with one normal are
 # moves farthest goes there, between these
 RUN, BACK = 0.7, (0.35, 0.9)
 SHORTER = (1.0, 0.75, 0.55, 0.4)  # of that way, where joints or bodies leave no more
-BEHIND = 0.06  # [m] of the start behind the target's plane at least
+BEHIND = 0.06, 0.15  # [m], and of the reach: of the start behind the target's plane, the smaller at least
 PARTS = (0.8, 3.0)  # of the time that joints need for their way: shortest and longest duration
 SECONDS = 10.0  # [s] of a strike
 
@@ -49,14 +50,17 @@ class Strong:
     impulse: float
 
 
-def strongest(robot: Robot, arm: Arm, q: Array, **given: Any) -> Strong | None:
-    """The best strike of the blows that are estimated best; None: check finds a fault with all of them.
+def strongest(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True, **given: Any) -> Strong | None:
+    """The best strike of the blows that are estimated best; None: check finds a fault with all of them, or
+    none of the strikes is solved.
 
-    q (nq,) : what does not strike stays as in it.  given : law, target and terms, as of `ImpactProblem`.
+    q (nq,) : what does not strike stays as in it.  with_face : the link's face meets the target; else any
+    part of it may touch first.  given : law and target, as of `ImpactProblem`.
     """
+    given["terms"] = () if with_face else (FirstTouch(enabled=False),)
     strength = Strength(robot=robot, striker=arm.name, law=given["law"], target=given["target"])
     best: Strong | None = None
-    for problem, blow in _sound(robot, arm, strength, q, given):
+    for problem, blow in _sound(robot, arm, drawn_blows(strength, q, with_face=with_face), given):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
             solved = optimize_strike(problem, time_limit=SECONDS)
@@ -83,17 +87,17 @@ def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float
 
 
 def _sound(
-    robot: Robot, arm: Arm, strength: Strength, q: Array, given: Mapping[str, Any]
+    robot: Robot, arm: Arm, blows: list[Blow], given: Mapping[str, Any]
 ) -> Iterator[tuple[ImpactProblem, Blow]]:
-    """Problems of the best estimated blows, unlike each other, that check finds no fault with."""
-    blows = [blow for blow in drawn_blows(strength, q) if blow.point[2] > LOWEST / 2]
+    """Problems of the best of estimated blows, unlike each other, that check finds no fault with."""
+    blows = [blow for blow in blows if blow.point[2] > LOWEST / 2]
     reach = max((float(np.linalg.norm(blow.point)) for blow in blows), default=0.0)
     taken: list[Blow] = []
     for blow in blows[:LOOKED_AT]:
         near = [b for b in taken if b.normal @ blow.normal > 0.9]
         if any(np.linalg.norm(b.point - blow.point) < ALIKE * reach for b in near):
             continue
-        problem = _problem(robot, arm, blow, given)
+        problem = _problem(robot, arm, blow, min(BEHIND[0], BEHIND[1] * reach), given)
         if problem is None:
             continue
         taken.append(blow)
@@ -102,8 +106,12 @@ def _sound(
             return
 
 
-def _problem(robot: Robot, arm: Arm, blow: Blow, given: Mapping[str, Any]) -> ImpactProblem | None:
-    """A blow's problem, from a start on the way that it comes; None: there is a fault in it."""
+def _problem(
+    robot: Robot, arm: Arm, blow: Blow, behind: float, given: Mapping[str, Any]
+) -> ImpactProblem | None:
+    """A blow's problem, from a start on the way that it comes, so far behind the target's plane at least [m];
+    None: there is a fault in it.
+    """
     point = np.round(blow.point, 3) + 0.0
     size = float(np.abs(blow.v).max())
     way = blow.v / size * float(np.clip(RUN * size, *BACK))
@@ -113,7 +121,7 @@ def _problem(robot: Robot, arm: Arm, blow: Blow, given: Mapping[str, Any]) -> Im
         edge = 0.02 * np.minimum(robot.upper - robot.lower, 1.0)
         inside = np.all(angles > robot.lower + edge) and np.all(angles < robot.upper - edge)
         at = striking_point(robot, arm.name, start)
-        if not inside or blow.normal @ (point - at) < BEHIND or at[2] < LOWEST / 2:
+        if not inside or blow.normal @ (point - at) < behind or at[2] < LOWEST / 2:
             continue
         try:
             problem = ImpactProblem(

@@ -1,0 +1,213 @@
+"""Anyone's robot at the first try: every arm and biped of example-robot-data, drafted, planned and replayed.
+
+One row a robot, with no line of its draft edited: seconds of drafting, how the solver ended, the replays in
+both engines, whether it stands; and for a bolted arm the drafted strike's share of the best one that random
+targets find. What cannot be drafted is a row, too, with the reason.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from importlib.metadata import distribution
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from benchmarks.kept import Kept
+from benchmarks.report import Report, Say, columns_table
+from impactopt.bodies.striker_face import striker_face
+from impactopt.errors import InputError
+from impactopt.files.draft.drafting import draft_problem
+from impactopt.files.problem_file import read_problem_file
+from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
+from impactopt.planning.strike import optimize_strike
+from impactopt.problem.problem import ImpactProblem
+
+__all__ = ["ROBOTS", "best_of_random", "run"]
+
+Array = NDArray[np.float64]
+ROWS = Path("results/bench/robots.jsonl")
+DRAFTS = Path("results/robots")
+TIME_LIMIT, STRIKE_LIMIT = 240.0, 10.0  # [s] of a solve, and of a strike
+FRONT = 0.0  # [m] ahead of the base that a random target is at least
+# name -> file below the robots of example-robot-data
+ROBOTS = {
+    "Franka Panda": "panda_description/urdf/panda.urdf",
+    "UR3": "ur_description/urdf/ur3_robot.urdf",
+    "UR5": "ur_description/urdf/ur5_robot.urdf",
+    "UR5 with gripper": "ur_description/urdf/ur5_gripper.urdf",
+    "UR10": "ur_description/urdf/ur10_robot.urdf",
+    "xArm7": "xarm_description/urdf/xarm7.urdf",
+    "Kinova": "kinova_description/robots/kinova.urdf",
+    "Unitree Z1": "z1_description/urdf/z1.urdf",
+    "SO-100": "so_arm_description/urdf/so100.urdf",
+    "SO-101": "so_arm_description/urdf/so101.urdf",
+    "TALOS's left arm": "talos_data/robots/talos_left_arm.urdf",
+    "two pendulums": "double_pendulum_description/urdf/double_pendulum.urdf",
+    "Finger Edu": "finger_edu_description/robots/finger_edu.urdf",
+    "Tiago": "tiago_description/robots/tiago.urdf",
+    "Tiago Pro": "tiago_pro_description/robots/tiago_pro.urdf",
+    "Baxter": "baxter_description/urdf/baxter.urdf",
+    "PR2": "pr2_description/urdf/pr2.urdf",
+    "TALOS": "talos_data/robots/talos_full_v2.urdf",
+    "Unitree G1": "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+    "Romeo": "romeo_description/urdf/romeo.urdf",
+    "iCub": "icub_description/robots/icub.urdf",
+    "Alex": "alex_description/urdf/alex_nub_hands.urdf",
+    "Alexander's legs": "alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf",
+    "simple humanoid": "simple_humanoid_description/urdf/simple_humanoid.urdf",
+    "human": "human_description/robots/human.urdf",
+    "Bolt": "bolt_description/robots/bolt.urdf",
+}
+COLUMNS = (
+    ("robot", "robot", 0),
+    ("joints", "joints", 0),
+    ("drafted s", "draft_seconds", 1),
+    ("status", "status", 0),
+    ("iterations", "iterations", 0),
+    ("solved s", "seconds", 1),
+    ("N s", "impulse_Ns", 2),
+    ("of the best", "share", 2),
+    ("held %", "held_pct", 2),
+    ("free %", "free_pct", 2),
+    ("stands", "stands", 0),
+)
+
+
+def run(
+    say: Say,
+    *,
+    names: list[str] | None = None,
+    targets: int = 0,
+    seed: int = 0,
+    resume: bool = False,
+    rows: Path = ROWS,
+    drafts: Path = DRAFTS,
+) -> Report:
+    """One row a robot.
+
+    names : of `ROBOTS`, all by default.  targets : random targets whose best strike a bolted arm's is
+    compared with; 0: none are.  seed : of them.  resume : do not repeat rows that `rows` has.
+    drafts : folder of the drafted files.
+
+    Raises
+    ------
+    InputError : example-robot-data is not installed; an unknown name; the file of rows is damaged.
+    """
+    chosen = names or list(ROBOTS)
+    for name in chosen:
+        if name not in ROBOTS:
+            raise InputError(f"there is no robot {name!r} in this bench: there are {', '.join(ROBOTS)}")
+    share = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share")))
+    kept = Kept(rows, ("robot",), resume=resume)
+    drafts.mkdir(parents=True, exist_ok=True)
+    found = []
+    for name in chosen:
+        if (name,) not in kept.found:
+            file = share / "example-robot-data" / "robots" / ROBOTS[name]
+            kept.add(_row(name, file, drafts, np.random.default_rng(seed), targets))
+        found.append(kept.found[(name,)])
+        row = found[-1]
+        say(", ".join(f"{key} {row[key]}" for _, key, _ in COLUMNS if row.get(key) is not None))
+        if row.get("reason"):
+            say(f"  {row['reason']}")
+    true = [row for row in found if _true(row)]
+    title = f"{len(found)} robots, no line edited: {len(true)} from file to a true plan"
+    numbers = {"rows": found, "true": len(true), "targets": targets, "seed": seed}
+    return Report(name="robots", numbers=numbers, tables=(columns_table(title, COLUMNS, found),))
+
+
+def _true(row: Mapping[str, Any]) -> bool:
+    """A plan that is solved, replayed within a per cent held and two free, and stands."""
+    if row["status"] != "solved" or not row.get("stands"):
+        return False
+    return abs(row["held_pct"]) < 1.0 and abs(row["free_pct"]) < 2.0
+
+
+def _row(name: str, file: Path, drafts: Path, rng: np.random.Generator, targets: int) -> dict[str, Any]:
+    out: dict[str, Any] = {"robot": name}
+    began = time.perf_counter()
+    try:
+        draft = draft_problem(file, folder=drafts)
+        place = drafts / f"{re.sub('[^a-z0-9]+', '_', name.lower())}.toml"
+        place.write_text(draft.text, encoding="utf-8")
+        out["draft_seconds"] = time.perf_counter() - began
+        problem = read_problem_file(place).build()
+    except InputError as error:
+        return out | {"status": "refused", "reason": str(error)}
+    out |= {"joints": problem.robot.n, "said": list(draft.said)}
+    if targets and not problem.robot.floating:
+        own, best = _strike(problem), best_of_random(problem, rng, targets)
+        out |= {"strike_Ns": own, "best_Ns": best, "share": own / max(own, best, 1e-12)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the row says so
+        try:
+            solution = solve(problem, time_limit=TIME_LIMIT)
+        except InputError as error:
+            return out | {"status": "refused", "reason": str(error)}
+    out |= {
+        "status": solution.status.value,
+        "iterations": solution.result.iterations,
+        "seconds": solution.solve_seconds,
+        "impulse_Ns": solution.impulse,
+        "reason": "" if solution.status.usable else solution.result.message,
+    }
+    return out | (_replayed(solution) if solution.status.usable else {})
+
+
+def _replayed(solution: Solution) -> dict[str, Any]:
+    held, free = (solution.validate(engine=engine) for engine in ("pinocchio", "mujoco"))
+    return {
+        "held_pct": 100 * (held.impulse / solution.impulse - 1),
+        "free_pct": 100 * (free.impulse / solution.impulse - 1),
+        "stands": free.standing,
+    }
+
+
+def _strike(problem: ImpactProblem) -> float:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # one that fails counts as none
+        try:
+            solved = optimize_strike(problem, time_limit=STRIKE_LIMIT)
+        except InputError:
+            return 0.0
+    return float(solved.impulse) if solved.status.usable else 0.0
+
+
+def best_of_random(problem: ImpactProblem, rng: np.random.Generator, count: int) -> float:
+    """Impulse [N s] of the hardest strike on so many random targets ahead of a bolted arm.
+
+    A target is where the striking point is in a random posture, struck along the link's face in it.
+    """
+    return max((_strike(p) for p in _targets(problem, rng, count)), default=0.0)
+
+
+def _targets(problem: ImpactProblem, rng: np.random.Generator, count: int) -> Iterator[ImpactProblem]:
+    robot = problem.robot
+    model, data = robot.model, robot.model.createData()
+    frame = model.getFrameId(robot.striker(problem.striker).model_frame)
+    face = striker_face(robot, problem.striker)
+    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    own = robot.joint_positions(problem.start_posture)
+    while count:
+        step = np.zeros(robot.nv)
+        step[robot.nv - robot.n :] = rng.uniform(low, high) - own
+        q = np.array(pin.integrate(model, problem.start_posture, step))
+        pin.framesForwardKinematics(model, data, q)
+        at = data.oMf[frame]
+        normal = rng.standard_normal(3) if face is None else at.rotation @ face.normal
+        if at.translation[0] < FRONT or (at.translation[2] < 0.1 and normal[2] < 0):
+            continue
+        count -= 1
+        try:
+            yield replace(problem, point=np.array(at.translation), normal=normal / np.linalg.norm(normal))
+        except InputError:  # one that no check lets pass is none
+            continue

@@ -29,7 +29,7 @@ _INTRODUCTION = """\
 
 A problem file has all arguments of `impactopt.ImpactProblem`, in [TOML](https://toml.io); nothing
 in it is executed. Units are SI, and part of a key's name. Keys and sections that are left out keep their
-defaults.
+defaults. In parentheses below: what is permitted, and the default.
 
 ```sh
 impactopt new                                 # lists the problems that come with the package
@@ -131,10 +131,10 @@ def _keys(section: type[BaseModel]) -> Iterator[str]:
         if _inner(info)[0] is not None or name == getattr(section, "choice", ""):
             continue  # a section of its own; or the header has it
         if info.is_required():
-            default = ", **needed**"
+            default = "; **needed**"
         else:
             value = usual.get(name, info.default)
-            default = "" if value is None or np.size(value) == 0 else f", default `{_show(value)}`"
+            default = "" if value is None or np.size(value) == 0 else f"; `{_show(value)}`"
         yield f"- `{info.alias or name}` ({_allowed(info)}{default}): {info.description}"
 
 

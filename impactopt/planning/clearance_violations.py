@@ -82,6 +82,8 @@ def clearance_violations(
         if here:  # at a place: as bodies are near there, it has constraints from then on
             asked.more(here, pair, found.apart)
             continue
+        # Between nodes a node helps, constraints at the nodes beside it do not, unless no node fits. Normals
+        # that turn round say that one body passes through the other, from one node to the next.
         normals = [bodies.closest(spots.at, k, pair).normal for k in beside]
         if not nodes.add(found, bool(normals[0] @ normals[-1] < 0)):
             asked.more(beside, pair, found.apart)

@@ -99,6 +99,7 @@ class ActiveSystem:
         if proximal:
             H = sp.csc_array(H + proximal * sp.eye_array(n))
         soft = np.concatenate([self._soft_rows[self._rows], self._soft_bounds[self._bounds]])
+        # A dx - (slack / multiplier) dy = -off: the linearization of slack x multiplier = mu
         self._matrix = sp.csc_array(sp.block_array([[H, A.T], [A, sp.diags_array(-soft)]]))
         self._factors: dict[float, Any] = {}
 

@@ -151,6 +151,8 @@ class _QP:
             if d is None or not np.isfinite(d).all():
                 return False
             moved = np.concatenate([self._jacobian @ d, d])[rows]
+            # later steps end where the augmented Lagrangian is least: full ones may jump between active sets
+            # for ever
             part = 1.0 if not k else self._length(d - self.d, at, moved - at)
             short += part < _SHORT
             if short == _JAMMED:

@@ -87,6 +87,7 @@ def _soles_outside(plan: Plan, wrenches: Array) -> NDArray[np.bool_]:
     own, least = wrenches.reshape(len(wrenches), -1, 6)[:, : len(soles)], least_kept(cone.margin)
     outside = (cop_margin(robot, [sole.polygon for sole in soles], own) < least).any(axis=1)
     outside |= (own[:, :, 2] < _SHARE * cone.minimum_force).any(axis=1)
+    # friction and torsion: the cone of the corners moved inwards by no more than what the margin has to keep
     for k, sole in enumerate(soles):
         rows = contact_wrench_cone(sole.polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
         outside |= (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)

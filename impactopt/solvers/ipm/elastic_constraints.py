@@ -48,6 +48,8 @@ class Elastic:
 
     def compliance(self, y: Vector, mu: float) -> tuple[Vector, Vector]:
         """Compliance of a row per unit of multiplier, and the offset that goes with it."""
+        # p (price - y) = mu and n (price + y) = mu, linearized, give the steps of p and n as in `step`. Put
+        # into J d + r = (p + dp) - (n + dn), they leave J d + (r - p + n) + offset = give y_new.
         zp, zn = self._below_price(y)
         give = self._p / zp + self._n / zn
         return give, give * y - (mu / zp - self._p) + (mu / zn - self._n)

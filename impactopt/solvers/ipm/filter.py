@@ -62,6 +62,8 @@ class Filter:
             return False
         if any(theta >= t and phi >= p for t, p in self.pairs):
             return False
+        # Where a step is to lessen phi, a little less violation is not enough: the iterates would go to a
+        # feasible point that is no optimum.
         if at.theta <= self.least and at.switches(length):
             return at.falls(length, phi)
         return theta <= (1.0 - _VIOLATION) * at.theta or phi <= at.phi - _OBJECTIVE * at.theta

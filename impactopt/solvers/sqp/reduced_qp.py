@@ -118,6 +118,8 @@ class ReducedQP:
         reach = radius * abs(every).sum(axis=1)  # how much a row can change
         off = np.maximum(lower, -upper)
         soft = off > _SOFT
+        # A constraint that no step inside the radius can meet, or whose multiplier was at its price, is given
+        # up: its violation is linear in t then, so its price is a part of the gradient, without a slack.
         lost = soft & ((off > _BEYOND * reach) | (np.abs(self._unit) > 0.99 * prices))
         late = np.argsort(-off / np.maximum(reach, 1e-12))[_NEAREST * T.shape[1] :]
         working = off > -_NEAR * reach
@@ -180,7 +182,7 @@ def _elastic(
     small = isinstance(A, np.ndarray)
     if k:
         sign = np.where(np.arange(k) < below.size, 1.0, -1.0)
-        bend = _SLACK_CURVATURE * prices[elastic]
+        bend = _SLACK_CURVATURE * prices[elastic]  # as the dual method needs a positive definite P
         c = np.concatenate([c, prices[elastic]])
         if small:
             S = np.zeros((lower.size, k))

@@ -111,9 +111,9 @@ class NewtonSystem:
 
     def _penalty(self) -> Vector:
         """Weights of the equalities left: far above the curvature along them, and no farther."""
-        # The term is constant on steps that meet A d = -off, so it changes none. And a matrix that is positive
-        # definite on A's null space becomes so altogether for a weight that is large enough (Debreu's lemma):
-        # then Cholesky's success says that the inertia is right.
+        # The term is constant on steps that meet A d = -off, so it changes none. And a matrix that is
+        # positive definite on A's null space becomes so altogether for a weight that is large enough
+        # (Debreu's lemma): then Cholesky's success says that the inertia is right.
         squares = self._A**2
         length = np.maximum(1e-30, squares.sum(axis=1))
         curvature = squares @ np.abs(self.condenser.curvature) / length

@@ -248,8 +248,8 @@ class ReducedRun(Run):
             return None
         slope = float(before.gradient @ solved.d)
         noise = _ROUNDING * (1.0 + abs(before.objective))
-        # The switching condition (Waechter and Biegler 2006, eq. 19) with a QP's slope: near the feasible set a
-        # step has to lower the objective.
+        # The switching condition (Waechter and Biegler 2006, eq. 19) with a QP's slope: near the feasible
+        # set a step has to lower the objective.
         leads = slope < 0 and before.violation < _NEAR and -length * slope > 1e-2 * before.violation**1.2
         if leads:
             return True if f <= before.objective + _ARMIJO * length * slope + noise else None

@@ -138,8 +138,8 @@ class BFGSModel:
         sBs, sy = float(step @ Bs), float(step @ change)
         if sBs < 1e-16:
             return
-        # procedure 18.2: a change of the gradient that shows too little curvature is mixed with Bs until s'r is
-        # 0.2 s'Bs, so that B stays positive definite
+        # procedure 18.2: a change of the gradient that shows too little curvature is mixed with Bs until
+        # s'r is 0.2 s'Bs, so that B stays positive definite
         theta = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
         r = theta * change + (1.0 - theta) * Bs
         if float(r @ r) > _STEEPEST * float(step @ r):

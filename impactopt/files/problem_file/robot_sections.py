@@ -168,11 +168,11 @@ class RobotSection(Section):
     inertias: Literal["given", "repaired"] = optional(
         '"repaired": those that no body can have are changed to ones that it can; `check` lists them'
     )
-    armature: PerJoint = optional("reflected rotor inertia [kg m2]", "armature_kg_m2")
-    kp: PerJoint = optional("servo stiffness [N m/rad]", "kp_N_m_rad")
-    kd: PerJoint = optional("servo damping [N m s/rad]", "kd_N_m_s_rad")
-    torque_limit: PerJoint = optional("torque limit [N m]", "torque_limit_N_m")
-    velocity_limit: PerJoint = optional("velocity limit [rad/s]", "velocity_limit_rad_s")
+    armature: PerJoint = optional("reflected rotor inertia, of all or by joint [kg m2]", "armature_kg_m2")
+    kp: PerJoint = optional("servo stiffness, of all or by joint [N m/rad]", "kp_N_m_rad")
+    kd: PerJoint = optional("servo damping, of all or by joint [N m s/rad]", "kd_N_m_s_rad")
+    torque_limit: PerJoint = optional("torque limit, of all or by joint [N m]", "torque_limit_N_m")
+    velocity_limit: PerJoint = optional("velocity limit, of all or by joint [rad/s]", "velocity_limit_rad_s")
     position_limit: dict[str, Range] = optional("limits [lower, upper] by joint [rad]", "position_limit_rad")
     disable_collisions: list[Pair] = optional("pairs of links that may pass through each other")
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")

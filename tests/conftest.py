@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 from support.small_plans import OPTIONS, Planned, arm_problem, biped_problem, planned, transcribed
 
+from impactopt import Solution, solve
 from impactopt.files.problem_file import load_problem
-from impactopt.planning.solution import Solution
-from impactopt.planning.solve import solve
 from impactopt.transcription.transcription import Transcription
 
 

@@ -15,7 +15,6 @@ from support.rooms import (
     NUMERIC,
     PACKAGE,
     RANK,
-    REACHES_UP,
     ROOMS,
     ROOMS_IN_ORDER,
     imports,
@@ -32,7 +31,7 @@ def test_every_module_has_its_place_in_the_order() -> None:
 @pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(PACKAGE)))
 def test_imports_go_one_way(file: Path) -> None:
     own = room(file)
-    if own == "__init__" or file == REACHES_UP:  # names are imported when they are used
+    if own == "__init__":  # names are imported when they are used
         return
     late = {other for other in rooms_imported(file) - {own} if RANK[other] >= RANK[own]}
     assert late == set()
@@ -65,8 +64,8 @@ def test_what_follows_the_transcription_is_without_casadi(name: str) -> None:
 def test_engines_share_no_code_with_the_planner() -> None:
     engines = sorted((PACKAGE / "simulation").glob("*_engine.py"))
     assert engines
-    names = ("result", "servo", "soles", "target_dynamics", "contact_times", "perturbation", "motors")
-    robots = ("mujoco_world", "mujoco_robot", "pinocchio_robot")
+    names = ("result", "target_dynamics", "perturbation", "motors")
+    robots = ("mujoco_world", "pinocchio_robot")
     shared = [PACKAGE / "simulation" / f"{name}.py" for name in (*names, *robots)]
     shared += sorted((PACKAGE / "simulation" / "controller").glob("*.py"))
     for file in [*engines, *shared]:

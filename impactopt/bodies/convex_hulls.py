@@ -1,10 +1,10 @@
-"""Convex hulls of a robot's links, from its own files or from the links' inertia."""
+"""Convex hulls of a robot's links, from its files or the links' inertia; shapes that are not plausible."""
 
 from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,14 +16,24 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from impactopt.bodies.mjcf import geoms_of
+from impactopt.bodies.file_shapes import geoms_of, lost_meshes, shapes_of, urdf_root
 from impactopt.bodies.solids import Solid, cylinder, rounded_box
-from impactopt.bodies.urdf import lost_meshes, shapes_of, urdf_root
-from impactopt.codegen.directory import kept
+from impactopt.codegen.files import kept
 from impactopt.robots.robot import Robot, Tool
 from impactopt.robots.tools import without
 
-__all__ = ["Piece", "bare_joints", "convex", "inertia_box", "pieces_of", "tool_solids"]
+__all__ = [
+    "ROD",
+    "Piece",
+    "bare_joints",
+    "convex",
+    "distance_to_link",
+    "inertia_box",
+    "is_far",
+    "pieces_of",
+    "size_of",
+    "tool_solids",
+]
 
 Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
@@ -208,3 +218,47 @@ def _hull_of(points: Array) -> tuple[Array, NDArray[np.intp]]:
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]
     return vertices, triangles
+
+
+FAR = 0.1  # [m] from all that is known of a link at least, and the shape's own size
+
+
+def is_far(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> bool:
+    """True if a shape is farther from its link than its size; beside : all shapes that the joint moves."""
+    return distance_to_link(model, piece, beside) > max(FAR, size_of(piece))
+
+
+def size_of(piece: Piece) -> float:
+    """Diagonal of a shape's bounds [m]."""
+    return float(np.linalg.norm(np.ptp(piece.vertices, axis=0)))
+
+
+def distance_to_link(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> float:
+    """Distance [m] of a shape to the nearest of what is known of its link otherwise.
+
+    That is the joint that moves it, the centre of mass, frames on it, the joints that it carries, and its
+    other shapes.
+    """
+    own = piece.joint
+    places = [np.zeros(3), np.array(model.inertias[own].lever)]
+    places += [
+        np.array(f.placement.translation) for f in model.frames if f.parentJoint == own and _is_link(f)
+    ]
+    places += [
+        np.array(model.jointPlacements[j].translation)
+        for j in range(1, model.njoints)
+        if int(model.parents[j]) == own
+    ]
+    shapes = [(coal.Sphere(1e-9), coal.Transform3s(np.eye(3), place)) for place in places]
+    shapes += [(other.shape, coal.Transform3s()) for other in beside if other is not piece]
+    return min(_distance(piece, shape, at) for shape, at in shapes)
+
+
+def _is_link(frame: pin.Frame) -> bool:
+    return frame.type in (pin.FrameType.BODY, pin.FrameType.FIXED_JOINT)
+
+
+def _distance(piece: Piece, shape: object, at: object) -> float:
+    found = coal.DistanceResult()
+    coal.distance(piece.shape, coal.Transform3s(), shape, at, coal.DistanceRequest(), found)
+    return max(float(found.min_distance), 0.0)

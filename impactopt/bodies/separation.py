@@ -33,8 +33,8 @@ from impactopt.bodies import separation_numpy
 from impactopt.bodies.robot_bodies import Pair, RobotBodies
 from impactopt.bodies.separation_numpy import ROUNDING
 from impactopt.bodies.world import WorldBody
-from impactopt.codegen.directory import kept
-from impactopt.codegen.library import address, native_library
+from impactopt.codegen.compiler import address, native_library
+from impactopt.codegen.files import kept
 
 __all__ = ["ROUNDING", "THIN", "Looked", "Placed", "Separations", "Shapes", "packed", "thinned"]
 

@@ -273,7 +273,7 @@ def _baseline(problem: ImpactProblem) -> dict[str, object]:
 
 
 def _write(record: Record, directory: Path, progress: SolveConsole) -> list[Path]:
-    from impactopt.files.result_folder import keep_record
+    from impactopt.files.output import keep_record
 
     written = [*keep_record(record, directory)]
     progress.say("drawing pictures")
@@ -289,7 +289,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     from rich.console import Console
 
     from impactopt.errors import printable
-    from impactopt.files.result_folder import set_aside
+    from impactopt.files.output import set_aside
     from impactopt.report.console import (
         multistart_table,
         reason_message,

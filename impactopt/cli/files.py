@@ -80,7 +80,7 @@ def _lost_meshes(robot: Robot) -> str:
     """Message about a robot's meshes that are missing or unreadable, and the consequences; "" if there are
     none.
     """
-    from impactopt.bodies.urdf import lost_meshes, urdf_root
+    from impactopt.bodies.file_shapes import lost_meshes, urdf_root
 
     root = None if robot.urdf is None else urdf_root(Path(robot.urdf))
     found = {} if root is None or robot.urdf is None else lost_meshes(robot.model, root, Path(robot.urdf))
@@ -161,7 +161,7 @@ def new(
         elif urdf is not None or mjcf is not None:
             _draft(str(mjcf if urdf is None else urdf), urdf is None, bolted, out)
         elif name is not None:
-            from impactopt.files.problem_file.template import problem_template
+            from impactopt.files.problem_file.reference import problem_template
 
             _give(problem_template(name), out)
         elif out is not None:

@@ -20,13 +20,13 @@ def complete_problem(incomplete: str) -> list[str]:
 
 def complete_sweep(incomplete: str) -> list[str]:
     """The same of sweeps."""
-    from impactopt.files.folders import SWEEPS
+    from impactopt.files.problem_file.names import SWEEPS
 
     return _complete(incomplete, SWEEPS)
 
 
 def _complete(incomplete: str, folder: str) -> list[str]:
-    from impactopt.files.folders import named_files
+    from impactopt.files.problem_file.names import named_files
 
     typed = Path(incomplete)
     inside = typed if incomplete.endswith("/") else typed.parent
@@ -39,8 +39,8 @@ def _complete(incomplete: str, folder: str) -> list[str]:
 def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
     """Keys of the problem that the command names, or of any, that begin like this."""
     from impactopt.errors import InputError
-    from impactopt.files.problem_file.changes import key_paths
     from impactopt.files.problem_file.names import problem_file
+    from impactopt.files.problem_file.reading import key_paths
     from impactopt.files.problem_file.toml import TOMLError, read_toml
 
     data: dict[str, Any] = {}
@@ -76,8 +76,9 @@ OtherProblem = Annotated[
 
 
 class SolverChoice(str, enum.Enum):
-    ipopt = "ipopt"
+    ipm = "ipm"
     sqp = "sqp"
+    ipopt = "ipopt"
 
 
 SolverName = Annotated[

@@ -124,8 +124,7 @@ def _page(what: Path, problem: Path | None, port: int) -> LiveLook | LiveBlow:
     """Page of a result, or of a problem file's collision."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file
-    from impactopt.files.replay import load_planned
-    from impactopt.files.resume import resumed
+    from impactopt.files.replay import load_planned, resumed
     from impactopt.live.collision_page import LiveBlow
     from impactopt.live.plan_page import LiveLook
 

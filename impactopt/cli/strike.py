@@ -54,9 +54,8 @@ def strike(
     """
     with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
         from impactopt.errors import printable
-        from impactopt.files.output import make_directory, record_of_strike
+        from impactopt.files.output import keep_record, make_directory, record_of_strike, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.files.result_folder import keep_record, set_aside
         from impactopt.planning.strike import optimize_strike
         from impactopt.report.console import SolveConsole
 

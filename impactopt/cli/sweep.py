@@ -66,7 +66,7 @@ def sweep(
         from impactopt.files.problem_file import parse_settings
         from impactopt.sweeps import read_sweep_file
         from impactopt.sweeps import sweep as run
-        from impactopt.sweeps.console import SweepConsole
+        from impactopt.sweeps.progress import SweepConsole
 
         check_loudness(quiet, verbose)
         chosen = read_sweep_file(file, parse_settings(settings or ()))
@@ -92,7 +92,7 @@ def _show(result: SweepResult) -> None:
     from rich.table import Table
 
     from impactopt.errors import printable
-    from impactopt.sweeps.console import words_for_time
+    from impactopt.sweeps.progress import words_for_time
 
     table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
     rows = {

@@ -1,29 +1,242 @@
-"""One collision in numbers, as `impactopt collide` shows it."""
+"""One collision in numbers, as `impactopt collide` shows it: [at_contact], collision model, measures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, ValidationError
 
-from impactopt.collide.at_contact import NOT_ENDED, AtContact, check_at_contact, collision_model
 from impactopt.collide.contact_states import ContactStates, States
-from impactopt.collide.measures import MEASURES, Blow
 from impactopt.collision import Collision, CollisionModel
+from impactopt.collision.sdc import frozen_model
 from impactopt.collision.symbolic import SymbolicModel
-from impactopt.errors import InputError
+from impactopt.contact.targets import Target
+from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import Record, load_record, plain
 from impactopt.files.problem_file import ProblemFile, parse_problem_file
+from impactopt.files.problem_file.diagnostics import mistakes_of, report_mistakes
+from impactopt.files.problem_file.sections import File
+from impactopt.files.problem_file.values import Positive, Section
+from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.robot import Robot
+from impactopt.simulation.reference import FullDynamics
 
-__all__ = ["collide_once", "planned_numbers", "problem_of_result"]
+__all__ = [
+    "MEASURES",
+    "NOT_ENDED",
+    "AtContact",
+    "Blow",
+    "Measure",
+    "check_at_contact",
+    "chosen",
+    "collide_once",
+    "collision_model",
+    "full_names",
+    "planned_numbers",
+    "problem_of_result",
+]
+
+NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
+_STEP = 1e-4  # [s] between instants of the full dynamics
+
+
+class AtContact(Section):
+    """Section [at_contact] of a sweep of collisions.
+
+    The state at contact is that of `result`, a directory of `impactopt solve` or `strike`; or of `posture`:
+    "reach" for the problem's start with the striking point moved to the problem's point, or a posture of the
+    robot by name, which hits where its hand is. `joints` are added to it. The striking point moves along the
+    normal at `speed`: a result's velocity is scaled, a posture gets the `velocity` of least kinetic energy,
+    or the one whose joint speeds over their limits have the least sum of squares. The feed-forward torque
+    lets the robot coast. Scales are of the robot's own gains and torque limits.
+    """
+
+    posture: str = "reach"
+    result: str | None = None
+    speed: Positive | None = Field(default=None, alias="speed_m_s")
+    velocity: Literal["least energy", "least rates"] = "least energy"
+    joints: dict[str, float] = Field(default_factory=dict, alias="joints_rad")
+    kp_scale: Positive = 1.0
+    kd_scale: Positive = 1.0
+    torque_limit_scale: Positive = 1.0
+    model: Literal["virtual-mass", "sdc-paper", "sdc", "full"] = "sdc"
+    freezes: int = Field(default=0, ge=0)
+    horizon: Positive = Field(default=0.2, alias="horizon_s")
+
+
+def full_names(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The table with the units that its keys may leave out: `speed` is `speed_m_s`."""
+    names = {name: info.alias for name, info in AtContact.model_fields.items() if info.alias}
+    return {names[k] if k in names and names[k] not in given else k: value for k, value in given.items()}
+
+
+def check_at_contact(given: Mapping[str, Any]) -> AtContact:
+    """The section from its table, whose keys may leave out their units.
+
+    Raises
+    ------
+    InputError : one message with all mistakes. It names no file: the table may be a sweep's, or from a call.
+    """
+    try:
+        section = AtContact.model_validate(full_names(given))
+    except ValidationError as error:
+        raise InputError(report_mistakes("[at_contact]", {}, mistakes_of(error, AtContact))) from None
+    if section.result is not None and "posture" in section.model_fields_set:
+        raise InputError("[at_contact] posture, result: give one of them")
+    if section.result is None and section.speed is None:
+        raise InputError("[at_contact] speed_m_s: missing; only a result has a speed of its own")
+    if section.freezes and section.model != "sdc":
+        raise InputError(f"[at_contact] freezes: only of the model 'sdc', not of {section.model!r}")
+    return section
+
+
+def collision_model(
+    content: File, robot: Robot, stance: Stance, section: AtContact, accuracy: float = 1e-2
+) -> CollisionModel:
+    """The model that [at_contact] names, for a problem file's blow; accuracy: as of `SDC`."""
+    content.check_one_striker()
+    options: dict[str, Any] = {
+        "robot": robot,
+        "striker": content.problem.striker,
+        "normal": content.problem.normal,
+        "law": content.contact.build(),
+        "target": content.target.build(),
+        "stance": stance,
+        "horizon": section.horizon,
+    }
+    if section.model == "full":
+        return FullDynamics(**options, step=_STEP)
+    return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)
+
 
 Array = NDArray[np.float64]
+
+LEAST_WEIGHT = 1.0  # [N] on the ground; with less there is no ZMP
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Blow:
+    """N collisions: outputs by name as of `SymbolicModel.batch`, their states, torque limits (N, n) or (1, n)
+    [N m], and the support polygon (k, 2) [m]."""
+
+    found: Mapping[str, Array]
+    states: States
+    torque_limit: Array
+    velocity_limit: Array
+    polygon: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """A column of the table: the outputs of a collision that it takes, what it is, and how it is had."""
+
+    outputs: tuple[str, ...]
+    what: str
+    of: Callable[[Blow], Array]
+
+
+def _torque_ratio(blow: Blow) -> Array:
+    demand = np.abs(blow.found["demand"])
+    return np.asarray((demand.max(axis=1) / blow.torque_limit).max(axis=1))
+
+
+def _velocity_ratio(blow: Blow) -> Array:
+    joints = np.abs(blow.states.v[:, -blow.velocity_limit.size :])
+    return np.asarray((joints / blow.velocity_limit).max(axis=1))
+
+
+def _zmp_margin(blow: Blow) -> Array:
+    ground = blow.found["ground_wrench"]
+    flat = ground.reshape(-1, 6)
+    out = np.full(len(flat), -np.inf)
+    stands = flat[:, 2] > LEAST_WEIGHT
+    out[stands] = margin(blow.polygon, zmp(flat[stands]))
+    return out.reshape(ground.shape[:2]).min(axis=1)
+
+
+MEASURES: Mapping[str, Measure] = {
+    "impulse_Ns": Measure(
+        outputs=("impulse",), what="delivered to the target", of=lambda b: b.found["impulse"]
+    ),
+    "peak_force_N": Measure(
+        outputs=("peak_force",), what="largest contact force", of=lambda b: b.found["peak_force"]
+    ),
+    "contact_ms": Measure(
+        outputs=("duration",), what="from contact to separation", of=lambda b: 1e3 * b.found["duration"]
+    ),
+    "energy_J": Measure(outputs=("energy",), what="given to the target", of=lambda b: b.found["energy"]),
+    "torque_ratio": Measure(
+        outputs=("demand",),
+        what="largest torque demand over its joint's limit, at every millisecond of contact",
+        of=_torque_ratio,
+    ),
+    "zmp_margin_m": Measure(
+        outputs=("ground_wrench",),
+        what="least distance of the ZMP from the soles' hull, positive inside, at every millisecond of "
+        "contact; minus infinity where the soles would have to pull",
+        of=_zmp_margin,
+    ),
+    "sole_force_N": Measure(
+        outputs=("sole_wrench",),
+        what="least vertical force of the ground on one sole, at every millisecond of contact",
+        of=lambda b: b.found["sole_wrench"][..., 2].min(axis=(1, 2)),
+    ),
+    "freeze_error_pct": Measure(
+        outputs=("freeze_error",),
+        what="what freezing may have cost of the impulse, as an estimate; 0 of full dynamics, nan of models "
+        "whose error is another",
+        of=lambda b: 100 * b.found["freeze_error"],
+    ),
+    "hand_speed_m_s": Measure(
+        outputs=(), what="of the striking point along the normal, at contact", of=lambda b: b.states.speed
+    ),
+    "effective_mass_kg": Measure(
+        outputs=(),
+        what="of the held robot at the striking point along the normal",
+        of=lambda b: b.states.mass,
+    ),
+    "velocity_ratio": Measure(
+        outputs=(), what="largest joint speed at contact over its limit", of=_velocity_ratio
+    ),
+}
+
+
+def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
+    """Measures by name; of a target its results too: target_speed_m_s, target_depth_m, target_broken.
+
+    Raises
+    ------
+    InputError : a name that there is not.
+    """
+    results = {f"target_{name}": _result(k) for k, name in enumerate(target.result_names)}
+    known = {**MEASURES, **results}
+    out = {}
+    for name in names:
+        if name not in known:
+            raise InputError(
+                f"there is no output {name!r}{did_you_mean(name, known)} of a sweep of collisions; there are "
+                + ", ".join(known)
+            )
+        out[name] = known[name]
+    if not out:
+        raise InputError(f"outputs: name at least one of {', '.join(known)}")
+    return out
+
+
+def _result(k: int) -> Measure:
+    def of(blow: Blow) -> Array:
+        result: Any = blow.found["target_result"]
+        return np.asarray(result[:, k])
+
+    return Measure(outputs=("target_result",), what="of the target after the blow", of=of)
+
 
 _TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
 _STAYS = (

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.cache import cached, library_path
 from impactopt.collision.checks import (
     ACCURACY,
+    Stability,
     breaks,
     left_out_by_breaking,
     too_large,
@@ -30,7 +31,6 @@ from impactopt.collision.checks import (
 from impactopt.collision.native import native_collision
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.settings import NO_LIMIT
-from impactopt.collision.stability import Stability
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array, raw_array
 

@@ -15,17 +15,19 @@ quaternions, and cosines and sines, unit ones first, so that it does not change 
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.codegen.library import NativeCode
-from impactopt.collision.native import native_differences, native_gradient, native_jacobian
+from impactopt.codegen.compiler import CompileError, NativeCode, find_compiler, why_no_compiler
+from impactopt.collision.native import native_collision, native_differences, native_gradient, native_jacobian
 from impactopt.collision.native.sizes import directions, shapes_out
 from impactopt.collision.native.source import least_size
 from impactopt.collision.outputs import HISTORIES, SCALARS
@@ -33,7 +35,15 @@ from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
 from impactopt.robots.rigid_body import RigidBody
 
-__all__ = ["CollisionFunction", "Part", "differentiable", "in_order", "native_part", "with_jacobian"]
+__all__ = [
+    "CollisionFunction",
+    "Part",
+    "differentiable",
+    "export",
+    "in_order",
+    "native_part",
+    "with_jacobian",
+]
 
 Array = NDArray[np.float64]
 Compile = Callable[[str, tuple[Any, ...], Callable[[], Any]], Any]
@@ -318,3 +328,51 @@ def _units(model: Any) -> list[tuple[int, int, slice]]:
         elif joint.nq > joint.nv:
             found.append((joint.idx_q, joint.idx_q + joint.nq, slice(joint.idx_v, joint.idx_v + joint.nv)))
     return found
+
+
+_TAKEN = ("collision", "collision_gradient", "collision_jacobian", "collision_differences")
+_SEEN = "-DGCC_HASCLASSVISIBILITY"  # of the function that CasADi writes, where nothing else is
+
+
+def export(
+    model: SteppedModel,
+    whole: Any,
+    parameters: tuple[str, ...],
+    by: tuple[str, ...] | None,
+    every: int,
+    compiled: Compile,
+    folder: Path,
+    name: str,
+) -> Path:
+    """The library, from arguments as of `differentiable`; see `SymbolicModel.export`."""
+    if not name.isidentifier() or name in _TAKEN or not ca.Function.check_name(name):
+        raise InputError(f"name {name!r}: give a name for C that is none of {', '.join(_TAKEN)}")
+    compiler = find_compiler()
+    if compiler is None:
+        raise InputError(f"export: it needs a C compiler that works; {why_no_compiler()}")
+    native = native_collision(model, tuple(whole.name_out()), every=every)
+    codes = {native.name: native.code}
+
+    def derivatives(part: Part) -> tuple[Any, Mapping[str, Any]]:
+        what, build = native_part(model, part, every)
+        codes[part.name] = build().code
+        function = compiled(part.name, what, build)
+        return function, dict.fromkeys(function.name_in(), 1.0)
+
+    functions = with_jacobian(model, whole, parameters, by, derivatives, name)
+    generator = ca.CodeGenerator(f"{name}.c", {"with_header": True})
+    for function in functions if by is None or by else functions[:1]:
+        generator.add(function)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        generator.generate(f"{folder.resolve()}/")
+        sources = [folder / f"{name}.c"]
+        for part, code in codes.items():
+            sources.append(folder / f"{name}_{part}.c")
+            sources[-1].write_text(code, encoding="utf-8")
+        with tempfile.TemporaryDirectory(dir=folder, prefix="tmp-") as scratch:
+            made = Path(scratch) / f"{name}.so"
+            compiler.run(sources[0], made, f"{native.level} {_SEEN}", *sources[1:])
+            return made.replace(folder / made.name).resolve()
+    except (CompileError, OSError) as error:
+        raise InputError(f"export to {folder}: {error}") from None

@@ -29,12 +29,16 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
 
-from impactopt.kinematics.stance import Stance
+from impactopt.codegen.cache import cached, model_hash
+from impactopt.errors import check_direction
+from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 
-__all__ = ["FrozenDynamics"]
+__all__ = ["FrozenDynamics", "effective_mass"]
 
 
 class FrozenDynamics:
@@ -325,3 +329,26 @@ def _inverse_of_cholesky(size: int) -> Any:
         for j in range(i):
             inverse[i, j] = -ca.mtimes(R[i, j:i], inverse[j:i, j]) / R[i, i]
     return ca.Function("inverse_of_cholesky", [G], [inverse])
+
+
+def effective_mass(robot: Robot, *, striker: str, normal: ArrayLike, stance: Stance | None = None) -> Any:
+    """Compiled ca.Function q (nq) -> 1 / (n' J P J' n) [kg], the mass that the target meets at first.
+
+    P is the inverse inertia of the robot as held by `stance` (None: all soles, or the fixed base); free
+    joints, no servo. The paper calls it virtual mass (its section III, after Asada and Ogawa, and Khatib).
+
+    Raises
+    ------
+    InputError : an unknown striker; a normal that is not a unit vector; a stance the robot cannot take.
+    """
+    frame = robot.striker(striker).model_frame
+    n = check_direction("normal", normal)
+    held_by = usual_stance(robot) if stance is None else stance
+
+    def build() -> list[Any]:
+        frozen = FrozenDynamics(robot, held_by, frame, bias=False, jdot=False)
+        m = frozen.function("frozen", ("m",))(frozen.q, np.zeros(robot.nv), n, 0.0)
+        return [ca.Function("effective_mass", [frozen.q], [1.0 / m], ["q"], ["mass"])]
+
+    recipe = (model_hash(robot.model), frame, repr(held_by), held_by.constraint_frames(robot), tuple(n))
+    return cached("effective_mass", recipe, build)["effective_mass"]

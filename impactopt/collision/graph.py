@@ -1,30 +1,36 @@
-"""Expression graph of a collision, from configuration and velocity at contact to its outputs and gradient."""
+"""Expression graph of a collision, from configuration and velocity at contact to its outputs and gradient.
+
+All of it is decided when the function is built: what is not in is not computed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import ceil
 from typing import Any
 
 import casadi as ca
 
-from impactopt.collision.course import Course, Loop
 from impactopt.collision.frozen import FrozenDynamics
 from impactopt.collision.implicit_numpy import implicit_loop
-from impactopt.collision.loop import run
-from impactopt.collision.model import JointSpaceModel, shape_of
-from impactopt.collision.outputs import HISTORIES, Outputs, frozen_for
-from impactopt.collision.runge_kutta import rk4_step
+from impactopt.collision.model import Course, JointSpaceModel, Loop, shape_of
+from impactopt.collision.outputs import HISTORIES, OF_SOLES, Outputs, frozen_for
+from impactopt.collision.runge_kutta import rk4_step, run
 from impactopt.collision.stepped import SteppedModel, number_of_steps
 from impactopt.contact import Target
 from impactopt.robots.rigid_body import RigidBody
 
 __all__ = [
     "MOST_STEPS",
+    "Description",
     "collision_graph",
     "columns_of",
+    "describe",
     "frozen_dynamics",
     "gradient_graph",
+    "independent_joints",
+    "instructions",
     "joint_space_model",
     "target_start",
 ]
@@ -160,3 +166,146 @@ def _implicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Lo
         return final, states if wanted else None
 
     return loop
+
+
+# term: what it is, and when it may be left out
+_EFFECTS = {
+    "stiffness": "the servo's stiffness (eq. 10): it matters little in contacts of a few milliseconds",
+    "feedforward": "the feed-forward torque: it is zero, or no saturation depends on it",
+    "saturation": "the torque limits (eq. 12): no joint reaches its limit, or rows of a plan keep it from it",
+    "friction": "joint friction (eq. 5): its numbers are not known, or small",
+    "bias": "Coriolis, centrifugal and gravity terms (eq. 6): small beside the blow",
+    "jdot": "the Jacobians' rates (eq. 14): small beside the blow",
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Description:
+    """Contents of a collision function, as text by str(), and as numbers.
+
+    Attributes
+    ----------
+    contents : what is in, by name: plain numbers, text, lists and mappings.
+    left_out : what is not in, and why.
+    """
+
+    contents: Mapping[str, Any]
+    left_out: Mapping[str, str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        return {**self.contents, "left_out": dict(self.left_out)}
+
+    def __str__(self) -> str:
+        lines = [f"{name.replace('_', ' ')}: {_words(value)}" for name, value in self.contents.items()]
+        return "\n".join([*lines, "left out:", *(f"  {what}: {why}" for what, why in self.left_out.items())])
+
+
+def describe(
+    collision: SteppedModel, outputs: tuple[str, ...], parameters: tuple[str, ...] = ()
+) -> Description:
+    """Description of `SteppedModel.function` for these outputs; see `SteppedModel.describe`."""
+    robot, held_by, settings = collision.robot, collision.held_by, collision.settings
+    by = f"{max(held_by.compliance):g} per kg" if any(held_by.compliance) else "exactly"
+    effects = [name for name in _EFFECTS if getattr(collision.effects, name)] if collision.n_servos else []
+    contents: dict[str, Any] = {
+        "robot": robot.name,
+        "joints": robot.n,
+        "velocities": robot.nv,
+        "striker": collision.striker,
+        "held": list(held_by.constraint_frames(robot)),
+        "held_how": by if held_by.constraint_frames(robot) else "fixed base",
+        "effects": (["damping", *effects] if collision.n_servos else []),
+        "law": type(collision.law).__name__,
+        "target": type(collision.target).__name__,
+        "outputs": list(outputs),
+        "method": collision.stepping,
+        **_steps(collision),
+        "horizon_s": collision.horizon,
+        "freezes": 1 + collision.n_freezes,
+        "inputs": ["q", "v", *(["feedforward"] if collision.effects.feedforward else []), *parameters],
+        "fixed_numbers": [name for name in settings if name not in parameters],
+        "instructions": instructions(collision, outputs),
+    }
+    return Description(contents=contents, left_out=_left_out(collision, outputs))
+
+
+def instructions(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, int]:
+    """Scalar instructions of one freeze and one Runge-Kutta step of the graph, as CasADi counts them.
+
+    Implicit steps, in C alone, have the freeze of the graph, and in place of its step one that costs twice as
+    much, or six times where law or target bend.
+    """
+    model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
+    whole = ("L_tau", "L_f", "L_0", "drift_velocity") if collision.n_freezes else ()
+    names = tuple(dict.fromkeys((*model.frozen, *frozen_for(outputs), *whole)))
+    freeze = frozen_dynamics(collision).function("frozen", names)
+    step = rk4_step(model, collision.step_of_graph)
+    return {"freeze": int(freeze.expand().n_instructions()), "step": int(step.expand().n_instructions())}
+
+
+def _steps(collision: SteppedModel) -> dict[str, float]:
+    if collision.stepping == "implicit":
+        return {"tolerance": collision.tolerance, "histories_every_s": collision.step_length}
+    return {"step_s": collision.step_length, "most_steps": number_of_steps(collision)}
+
+
+def independent_joints(collision: SteppedModel) -> list[str]:
+    """Joints that the blow cannot move, and that move nothing that is asked for: on a fixed base, those of
+    limbs that share no joint with the striking point's. H has no entries between the two, nor have gains
+    given one a joint. To lock them in the robot changes nothing of the collision."""
+    robot = collision.robot
+    gains = [value for name, value in collision.settings.items() if name in ("kp", "kd")]
+    if robot.floating or any(gain.ndim == 2 for gain in gains):
+        return []
+    model = robot.model
+    frame = model.getFrameId(robot.striker(collision.striker).model_frame)
+    hit = {int(j) for j in model.supports[model.frames[frame].parentJoint]} - {0}
+    apart = (j for j in range(1, model.njoints) if not hit & {int(i) for i in model.supports[j]})
+    return [str(model.names[j]) for j in apart]
+
+
+def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, str]:
+    robot, held_by = collision.robot, collision.held_by
+    out: dict[str, str] = {}
+    if not collision.n_servos:
+        out["servo"] = "a point mass has none"
+    else:
+        out |= {
+            name: f"{what} (effects.{name} is off)"
+            for name, what in _EFFECTS.items()
+            if not getattr(collision.effects, name)
+        }
+    wanted = {*outputs}
+    if not held_by.soles(robot):
+        out["wrenches and ZMP"] = "nothing holds the robot" if robot.floating else "the base is fixed"
+    elif not wanted & {*OF_SOLES}:
+        out["wrenches and ZMP"] = "not asked for"
+    elif not wanted & {"ground_wrench", "zmp"}:
+        out["ZMP"] = "not asked for"
+    free = [sole.name for sole in robot.soles if sole not in held_by.soles(robot)] if robot.floating else []
+    if free:
+        out["held soles"] = f"{', '.join(free)}: not held by the stance"
+    if not wanted & {*HISTORIES}:
+        out["histories"] = "not asked for"
+    if "peak_force" not in wanted:
+        out["peak force"] = "not asked for"
+    if "configuration" not in wanted and not collision.n_freezes:
+        out["second integrals"] = "no configuration asked for, nothing frozen again"
+    if not wanted & {"configuration", "velocity"}:
+        out["motion of the whole robot"] = "not asked for"
+    out["derivatives"] = "in `gradient_function`, and in `graph`"
+    if independent := independent_joints(collision):
+        out["nothing yet"] = (
+            f"{len(independent)} joints share none with the striking point's limb, and could be locked "
+            f"without any change: {', '.join(independent)}"
+        )
+    return out
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {x}" for name, x in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from impactopt.collision.bernstein import first_negative, largest
-from impactopt.collision.dense_step import Contact, Step, Watched
-from impactopt.collision.implicit import STAGES, tables
+from impactopt.collision.implicit import STAGES, Contact, Step, Watched, first_negative, largest, tables
 from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["implicit_loop"]

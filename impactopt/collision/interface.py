@@ -1,19 +1,111 @@
-"""Interface of all collision models, from the point mass to full dynamics."""
+"""Interface of all collision models, from the point mass to full dynamics, and the result of a collision."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from impactopt.collision.result import Collision
+from impactopt.collision.outputs import HISTORIES, OUTPUTS, SCALARS
 from impactopt.contact import ContactLaw, Target
 from impactopt.errors import InputError, check_array, check_direction
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.robot import Robot
 
-__all__ = ["CollisionModel"]
+__all__ = ["Collision", "CollisionModel"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Collision:
+    """Result of a collision from contact to separation. Histories have k entries, at the steps, first at
+    contact, last at separation.
+
+    Attributes
+    ----------
+    impulse : [N s] delivered to the target.
+    peak_force : [N] largest contact force; of 'rk4' at the steps.
+    duration : [s] from contact to separation.
+    energy : [J] given to the target.
+    separated : whether the contact ended within the horizon.
+    velocity : (nv) Pinocchio's v after the collision.
+    configuration : (nq) Pinocchio's q after the collision.
+    target_result : what the target says of itself at separation, by the names in its `results`.
+    time : (k) [s] since contact.
+    force : (k) [N] on the target along the normal.
+    penetration : (k) [m] of the contact law.
+    hand_speed, target_speed : (k) [m/s] along the normal.
+    joint_velocity : (k, n) [rad/s].
+    torque, demand : (k, n) [N m] of the servo, and what it would be without saturation. These, the joint
+        velocities and all wrenches are None of a point mass, which knows nothing of them.
+    sole_wrench : (k, soles, 6) [N, N m] of the ground on each fixed sole, world axes, at the sole's frame;
+        in the stance's order of soles. None on a fixed base.
+    hand_wrench : (k, hands, 6) [N, N m] of the world on each supporting hand, world axes, at its striking
+        point; in the stance's order of hands. None where none is held.
+    ground_wrench : (k, 6) [N, N m] of the ground on the robot, world axes, about the world's origin; None
+        on a fixed base.
+    zmp : (k, 2) [m] x and y of the zero-moment point on the ground z = 0; None on a fixed base.
+    freeze_error : relative, what freezing may have cost of the impulse, as an estimate from the same
+        collision frozen more often (see `SDC`): infinite where that does not end by the horizon; 0 where
+        nothing is frozen, nan where it is not estimated, as of a point mass.
+    caution : what to do where freeze_error is above the accuracy that the model was asked for; else "".
+    """
+
+    impulse: float
+    peak_force: float
+    duration: float
+    energy: float
+    separated: bool
+    velocity: Array
+    configuration: Array
+    target_result: dict[str, float]
+    time: Array
+    force: Array
+    penetration: Array
+    hand_speed: Array
+    target_speed: Array
+    joint_velocity: Array | None
+    torque: Array | None
+    demand: Array | None
+    sole_wrench: Array | None
+    hand_wrench: Array | None
+    ground_wrench: Array | None
+    zmp: Array | None
+    freeze_error: float = np.nan
+    caution: str = ""
+
+    @classmethod
+    def from_outputs(cls, found: dict[str, Array], target: Target) -> Collision:
+        """Makes a result from the arrays of a collision function, without instants that repeat the one
+        before.
+
+        What judges a result, `step_error`, is no part of it.
+        """
+        time = found["time"].ravel()
+        kept = np.concatenate([[True], np.diff(time) > 0])
+        out: dict[str, Any] = {}
+        for name, value in found.items():
+            if name == "step_error":
+                continue
+            if name in HISTORIES:
+                columns = value.T if value.shape == (time.size, 1) else value
+                rows = np.ascontiguousarray(columns[:, kept].T)
+                out[name] = rows.ravel() if OUTPUTS[name].startswith("(k)") else rows
+            else:
+                out[name] = float(value.item()) if name in SCALARS else value.ravel()
+        out["separated"] = bool(round(out["separated"]))
+        given = out.pop("target_result", np.zeros(0))
+        out["target_result"] = dict(zip(target.results, map(float, given), strict=True))
+        for name in HISTORIES:
+            out.setdefault(name, None)
+        for name in ("sole_wrench", "hand_wrench"):
+            if out[name] is not None:
+                out[name] = out[name].reshape(int(kept.sum()), -1, 6)
+        return cls(**out)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

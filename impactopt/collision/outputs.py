@@ -7,8 +7,7 @@ from typing import Any
 
 import casadi as ca
 
-from impactopt.collision.course import Segment
-from impactopt.collision.model import JointSpaceModel
+from impactopt.collision.model import JointSpaceModel, Segment
 from impactopt.errors import InputError, did_you_mean
 
 __all__ = [

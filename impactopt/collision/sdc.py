@@ -1,23 +1,40 @@
-"""Simplified dynamics computation of a collision (paper, section II-B)."""
+"""Simplified dynamics computation of a collision (paper, section II-B), and the point mass beside it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 from numpy.typing import ArrayLike
 
-from impactopt.collision.effects import Effects, JointFriction
-from impactopt.collision.freezing import caution, more_often
-from impactopt.collision.settings import servo_settings
+from impactopt.collision.checks import caution, more_often
+from impactopt.collision.settings import Effects, JointFriction, servo_settings
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.kinematics.stance import BothSoles, FixedBase, Stance
 from impactopt.robots.robot import Robot
 
-__all__ = ["SDC"]
+__all__ = ["FROZEN", "SDC", "VirtualMass", "frozen_model"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VirtualMass(SymbolicModel):
+    """A point of the robot's effective mass m_a = 1 / (n' J P J' n) meets the target; no servo, no gravity.
+
+    The simplest model of the hierarchy (paper, fig. 9, Table III; after Asada and Ogawa, and Khatib): P is
+    the inverse inertia of the robot as held. It knows nothing of joint torques, sole wrenches and ZMP (None
+    in its results); the velocity after the collision is that of free joints. Attributes and errors as of
+    `SymbolicModel`.
+    """
+
+    effects: Effects = field(init=False, default=Effects.none())
+
+    @property
+    def n_servos(self) -> int:
+        return 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,3 +141,36 @@ class SDC(SymbolicModel):
 
     def _servo_settings(self) -> dict[str, ArrayLike]:
         return servo_settings(self.robot, self.effects, self.joint_friction, self.kp, self.kd)
+
+
+FROZEN = ("virtual-mass", "sdc-paper", "sdc")
+
+
+def frozen_model(
+    name: str, freezes: int = 0, *, accuracy: float | None = None, **scene: Any
+) -> SymbolicModel:
+    """The model that a plan with `ImpactProblem.collision` of this name has in it, on its own.
+
+    Its steps find their own length, and "sdc-paper" has no virtual base but that of the stance: soles are
+    held exactly, as plans do. `SDC.paper` by itself is the paper's in these too.
+
+    Parameters
+    ----------
+    name : one of `FROZEN`.
+    freezes, accuracy : of "sdc": as of `SDC`.
+    scene : robot, striker, normal, law, target, stance, horizon: as of `SDC`.
+
+    Raises
+    ------
+    InputError : an unknown name; what the models refuse.
+    """
+    if name == "virtual-mass":
+        return VirtualMass(**scene)
+    if name == "sdc-paper":
+        return replace(SDC.paper(**scene), method=None, step=None)
+    if name == "sdc":
+        return SDC(**scene, freezes=freezes, accuracy=accuracy)
+    raise InputError(
+        f"no model with frozen dynamics is called {name!r}{did_you_mean(name, FROZEN)}: there are "
+        + ", ".join(FROZEN)
+    )

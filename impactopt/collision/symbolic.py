@@ -14,16 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.cache import cached
 from impactopt.collision.batch import Batch
-from impactopt.collision.checks import breaks, check_course, check_finite, left_out_by_breaking
-from impactopt.collision.derivatives import differentiable, in_order
-from impactopt.collision.describe import Description, describe
-from impactopt.collision.export import export
-from impactopt.collision.freezing import FREEZE_ERROR, freeze_error
-from impactopt.collision.graph import collision_graph, target_start
+from impactopt.collision.checks import (
+    FREEZE_ERROR,
+    Stability,
+    breaks,
+    check_course,
+    check_finite,
+    freeze_error,
+    left_out_by_breaking,
+)
+from impactopt.collision.derivatives import differentiable, export, in_order
+from impactopt.collision.graph import Description, collision_graph, describe, target_start
+from impactopt.collision.interface import Collision
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
 from impactopt.collision.outputs import OF_SERVO, SCALARS, check_jacobian, check_outputs
-from impactopt.collision.result import Collision
-from impactopt.collision.stability import Stability
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array
 

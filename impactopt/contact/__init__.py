@@ -1,10 +1,10 @@
 """Contact laws (force from penetration) and targets (motion from force).
 
-One class a file, in `laws/` and `targets/`; `factors.py` is for numbers that differ from the expected ones.
+One class a file, in `laws/` and `targets/`; `targets/base.py` has numbers that differ from the expected ones.
 """
 
 from impactopt.contact import laws, targets
-from impactopt.contact._expressions import power
+from impactopt.contact.fields import power
 from impactopt.contact.laws import *  # noqa: F403
 from impactopt.contact.targets import *  # noqa: F403
 

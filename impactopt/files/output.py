@@ -1,4 +1,4 @@
-"""Files of a result: `solution.npz` with all arrays, and `summary.json` with the main figures.
+"""Files of a result: `solution.npz` with all arrays, `summary.json` with the main figures, and their folder.
 
 `solution.npz` stands for itself: it holds the summary and the problem file too. Every file is written beside
 its place and then moved there, so that a reader never sees half of one. When new numbers take the place of
@@ -7,6 +7,7 @@ old ones, what was made of those goes first: whenever a process ends, all files 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -16,26 +17,35 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.codegen.files import read_archive, write_atomically
+from impactopt.codegen.files import read_archive, read_plain, write_atomically
 from impactopt.errors import InputError
-from impactopt.files.problem_file.changes import change_data
-from impactopt.files.problem_file.key_docs import comment_at
+from impactopt.files.problem_file.reading import change_data
+from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.toml import read_toml, write_toml
 from impactopt.files.record_schema import check_arrays, check_summary
 from impactopt.kinematics.support import support_polygon
-from impactopt.planning.solution import Solution
-from impactopt.planning.strike import StrikeSolution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
-from impactopt.solvers.program import SolverResult
+from impactopt.solvers.program import SolverResult, Status
+
+if TYPE_CHECKING:  # who only reads a record loads no planner
+    from impactopt.planning.solution import Solution
+    from impactopt.planning.strike import StrikeSolution
 
 __all__ = [
+    "DERIVED",
+    "FORMAT",
+    "LARGEST",
+    "NUMBERS",
+    "SUMMARY",
     "Record",
+    "keep_record",
+    "keep_series",
     "load_record",
     "make_directory",
     "plain",
@@ -44,6 +54,7 @@ __all__ = [
     "remove_file",
     "replay_arrays",
     "save_record",
+    "set_aside",
     "summary_of",
     "write_file",
 ]
@@ -167,6 +178,8 @@ def _settled(problem: str, solution: Solution | StrikeSolution) -> str:
 
 def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:
     """Summary of a solution's record; made without the record's arrays, if nothing else of it is kept."""
+    from impactopt.planning.strike import StrikeSolution
+
     return plain(
         solution.summary() if isinstance(solution, StrikeSolution) else _summary(solution, None, None)
     )
@@ -352,3 +365,91 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         raise InputError(f"{path} is damaged ({error}); {fix}") from error
     place = Path(os.path.normpath(path.parent.resolve() / near)) if near else None
     return Record(summary=summary, problem=problem, arrays=arrays, problem_path=place)
+
+
+FAILED = "failed"  # in a result's directory: what would have taken a good result's place
+SERIES = "blows.json"
+
+
+def keep_record(record: Record, directory: Path) -> tuple[Path, Path]:
+    """Saves a record (`save_record`); one that is not solved leaves a good one in the directory as it is.
+
+    It is in the directory's own directory `failed` then, and its summary says so in `set_aside`. A good one
+    takes the place of all that there was, a failed one that it makes up for included.
+
+    Raises
+    ------
+    InputError : they cannot be written.
+    """
+    good = _good(record.summary.get("status"))
+    place = _place(directory, good, _good(_status_in(directory)), record.summary)
+    written = save_record(record, place)
+    if good:
+        _forget(directory / FAILED, NUMBERS, SUMMARY, *DERIVED)
+    return written
+
+
+def keep_series(done: dict[str, Any], directory: Path) -> Path:
+    """The same of a series of blows, in `blows.json`: good is one whose nail is in.
+
+    done : `Series.describe`.
+
+    Raises
+    ------
+    InputError : it cannot be written.
+    """
+    place = _place(directory, done["done"], bool(_read(directory / SERIES).get("done")), done)
+    text = f"{json.dumps(plain(done), indent=2)}\n".encode()
+    place.mkdir(exist_ok=True)
+    write_file(place / SERIES, lambda file: file.write(text))
+    if done["done"]:
+        _forget(directory / FAILED, SERIES)
+    return place / SERIES
+
+
+def set_aside(summary: Mapping[str, Any]) -> str:
+    """Message about a result that has not replaced a good one; "" for others."""
+    found = summary.get("set_aside")
+    if found is None:
+        return ""
+    return (
+        f"{found['kept']} holds a good result, which is left as it is; this one came to nothing, and is in "
+        f"{found['directory']}"
+    )
+
+
+def _place(directory: Path, good: bool, held: bool, summary: dict[str, Any]) -> Path:
+    """Directory for a result; `held`: there is a good one. Its summary notes if that is another directory."""
+    if good or not held:
+        return directory
+    place = directory / FAILED
+    summary["set_aside"] = {"directory": str(place), "kept": str(directory)}
+    return place
+
+
+def _good(status: Any) -> bool:
+    """True if a record's status is that of a result to keep; a newer version's status is."""
+    known = [s.value for s in Status if not s.usable]
+    return isinstance(status, str) and status not in known
+
+
+def _status_in(directory: Path) -> Any:
+    with contextlib.suppress(InputError):
+        return load_record(directory).summary.get("status")
+    return _read(directory / SUMMARY).get("status")  # numbers of a newer version
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A file of ours; nothing where it is none."""
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        found = json.loads(read_plain(path, LARGEST))
+        return found if isinstance(found, dict) else {}
+    return {}
+
+
+def _forget(directory: Path, *names: str) -> None:
+    """Remove files of ours, and the directory if nothing else is in it."""
+    with contextlib.suppress(OSError):
+        for name in names:
+            (directory / name).unlink(missing_ok=True)
+        directory.rmdir()

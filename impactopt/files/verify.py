@@ -22,14 +22,12 @@ from numpy.typing import NDArray
 from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError
 from impactopt.files.output import LARGEST, NUMBERS, SUMMARY, Record, load_record, record_of
-from impactopt.files.replay import problem_of
-from impactopt.files.resume import program_of_record, solution_of_record
+from impactopt.files.replay import problem_of, program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.sole_margins import weight_of
+from impactopt.robots.loads import weight_of
 from impactopt.solvers.program import bound_violations, complementarity, row_violations, scaled_residual
 from impactopt.transcription.contact_refinement import contact_error
-from impactopt.transcription.program_summary import statement_of
-from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.transcription import Transcription, statement_of
 
 __all__ = ["KKT", "VIOLATION", "Verdict", "motion_of_record", "verify", "verify_record"]
 

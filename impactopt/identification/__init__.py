@@ -1,9 +1,8 @@
 """Contact laws from measured blows: least squares on the package's own collision.
 
-* log.py       a log's columns, and what is wrong with them
-* blows.py     the contacts in it, each with the samples that are fitted
-* lump.py      the collision of two masses as histories, for many numbers at once
-* fitting.py   one law's numbers, with intervals; start.py: where the search for them begins
+* log.py       a log's columns, what is wrong with them, and the contacts in it
+* fitting.py   one law's numbers, with intervals, by the collision of two masses as histories
+* start.py     where the search for them begins
 * result.py    what comes out; identify.py puts all together
 """
 

@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike
 
 from impactopt.contact.laws import LAWS, ContactLaw
 from impactopt.errors import InputError, check_number, did_you_mean
-from impactopt.identification.blows import find_blows
 from impactopt.identification.fitting import fit_law
-from impactopt.identification.log import ImpactLog, read_log
+from impactopt.identification.log import ImpactLog, find_blows, read_log
 from impactopt.identification.result import Identification
 from impactopt.identification.start import sample_law
 from impactopt.robots.robot import Robot

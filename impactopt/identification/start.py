@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw, CustomLaw
 from impactopt.errors import InputError
-from impactopt.identification.blows import Blow
+from impactopt.identification.log import Blow
 
 __all__ = ["MASS", "Free", "free_numbers", "sample_law", "starts"]
 

@@ -1,5 +1,7 @@
 """Independent coordinates of a robot whose soles are held: the base's pose and the joints outside its legs.
 
+References and distances between bodies ask for thousands of them, so what all have in common is kept.
+
 A motion that is written in these coordinates y keeps its soles where they are at *every* instant, not only at
 an optimizer's nodes: the legs follow from y by inverse kinematics, and their velocities and accelerations by
 the sole's constraint
@@ -15,24 +17,216 @@ first of a leg of seven, a waist that leads to both legs. A hand that holds on i
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
 
 from impactopt.errors import InputError
-from impactopt.kinematics.leg_closure import Closing, Limb
-from impactopt.kinematics.symbolic_elimination import Index, elimination_order, solve_in_order
 from impactopt.robots.checks import LEG, check_arms, check_legs
-from impactopt.robots.hinges import check_held
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
+from impactopt.robots.tools import check_held
+
+__all__ = [
+    "Closing",
+    "Index",
+    "Limb",
+    "StanceCoordinates",
+    "base_motion",
+    "elimination_order",
+    "solve_in_order",
+    "striker_kinematics",
+]
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+_STEPS = 50  # of Newton, at most
+_LONGEST = 0.3  # [rad] of a Newton step
+_NEAR = 1e-7  # [m, rad]: Newton's next step leaves its square, so it is the last
+_OFF = 1e-6  # [m, rad] and no more, where Newton ends without getting there
+_DAMPING = 1e-12 * np.eye(6)  # a stretched leg's Jacobian is singular
+
+
+class Limb(NamedTuple):
+    """A limb that holds a frame in its place in the world, by six joints: their columns (6,) in v."""
+
+    frame: str
+    placement: pin.SE3
+    columns: Index
+
+
+class Closing:
+    """Inverse kinematics of a stance's legs, and velocities and accelerations from the soles' constraint."""
+
+    def __init__(
+        self,
+        model: pin.Model,
+        data: pin.Data,
+        limbs: Sequence[Limb],
+        *,
+        base: int,
+        independent: Index,
+        join: Callable[[Array, Array], Array],
+    ) -> None:
+        """base : number of the base's coordinates, 6 or 0.  independent : columns in v of the other joints
+        that are coordinates.  join : q of coordinates (ny,) and legs (nl,).
+        """
+        self._model, self._data, self._base, self._join = model, data, base, join
+        self._frames = [model.getFrameId(limb.frame) for limb in limbs]
+        self._limbs = [
+            (frame, limb.placement, limb.columns, slice(6 * k, 6 * k + 6))
+            for k, (frame, limb) in enumerate(zip(self._frames, limbs, strict=True))
+        ]
+        none = np.zeros(0, dtype=np.intp)
+        self._dependent = np.concatenate([none, *(limb.columns for limb in limbs)])
+        self._independent = independent
+        of_column = {joint.idx_v: joint for joint in model.joints}
+        joints = [of_column[int(column)] for column in self._dependent]
+        turning = all(joint.nq == 1 for joint in joints)  # no joint without limits, which has two numbers
+        self._places = np.array([joint.idx_q for joint in joints], dtype=np.intp) if turning else None
+
+    def legs(self, y: Array, guess: Array) -> Array:
+        """`StanceCoordinates.solve_legs`."""
+        legs = np.array(guess, dtype=float)
+        if not self._limbs:
+            return legs
+        model, data, worst = self._model, self._data, np.inf
+        q = self._join(y, legs)
+        for _ in range(_STEPS):
+            if self._places is None:
+                q = self._join(y, legs)
+            else:
+                q[self._places] = legs
+            pin.computeJointJacobians(model, data, q)
+            worst = 0.0
+            for frame, placement, columns, own in self._limbs:
+                m = pin.updateFramePlacement(model, data, frame)
+                error = pin.log6(m.actInv(placement)).vector
+                worst = max(worst, float(np.abs(error).max()))
+                jac = pin.getFrameJacobian(model, data, frame, pin.LOCAL)[:, columns]
+                step = dgesv(jac.T @ jac + _DAMPING, jac.T @ error)[2]
+                legs[own] += np.minimum(np.maximum(step, -_LONGEST), _LONGEST)
+            if worst < _NEAR:
+                return legs
+        if worst < _OFF:
+            return legs
+        raise InputError(
+            f"the legs cannot hold the soles in place here (off by {worst:.2g} m or rad): the base is out of "
+            "the legs' reach"
+        )
+
+    def follow(self, rows: Iterable[Array], guess: Array) -> Iterator[Array]:
+        """Legs (nl,) of one row of coordinates (ny,) after the other, each near the next."""
+        before, legs = None, guess
+        for y in rows:
+            ahead = legs if before is None else 2 * legs - before
+            found = self.legs(y, ahead)
+            before, legs = None if legs is guess else legs, found
+            yield found
+
+    def jacobians(self, q: Array) -> Array:
+        """(6 a sole, nv) of the fixed soles, each in its own frame, at a pin configuration."""
+        model, data = self._model, self._data
+        pin.computeJointJacobians(model, data, q)
+        out = np.zeros((6 * len(self._frames), model.nv))
+        for k, frame in enumerate(self._frames):
+            out[6 * k : 6 * k + 6] = pin.getFrameJacobian(model, data, frame, pin.LOCAL)
+        return out
+
+    def motion(self, y: Array, yd: Array, ydd: Array, legs: Array) -> tuple[Array, Array, Array, Array]:
+        """`StanceCoordinates.complete_motion`, and the soles' Jacobians at its configuration."""
+        model, data, b = self._model, self._data, self._base
+        q = self._join(y, legs)
+        v, a = np.zeros(model.nv), np.zeros(model.nv)
+        if b:
+            v[:6], a[:6] = base_motion(y[:6], yd[:6], ydd[:6])
+        v[self._independent], a[self._independent] = yd[b:], ydd[b:]
+        jac = self.jacobians(q)
+        if self._frames:
+            block = jac[:, self._dependent]
+            v[self._dependent] = np.linalg.solve(block, -jac @ v)
+            pin.forwardKinematics(model, data, q, v, a)
+            drift = [pin.getFrameAcceleration(model, data, k, pin.LOCAL).vector for k in self._frames]
+            a[self._dependent] = np.linalg.solve(block, -np.concatenate(drift))
+        return q, v, a, jac
+
+
+def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
+    """Free-flyer velocity and acceleration (6,), in its own frame, of (p, roll, pitch, yaw) and rates.
+
+    The numeric twin of the symbolic map.
+    """
+    rotation = pin.rpy.rpyToMatrix(y[3:6])
+    jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
+    omega = jac @ yd[3:6]
+    alpha = jac @ ydd[3:6] + pin.rpy.computeRpyJacobianTimeDerivative(y[3:6], yd[3:6], pin.LOCAL) @ yd[3:6]
+    linear = rotation.T @ yd[:3]
+    # body components of a vector that turns with the base: d/dt (R' pdot) = R' pddot - omega x (R' pdot)
+    return np.concatenate([linear, omega]), np.concatenate(
+        [rotation.T @ ydd[:3] - pin.skew(omega) @ linear, alpha]
+    )
+
+
+def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:
+    """Row and column order in which Gaussian elimination needs no pivoting at any of the sample matrices.
+
+    Complete pivoting on the least of the samples' normalised magnitudes; with a fixed order the symbolic
+    elimination has no branches.
+    """
+    work = [m / np.abs(m).max() for m in matrices]
+    n = work[0].shape[0]
+    rows, cols = np.arange(n), np.arange(n)
+    for k in range(n):
+        size = np.min([np.abs(w[k:, k:]) for w in work], axis=0)
+        r, c = np.unravel_index(int(np.argmax(size)), size.shape)
+        rows[[k, k + r]], cols[[k, k + c]] = rows[[k + r, k]], cols[[k + c, k]]
+        for w in work:
+            w[[k, k + r]] = w[[k + r, k]]
+            w[:, [k, k + c]] = w[:, [k + c, k]]
+            w[k + 1 :, k:] -= np.outer(w[k + 1 :, k] / w[k, k], w[k, k:])
+    return rows, cols
+
+
+def solve_in_order(a: Any, b: Any, order: tuple[Index, Index]) -> tuple[Any, Any]:
+    """x of  a x = b  (SX, a square) by elimination in a fixed order, and the product of the pivots.
+
+    Structural zeros are skipped.
+    """
+    rows, cols = order
+    n, k_rhs = a.shape[0], b.shape[1]
+    m = [[a[int(r), int(c)] for c in cols] for r in rows]
+    y = [[b[int(r), j] for j in range(k_rhs)] for r in rows]
+    for k in range(n):
+        for i in range(k + 1, n):
+            if m[i][k].is_zero():
+                continue
+            f = m[i][k] / m[k][k]
+            for j in range(k + 1, n):
+                if not m[k][j].is_zero():
+                    m[i][j] = m[i][j] - f * m[k][j]
+            for j in range(k_rhs):
+                y[i][j] = y[i][j] - f * y[k][j]
+    x = ca.SX(n, k_rhs)
+    for j in range(k_rhs):
+        back: list[Any] = [None] * n
+        for i in range(n - 1, -1, -1):
+            s = y[i][j]
+            for c in range(i + 1, n):
+                if not m[i][c].is_zero():
+                    s = s - m[i][c] * back[c]
+            back[i] = s / m[i][i]
+            x[int(cols[i]), j] = back[i]
+    pivots = m[0][0]
+    for k in range(1, n):
+        pivots = pivots * m[k][k]
+    return x, pivots
 
 
 @dataclass(frozen=True)
@@ -356,3 +550,14 @@ class StanceCoordinates:
         """pin q, v, a of independent coordinates and rates; the legs' part is from the soles' constraint."""
         q, v, a, _ = self.closing.motion(y, yd, ydd, legs)
         return q, v, a
+
+
+def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
+    """CasADi function (q, v, a) -> point [m], velocity [m/s], acceleration [m/s^2] of the striking point.
+
+    World axes.
+    """
+    rb, frame = c.rb, f"striker:{striker}"
+    _, point = rb.frame(frame)
+    outs = [point, rb.frame_velocity(frame, rb.v)[:3], rb.frame_acceleration(frame, rb.v, rb.a)[:3]]
+    return ca.Function("striker", [rb.q, rb.v, rb.a], outs)

@@ -1,7 +1,7 @@
-"""Effective mass, mobility and coasting torque of a constrained robot's striking point.
+"""Striking point of a constrained robot: place, effective mass, mobility, coasting torque; wrenches at rest.
 
 In numbers for one configuration, by Pinocchio and least squares. For many of them, and for gradients,
-there are compiled graphs, `impactopt.collision.effective_mass` and `impactopt.collision.striking`; tests
+there are compiled graphs, `impactopt.collision.effective_mass` and `impactopt.collide.contact_states`; tests
 hold them to this.
 """
 
@@ -15,12 +15,40 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import MOST, InputError, check_array
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.robot import Robot
 
-__all__ = ["Held", "holding_torque", "striking_velocity"]
+__all__ = ["Held", "across", "holding_torque", "static_wrenches", "striking_point", "striking_velocity"]
 
 Array = NDArray[np.float64]
+
+
+def across(direction: Array) -> Array:
+    """(2, 3) rows: two unit vectors at right angles to a direction (3,) and to each other."""
+    return np.asarray(np.linalg.svd(direction.reshape(1, 3))[2][1:])
+
+
+def striking_point(robot: Robot, striker: str, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Its place (3,) [m] in the world, at a configuration (nq,)."""
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return np.array(data.oMf[model.getFrameId(robot.striker(striker).model_frame)].translation)
+
+
+def static_wrenches(c: StanceCoordinates, y: Array, legs: Array) -> Array:
+    """Sole wrenches (6 a sole) of least norm that carry the robot at rest. Hands and hinges bear nothing."""
+    if not c.legs:
+        return np.zeros(0)
+    model, data = c.model, c.model.createData()
+    q = c.join(y, legs)
+    tau = np.array(pin.computeGeneralizedGravity(model, data, q))
+    jac = c.sole_jacobians(q)[0][: 6 * len(c.soles), c.undriven]
+    lever = np.array([1, 1, 1, 10, 10, 10] * len(c.soles))  # moments cost more: keep the CoP in the sole
+    found = np.linalg.lstsq(jac.T / lever, tau[c.undriven], rcond=None)[0] / lever
+    return np.concatenate([found, np.zeros(6 * len(c.hands))])
+
+
 _DEPENDENT = 1e-12  # of the largest: a robot of few joints has rows that depend on each other
 
 

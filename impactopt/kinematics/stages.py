@@ -11,8 +11,7 @@ from typing import Any
 
 import casadi as ca
 
-from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.symbolic_elimination import Index, solve_in_order
+from impactopt.kinematics.coordinates import Index, StanceCoordinates, solve_in_order
 
 __all__ = ["Stage", "motion_in_stages", "velocity_in_stages"]
 

@@ -1,16 +1,100 @@
-"""Support polygon and ZMP of soles on level ground."""
+"""Support of soles on level ground: polygon, ZMP, contact wrench cone.
+
+A wrench (f, m) at the sole's frame can be transmitted by unilateral frictional forces at the corners if and
+only if it lies in the cone spanned by them; CoP, friction and yaw torsion are bounded *together* (torsion
+capacity vanishes as the CoP nears a corner). Source: Caron, Pham, Nakamura, "Stability of surface contacts
+for humanoid robots", ICRA 2015, whose closed form for a rectangle the tests compare with.
+"""
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import ConvexHull, QhullError
 
-from impactopt.kinematics.wrench_cone import inward_edges
+from impactopt.errors import InputError
 
 Array = NDArray[np.float64]
+_ON_LINE = 1e-9  # [m] corners nearer to a line than this lie on it
+
+
+def inward_edges(polygon: Array) -> tuple[Array, Array]:
+    """Inward unit normals (k, 2), offsets (k,) [m] of a counter-clockwise polygon; inside, n.p >= offset."""
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    return inward, np.einsum("ij,ij->i", inward, polygon)
+
+
+def shrink(polygon: ArrayLike, margin: float) -> Array:
+    """The convex polygon (k, 2) [m], counter-clockwise, with every edge moved inwards by ``margin`` [m]."""
+    p = np.array(polygon, dtype=float)
+    if margin == 0.0:
+        return p
+    inward, offset = inward_edges(p)
+    for normal, least in zip(
+        inward, offset + margin, strict=True
+    ):  # an edge shorter than the margin may vanish
+        p = _clip(p, p @ normal - least)
+    if len(p) < 3:
+        raise InputError(
+            f"a margin of {margin:g} m leaves nothing of the sole: make it smaller than half the sole's width"
+        )
+    return p
+
+
+def _clip(corners: Array, inside: Array) -> Array:
+    """Part of a convex polygon where the signed distances ``inside`` [m] of its corners are positive."""
+    out: list[Array] = []
+    for k in range(len(corners)):
+        a, b = inside[k - 1], inside[k]
+        if min(a, b) < -_ON_LINE and max(a, b) > _ON_LINE:  # the edge that ends here is cut
+            out.append(corners[k - 1] + a / (a - b) * (corners[k] - corners[k - 1]))
+        if b >= -_ON_LINE:
+            out.append(corners[k])
+    return np.array(out) if len(out) > 2 and max(inside) > _ON_LINE else np.zeros((0, 2))
+
+
+def contact_wrench_cone(polygon: ArrayLike, friction: float, *, margin: float = 0.0) -> Array:
+    """Rows F (k, 6) with  F @ (f, m) >= 0  exactly for the wrenches that the sole can transmit.
+
+    polygon (c, 2) [m]: corners in the sole's frame, counter-clockwise; friction: coefficient of the pyramid
+    inscribed along the sole's axes (|f_x|, |f_y| <= mu f_z); margin [m]: how far the CoP stays inside. Rows
+    are scaled so that a unit normal force at the middle gives values of the order of one (forces [N], moments
+    [N m]).
+    """
+    if not friction > 0:
+        raise InputError(f"friction must be positive, not {friction}")
+    corners = shrink(polygon, margin)
+    return _facets(tuple(map(tuple, corners.tolist())), float(friction)).copy()
+
+
+@functools.lru_cache(maxsize=64)  # asked for at every node of a program, for the same few soles
+def _facets(corners: tuple[tuple[float, float], ...], friction: float) -> Array:
+    rays = []
+    for x, y in corners:
+        for fx, fy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            f = np.array([friction * fx, friction * fy, 1.0])
+            rays.append(np.concatenate([f, np.cross([x, y, 0.0], f)]))
+    r = np.array(rays)
+    # every ray has f_z = 1, so the cone is the one over the 5-dimensional polytope of the other components
+    size = np.maximum(np.abs(np.delete(r, 2, axis=1)).max(axis=0), _ON_LINE)
+    points = np.delete(r, 2, axis=1) / size
+    try:
+        hull = ConvexHull(points)
+    except QhullError as error:  # pragma: no cover - degenerate polygons are refused by Sole
+        raise InputError(
+            "the sole's polygon is degenerate: give at least three corners that span an area"
+        ) from error
+    facets = np.unique(np.round(hull.equations, 10), axis=0)  # one simplex per row: coplanar ones coincide
+    rows = np.zeros((len(facets), 6))
+    rows[:, [0, 1, 3, 4, 5]] = -facets[:, :5] / size
+    rows[:, 2] = -facets[:, 5]
+    return rows
+
+
 MERGED = 1e-6  # [m] a corner nearer than this to the line of its neighbours is no corner
 
 

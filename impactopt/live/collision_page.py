@@ -16,9 +16,8 @@ from impactopt.collision import SDC, Collision
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.support import margin, support_polygon
-from impactopt.live.drawing import Drawing
-from impactopt.live.latest_request import LatestRequest
-from impactopt.live.motion import Moment
+from impactopt.live.drawing import Drawing, Moment
+from impactopt.live.requests import LatestRequest
 from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.problem.problem import ImpactProblem
 

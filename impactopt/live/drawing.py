@@ -1,25 +1,71 @@
-"""The 3D scene of a live look: robot, world, force, ZMP and the hand's path, drawn by viser."""
+"""The 3D scene of a live page, drawn by viser: robot, world, force, ZMP, the hand's path, the motion."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from impactopt.bodies.scene_visuals import Part, surroundings_of
-from impactopt.bodies.shapes import face_axes
 from impactopt.bodies.solids import cylinder
-from impactopt.live.motion import Moment
+from impactopt.bodies.visuals import Part, surroundings_of
+from impactopt.bodies.world import face_axes
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.stage import bodies_drawn
 from impactopt.report.tracks import Track
 from impactopt.robots.robot import Robot
 
-__all__ = ["Drawing"]
+__all__ = ["Drawing", "Moment", "moment_of"]
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Moment:
+    """An instant of a :class:`~impactopt.report.tracks.Track`: the same numbers at one time.
+
+    place (joints, 3) [m], turn (joints, 4): of the joints in the world, quaternions w, x, y, z.
+    """
+
+    time: float
+    place: Array
+    turn: Array
+    hand: Array
+    mass: Array
+    force: float
+    travel: float
+    zmp: Array
+
+
+def moment_of(track: Track, time: float) -> Moment:
+    """State at a time [s], clipped to the track's ends; right of a jump."""
+    at = float(np.clip(time, track.time[0], track.time[-1]))
+    after = min(int(np.searchsorted(track.time, at, side="right")), len(track.time) - 1)
+    before = max(after - 1, 0)
+    span = float(track.time[after] - track.time[before])
+    share = (at - float(track.time[before])) / span if span > 0 else 1.0
+
+    def between(values: Array) -> Array:
+        return np.asarray((1 - share) * values[before] + share * values[after])
+
+    one, other = track.places[before, :, 3:], track.places[after, :, 3:]
+    same = np.where((one * other).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)  # of two signs, one is far
+    turn = (1 - share) * one + share * same * other
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    return Moment(
+        time=at,
+        place=between(track.places[:, :, :3]),
+        turn=turn[:, [3, 0, 1, 2]],
+        hand=between(track.hand),
+        mass=between(track.mass),
+        force=float(between(track.force)),
+        travel=float(between(track.travel)),
+        zmp=between(track.zmp),
+    )
+
+
 RED, BLUE, GREEN, WOOD, GREY = (214, 69, 65), (31, 119, 180), (44, 160, 44), (201, 160, 106), (150, 155, 160)
 LONGEST = 0.4  # [m] arrow of the largest force
 MARK = 0.05, 0.01  # [m] radius and thickness of the mark where no body of the target is known

@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.live.drawing import Drawing
-from impactopt.live.latest_request import LatestRequest
-from impactopt.live.motion import moment_of
+from impactopt.live.drawing import Drawing, moment_of
 from impactopt.live.replanning import Answer, Replanning
-from impactopt.live.requests import PlanRequest, numbers_of, request_of
+from impactopt.live.requests import LatestRequest, PlanRequest, numbers_of, request_of
 from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.planning.solution import Solution
 from impactopt.report.tracks import Track

@@ -13,6 +13,7 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.live.requests import PlanRequest
 from impactopt.planning.parameter_changes import moved_problem
+from impactopt.planning.replanning import moved_solution
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.report.tracks import Track, planned_track
@@ -47,7 +48,7 @@ class Answer:
 class Replanning:
     """Plans for requests, from a first plan.
 
-    The first plan is bent (`Solution.moved`): one setting of the sliders then gives one plan, whatever came
+    The first plan is bent (`moved_solution`): one setting of the sliders then gives one plan, whatever came
     before. Where that fails, the request is solved from the last plan that there was, which may be nearer.
     """
 
@@ -57,7 +58,7 @@ class Replanning:
         with contextlib.suppress(
             InputError
         ):  # what that needs is made now, and not when the first slider moves
-            first.moved(point=first.problem.point, options=_LOOSE)
+            moved_solution(first, point=first.problem.point, options=_LOOSE)
 
     def __call__(self, request: PlanRequest, stale: Callable[[], bool]) -> Answer:
         began = time.perf_counter()
@@ -84,7 +85,7 @@ class Replanning:
 
         common: dict[str, Any] = {"callback": stop, "time_limit": self.patience, "options": _LOOSE}
         try:
-            bent = self.first.moved(**changes, **common)
+            bent = moved_solution(self.first, **changes, **common)
         except InputError:  # its program has other constraints, or there is no such problem
             bent = None
         if bent is not None and (bent.status.usable or stale()):

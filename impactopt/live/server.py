@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from impactopt.errors import InputError, missing_package
-from impactopt.live.latest_request import LatestRequest
+from impactopt.live.requests import LatestRequest
 
 __all__ = ["LOCAL", "LivePage", "served"]
 

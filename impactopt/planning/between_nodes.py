@@ -8,14 +8,12 @@ from dataclasses import replace
 
 from impactopt.errors import InputError
 from impactopt.planning.budget import Budget, touching, with_effort_of
-from impactopt.planning.clearance_constraints import Margins, solved_apart
-from impactopt.planning.clearance_violations import clearance_violations
+from impactopt.planning.clearance_constraints import Margins, clearance_violations, solved_apart
 from impactopt.planning.contact_replay import AGREED, REFUTED
 from impactopt.planning.refinement import Additions, Guess, Outcome, program_for, refine, start_of
 from impactopt.transcription.contact_refinement import ASKED, all_halved, refined_elements
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.mesh import Elements, contact_elements
-from impactopt.transcription.mesh_refinement import nodes_to_add
+from impactopt.transcription.mesh import Elements, contact_elements, nodes_to_add
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["BetweenNodes"]

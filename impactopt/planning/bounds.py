@@ -30,7 +30,7 @@ from impactopt.problem.terms import (
 )
 from impactopt.solvers.program import row_violations
 from impactopt.solvers.relaxed import Relaxation
-from impactopt.transcription.constraints import Row
+from impactopt.transcription.layout import Row
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["MET", "USUAL", "Bound", "Cause", "bounds_of", "changed_or_none"]

@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.options import OPTIONS
 from impactopt.solvers.program import Callback, IterationRecord, NonlinearProgram, SolverResult, Status
 from impactopt.solvers.run import Path, Watch
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
 
 Array = NDArray[np.float64]
-SOLVERS = ("sqp", "ipopt")
+SOLVERS = (*OPTIONS, "ipopt")
 EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 VIOLATED = 1e-4  # larger violations are named; an iterate without any is a solution, if not an optimum
 _PUSH = 1e-6  # into its bounds, of a start that is to stay where it is
@@ -101,15 +103,15 @@ class Budget:
             return
         if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):
             raise InputError(f"options are those of the solver by name, not {self.options!r}")
-        if self.solver == "sqp":
-            known = [f.name for f in fields(SQPOptions)]
+        if kind := OPTIONS.get(self.solver):
+            known = [f.name for f in fields(kind)]
             for name in self.options:
                 if name not in known:
                     raise InputError(
-                        f"the solver 'sqp' has no option {name!r}{did_you_mean(name, known)}; it has "
-                        f"{', '.join(known)}"
+                        f"the solver {self.solver!r} has no option {name!r}{did_you_mean(name, known)}; it "
+                        f"has {', '.join(known)}"
                     )
-            SQPOptions(**self.options)
+            kind(**self.options)
 
     def started(self) -> Budget:
         """The same with all its time, which begins now; from here on an iterate is kept if it is stopped."""
@@ -120,14 +122,12 @@ class Budget:
         """The same, whose solver hardly moves a start off its bounds: it is a solution, or next to one, and
         what is moved may come to another.
         """
-        return (
-            replace(self, options={"push": _PUSH, **(self.options or {})}) if self.solver == "sqp" else self
-        )
+        return replace(self, options={"push": _PUSH, **(self.options or {})}) if self.interior else self
 
     @property
     def interior(self) -> bool:
         """True if the solver is the interior-point method."""
-        return self.solver == "sqp" and (self.options or {}).get("qp_solver", "interior") == "interior"
+        return self.solver == "ipm"
 
     @property
     def left(self) -> float | None:
@@ -160,10 +160,10 @@ class Budget:
     ) -> SolverResult:
         """Let the solver work on a program in the time that is left.
 
-        start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
-        barrier : the first of "sqp" from a result, where that is not as near as it looks.
-        most : iterations of "sqp", if the options do not say how many.
-        watch, path : as of `solve_sqp`, of the interior-point method.
+        start : variables (n,); or a neighbouring program's result, whose multipliers our solvers take too.
+        barrier : the first of "ipm" from a result, where that is not as near as it looks.
+        most : iterations of our solvers, if the options do not say how many.
+        watch, path : as of `solve_ipm`.
         """
         left, y, z = None if self.stop.asked else self.left, None, None
         if isinstance(start, SolverResult):
@@ -175,20 +175,14 @@ class Budget:
         settings = dict(self.options or {})
         if most is not None:
             settings.setdefault("max_iterations", most)
-        if barrier is not None and z is not None:
-            settings.setdefault("barrier_warm", barrier)
         if left is not None:
             settings["time_limit"] = max(left, 1e-9)
-        return solve_sqp(
-            program,
-            x0,
-            options=SQPOptions(**settings),
-            callback=self._told,
-            multipliers=y,
-            bound_multipliers=z,
-            watch=watch if self.interior else None,
-            path=path,
-        )
+        common: dict[str, Any] = {"callback": self._told, "multipliers": y, "bound_multipliers": z}
+        if not self.interior:
+            return solve_sqp(program, x0, options=SQPOptions(**settings), **common)
+        if barrier is not None and z is not None:
+            settings.setdefault("barrier_warm", barrier)
+        return solve_ipm(program, x0, options=IPMOptions(**settings), watch=watch, path=path, **common)
 
 
 def rank_of(result: SolverResult) -> tuple[bool, float]:

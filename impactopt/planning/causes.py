@@ -22,10 +22,10 @@ from impactopt.planning.budget import Budget
 from impactopt.planning.lazy_constraints import with_rows
 from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import program_for
-from impactopt.problem.phase import LONGEST, SHORTEST, Phase
+from impactopt.problem.scenario import LONGEST, SHORTEST, Phase
+from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.program import NonlinearProgram, SolverResult, max_violation
 from impactopt.solvers.relaxed import RelaxedProgram
-from impactopt.solvers.sqp import SQPOptions, solve_sqp
 from impactopt.transcription.initial_guess import carried_over, first_iterate
 from impactopt.transcription.transcription import Transcription
 
@@ -169,14 +169,14 @@ class _Relaxing:
         most, left = min(most, self._iterations), self._budget.left
         if not most or left == 0:
             return None
-        options = SQPOptions(
+        options = IPMOptions(
             max_iterations=most,
             time_limit=left,
             kkt_tolerance=_ROUGH,
             complementarity_tolerance=_ROUGH,
             **more,
         )
-        result = solve_sqp(program, start, options=options, callback=lambda _: self._budget.stop.asked)
+        result = solve_ipm(program, start, options=options, callback=lambda _: self._budget.stop.asked)
         self._iterations -= min(result.iterations, self._iterations)
         return result if result.status.usable else None
 

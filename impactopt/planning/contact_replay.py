@@ -16,18 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.frozen_models import frozen_model
+from impactopt.collision.sdc import frozen_model
 from impactopt.errors import InputError
 from impactopt.planning.budget import VIOLATED
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.cases import errors_against
+from impactopt.simulation.engines import scene_of
 from impactopt.simulation.pinocchio_engine import Followed, follow_contact
 from impactopt.simulation.reference.coasting import coasting_reference, independent_rates
-from impactopt.simulation.scene import scene_of
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.contact_program import ContactProgram
-from impactopt.transcription.plan import Plan, Trajectory
-from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.plan import Plan, PlannedStrike, Trajectory
 
 __all__ = [
     "AGREED",

@@ -14,7 +14,7 @@ from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.causes import Cause
 from impactopt.planning.solution import Solution
 from impactopt.problem.feasibility import too_weak
-from impactopt.robots.sole_margins import shortfalls
+from impactopt.robots.loads import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import Parting, fastest, parting
@@ -25,13 +25,13 @@ TOLD = 3  # margins at most, in a message
 
 
 def second_look(budget: Budget, program: NonlinearProgram, start: Array, old: SolverResult) -> SolverResult:
-    """The result that IPOPT comes to from the same start, where the SQP gave up, if it says more.
+    """The result that IPOPT comes to from the same start, where ours gave up, if it says more.
 
     It scales constraints, and restores them by another way, so it rarely fails on the same programs. A limit
     that the caller has set is an answer, and stays one.
     """
     open_end = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
-    if budget.solver != "sqp" or not open_end or budget.left == 0:
+    if budget.solver == "ipopt" or not open_end or budget.left == 0:
         return old
     rows = max_violation(program, old.x, program.constraints(old.x))
     if old.status is Status.FAILED and rows <= VIOLATED < old.max_violation:

@@ -19,16 +19,15 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from impactopt.errors import InputError
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import quintic
-from impactopt.kinematics.statics import static_wrenches
-from impactopt.kinematics.wrench_cone import contact_wrench_cone
+from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
-from impactopt.robots.hinges import inside
+from impactopt.robots.tools import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.transcription.initial_guess import strike_rates
-from impactopt.transcription.plan import Trajectory
-from impactopt.transcription.reference import complete_reference
+from impactopt.transcription.plan import Trajectory, complete_reference
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,7 @@ from impactopt.planning.refinement import Outcome
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription.contact_refinement import ContactError
-from impactopt.transcription.mesh import Elements, Shares
-from impactopt.transcription.mesh_refinement import MoreNodes
+from impactopt.transcription.mesh import Elements, MoreNodes, Shares
 from impactopt.transcription.transcription import Transcription, block_functions
 
 __all__ = ["program_of", "program_on", "solution_of"]

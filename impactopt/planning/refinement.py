@@ -23,8 +23,7 @@ from impactopt.transcription.clearance import ApartRow, Held
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import ContactError, contact_error
 from impactopt.transcription.initial_guess import carried_over
-from impactopt.transcription.mesh import Elements, Shares
-from impactopt.transcription.mesh_refinement import MoreNodes
+from impactopt.transcription.mesh import Elements, MoreNodes, Shares
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 

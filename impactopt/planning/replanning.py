@@ -1,33 +1,267 @@
-"""Plans bent for other parameters of their problem: first by the KKT system of the plan, then by the
-solver.
-"""
+"""Re-planning for other parameters, by the KKT system of a plan and then by the solver; sensitivities."""
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
+from impactopt.errors import InputError
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget, one_after_the_other
-from impactopt.planning.clearance_constraints import Margins
+from impactopt.planning.clearance_constraints import Margins, same_bodies
 from impactopt.planning.lazy_constraints import LazyTerms
-from impactopt.planning.parameter_changes import moved_problem
-from impactopt.planning.parametric_program import Bent, bent_of
-from impactopt.planning.reconstruction import solution_of
+from impactopt.planning.parameter_changes import Parameter, changed, moved_problem, parameter_of
+from impactopt.planning.reconstruction import program_on, solution_of
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.refinement import refine as refine_with
 from impactopt.planning.solution import Solution
-from impactopt.solvers.active import Change
-from impactopt.solvers.predictor import Prediction
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.options import with_todays_name
+from impactopt.solvers.predictor import ActiveSystem, Change, Offset, Prediction, Predictor
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
-from impactopt.transcription.program_summary import statement_of
-from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.transcription import Transcription, statement_of
 
-__all__ = ["moved_solution"]
+__all__ = ["Bent", "Binding", "Sensitivity", "bent_of", "moved_solution", "sensitivity_of"]
+
+_MORE, _ASIDE = 1.01, 1e-3  # of law and target; [m]
+_PROXIMAL = 1e-2  # [N s] beside the objective's curvature, per square of a variable of order one
+
+
+class Bent:
+    """A solution's own program, and its KKT system, factored once."""
+
+    def __init__(self, solution: Solution) -> None:
+        self.solution = solution
+        self.program = self._built(solution.problem)
+        self._moving = self._follows()
+
+    def program_for(
+        self,
+        problem: ImpactProblem,
+        report: Callable[[str], None] | None = None,
+        *,
+        anew: bool = True,
+    ) -> Transcription:
+        """The solution's program with the numbers of another problem: the same variables and constraints.
+
+        Where point, contact law and target alone are others it is good until the next one is asked for.
+        anew : as of `ContactProgram.move_to`.
+
+        Raises
+        ------
+        InputError : they are others.
+        """
+        if self._moving is not None and _alike(problem, self.solution.problem):
+            self._moving.move_to(problem, anew=anew)
+            return self._moving
+        return self._built(problem, report)
+
+    def _follows(self) -> Transcription | None:
+        """A program that follows the problem; None if parts of it do not, such as a term of someone's own."""
+        problem = self.solution.problem
+        try:
+            t = self._built(_beside(problem))
+        except InputError:
+            return None
+        t.move_to(problem)
+        return t if t.program.same_numbers(self.program.program) else None
+
+    def _built(self, problem: ImpactProblem, report: Callable[[str], None] | None = None) -> Transcription:
+        s = self.solution
+        t = program_on(problem, s.nodes, s.elements, s.shares, report)
+        if s.apart:
+            if not same_bodies(problem, s.problem):
+                raise InputError("the world has other bodies then: use solve(problem, start=solution)")
+            t = t.with_apart(s.apart)
+        if (t.program.n, t.program.m) != (len(s.result.x), len(s.result.multipliers)):
+            raise InputError("the program has other constraints then: use solve(problem, start=solution)")
+        return t
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        r = self.solution.result
+        return Predictor(self.program.program, r.x, r.multipliers, r.bound_multipliers)
+
+    @cached_property
+    def system(self) -> ActiveSystem:
+        r = self.solution.result
+        return ActiveSystem(self.program.program, r.x, r.multipliers, r.bound_multipliers)
+
+    @cached_property
+    def steady(self) -> tuple[ActiveSystem, Offset]:
+        """The same for steps that are not small, and leave alone what hardly matters; and what the solver has
+        left, which is no part of what a change does.
+        """
+        r = self.solution.result
+        common = r.x, r.multipliers, r.bound_multipliers
+        system = ActiveSystem(self.program.program, *common, proximal=_PROXIMAL)
+        return system, system.offset(self.program.program)
+
+
+def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
+    """True if the programs of the two problems differ in bounds, constants and parameters only."""
+    changing = {"point", "law", "target", "name"}
+    pairs = [
+        (getattr(problem, f.name), getattr(other, f.name)) for f in fields(problem) if f.name not in changing
+    ]
+    same = all(
+        one is two or (np.array_equal(one, two) if isinstance(one, np.ndarray) else one == two)
+        for one, two in pairs
+    )
+    kinds = type(problem.law) is type(other.law) and type(problem.target) is type(other.target)
+    kinds = kinds and problem.target.speed_before() == other.target.speed_before()
+    return same and kinds and (not problem.keeps_apart or same_bodies(problem, other))
+
+
+def _beside(problem: ImpactProblem) -> ImpactProblem:
+    """A problem with a point, law and target that are a little others."""
+    law, target = (
+        type(part)(**{name: _MORE * value for name, value in part.parameters.items()})
+        for part in (problem.law, problem.target)
+    )
+    with contextlib.suppress(InputError):  # an arm in a plane reaches no point beside it
+        return changed(problem, law=law, target=target, point=problem.point + _ASIDE)
+    return changed(problem, law=law, target=target, point=problem.point + _ASIDE * problem.normal)
+
+
+_known: WeakKeyDictionary[Solution, Bent] = WeakKeyDictionary()
+
+
+def bent_of(solution: Solution) -> Bent:
+    if not solution.status.usable:
+        raise InputError(
+            f"this plan is no solution ({solution.status.value}): it has no sensitivities; solve it first"
+        )
+    if solution not in _known:
+        _known[solution] = Bent(solution)
+    return _known[solution]
+
+
+Array = NDArray[np.float64]
+# of a parameter's size: half of a difference. The least durations of a contact's phases come from a point
+# mass's blow, whose integration leaves 1e-6 of them: a smaller step would see that
+_STEP = 1e-2
+_SMALL = 1e-6  # a shadow price that is nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Binding:
+    """A constraint that a plan is at, and its shadow price: what the objective gains by its bound, per unit.
+
+    row : as messages name it.  price : [objective's unit / unit]; ``unit`` of what the bound is moved by.
+    """
+
+    row: str
+    price: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.row}: {self.price:.3g} per {self.unit}"
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Sensitivity:
+    """First-order sensitivity of a plan to a parameter of its problem.
+
+    parameter, value : its name and value.  impulse : d impulse / d parameter [N s / unit].
+    objective : d (weighted sum of the objectives, less the prices on motion) / d parameter.
+    binding : constraints and bounds that the plan is at, dearest first.
+    """
+
+    parameter: str
+    value: float
+    impulse: float
+    objective: float
+    binding: tuple[Binding, ...]
+
+    def __repr__(self) -> str:
+        return f"<Sensitivity to {self.parameter}: {self.impulse:.4g} N s per unit>"
+
+
+def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
+    """Sensitivity of impulse and objective to a parameter, and the active constraints:
+    `Solution.sensitivity`.
+
+    Derivatives of the program by the parameter are central differences at the solution; the solution's own
+    follow from the KKT system.
+    """
+    bent = bent_of(solution)
+    number, x = parameter_of(solution.problem, parameter), solution.result.x
+    whole, half = (_slope(bent, number, _STEP * number.typical / k) for k in (1, 2))
+    offset, impulse, objective = (_extrapolated(*pair) for pair in zip(whole, half, strict=True))
+    n, m = len(x), len(solution.result.multipliers)
+    # implicit function theorem: the KKT matrix times dz/dp is minus the slope of the KKT residual at fixed z
+    change = bent.system.step(Offset(dual=offset[:n], rows=offset[n : n + m], variables=offset[n + m :]))
+    # impulse and objective may depend on the number at the same motion too
+    program = bent.program
+    slope = float(impulse) + _along(program.impulse, x, change.x)
+    cost_slope = float(objective) + float(program.program.gradient(x) @ change.x)
+    return Sensitivity(
+        parameter=parameter,
+        value=number.value,
+        impulse=slope,
+        objective=-cost_slope,
+        binding=_binding(bent),
+    )
+
+
+def _slope(bent: Bent, number: Parameter, half: float) -> tuple[Array, Array, Array]:
+    """Central differences by a number at the solution: of KKT conditions, impulse and what is minimized."""
+    x, sides = bent.solution.result.x, []
+    for value in (number.value + half, number.value - half):
+        t = bent.program_for(number.at(value))
+        off = bent.system.offset(t.program)
+        parts = np.concatenate([getattr(off, name) for name in Offset.PARTS])
+        sides.append((parts, np.array(t.impulse(x)), np.array(t.program.objective(x))))
+    parts, impulse, objective = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))
+    return parts, impulse, objective
+
+
+def _extrapolated(whole: Array, half: Array) -> Array:
+    """Richardson extrapolation of central differences with a step and its half."""
+    # both errors are even in the step: four times the half's less the whole's leaves those of fourth order
+    return (4 * half - whole) / 3
+
+
+def _along(function: Callable[[Array], float], x: Array, d: Array) -> float:
+    """Derivative of a smooth function along d, by central differences."""
+    size = float(np.abs(d).max(initial=0.0))
+    if not size:
+        return 0.0
+    h = 1e-4 / size
+    return (function(x + h * d) - function(x - h * d)) / (2 * h)
+
+
+def _binding(bent: Bent) -> tuple[Binding, ...]:
+    """Inequalities and bounds that hold with a price, dearest first."""
+    t, system = bent.program, bent.system
+    program, out = t.program, list[Binding]()
+    unequal = program.g_lower < program.g_upper
+    for i in np.flatnonzero(system.rows * unequal):
+        price, origin = abs(float(system.y[i])), t.rows.origins[int(i)]
+        measure = origin.measure
+        unit, factor = ("1", 1.0) if measure is None else (measure.unit, measure.factor)
+        if measure is not None and measure.over is not None:
+            factor /= max(float(measure.over.evaluate(system.x)[0]), measure.least)
+        if price > _SMALL:
+            out.append(Binding(row=origin.told(system.x, 0.0)[0], price=price / factor, unit=unit))
+    moves = program.x_lower < program.x_upper
+    for j in np.flatnonzero(system.bounds * moves):
+        price = abs(float(system.z[j]))
+        if price > _SMALL:
+            group = next(g for g in t.layout.groups.values() if g.offset <= j < g.offset + g.count * g.size)
+            scale = float(group.scale[(int(j) - group.offset) % group.size])
+            out.append(Binding(row=f"bound of {t.layout.name(int(j))}", price=price / scale, unit="SI unit"))
+    return tuple(sorted(out, key=lambda binding: -binding.price))
+
 
 _FIRST_ORDER = 1e-3  # of constraints: a first-order plan that is off by more is none
 _ENOUGH, _CORRECTIONS = 1e-4, 4  # of constraints: no more steps; and so many at most beside the first
@@ -57,7 +291,8 @@ def moved_solution(
     began = time.perf_counter()
     t = bent.program_for(problem, anew=polish)
     built = time.perf_counter()
-    budget = Budget(solver="sqp", options=options, time_limit=time_limit, callback=callback).started()
+    solver, options = with_todays_name("ipm", options)
+    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback).started()
     first = _first_order(solution, t, bent)
     if not polish:
         return _solution(solution, Outcome.of(t, first), (built - began, time.perf_counter() - built))

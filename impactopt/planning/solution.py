@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
-from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,21 +15,17 @@ from numpy.typing import NDArray
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.planning.causes import Cause
-from impactopt.planning.cautions import gear_caution, slide, slide_caution
 from impactopt.planning.contact_replay import AGREED, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
-from impactopt.planning.lazy_constraints import rows_on_demand
+from impactopt.planning.lazy_constraints import gear_caution, rows_on_demand, slide, slide_caution
 from impactopt.planning.refinement import Attempt
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.actuator_loads import DriveLoads
+from impactopt.robots.loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_refinement import ContactError
-from impactopt.transcription.mesh import Elements, Shares, contact_elements
-from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
+from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares, contact_elements
 from impactopt.transcription.motion_measures import first_touch, motion_measures
-from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
-from impactopt.transcription.planned_loads import motion_loads
-from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, Trajectory, motion_loads
 
 Array = NDArray[np.float64]
 
@@ -134,7 +128,7 @@ class Solution(Solved):
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
-    statement : names of the program's variables and constraints, as `impactopt.transcription.program_summary`
+    statement : names of the program's variables and constraints, as `impactopt.transcription.transcription`
     writes them.
     causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
         cheapest first. Each has the ``problem`` with that value. Empty where none is known to.
@@ -212,91 +206,6 @@ class Solution(Solved):
 
         options.setdefault("missed", self._missed)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
-
-    def moved(self, *, polish: bool = True, **changes: Any) -> Solution:
-        """The plan bent for another ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` or
-        ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
-
-        First come quadratic programs about this plan, which find constraints that begin and cease to hold;
-        then the solver goes on from there, with this plan's mesh, and with new constraints where bodies come
-        into each other that have none. ``polish=False``: the first alone. They are quick
-        and within a thousandth of the constraints where status says "acceptable"; other plans of theirs are
-        none. ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and
-        ``time_limit`` are those of `impactopt.solve`.
-
-        Raises
-        ------
-        InputError : this is no solution; nothing is changed, or what target and law do not have; the program
-            has other constraints or bodies then.
-        """
-        # by the public name: what solves comes after solutions in the order of imports
-        from impactopt import moved_solution
-
-        found: Solution = moved_solution(self, polish=polish, **changes)
-        return found
-
-    def sensitivity(self, parameter: str) -> Any:
-        """Derivatives of impulse and objective by a parameter of the problem, such as ``"target.mass"``,
-        ``"contact.stiffness"``, ``"point.x"`` or ``"terms.torque_limit.fraction"``, and the active
-        constraints with their shadow prices: a :class:`impactopt.planning.sensitivity.Sensitivity`.
-
-        Raises
-        ------
-        InputError : there is no such number; this is no solution, or its KKT system is singular.
-        """
-        from impactopt import sensitivity_of
-
-        return sensitivity_of(self, parameter)
-
-    def animate(self, *, simulation: Any | None = None, replay: Any | None = None) -> Any:
-        """The motion in 3D, in a notebook or as a file: ``solution.animate().save("punch.html")``.
-
-        simulation, replay : as of :func:`impactopt.animate`.
-        """
-        # by the public name: pages come after solutions in the order of imports
-        from impactopt import animate
-
-        return animate(self, simulation=simulation, replay=replay)
-
-    def report(
-        self, path: str | PathLike[str], *, simulation: Any | None = None, replay: Any | None = None
-    ) -> Path:
-        """Write the page of `impactopt show`; simulation, replay : as of :func:`impactopt.animate`.
-
-        Raises
-        ------
-        InputError : it cannot be written, or its name does not end in .html.
-        """
-        from impactopt import report_page
-
-        return Path(report_page(self, simulation=simulation, replay=replay).save(path))
-
-    def plot(
-        self, what: str = "overview", *, simulation: Any | None = None, replay: Any | None = None
-    ) -> Any:
-        """Poses, contact force, ZMP and torque as one picture, or another one by name; a matplotlib figure.
-
-        what, simulation, replay : as of :func:`impactopt.plot`, such as ``solution.plot("strobe")``.
-        """
-        from impactopt import plot
-
-        return plot(self, what, simulation=simulation, replay=replay)
-
-    def export(
-        self,
-        to: str,
-        directory: str | PathLike[str],
-        *,
-        rate: float | None = None,
-        joints: Sequence[str] | None = None,
-    ) -> list[Path]:
-        """Write the plan for other programs: ``solution.export("csv", "results/csv")``; the files.
-
-        to, directory, rate, joints : as of :func:`impactopt.export`.
-        """
-        from impactopt import export
-
-        return [Path(path) for path in export(self, to, directory, rate=rate, joints=joints)]
 
     def clearance(self) -> dict[str, Any]:
         """Clearances and unintended contacts in the plan, by exact geometry at 1 ms: the keys

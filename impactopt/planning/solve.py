@@ -19,11 +19,10 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
 from impactopt.planning.causes import Cause, search
-from impactopt.planning.cautions import window_caution
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solved_apart
 from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, with_rows
+from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, window_caution, with_rows
 from impactopt.planning.models import carried_start
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
@@ -40,12 +39,12 @@ from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
-from impactopt.transcription.mesh_refinement import NO_MORE
-from impactopt.transcription.program_summary import statement_of
+from impactopt.transcription.mesh import NO_MORE
 from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.transcription import Transcription, statement_of
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
@@ -55,7 +54,7 @@ _STUCK = (Status.INFEASIBLE, Status.FAILED)
 def solve(
     problem: ImpactProblem,
     *,
-    solver: str = "sqp",
+    solver: str = "ipm",
     start: str | ArrayLike | Solution = "reach",
     starts: int = 1,
     seed: int = 0,
@@ -68,9 +67,9 @@ def solve(
 ) -> Solution:
     """Plan the motion that maximizes the problem's objectives, by default the impulse, within its terms.
 
-    solver : "sqp", our own, or "ipopt". Ours is a primal-dual interior-point method: it takes one Newton step
-        on each quadratic model of the program. ``options={"qp_solver": "osqp"}`` makes it a true SQP, which
-        solves its QPs to their end, for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
+    solver : "ipm", our primal-dual interior-point method; "sqp" with ``options={"qp_solver": "osqp"}``, our
+        SQP, which solves its QPs to their end, for small programs; or "ipopt". Their options are those of
+        :class:`impactopt.solvers.ipm.IPMOptions`, :class:`impactopt.solvers.sqp.SQPOptions`, IPOPT's own.
     start : "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such
         a reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables (n,); or
         the solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
@@ -93,6 +92,7 @@ def solve(
     ------
     InputError : unknown solver, option or start, a start of the wrong length, several of a given start.
     """
+    solver, options = with_todays_name(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
     check_starts(starts, seed, workers, callback, given=not isinstance(start, str))
     if isinstance(start, str) and start not in STARTS:

@@ -13,12 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
 from impactopt.planning.budget import Budget, touching
-from impactopt.planning.cautions import gear_caution
-from impactopt.planning.clearance_constraints import Margins, solved_apart
-from impactopt.planning.clearance_violations import deepest_penetration
+from impactopt.planning.clearance_constraints import Margins, deepest_penetration, solved_apart
 from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, with_rows
+from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, rows_on_demand, with_rows
 from impactopt.planning.models import carried_start
 from impactopt.planning.multistart import (
     Guesses,
@@ -30,10 +28,11 @@ from impactopt.planning.multistart import (
 from impactopt.planning.refinement import Additions, Guess, Outcome, carried, program_for, refine
 from impactopt.planning.solution import Solved, impact_summary, versions
 from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Callback, Status
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.mesh import contact_elements
-from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
@@ -83,7 +82,7 @@ def optimize_strike(
     problem: ImpactProblem,
     *,
     method: str = "collocation",
-    solver: str = "sqp",
+    solver: str = "ipm",
     starts: int = 1,
     seed: int = 0,
     start: ArrayLike | StrikeSolution | None = None,
@@ -115,6 +114,7 @@ def optimize_strike(
     if method != "collocation":
         gone = "is no longer supported" if method == "shooting" else "is unknown"
         raise InputError(f'method {method!r} {gone}: give "collocation", or leave it out')
+    solver, options = with_todays_name(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
     check_starts(starts, seed, workers, callback, given=start is not None)
     if all(o.whole_motion for o in problem.objectives):

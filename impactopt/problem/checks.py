@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.shapes import Ground, Obstacle, TargetBody
+from impactopt.bodies.world import Ground, Obstacle, TargetBody
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened

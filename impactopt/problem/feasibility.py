@@ -9,8 +9,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from impactopt.kinematics.balanced_postures import Reach, reach
-from impactopt.kinematics.striking_point import striking_point
+from impactopt.kinematics.inverse_kinematics import Reach, reach
+from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.plausibility import giant_soles
 from impactopt.problem.terms import TorqueLimit

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.codegen.hashing import canonical, model_hash
+from impactopt.codegen.cache import canonical, model_hash
 from impactopt.contact.laws import CustomLaw
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS
 from impactopt.robots.robot import Robot

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 
-from impactopt.bodies.convex_hulls import pieces_of
-from impactopt.bodies.plausible import distance_to_link, is_far, size_of
+from impactopt.bodies.convex_hulls import distance_to_link, is_far, pieces_of, size_of
+from impactopt.robots.gains import HEAVIEST_ROTOR, LIGHTEST_ROTOR
 from impactopt.robots.robot import Robot
-from impactopt.robots.rotors import HEAVIEST_ROTOR, LIGHTEST_ROTOR
 
 __all__ = ["doubts", "far_shapes", "giant_soles"]
 

@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Bodies
-from impactopt.bodies.shapes import Ground, Obstacle, TargetBody
-from impactopt.bodies.world import WorldBody, body_message, ground_body, obstacle_bodies, target_bodies
-from impactopt.collision.effects import Effects
+from impactopt.bodies.world import (
+    Ground,
+    Obstacle,
+    TargetBody,
+    WorldBody,
+    body_message,
+    ground_body,
+    obstacle_bodies,
+    target_bodies,
+)
+from impactopt.collision.settings import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import (
@@ -44,9 +52,7 @@ from impactopt.problem.checks import (
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
-from impactopt.problem.phase import Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.second_striker import SecondStriker, check_second
+from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,

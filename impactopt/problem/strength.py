@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.striker_face import striker_face
+from impactopt.bodies.robot_bodies import striker_face
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Target
 from impactopt.errors import InputError

@@ -14,7 +14,7 @@ from impactopt.errors import InputError
 from impactopt.files.output import Record, plain
 from impactopt.files.problem_file.toml import TOMLError, read_toml
 from impactopt.kinematics.support import margin
-from impactopt.report.histories import at_contact, ground_wrenches, planned_torque
+from impactopt.report.histories import at_contact, ground_wrenches, planned_torque, thinned
 from impactopt.report.page import html_page
 from impactopt.report.report import Report
 from impactopt.report.result_rows import (
@@ -26,7 +26,6 @@ from impactopt.report.result_rows import (
     standing,
     word_row,
 )
-from impactopt.report.thinning import thinned
 from impactopt.simulation.result import centre_of_pressure
 
 __all__ = ["MOST", "Comparison", "Difference", "compare", "histories_of"]

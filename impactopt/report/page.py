@@ -1,19 +1,60 @@
-"""One HTML file with all in it: style, scripts and numbers. It asks nothing of any network."""
+"""One HTML file with all in it: style, scripts and packed numbers. It asks nothing of any network."""
 
 from __future__ import annotations
 
+import base64
+import json
 import re
+import zlib
 from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.report.pack import pack
+from impactopt.files.output import plain
 
-__all__ = ["html_page"]
+__all__ = ["html_page", "pack", "unpack"]
+
+KINDS = {"<f4": np.float32, "<u2": np.uint16, "<u4": np.uint32, "|u1": np.uint8}  # as JavaScript has them
+
+
+def pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Base64 of a zlib stream: length of the JSON (4 bytes), JSON, and arrays, each aligned to 4 bytes.
+
+    The JSON is the header, and under "arrays" each array's kind, shape and place after the JSON. What is not
+    of one of the KINDS is kept with single precision.
+    """
+    table: dict[str, Any] = {}
+    parts, place = [], 0
+    for name, array in arrays.items():
+        kept = array if array.dtype.str in KINDS else array.astype("<f4")
+        data = np.ascontiguousarray(kept).tobytes()
+        table[name] = {"kind": kept.dtype.str, "shape": kept.shape, "place": place}
+        parts.append(data + bytes(-len(data) % 4))
+        place += len(parts[-1])
+    text = json.dumps(plain({**header, "arrays": table}), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    return base64.b64encode(
+        zlib.compress(len(text).to_bytes(4, "little") + text + b"".join(parts), 9)
+    ).decode()
+
+
+def unpack(packed: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """The header and the arrays of a packed text."""
+    data = zlib.decompress(base64.b64decode(packed))
+    start = 4 + int.from_bytes(data[:4], "little")
+    header = json.loads(data[4:start])
+    arrays = {}
+    for name, entry in header.pop("arrays").items():
+        kind, shape = np.dtype(entry["kind"]), entry["shape"]
+        count = int(np.prod(shape))
+        arrays[name] = np.frombuffer(data, kind, count, start + entry["place"]).reshape(shape)
+    return header, arrays
+
 
 # in this order: each uses what is in those before it
 SCRIPTS = ("unpack", "geometry", "view", "player", "charts", "main")

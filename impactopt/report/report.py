@@ -14,7 +14,7 @@ from impactopt.report.charts import charts_of
 from impactopt.report.page import html_page
 from impactopt.report.result_rows import result_columns, result_rows, worst_rows
 from impactopt.report.stage import stage_of
-from impactopt.robots.sole_margins import shortfalls
+from impactopt.robots.loads import shortfalls
 
 __all__ = ["Report", "report_of"]
 

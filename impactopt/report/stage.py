@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.robot_visuals import Visual, visuals_of
-from impactopt.bodies.scene_visuals import surroundings_of
 from impactopt.bodies.solids import Solid, joined, simplified
+from impactopt.bodies.visuals import Visual, surroundings_of, visuals_of
 from impactopt.bodies.world import WorldBody
 from impactopt.files.output import Record
 from impactopt.problem.problem import ImpactProblem
@@ -27,7 +26,7 @@ GRID = 65535  # steps of a vertex's coordinate in its solid's bounds
 
 
 def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Arrays]:
-    """Header and arrays, for :func:`impactopt.report.pack.pack`, of the record's motions."""
+    """Header and arrays, for :func:`impactopt.report.page.pack`, of the record's motions."""
     arrays: Arrays = {}
     bodies = pack_robot(problem.robot, arrays)
     world = pack_world(problem.world, arrays)

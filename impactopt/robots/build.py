@@ -17,8 +17,7 @@ from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Striker
-from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame
-from impactopt.robots.names import reduced, tell_apart
+from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame, reduced, tell_apart
 
 Array = NDArray[np.float64]
 MANY = 100  # soles, strikers or tools

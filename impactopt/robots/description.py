@@ -13,7 +13,7 @@ import pinocchio as pin
 from impactopt.errors import Mistakes
 from impactopt.robots.attachments import Source, Striker
 from impactopt.robots.build import joint_names, lock_joints
-from impactopt.robots.inertias import REPAIRED, check_choice, repair_inertias
+from impactopt.robots.checks import REPAIRED, check_choice, repair_inertias
 
 __all__ = ["Description", "Tie", "between"]
 

@@ -17,12 +17,12 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.errors import InputError, did_you_mean, missing_package
-from impactopt.robots import arms as _arms
+from impactopt.robots import link_tables as _arms
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source
 from impactopt.robots.build import joint_names, lock_joints
+from impactopt.robots.link_tables import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, standin_model
 from impactopt.robots.robot import Robot, Sole, Striker
-from impactopt.robots.standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, standin_model
 
 P = ParamSpec("P")
 
@@ -215,8 +215,8 @@ def standin(
     """A stand-in for the paper's robot, HRP-2: 58 kg, 28 joints and a free-flyer. It needs no files.
 
     HRP-2's own description is not public. Torque and velocity limits, gear ratios, rotor inertias and soles
-    are HRP-2's from a public source (named in `robots/standin.py`), and so are 58 kg and 1.54 m. Lengths, the
-    masses of the links, inertias (of solid boxes) and position limits are *ours*: what is planned on the
+    are HRP-2's from a public source (named in `robots/link_tables.py`), and so are 58 kg and 1.54 m. Lengths,
+    the masses of the links, inertias (of solid boxes) and position limits are *ours*: what is planned on the
     stand-in is of HRP-2's class, not HRP-2's.
 
     * Joints of a side: hip yaw, roll, pitch, knee, ankle pitch, roll; shoulder pitch, roll, yaw, elbow, wrist

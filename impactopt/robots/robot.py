@@ -19,9 +19,8 @@ from impactopt.robots import mjcf as _mjcf
 from impactopt.robots import urdf as _urdf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
 from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, read_only
-from impactopt.robots.hinges import check_sole, with_hinges
-from impactopt.robots.inertias import GIVEN, REPAIRED, check_inertias
-from impactopt.robots.names import tell_apart
+from impactopt.robots.checks import GIVEN, REPAIRED, check_inertias, tell_apart
+from impactopt.robots.tools import check_sole, with_hinges
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
 

@@ -6,15 +6,153 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
+from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
-from impactopt.simulation.clearance import with_clearance
+from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, Touched
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
-from impactopt.simulation.result import Simulation
-from impactopt.simulation.scene import scene_of
-from impactopt.simulation.step_error import with_step_error
+from impactopt.simulation.result import Scene, Simulation
+
+__all__ = ["ALLOWED", "ENGINES", "check_steps", "scene_of", "simulate", "with_clearance", "with_step_error"]
+
+
+def scene_of(problem: ImpactProblem) -> Scene:
+    """Target, contact and fixed soles of ``problem``."""
+    p = problem
+    return Scene(
+        solids=solids_of(p) if p.keeps_apart else Solids(),
+        point=p.point,
+        normal=p.normal,
+        law=p.law,
+        target=p.target,
+        striker=p.robot.striker(p.striker).model_frame,
+        soles=p.stance.sole_frames(p.robot),
+        hands=p.stance.hand_frames(p.robot),
+        second=None if p.second is None else (p.robot.striker(p.second.striker).model_frame, p.second.point),
+        corners=tuple(sole.polygon for sole in p.stance.soles(p.robot)),
+        polygon=support_polygon(p.robot, p.coordinates),
+    )
+
+
+def solids_of(problem: ImpactProblem) -> Solids:
+    """The hulls of the robot's links, the bodies of the world, and which of them are not to touch."""
+    bodies = problem.bodies
+    pieces = bodies.links.pieces
+    solids = [Solid(name=piece.link, joint=piece.joint, vertices=piece.vertices) for piece in pieces]
+    number = {id(piece): k for k, piece in enumerate(pieces)}
+    pairs = [(number[id(a)], number[id(b)]) for found in bodies.pairs.values() for a, b in found]
+    place = dict[int, int]()
+    for w, body in enumerate(bodies.world):
+        if body.ground:
+            place[w] = FLOOR
+        if body.ground or body.core:
+            continue
+        place[w] = len(solids)
+        solids.append(
+            Solid(
+                name=body.name,
+                half=body.half,
+                radius=body.radius,
+                place=body.place,
+                rotation=body.rotation,
+                of_target=body.of_target,
+                moves=body.moves,
+                before=body.before,
+            )
+        )
+    for joint, w in bodies.world_pairs:
+        if w in place:
+            pairs += [(number[id(piece)], place[w]) for piece in bodies.links.of_joint[joint]]
+    height = problem.ground_height
+    return Solids(solids=tuple(solids), pairs=tuple(pairs), floor=0.0 if height is None else height)
+
+
+STEP = 1e-3  # [s] at which a replay is looked at
+
+
+def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation:
+    """The simulation with its least clearance; and what touched what, where the engine has not said so
+    itself.
+    """
+    time = simulation.time
+    _, chosen = np.unique(np.floor(time / STEP), return_index=True)
+    phase = np.full(len(time), MISSED) if simulation.missed else simulation.phase()
+    bodies = problem.bodies
+    at = Places.of(problem.robot, simulation.q[chosen], simulation.travel()[chosen], phase[chosen])
+    found = bodies.survey(time[chosen], at)
+    touched = simulation.touched
+    if simulation.fall is None or not problem.keeps_apart:  # this replay's robot has no solids
+        touched = tuple(
+            Touched(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth) for t in found.touches
+        )
+    return replace(
+        simulation,
+        clearance=found.clearance,
+        nearest=found.nearest,
+        touched=touched,
+    )
+
+
+ALLOWED = 1e-2  # of the impulse
+HALVINGS = 2
+BEYOND = 0.02  # [s] after the blow that the comparison goes on
+
+
+def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any) -> Simulation:
+    """The simulation by an engine, with how far off its impulse is by its steps, as an estimate.
+
+    It is compared up to the end of the blow with one of twice the step, or where that was given longer than
+    the engine's own with one of that. Where more than 1 % is left, and the step is not longer, it is halved,
+    twice at most.
+    """
+    own = float((run.__kwdefaults__ or {})["step"])
+    step = float(options.pop("step", own))
+    for _ in range(HALVINGS + 1):
+        found = run(*given, **options, step=step)
+        found = replace(found, step_error=_error(run, given, options, found, step, own))
+        if not found.step_error > ALLOWED or step > own:
+            break
+        step /= 2
+    return found
+
+
+def _error(
+    run: Callable[..., Simulation],
+    given: tuple[Any, ...],
+    options: dict[str, Any],
+    found: Simulation,
+    step: float,
+    own: float,
+) -> float:
+    """Relative to the larger of the impulses; nan where both have missed the target."""
+    until = np.inf if np.isnan(found.contact_end) else found.contact_end + BEYOND
+    if found.missed or (until == np.inf and step <= own):
+        return np.nan
+    for other in (own if step > own else 2 * step, step / 2):
+        try:
+            compared = run(*given, **options, step=other, until=until)
+        except InputError:
+            continue  # twice the step may be too long for the servo
+        impulses = [sum(touch[2] for touch in s.touches if touch[0] <= until) for s in (found, compared)]
+        largest = max(impulses)
+        return abs(impulses[0] - impulses[1]) / largest if largest > 0 else np.nan
+    return np.inf
+
+
+def check_steps(found: Simulation, step: float | None) -> None:
+    """InputError where the steps leave more than 1 % of the impulse uncertain."""
+    if found.step_error > ALLOWED:
+        given = "the engine's steps leave" if step is None else f"steps of {step:g} s leave"
+        raise InputError(
+            f"the replay is not to be trusted: {given} {100 * min(found.step_error, 1.0):.2g} % of its "
+            f"impulse, {found.impulse:.4g} N s, uncertain; give a shorter step (--step), or a softer contact"
+        )
+
 
 ENGINES: dict[str, Callable[..., Simulation]] = {
     "pinocchio": simulate_pinocchio,

@@ -15,21 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.robots.loads import BEARS, weight_of
 from impactopt.robots.robot import Robot
-from impactopt.robots.sole_margins import BEARS, weight_of
-from impactopt.simulation.contact_times import FollowedReference, Touches
+from impactopt.simulation.collision_geometry import Besides
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
-from impactopt.simulation.gears import GearWatch
-from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of
-from impactopt.simulation.motors import CutWatch, Delay, Motors
-from impactopt.simulation.mujoco_robot import MujocoRobot
-from impactopt.simulation.mujoco_welds import Welds
-from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log_file, site_name
+from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
+from impactopt.simulation.mujoco_world import (
+    MujocoOptions,
+    MujocoRobot,
+    Welds,
+    build_world,
+    no_log_file,
+    site_name,
+)
 from impactopt.simulation.perturbation import Perturbation
-from impactopt.simulation.result import Scene, Simulation
-from impactopt.simulation.servo import Servo
+from impactopt.simulation.result import (
+    FollowedReference,
+    Scene,
+    Simulation,
+    Touches,
+    check_not_diverged,
+    posture_error,
+    simulation_of,
+)
 from impactopt.simulation.target_dynamics import Push, Struck
-from impactopt.simulation.unintended_contacts import Besides
 
 Array = NDArray[np.float64]
 THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after and before each
@@ -282,7 +291,7 @@ def simulate_mujoco(
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
     missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
-        :class:`impactopt.simulation.contact_times.FollowedReference`); default: it does not notice.
+        :class:`impactopt.simulation.result.FollowedReference`); default: it does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 

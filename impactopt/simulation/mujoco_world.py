@@ -17,6 +17,22 @@ from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
 
+__all__ = [
+    "MujocoOptions",
+    "MujocoRobot",
+    "Welds",
+    "add_welds",
+    "build_world",
+    "mujoco_module",
+    "no_log_file",
+    "primitive",
+    "quaternion",
+    "robot_bodies",
+    "robot_on_floor",
+    "site_name",
+    "spec_of",
+]
+
 Array = NDArray[np.float64]
 # of a weld, MuJoCo's own limits: impedance, and time constant in steps
 _IMPEDANCE, _TIME_CONSTANT = 0.9999, 2.0
@@ -260,3 +276,115 @@ def quaternion(rotation: Any) -> list[float]:
     """(w, x, y, z), as MuJoCo has it."""
     x, y, z, w = pin.Quaternion(np.asarray(rotation)).normalized().coeffs()
     return [w, x, y, z]
+
+
+class MujocoRobot:
+    """A robot in a compiled MuJoCo model, struck at one of its sites.
+
+    world, data : MuJoCo's model and its data.  dof, place : where the joints' rates and angles are in qvel
+    and qpos.  sites : of the striking points, and along (h, nv): their Jacobians along the normal, where they
+    have been last.
+    """
+
+    def __init__(self, robot: Robot, world: Any, *strikers: str) -> None:
+        self.mujoco, self.robot, self.world = mujoco_module(), robot, world
+        self.data = self.mujoco.MjData(world)
+        self.floating = robot.floating
+        self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv
+        joints = [world.joint(name) for name in robot.joint_names]
+        self.dof = np.array([joint.dofadr[0] for joint in joints])
+        self.place = np.array([joint.qposadr[0] for joint in joints])
+        own = list(robot.model.joints)[-robot.n :]
+        self._place = np.array([joint.idx_q for joint in own], dtype=np.intp)
+        # a continuous joint's angle is (cosine, sine) in Pinocchio
+        self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
+        self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
+        self._rows, self.along = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
+
+    def put(self, q: Array, v: Array | None = None) -> None:
+        """Go to q (nq), v (nv; None: the rates stay); what depends on them is not computed yet."""
+        d, robot = self.data, self.robot
+        if self.floating:
+            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
+        d.qpos[self.place] = robot.joint_positions(q)
+        if v is not None:
+            if self.floating:
+                d.qvel[:3], d.qvel[3:6] = self.base_rotation() @ v[:3], v[3:6]
+            d.qvel[self.dof] = v[-robot.n :]
+
+    def state(self) -> tuple[Array, Array]:
+        """q (nq), v (nv)."""
+        qpos, qvel = self.data.qpos, self.data.qvel
+        q, v = np.zeros(self._nq), np.zeros(self._nv)
+        if self.floating:
+            q[:3], q[3:6], q[6] = qpos[:3], qpos[4:7], qpos[3]
+            v[:3], v[3:6] = self.base_rotation().T @ qvel[:3], qvel[3:6]
+        angles = qpos[self.place]
+        q[self._place] = angles
+        for k in self._continuous:
+            at = self._place[k]
+            q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
+        v[-self._n :] = qvel[self.dof]
+        return q, v
+
+    def base_rotation(self) -> Array:
+        """(3, 3) of a floating base."""
+        rotation = np.zeros(9)
+        self.mujoco.mju_quat2Mat(rotation, self.data.qpos[3:7])
+        return rotation.reshape(3, 3)
+
+    def places(self) -> Array:
+        """(h, 3) [m] of the striking points."""
+        return np.asarray(self.data.site_xpos[self.sites])
+
+    def speeds_along(self, normal: Array) -> Array:
+        """Speeds (h,) [m/s] of the striking points along a normal (3,); leaves their rows in `along`."""
+        for k, site in enumerate(self.sites):
+            self.mujoco.mj_jacSite(self.world, self.data, self._rows, None, site)
+            self.along[k] = normal @ self._rows
+        return np.asarray(self.along @ self.data.qvel)
+
+    def apply(self, torque: Array, forces: Array | float) -> None:
+        """Torque (n) [N m] at the joints, and the contacts' forces (h,) [N], against the normal."""
+        applied = self.data.qfrc_applied
+        applied[:] = -np.atleast_1d(forces) @ self.along
+        applied[self.dof] += torque
+
+
+class Welds:
+    """The welds of a compiled world that has no other equalities.
+
+    frames : as :func:`impactopt.simulation.mujoco_world.add_welds` has added them.
+    """
+
+    def __init__(self, world: Any, frames: Sequence[str]) -> None:
+        self.mujoco, self.world = mujoco_module(), world
+        self.frames = [world.site(name).id for name in frames]
+        self.ground = [world.site(f"ground {name}").id for name in frames]
+        world.site_sameframe[self.ground] = self.mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # they are moved
+        self._map = np.zeros((6, world.nv))
+
+    def put(self, data: Any) -> None:
+        """They hold the frames where they are; needs kinematics."""
+        for frame, ground in zip(self.frames, self.ground, strict=True):
+            self.world.site_pos[ground] = data.site_xpos[frame]
+            rotation = np.zeros(4)
+            self.mujoco.mju_mat2Quat(rotation, data.site_xmat[frame])
+            self.world.site_quat[ground] = rotation
+
+    def wrenches(self, data: Any) -> tuple[Array, Array]:
+        """Wrenches of the world on the frames (frames, 6), world axes, and their places, at the last step's
+        start.
+        """
+        d, J = data, self._map
+        out, places = np.empty((len(self.frames), 6)), np.empty((len(self.frames), 3))
+        if not self.frames:
+            return out, places
+        rows = np.reshape(d.efc_J, (-1, self.world.nv))
+        for k, frame in enumerate(self.frames):
+            its = slice(6 * k, 6 * k + 6)
+            self.mujoco.mj_jacSite(self.world, d, J[:3], J[3:], frame)
+            # the rows of a weld are in coordinates of its own
+            out[k] = np.linalg.lstsq(J.T, rows[its].T @ d.efc_force[its], rcond=None)[0]
+            places[k] = d.site_xpos[frame]
+        return out, places

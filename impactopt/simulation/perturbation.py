@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from impactopt.contact.factors import scaled_numbers
+from impactopt.contact.targets.base import scaled_numbers
 from impactopt.errors import FARTHEST, InputError, check_array, shortened
 from impactopt.simulation.result import Scene
 

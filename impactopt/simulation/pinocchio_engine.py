@@ -15,13 +15,17 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
-from impactopt.simulation.contact_times import FollowedReference, Touches
-from impactopt.simulation.gears import GearWatch
-from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of
-from impactopt.simulation.motors import CutWatch, Delay, Motors
+from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
 from impactopt.simulation.pinocchio_robot import PinocchioBody
-from impactopt.simulation.result import Scene, Simulation
-from impactopt.simulation.servo import Servo
+from impactopt.simulation.result import (
+    FollowedReference,
+    Scene,
+    Simulation,
+    Touches,
+    check_not_diverged,
+    posture_error,
+    simulation_of,
+)
 from impactopt.simulation.target_dynamics import Push, Struck
 
 Array = NDArray[np.float64]
@@ -257,7 +261,7 @@ def simulate_pinocchio(
     until [s] : it ends, if that is earlier.
     record : steps between recorded instants; every step is recorded in contact.
     missing : there is no target.  missed : the reference of a robot that hits nothing, which it notices at
-        ``missed.contact_end`` (:class:`impactopt.simulation.contact_times.FollowedReference`); default: it
+        ``missed.contact_end`` (:class:`impactopt.simulation.result.FollowedReference`); default: it
         does not.
 
     Raises

@@ -18,8 +18,8 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation import Perturbation, Scene, Simulation, scene_of, simulate_mujoco
 from impactopt.simulation.controller import ControllerSettings
+from impactopt.simulation.engines import check_steps, with_step_error
 from impactopt.simulation.mujoco_world import mujoco_module
-from impactopt.simulation.step_error import check_steps, with_step_error
 from impactopt.simulation.workers import map_on_workers
 
 __all__ = ["PerturbationRanges", "Robustness", "draw_perturbations", "robustness"]

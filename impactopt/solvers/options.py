@@ -1,8 +1,11 @@
-"""Options of our solver."""
+"""Options of our solvers."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.solvers.qp.registry import QP_SOLVERS, check_qp_solver
@@ -11,50 +14,29 @@ HESSIANS = ("exact", "bfgs")
 
 
 @dataclass(frozen=True, kw_only=True)
-class SQPOptions:
-    """Options of `solve_sqp`; the defaults suit variables and rows of order one.
+class SolverOptions:
+    """Options that our solvers share; the defaults suit variables and constraints of order one.
 
     Attributes
     ----------
-    qp_solver : "interior": a primal-dual interior-point method, which takes one Newton step on each quadratic
-        model; or a name in `QP_SOLVERS`, which solves every QP to its end (SQP in the strict sense). Options
-        of only one of the two say so.
-    hessian : with QP solvers, "exact" (made convex) or "bfgs" (damped; dense, for some hundred free
-        variables at most).
-    violation_tolerance : largest violation of a row or bound at a solution.
+    violation_tolerance : largest violation of a constraint or bound at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
-    complementarity_tolerance : of "interior", largest product of a multiplier and the distance to its bound
-        at a solution. The objective's error is at most this times the number of active bounds.
     acceptable_tolerance : tolerance in place of kkt_tolerance for the status ACCEPTABLE, if no step helps.
     max_iterations : most iterations; then the best iterate is returned.
     time_limit : [s]; then the best iterate is returned.
-    radius : with QP solvers, largest radius of the trust region |d|_inf <= radius.
-    price : first price of violations: with QP solvers in the merit function f + price * sum of violations,
-        with "interior" in its elastic phase. It rises by itself; if it is too low, it takes more iterations.
+    price : first price of violations. It rises by itself; if it is too low, it takes more iterations.
     price_max : largest price of violations. If it is too low, the end may be infeasible.
-    second_order_correction : whether a refused step is corrected for the curvature of the rows.
-    barrier : of "interior", first barrier parameter of a start without multipliers.
-    barrier_warm : the same of a start with multipliers. Below 5e-3 it falls at once where the start is near a
-        solution.
-    push : of "interior", how far the start is moved inside its bounds; with multipliers no farther than its
-        barrier.
+    second_order_correction : whether a refused step is corrected for the curvature of the constraints.
     """
 
-    qp_solver: str = "interior"
-    hessian: str = "exact"
     violation_tolerance: float = 1e-6
     kkt_tolerance: float = 1e-6
-    complementarity_tolerance: float = 1e-6
     acceptable_tolerance: float = 1e-4
     max_iterations: int = 500
     time_limit: float | None = None
-    radius: float = 1.0
     price: float = 100.0
     price_max: float = 1e5
     second_order_correction: bool = True
-    barrier: float = 3e-2
-    barrier_warm: float = 1e-5
-    push: float = 1e-2
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant.
@@ -63,15 +45,6 @@ class SQPOptions:
         ------
         InputError : an unknown name, or a number out of its range.
         """
-        check_qp_solver(self.qp_solver, ("interior", *QP_SOLVERS))
-        if self.hessian not in HESSIANS:
-            near = did_you_mean(self.hessian, HESSIANS)
-            raise InputError(f"hessian: no '{self.hessian}'{near}; there are: {', '.join(sorted(HESSIANS))}")
-        if self.qp_solver == "interior" and self.hessian != "exact":
-            raise InputError(
-                'hessian: with qp_solver "interior" it is "exact"; for "bfgs" give another qp_solver, '
-                'such as "active_set"'
-            )
         for option in fields(self):
             value, default = getattr(self, option.name), option.default
             if isinstance(default, (bool, str)) or (value is None and default is None):
@@ -86,3 +59,77 @@ class SQPOptions:
                 raise InputError(f"{option.name}: {value} is out of range; it must be positive")
         if self.price > self.price_max:
             raise InputError(f"price ({self.price:g}) must not exceed price_max ({self.price_max:g})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class IPMOptions(SolverOptions):
+    """Options of the interior-point method, `solve_ipm`; prices are those of its elastic phase.
+
+    Attributes
+    ----------
+    complementarity_tolerance : largest product of a multiplier and the distance to its bound at a solution.
+        The objective's error is at most this times the number of active bounds.
+    barrier : first barrier parameter of an initial guess without multipliers.
+    barrier_warm : the same of one with multipliers. Below 5e-3 it falls at once where the initial guess is
+        near a solution.
+    push : how far the initial guess is moved inside its bounds; one with multipliers no farther than its
+        barrier.
+    """
+
+    complementarity_tolerance: float = 1e-6
+    barrier: float = 3e-2
+    barrier_warm: float = 1e-5
+    push: float = 1e-2
+
+
+@dataclass(frozen=True, kw_only=True)
+class SQPOptions(SolverOptions):
+    """Options of the SQP, `solve_sqp`; prices are those of its merit function f + price * sum of violations.
+
+    Attributes
+    ----------
+    qp_solver : name in `QP_SOLVERS` of what solves every QP to its end.
+    hessian : "exact" (made convex) or "bfgs" (damped; dense, for some hundred free variables at most).
+    radius : largest radius of the trust region |d|_inf <= radius.
+    """
+
+    qp_solver: str = "osqp"
+    hessian: str = "exact"
+    radius: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant, as `SolverOptions` does."""
+        check_qp_solver(self.qp_solver, QP_SOLVERS)
+        if self.hessian not in HESSIANS:
+            near = did_you_mean(self.hessian, HESSIANS)
+            raise InputError(f"hessian: no '{self.hessian}'{near}; there are: {', '.join(sorted(HESSIANS))}")
+        super().__post_init__()
+
+
+OPTIONS: Mapping[str, type[SolverOptions]] = {"ipm": IPMOptions, "sqp": SQPOptions}
+"""Options of our solvers, by the solver's name."""
+INTERIOR = "interior"  # the QP solver that once said "ipm"
+
+
+def with_todays_name(solver: str, options: Mapping[str, Any] | None) -> tuple[str, Mapping[str, Any] | None]:
+    """Name of a solver, and its options, as they are spelled now.
+
+    For one version "sqp" without a QP solver means the interior-point method, as it did, and the default
+    solver with a QP solver means the SQP.
+
+    Warns
+    -----
+    FutureWarning : the spelling has changed; it says what to write.
+    """
+    named = options.get("qp_solver") if isinstance(options, Mapping) else None
+    if solver == "sqp" and named in (None, INTERIOR):
+        write, new = 'the interior-point method is now solver "ipm"; for the SQP name a qp_solver too', "ipm"
+    elif solver == "ipm" and named is not None:
+        write = 'a qp_solver is an option of solver "sqp"; name that'
+        new = "ipm" if named == INTERIOR else "sqp"
+    else:
+        return solver, options
+    warnings.warn(write, FutureWarning, stacklevel=4)
+    if options is not None and named == INTERIOR:
+        options = {name: value for name, value in options.items() if name != "qp_solver"}
+    return new, options

@@ -1,15 +1,123 @@
-"""Base class of one solve, whatever its steps."""
+"""Base class of one solve by a solver of our own, and the history that it reports."""
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cache
+from typing import Generic, Protocol, TypeVar
 
-from impactopt.solvers.options import SQPOptions
-from impactopt.solvers.point import TimedProgram
-from impactopt.solvers.program import Callback, NonlinearProgram, Status, Vector
-from impactopt.solvers.report import Report
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import ThreadpoolController
+
+from impactopt.errors import check_array
+from impactopt.solvers.options import SolverOptions
+from impactopt.solvers.program import (
+    BestIterate,
+    Callback,
+    Determined,
+    IterationRecord,
+    NonlinearProgram,
+    Point,
+    SolverResult,
+    Status,
+    TimedProgram,
+    Vector,
+    check_program,
+    explain,
+    stationarity,
+)
+
+
+class Report:
+    """Keeps time, the history and the best iterate, and tells the caller.
+
+    Attributes
+    ----------
+    seconds_qp : spent in QPs; the run adds to it.
+    best : the best iterate.
+    """
+
+    def __init__(self, program: NonlinearProgram, tolerance: float, callback: Callback | None):
+        self.seconds_qp = 0.0
+        self._program, self._tolerance, self._callback = program, tolerance, callback
+        self._began = time.perf_counter()
+        self._history: list[IterationRecord] = []
+        self.best = BestIterate(program, tolerance)
+        self._last: Point | None = None
+
+    @property
+    def iterations(self) -> int:
+        """Number of points recorded."""
+        return len(self._history)
+
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._began
+
+    def iteration(self, point: Point, kkt: float, note: str) -> bool:
+        """Record an iteration and tell the caller; True if the caller wants to stop."""
+        self.best.consider(point.x, point.objective, point.g)
+        step = 0.0 if self._last is None else float(np.max(np.abs(point.x - self._last.x), initial=0.0))
+        self._last = point
+        record = IterationRecord(
+            iteration=len(self._history),
+            objective=point.objective,
+            max_violation=point.max_violation,
+            kkt=kkt,
+            step=step,
+            seconds=self.elapsed(),
+            note=note,
+        )
+        self._history.append(record)
+        return self._callback is not None and self._callback(record) is True
+
+    def result(
+        self, status: Status, program: TimedProgram, point: Point, y: Vector, z: Vector
+    ) -> SolverResult:
+        """The result with that status: at the point if it is a solution, else at the best iterate."""
+        if not status.usable and self.best.x is not None:
+            point = program.point(self.best.x)
+        message = explain(self._program, status, point.x, point.g, tolerance=self._tolerance)
+        if status is Status.FAILED:
+            message += _why(point)
+        return SolverResult(
+            x=point.x,
+            multipliers=y,
+            bound_multipliers=z,
+            objective=point.objective,
+            status=status,
+            iterations=max(len(self._history) - 1, 0),
+            seconds=self.elapsed(),
+            seconds_functions=program.seconds,
+            seconds_qp=self.seconds_qp,
+            max_violation=point.max_violation,
+            kkt=stationarity(point.gradient, point.jacobian, y, z) if point.differentiable else np.nan,
+            message=message,
+            history=tuple(self._history),
+        )
+
+
+def _why(point: Point) -> str:
+    if not point.finite:
+        return " The program's functions are not finite there; start elsewhere."
+    if not point.differentiable:
+        return " The program's derivatives are not finite there; start elsewhere."
+    return " No step makes progress: wrong derivatives, bad scaling, or a QP solver that fails."
+
+
+_Options = TypeVar("_Options", bound=SolverOptions)
+
+
+@cache
+def threads() -> ThreadpoolController:
+    """Controller of BLAS's threads, which small matrices do not need: a second one only waits, and takes the
+    processor. Cached, as finding the loaded libraries takes as long as a QP.
+    """
+    return ThreadpoolController()
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,36 +146,46 @@ class Watch(Protocol):
         """The part of a step (n,) from an iterate (n,), ``most`` at most, that may be taken."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Task:
-    """Task of a run: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds.
-
-    watch, path : as of `solve_sqp`.
-    """
-
-    program: NonlinearProgram
-    options: SQPOptions
-    callback: Callback | None
-    x: Vector
-    y: Vector
-    z: Vector
-    watch: Watch | None = None
-    path: Path | None = None
-
-
-class Run(ABC):
+class Run(ABC, Generic[_Options]):
     """One solve: the program and the point that it has come to, with its multipliers.
+
+    x0 : initial guess (n,); moved into the variables' bounds, where every iterate stays.
+    y, z : guess of the multipliers of constraints (m,) and of bounds (n,); None: there is none.
 
     Attributes
     ----------
-    point : the last iterate. y (m,), z (n,) : multipliers of its rows and bounds.
+    point : the last iterate. y (m,), z (n,) : multipliers of its constraints and bounds.
+
+    Raises
+    ------
+    InputError : wrong shapes, NaN, crossing bounds.
     """
 
-    def __init__(self, task: Task):
-        self.report = Report(task.program, task.options.violation_tolerance, task.callback)
-        self.program, self.options = TimedProgram(task.program), task.options
-        self.point = self.program.unknown(task.x)
-        self.y, self.z = task.y, task.z
+    def __init__(
+        self,
+        program: NonlinearProgram,
+        x0: npt.ArrayLike,
+        options: _Options,
+        callback: Callback | None,
+        y: npt.ArrayLike | None,
+        z: npt.ArrayLike | None,
+    ):
+        x0 = np.clip(check_program(program, x0), program.x_lower, program.x_upper)
+        self.y = np.zeros(program.m) if y is None else check_array("multipliers", y, (program.m,))
+        self.z = np.zeros(program.n) if z is None else check_array("bound_multipliers", z, (program.n,))
+        self.report = Report(program, options.violation_tolerance, callback)
+        self.program, self.options = TimedProgram(program), options
+        self.determined: Sequence[Determined] = getattr(program, "determined", ())
+        self.point = self.program.unknown(x0)
+
+    def solve(self) -> SolverResult:
+        """Result of the solve; infeasible programs, interruption (Ctrl-C) and limits are statuses."""
+        with threads().limit(limits=1, user_api="blas"):
+            try:
+                status = self.iterate()
+            except KeyboardInterrupt:
+                status = Status.INTERRUPTED
+        return self.report.result(status, self.program, self.point, self.y, self.z)
 
     @abstractmethod
     def iterate(self) -> Status:

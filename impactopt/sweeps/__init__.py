@@ -1,12 +1,9 @@
 """Sweeps: many cases of one problem, done by many workers, and none of them lost.
 
-* definition.py   sweep files: sections.py, varied_keys.py; design.py: grids, lists and draws
-* units.py        inputs and results of a worker
-* case_kinds.py   from a case's settings to its row; evaluate.py: on a worker; watchdog.py: time limits
-* collisions.py   batches of collisions in compiled code: collision_batch.py, collision_keys.py;
-                  states and measures of one: `impactopt.collide`
-* local_pool.py   pool of processes on this machine; cluster.py: Dask workers
-* journal.py      finished units on disk; store.py: the directory; table.py: the result
+* definition.py   sweep files; sections.py: their sections; design.py: grids, lists and draws, units of work
+* evaluate.py     from a unit to its rows: kinds of cases, on a process of this machine; cluster.py: on Dask
+* collisions.py   batches of collisions in compiled code; states and measures of one: `impactopt.collide`
+* store.py        finished units on disk; table.py: the result
 * progress.py     progress of a sweep
 * running.py      all of it together
 """

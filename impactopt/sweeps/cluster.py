@@ -12,8 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from impactopt.errors import InputError, missing_package
+from impactopt.sweeps.design import Found, Unit, Work, failed_columns
 from impactopt.sweeps.evaluate import evaluate
-from impactopt.sweeps.units import Found, Unit, Work, failed_columns
 
 __all__ = ["connected", "on_cluster"]
 

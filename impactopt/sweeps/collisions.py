@@ -1,4 +1,4 @@
-"""Many collisions of a problem: columns of parameters in, columns of numbers out, in compiled code.
+"""Sweeps of collisions: their keys, and batches of them in one compiled call.
 
 What a row shares with others is made once: a robot and a model for each combination of keys that change the
 structure, a posture for each hit point. All else are inputs of the compiled functions.
@@ -8,24 +8,331 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.collide.at_contact import AtContact, check_at_contact, collision_model, full_names
-from impactopt.collide.contact_states import ContactStates
-from impactopt.collide.measures import chosen
-from impactopt.collision.freezing import FREEZE_ERROR
+from impactopt.collide.contact_states import ContactStates, Posture, States
+from impactopt.collide.single_collision import (
+    NOT_ENDED,
+    AtContact,
+    Blow,
+    Measure,
+    check_at_contact,
+    chosen,
+    collision_model,
+    full_names,
+)
+from impactopt.collision import Collision, CollisionModel
+from impactopt.collision.checks import FREEZE_ERROR, too_large
+from impactopt.collision.outputs import HISTORIES
 from impactopt.collision.symbolic import SymbolicModel
-from impactopt.errors import InputError, raw_array
-from impactopt.files.problem_file import ProblemFile, read_problem_file
-from impactopt.files.problem_file.toml import plain_value
-from impactopt.sweeps.collision_batch import AlikeCollisions
-from impactopt.sweeps.collision_keys import role_of, sweep_place
+from impactopt.errors import InputError, did_you_mean, raw_array
+from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file
+from impactopt.files.problem_file.toml import Place, plain_value
 
-__all__ = ["Collisions", "collide_many"]
+__all__ = [
+    "SERVO",
+    "AlikeCollisions",
+    "Collisions",
+    "Role",
+    "collide_many",
+    "role_of",
+    "setting_of",
+    "sweep_place",
+]
+
+# a number of its own in each row; one that makes another posture; one that makes another model
+Role = Literal["number", "point", "structure"]
+
+SERVO = {
+    ("robot", "kp_N_m_rad"): "kp",
+    ("robot", "kd_N_m_s_rad"): "kd",
+    ("robot", "torque_limit_N_m"): "torque_limit",
+    ("at_contact", "kp_scale"): "kp",
+    ("at_contact", "kd_scale"): "kd",
+    ("at_contact", "torque_limit_scale"): "torque_limit",
+}
+_KINDS = {"target": "kind", "contact": "law"}
+_STATE = (("at_contact", "speed_m_s"), ("at_contact", "joints_rad"))
+
+
+def sweep_place(data: Mapping[str, Any], key: str) -> Place:
+    """Place of a key path in the problem file's data, or in [at_contact]; units may be left out.
+
+    Raises
+    ------
+    InputError : there is no such key, or one that no collision depends on.
+    """
+    if key.partition(".")[0] != "at_contact":
+        place = key_place(data, key)
+    else:
+        place = ("at_contact", *_in_section(key))
+    role_of(place)
+    return place
+
+
+def role_of(place: Place) -> Role:
+    """Role of a key at this place in a collision; InputError if it has none."""
+    table, *rest = place
+    if table in _KINDS:
+        return "structure" if rest == [_KINDS[str(table)]] else "number"
+    if place[:2] in SERVO or place[:2] in _STATE:
+        return "number"
+    if place[:2] == ("problem", "point_m"):
+        return "point"
+    if table in ("problem", "robot", "stance", "at_contact") and rest != ["name"]:
+        return "structure"
+    key = ".".join(map(str, place))
+    raise InputError(
+        f"{key}: no collision depends on it; vary it in a sweep of solves, or vary a key of [target], "
+        "[contact], [at_contact], [robot], [stance] or [problem]"
+    )
+
+
+def setting_of(place: Place, content: Any) -> str:
+    """Name of a collision's setting (`Settings`) that a number of [target] or [contact] is."""
+    table, key = str(place[0]), str(place[1])
+    section = getattr(content, table)
+    fields = {info.alias or name: name for name, info in type(section).model_fields.items()}
+    return f"{table}_{fields[key]}"
+
+
+def _in_section(key: str) -> tuple[str, ...]:
+    _, *parts = key.split(".")
+    known = {info.alias or name: name for name, info in AtContact.model_fields.items()}
+    for alias, name in known.items():
+        if parts and parts[0] in (alias, name):
+            table = alias == "joints_rad"
+            if len(parts) != 1 + table:
+                raise InputError(
+                    f"{key}: name one joint, as at_contact.{alias}.<joint>"
+                    if table
+                    else f"{key}: has no parts"
+                )
+            return (alias, *parts[1:])
+    near = did_you_mean(parts[0] if parts else "", known)
+    raise InputError(f"{key}: [at_contact] has no such key{near}; known are {', '.join(known)}")
+
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+Numbers = Mapping[Place, Array]  # columns of numbers, by their keys' places
+
+_ROWS, _WITH_HISTORIES = 8192, 512  # rows at a time: histories are large
+_TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
+NO_NUMBER = (
+    "the collision has no finite numbers: its steps are unstable here, or what holds the robot cannot be "
+    "told apart"
+)
+TOO_STIFF = "the contact is too stiff for the steps of its law: {:.1g} of the impulse would be left out"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AlikeCollisions:
+    """Batch of collisions that differ in numbers and hit points only.
+
+    file, section : problem and [at_contact], with the values of keys that make the structure.
+    model, states, measures : what collides, from where, and what of it is asked for.
+    """
+
+    file: ProblemFile
+    section: AtContact
+    model: CollisionModel
+    states: ContactStates
+    measures: Mapping[str, Measure]
+
+    def posture(self, point: tuple[float, ...] | None = None) -> Posture | str:
+        """The posture that rows with this hit point (3,) [m] start from, None being the problem's own; or why
+        there is none.
+
+        Raises
+        ------
+        InputError : as of `ContactStates.posture`.
+        """
+        at = tuple(self.file.content.problem.point) if point is None else point
+        return self.states.posture(self.section.posture, self.section.result, at)
+
+    def __call__(self, numbers: Numbers, count: int, threads: int | None) -> dict[str, NDArray[Any]]:
+        """Columns of `count` rows by measure, and ``reason``."""
+        out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.measures}
+        out["reason"] = np.full(count, "", dtype=object)
+        for point, rows in self._points(numbers, count):
+            posture = self.posture(point)
+            if isinstance(posture, str):
+                out["reason"][rows] = posture
+                continue
+            for begin in range(0, len(rows), self._together):
+                some = rows[begin : begin + self._together]
+                own = {place: x[some] for place, x in numbers.items() if not _is_point(place)}
+                for name, values in self._collide(posture, own, len(some), threads).items():
+                    out[name][some] = values
+        return out
+
+    def _points(self, numbers: Numbers, count: int) -> Iterator[tuple[tuple[float, ...], Rows]]:
+        """Hit points, and the rows that have them."""
+        own = self.file.content.problem.point
+        given = {place: x for place, x in numbers.items() if _is_point(place)}
+        if not given:
+            yield tuple(own), np.arange(count)
+            return
+        point = np.repeat(np.array(own, dtype=float)[None], count, axis=0)
+        for place, values in given.items():
+            point[:, slice(None) if len(place) == 2 else int(place[2])] = values
+        kept, back = np.unique(point, axis=0, return_inverse=True)
+        for k, one in enumerate(kept):
+            yield tuple(one.tolist()), np.flatnonzero(back.ravel() == k)
+
+    @cached_property
+    def _outputs(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for m in self.measures.values() for name in m.outputs))
+
+    @cached_property
+    def _together(self) -> int:
+        return _WITH_HISTORIES if {*self._outputs} & {*HISTORIES} else _ROWS
+
+    def _collide(
+        self, posture: Posture, numbers: Numbers, count: int, threads: int | None
+    ) -> dict[str, NDArray[Any]]:
+        section, model = self.section, self.model
+        joints = {name: np.full(count, angle) for name, angle in section.joints.items()}
+        joints |= {str(at[2]): x for at, x in numbers.items() if at[:2] == ("at_contact", "joints_rad")}
+        speed = numbers.get(("at_contact", "speed_m_s"))
+        if speed is None and section.speed is not None:
+            speed = np.full(count, section.speed)
+        normal = np.asarray(model.normal)
+        states = self.states.rows(posture, joints, speed, normal, count, velocity=section.velocity)
+        out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.measures}
+        out["reason"] = states.reason
+        good = np.flatnonzero(states.reason == "")
+        if not good.size:
+            return out
+        states = states.some(good)
+        settings = {
+            name: x[good] if len(x) == count else x for name, x in self._settings(numbers, count).items()
+        }
+        settings |= states.bend
+        # a point mass has no servo, and the paper's SDC no stiffness
+        known = getattr(model, "settings", settings)
+        given = {name: x for name, x in settings.items() if name in known}
+        if isinstance(model, SymbolicModel):
+            found, reason = batch(model, self._outputs, states, given, threads)
+        else:
+            found, reason = one_by_one(model, self._outputs, states, given)
+        blow = Blow(
+            found=found,
+            states=states,
+            torque_limit=settings["torque_limit"],
+            velocity_limit=model.robot.velocity_limit,
+            polygon=posture.polygon,
+        )
+        for name, measure in self.measures.items():
+            out[name][good] = np.where(reason == "", measure.of(blow), np.nan)
+        out["reason"][good] = reason
+        return out
+
+    def _settings(self, numbers: Numbers, count: int) -> dict[str, Array]:
+        """Numbers of law, target and servo by the names of `Settings`, (count, ...) or (1, ...)."""
+        section, robot = self.section, self.model.robot
+        out = {"kp": robot.kp[None], "kd": robot.kd[None], "torque_limit": robot.torque_limit[None]}
+        scales: dict[str, Any] = {"kp": section.kp_scale, "kd": section.kd_scale}
+        scales["torque_limit"] = section.torque_limit_scale
+        for place, values in numbers.items():
+            name = SERVO.get((str(place[0]), str(place[1])))
+            if place[0] in ("target", "contact"):
+                out[setting_of(place, self.file.content)] = values.astype(float)
+            elif name is not None and place[0] == "robot":
+                joint = slice(None) if len(place) == 2 else robot.joint_index(str(place[2]))
+                out[name] = np.broadcast_to(out[name], (count, robot.n)).copy()
+                out[name].T[joint] = values
+            elif name is not None:
+                scales[name] = values[:, None]
+        return out | {name: out[name] * scale for name, scale in scales.items()}
+
+
+def _is_point(place: Place) -> bool:
+    return place[:2] == ("problem", "point_m")
+
+
+# ---------------------------------------------------------------- models
+def batch(
+    model: SymbolicModel,
+    outputs: tuple[str, ...],
+    states: States,
+    settings: Mapping[str, Array],
+    threads: int | None,
+) -> tuple[dict[str, Array], NDArray[np.object_]]:
+    """Outputs by name, and why a row has none."""
+    single: dict[str, Any] = {
+        name: x[0] if x.ndim == 2 and len(x) == 1 else x for name, x in settings.items()
+    }
+    found = model.batch(states.q, states.v, states.torque, outputs=outputs, threads=threads, **single)
+    reason = np.where(found["separated"], "", NOT_ENDED).astype(object)
+    finite = np.ones(len(reason), dtype=bool)
+    for name in outputs:
+        if name == FREEZE_ERROR:  # may be infinite, and says so
+            continue
+        finite &= np.isfinite(found[name]).reshape(len(reason), -1).all(axis=1)
+    reason[~finite] = NO_NUMBER
+    if "step_error" in found:
+        error = found["step_error"]
+        for row in np.flatnonzero(np.isfinite(error) & too_large(model.stepping, error)):
+            reason[row] = TOO_STIFF.format(error[row])
+    return found, reason
+
+
+def one_by_one(
+    model: Any, outputs: tuple[str, ...], states: States, settings: Mapping[str, Array]
+) -> tuple[dict[str, Array], NDArray[np.object_]]:
+    """Likewise, of the full dynamics, which have no batch."""
+    count = len(states.q)
+    rows: list[Collision | None] = []
+    reason = np.full(count, "", dtype=object)
+    for i in range(count):
+        own = {name: x[0 if len(x) == 1 else i] for name, x in settings.items()}
+        try:
+            result, _ = model.converged(
+                states.q[i],
+                states.v[i],
+                states.torque[i],
+                tolerance=_TOLERANCE,
+                require_separation=False,
+                **own,
+            )
+        except InputError as error:
+            rows.append(None)
+            reason[i] = str(error)
+            continue
+        rows.append(result)
+        if not result.separated:
+            reason[i] = NOT_ENDED
+    return {name: _stacked([_of(row, name) for row in rows]) for name in outputs}, reason
+
+
+def _of(collision: Collision | None, name: str) -> Any:
+    if collision is None:
+        return None
+    value = getattr(collision, name)
+    return list(value.values()) if name == "target_result" else value
+
+
+def _stacked(values: list[Any]) -> Array:
+    """Rows of equal shape: histories repeat their last instant, and what there is not is nan."""
+    arrays = [None if x is None else np.asarray(x, dtype=float) for x in values]
+    there = [x for x in arrays if x is not None]
+    if not there:
+        return np.full((len(values), 1, 1), np.nan)
+    length = max((len(x) for x in there if x.ndim), default=0)
+    out = []
+    for x in arrays:
+        if x is None:
+            x = np.full(there[0].shape, np.nan)
+        out.append(np.concatenate([x, np.repeat(x[-1:], length - len(x), axis=0)]) if x.ndim else x)
+    return np.stack(out)
 
 
 def collide_many(

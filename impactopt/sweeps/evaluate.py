@@ -1,25 +1,164 @@
-"""A unit's rows, on the worker that it went to: a process of one's own, or of a cluster."""
+"""Evaluation of a sweep's units, by kind of case, in this process or on local ones."""
 
 from __future__ import annotations
 
 import gc
 import resource
+import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from impactopt import __version__
 from impactopt.errors import InputError
-from impactopt.files.output import Record
-from impactopt.sweeps.case_kinds import CASE_KINDS
-from impactopt.sweeps.units import Found, Unit, Work, failed_columns
-from impactopt.sweeps.watchdog import Watchdog
+from impactopt.files.output import Record, plain, record_of, record_of_strike, summary_of
+from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.files.solution_library import SolvedFolder
+from impactopt.planning.solution import Solution
+from impactopt.planning.solve import solve
+from impactopt.planning.strike import StrikeSolution, optimize_strike
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.workers import Died, each_on_workers
+from impactopt.sweeps.collisions import Collisions
+from impactopt.sweeps.design import Columns, Found, Unit, Work, failed_columns
+from impactopt.sweeps.progress import START
 
-__all__ = ["evaluate"]
+__all__ = ["CASE_KINDS", "ENDED_BY_WATCHDOG", "TRIES", "Watchdog", "evaluate", "on_processes"]
+
+ENDED_BY_WATCHDOG = -int(signal.SIGALRM)  # exit code of a process that it ended
+BUILDING = 900.0  # [s]: the longest that one step of building functions may take
+
+
+class Watchdog:
+    """Ends this process where a case takes much longer than its time; news from the case put it off.
+
+    The kernel does, by SIGALRM: nothing else stops compiled code.
+
+    limit [s] : None for none.  grace [s] : how much longer.
+    """
+
+    def __init__(self, limit: float | None, grace: float) -> None:
+        self._seconds = 0.0 if limit is None else limit + grace
+        self._set(self._seconds)
+
+    def building(self, line: str) -> None:
+        """A solve's `report`: functions may be compiled, which is no part of a case's time."""
+        self._set(max(BUILDING, self._seconds))
+
+    def iteration(self, record: Any) -> None:
+        """A solve's `callback`."""
+        self._set(self._seconds)
+
+    def off(self) -> None:
+        self._set(0.0)
+
+    def _set(self, seconds: float) -> None:
+        if self._seconds:  # without a limit a timer of the caller's own is left alone
+            signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+Rows = tuple[Columns, Mapping[int, Record]]
+
+_PLAIN = (
+    START,
+    "impulse_Ns",
+    "peak_force_N",
+    "contact_ms",
+    "hand_speed_m_s",
+    "duration_s",
+    "capture_margin_m",
+    "max_violation",
+    "iterations",
+    "solve_seconds",
+    "build_seconds",
+)
+_UNITS = {"N s": "_Ns", "N": "_N", "J": "_J", "m": "_m", "s": "_s", "(N m s)^2": "_N2m2s2"}
+
+
+def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
+    file = _file(work, unit)
+    problem = file.build()
+    options = {
+        "starts": work.starts,
+        "seed": work.seed,
+        "report": watchdog.building,
+        "callback": watchdog.iteration,
+        **_arguments(file, work),
+    }
+    solution: Solution | StrikeSolution
+    started: dict[str, str] = {}
+    if work.case_kind == "strike":
+        solution = optimize_strike(problem, **options)
+    elif work.solved is not None:
+        folder = SolvedFolder(work.solved)
+        solution, near = folder.solve(problem, file, **options)
+        folder.keep(solution, file, f"{unit.first:06d}")
+        started = {START: near.path.name if near is not None else ""}
+    else:
+        solution = solve(problem, start=work.start, **options)
+    if not work.trajectories:
+        return _row({**summary_of(solution), **started}, problem), {}
+    from_file: Any = {"problem": file.text, "problem_path": file.path}
+    if isinstance(solution, StrikeSolution):
+        record = record_of_strike(solution, **from_file)
+    else:
+        record = record_of(solution, **from_file)
+    return _row({**record.summary, **started}, problem), {unit.first: record}
+
+
+def _collide(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
+    global _kept
+    if _kept is None or _kept[0] != work:  # what rows share is made once a worker
+        file = problem_file_from_data(work.data, where=work.path)
+        keys, folder = tuple(unit.columns), work.folder
+        _kept = work, Collisions(file, work.at_contact, work.outputs, keys=keys, folder=folder)
+    rows = _kept[1](unit.columns, threads=1)
+    return {"reason": rows.pop("reason").tolist(), **rows}, {}
+
+
+_kept: tuple[Work, Collisions] | None = None
+CASE_KINDS: dict[str, Callable[[Work, Unit, Watchdog], Rows]] = {
+    "solve": _plan,
+    "strike": _plan,
+    "collision": _collide,
+}
+
+
+def _file(work: Work, unit: Unit) -> ProblemFile:
+    settings = {key: values[0] for key, values in unit.columns.items()}
+    return problem_file_from_data(work.data, where=work.path).changed(settings)
+
+
+def _arguments(file: ProblemFile, work: Work) -> dict[str, Any]:
+    own = file.solver.time_limit
+    limits = [seconds for seconds in (own, work.time_limit) if seconds is not None]
+    return file.solver.arguments(time_limit=min(limits, default=None))
+
+
+def _row(summary: Mapping[str, Any], problem: ImpactProblem) -> Columns:
+    """The numbers of a summary as columns, each named with its unit."""
+    usable = summary["status"] in ("solved", "acceptable") and "note" not in summary
+    row = {
+        "status": summary["status"],
+        "reason": "" if usable else " ".join(filter(None, (summary["message"], summary.get("note")))),
+    }
+    row |= {name: summary[name] for name in _PLAIN if name in summary}
+    row |= {f"target_{name}": value for name, value in (summary.get("target") or {}).items()}
+    row |= {f"torque_ratio_{phase}": x for phase, x in summary.get("torque_ratio", {}).items()}
+    row |= {f"zmp_margin_{phase}_m": x for phase, x in summary.get("zmp_margin_m", {}).items()}
+    units = {objective.name: _UNITS.get(objective.unit, "") for objective in problem.objectives}
+    for name, value in summary.get("objectives", {}).items():
+        row[f"objective_{name.replace(' ', '_')}{units[name]}"] = value
+    for scenario in summary.get("scenarios", ()):
+        name = str(scenario["name"]).replace(" ", "_")
+        row |= {f"{name}_{key}": x for key, x in scenario.items() if isinstance(x, (int, float))}
+    return {name: [value] for name, value in plain(row).items()}
+
 
 _ONE_AT_A_TIME = threading.Lock()  # in a Dask worker of several threads: the watchdog is the process's
 
@@ -64,3 +203,50 @@ def _peak_memory() -> float:
                 return float(line.split()[1]) / 1024
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+TRIES = 3  # so many processes may die of a unit; one of them might have been killed for another's memory
+
+
+def on_processes(
+    work: Work, units: Iterable[Unit], *, workers: int
+) -> Generator[tuple[Unit, Found], None, None]:
+    """Results of units, in the order in which they are finished.
+
+    A unit whose process died is tried again, then its rows say so; one that took too long is not.
+    """
+    given: dict[int, Unit] = {}
+
+    def numbered() -> Iterator[tuple[int, Unit]]:
+        for unit in units:
+            given[unit.index] = unit
+            yield unit.index, unit
+
+    found = each_on_workers(
+        evaluate,
+        work,
+        numbered(),
+        workers=workers,
+        again=lambda died: died.code != ENDED_BY_WATCHDOG and died.tries < TRIES,
+    )
+    for index, result in found:
+        unit = given.pop(index)
+        yield unit, _lost(work, unit, result) if isinstance(result, Died) else result
+
+
+def _lost(work: Work, unit: Unit, died: Died) -> Found:
+    if died.code == ENDED_BY_WATCHDOG:
+        columns = failed_columns(
+            unit.count, "time_limit", f"it took longer than {work.time_limit:g} s and did not stop by itself"
+        )
+    else:
+        how = f"exit code {died.code}" if died.code >= 0 else f"killed by {_signal(-died.code)}"
+        columns = failed_columns(unit.count, "crashed", f"its process died {died.tries} times ({how})")
+    return Found(columns=columns, peak_mb=0.0)
+
+
+def _signal(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

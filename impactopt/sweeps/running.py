@@ -14,14 +14,12 @@ from impactopt.errors import InputError
 from impactopt.planning.solution import versions
 from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.cluster import connected, on_cluster
-from impactopt.sweeps.console import told
 from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
-from impactopt.sweeps.evaluate import evaluate
-from impactopt.sweeps.local_pool import on_processes
-from impactopt.sweeps.progress import ProgressCounter, SweepProgress
+from impactopt.sweeps.design import Found, Unit, Work
+from impactopt.sweeps.evaluate import evaluate, on_processes
+from impactopt.sweeps.progress import ProgressCounter, SweepProgress, told
 from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
-from impactopt.sweeps.units import Found, Unit, Work
 from impactopt.transcription.transcription import block_functions
 
 __all__ = ["SweepResult", "sweep"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError, did_you_mean, missing_package
 from impactopt.files.output import write_file
-from impactopt.sweeps.units import Columns
+from impactopt.sweeps.design import Columns
 
 __all__ = ["merge_kinds", "pyarrow", "read_columns", "unit_of", "without_unit", "write_table"]
 

@@ -1,8 +1,8 @@
 """Transcribes a problem to a nonlinear program, and its solution back to a `Plan`.
 
 * transcription.py, strike.py    the programs of a whole motion and of the blow alone: which parts they have
-* swing.py, follow.py, contact_set.py   parts; builder.py: what each of them takes
-* layout.py, constraints.py      the variables and constraints that parts add
+* motion_phase.py, contact_set.py   parts; builder.py: what each of them takes
+* layout.py                      the variables and constraints that parts add
 * blocks.py, contact_blocks.py   the nonlinear functions
 * structured.py                  the program that a solver gets
 * plan.py                        the plan

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impactopt.transcription.constraints import Index
-from impactopt.transcription.layout import Affine, Array, stack
+from impactopt.transcription.layout import Affine, Array, Index, stack
 
 # of functions that take one instance a call: those in lanes are done before a thread has started
 THREADS = 2

@@ -13,9 +13,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription import blocks as symbolic
 from impactopt.transcription.batched import Block
-from impactopt.transcription.constraints import Index, Measure, Place, Rows
-from impactopt.transcription.layout import Array, Group, Layout
-from impactopt.transcription.limits import Limits
+from impactopt.transcription.layout import Array, Group, Index, Layout, Limits, Measure, Place, Rows
 
 
 class Builder:

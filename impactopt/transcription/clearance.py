@@ -23,8 +23,7 @@ from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.robots.robot import Robot
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.constraints import Index, Place, Row, millimetres
-from impactopt.transcription.layout import Affine, Array, stack
+from impactopt.transcription.layout import Affine, Array, Index, Place, Row, millimetres, stack
 
 TOO_NEAR = millimetres("too near")
 

@@ -1,4 +1,4 @@
-"""The contact's phases in the program: Radau IIA collocation of the whole equation of motion.
+"""Collocated contact phases: Radau IIA collocation of the whole equation of motion, and the impact's onset.
 
 Compression and restitution, each of which is smooth, or the phases of a target with events. One contact for
 the expected target, one for each scenario. They share the state at contact, the
@@ -11,24 +11,279 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
+from impactopt.contact.laws import ContactLaw
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.objectives import PeakForce
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.collocation_values import Collocated
-from impactopt.transcription.constraints import Measure, Place, along, by_leg, percent, rates
 from impactopt.transcription.contact_blocks import FORCE_SCALE, typical_state
 from impactopt.transcription.contact_guess import blow, coasted, effective_mass
-from impactopt.transcription.contact_parameters import ContactNumbers, pulls_apart, switches
-from impactopt.transcription.contact_state import Contact
-from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.layout import Affine, Array, Group
-from impactopt.transcription.limits import DIRECTIONS
+from impactopt.transcription.contact_state import (
+    Contact,
+    ContactEnd,
+    ContactNumbers,
+    DrivePoint,
+    pulls_apart,
+    still,
+    switches,
+)
+from impactopt.transcription.layout import (
+    DIRECTIONS,
+    Affine,
+    Array,
+    Group,
+    Index,
+    Measure,
+    Place,
+    Turn,
+    along,
+    by_leg,
+    determined,
+    percent,
+    rates,
+)
 from impactopt.transcription.mesh import CollocationPoint
-from impactopt.transcription.nodes import add_cone_rows
-from impactopt.transcription.plan import PlannedCollision
-from impactopt.transcription.reference import total_ground_wrench
+from impactopt.transcription.motion_phase import add_cone_rows
+from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
+
+TYPICAL = 100.0  # [rad/s^2]
+
+
+class FirstInstant:
+    """Variables and constraints of it.
+
+    law : numbers of the contact law.  suffix : of the names of its place and variables.
+    """
+
+    def __init__(self, b: Builder, contact: Contact, law: dict[str, float], suffix: str) -> None:
+        self._b, self.contact, self.law = b, contact, law
+        self.place = Place.plain(f"first instant of contact{suffix}")
+
+        def add(name: str, size: int, **options: Any) -> Group:
+            return b.layout.add(name + suffix, 1, size, **options)
+
+        self.change = add("jump of acceleration", b.ny, scale=TYPICAL, labels=b.coordinates.labels)
+        of_wrenches = {name: b.limits.of_wrenches[name] for name in ("scale", "labels")}
+        self.w = add("jump of sole wrench", b.nw, **of_wrenches)
+        self.f = add("first force", 1, scale=FORCE_SCALE)
+
+    def instance(self) -> tuple[list[Affine], Array]:
+        """Slots and parameters of the block ``first``."""
+        b, state = self._b, self.contact.state
+        slots = [state.y, state.legs, self.contact.u0[0], self.change[0], self.w[0], self.f[0]]
+        law, robot = np.array([*self.law.values()]), b.robot
+        before = np.array([float(b.problem.target.speed_before())])
+        numbers = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
+        return slots, np.concatenate(numbers)
+
+    def add_rows(self, at: int) -> None:
+        """``at``: number of the first output of its instance."""
+        b, part = self._b, self._b.parts("first")
+        term, share = "jump of acceleration", percent("of the joint's limit off")
+        b.equal(term, self.place, DIRECTIONS[: b.coordinates.base], at + part["base"], b.limits.unbalanced)
+        b.equal(term, self.place, b.robot.joint_names, at + part["joints"], share)
+        b.equal("contact law", self.place, ["force"], at + part["law"], Measure("N", FORCE_SCALE, "off"))
+        self._rotors = at + part["rotors"]
+
+    @property
+    def rotors(self) -> Index:
+        """Numbers of the outputs that are the rotors' part of the gears' load, once constraints are there."""
+        return np.asarray(self._rotors)
+
+    def determined(self) -> list[Determined]:
+        """All of it, as of one element."""
+        groups = (self.change, self.w, self.f)
+        return [determined(Turn.ELEMENT, np.concatenate([g.index(0) for g in groups]))]
+
+    def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        """Write what it is for coordinates and rates (ny,) and legs (nl,) at contact."""
+        b, law = self._b, type(self._b.problem.law)(**self.law)
+        force, change, w, _ = jump(b.problem, b.coordinates, law, y, rates, legs)
+        self.f.write(x, force)
+        self.change.write(x, change)
+        self.w.write(x, w)
+
+
+def jump(
+    problem: ImpactProblem, c: StanceCoordinates, law: ContactLaw, y: Array, rates: Array, legs: Array
+) -> tuple[float, Array, Array, Array]:
+    """First force [N] of all strikers; by how much it changes yddot (ny,) and the sole wrenches (6 a sole);
+    and the joints' accelerations (n,) then, of a robot that has coasted until then.
+    """
+    model = problem.robot.model
+    q, v, a = c.complete_motion(y, rates, np.zeros(c.ny), legs)
+    data: Any = model.createData()
+    upper = np.triu(pin.crba(model, data, q))
+    inertia = upper + np.triu(upper, 1).T
+    soles = c.sole_jacobians(q)[0] if c.legs else np.zeros((0, model.nv))
+    hands = [model.getFrameId(problem.robot.striker(name).model_frame) for name in problem.strikers]
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    axes = pin.LOCAL_WORLD_ALIGNED
+    found = [np.reshape(pin.getFrameJacobian(model, data, hand, axes), (6, model.nv))[:3] for hand in hands]
+    rows = np.array([problem.normal @ jacobian for jacobian in found])
+    rates = rows @ v - float(problem.target.speed_before())
+    forces = np.array([float(law.branch(0.0, float(rate), True)) for rate in rates])
+    both = np.linalg.solve(inertia, np.column_stack([soles.T, -forces @ rows]))
+    spread, free = both[:, :-1], both[:, -1]
+    w: Array = np.zeros(0)
+    if len(soles):
+        w = np.asarray(np.linalg.lstsq(soles @ spread, -soles @ free, rcond=None)[0])
+    change = free + spread @ w
+    base = change[: c.base].copy()
+    if c.base:  # from the base's own frame to rates of its coordinates
+        base[:3] = pin.rpy.rpyToMatrix(y[3:6]) @ base[:3]
+        base[3:] = np.linalg.solve(pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL), base[3:])
+    independent = np.concatenate([base, change[c.base :][c.independent]])
+    return float(forces.sum()), independent, w, np.asarray((a + change)[c.base :])
+
+
+class Collocated:
+    """Its stages, and variables that all contacts have: who completes it makes them.
+
+    Attributes
+    ----------
+    stages : collocation points of the phases.  end : the last one of each phase.  T : durations [s] of them.
+    u, d : rates and travel of the robot.  xt : travel of the target.  joined, joined_x : those of two phases
+        of three as one.  suffix : of places' names.
+    legs : at the stages.  contact : what it starts from.  torques : over limit at the stages, as variables.
+    """
+
+    _b: Builder
+    stages: Sequence[CollocationPoint]
+    end: list[int]
+    T: list[Group]
+    u: Group
+    d: Group
+    xt: Group
+    joined: Group
+    joined_x: Group
+    suffix: str
+    legs: Group
+    w: Group
+    contact: Contact
+    torques: list[Affine]
+
+    def _before(self, phase: int) -> tuple[Affine, Affine, Affine]:
+        """Time [s], travel and the target's travel in the phases before one, both divided by that time."""
+        time = Affine.zeros(1)
+        for T in self.T[:phase]:
+            time = time + T[0]
+        return time, self._so_far(self.d, self.joined, phase), self._so_far(self.xt, self.joined_x, phase)
+
+    def _so_far(self, integral: Group, joined: Group, phase: int) -> Affine:
+        """Integral over the phases before one, divided by their time."""
+        if phase == 0:
+            return Affine.zeros(integral.size)
+        return integral[self.end[0]] if phase == 1 else joined[0]
+
+    def _time(self, phase: int, place: float) -> Affine:
+        """[s] since contact."""
+        return self._before(phase)[0] + self.T[phase][0] * place
+
+    def _integrals(self) -> list[tuple[Group, Group]]:
+        """Integrals over the phase so far, each with its group of the first two phases of three as one."""
+        return [(self.d, self.joined), (self.xt, self.joined_x)]
+
+    def _join(self) -> list[list[Affine]]:
+        """Slots of the block ``join``: integrals in the first two phases of three as one."""
+        first, second = self.end[:2]
+        times = self.T[0][0], self.T[1][0]
+        parts = [(integral[first], integral[second], joined[0]) for integral, joined in self._integrals()]
+        return [
+            [*times, *(integral[k : k + 1] for integral in integrals)]
+            for integrals in parts
+            for k in range(integrals[0].size)
+        ]
+
+    def _slots(self, group: Group, i: int, start: Affine, *, anew: bool = False) -> tuple[Affine, Affine]:
+        """Value and d/ds of a collocated group at stage i; ``start``: at contact; ``anew``: of each phase."""
+        s = self.stages[i]
+        slope = Affine.zeros(group.size)
+        for m, w in zip(s.members, s.weights, strict=True):
+            slope = slope + group[m] * w
+        begins = s.previous < 0 or (anew and s.new_phase)
+        before = start if begins else group[s.previous]
+        return group[i], slope + before * s.start
+
+    def _place(self, s: CollocationPoint) -> Place:
+        time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
+        suffix = self.suffix.replace("{", "{{").replace("}", "}}")
+        return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
+
+    def _travel(self, i: int) -> list[Affine]:
+        """Slots of y = y0 + T1 d1 + T d at a stage."""
+        s = self.stages[i]
+        T1, d1, _ = self._before(s.phase)
+        return [d1, T1, self.d[i], self.T[s.phase][0]]
+
+    def _torque_rows(self, place: Place, outputs: Index, most: float) -> None:
+        """Servo torques over limit (n) at a stage are bounded; as variables, if a term is about drives."""
+        b, term = self._b, f"{self._b.limits.torque.name} in collision"
+        common: dict[str, Any] = {"term": term, "place": place, "lower": -most, "upper": most}
+        common["measure"] = percent("over its limit", of=most)
+        if b.problem.of_drives:
+            name = f"torque in collision, {place.name}"
+            self.torques.append(b.lift(name, outputs, labels=b.robot.joint_names, **common)[0])
+        else:
+            b.rows.add(components=b.robot.joint_names, outputs=outputs, **common)
+
+    def drives(self) -> list[DrivePoint]:
+        """Drives at each stage; known once constraints are added, if a term is about drives."""
+        pairs = zip(self.stages, self.torques, strict=True)
+        return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
+
+    def wrenches(self) -> list[tuple[Place, Affine]]:
+        """Wrenches on soles and supporting hands at each stage."""
+        return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
+
+    def _motion(self, i: int) -> list[Affine]:
+        """Slots of a `impactopt.problem.joint_motion.joint_motion` at a stage."""
+        rates = self._slots(self.u, i, self.contact.u0[0])
+        return [self.contact.state.y, *self._travel(i), *rates, Affine.constant(1.0), self.legs[i]]
+
+    def contact_end(self) -> ContactEnd:
+        state, u0, last = self.contact.state, self.contact.u0[0], self.end[-1]
+        before = still(state.y, u0, u0 * 0.0, Affine.constant(1.0), state.legs)
+        place = Place.plain(f"after contact{self.suffix}")
+        return ContactEnd(place, before, self._motion(last), self.u[last] - u0)
+
+    def _joints(self, x: Array, law: ContactLaw) -> dict[str, Array]:
+        """Velocity and acceleration of the joints (m + 1, n), the first at once after contact, for solver
+        variables (n,).
+        """
+        b, c, state = self._b, self._b.coordinates, self.contact.state
+        y, rates, legs = (e.evaluate(x) for e in (state.y, self.contact.u0[0], state.legs))
+        velocity = [c.complete_motion(y, rates, 0 * rates, legs)[1][c.base :]]
+        acceleration = [jump(b.problem, c, law, y, rates, legs)[3]]
+        for i in range(len(self.stages)):
+            y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
+            _, v, a = c.complete_motion(y0 + T1 * d1 + T * d, u, slope / T, legs_there)
+            velocity.append(v[c.base :])
+            acceleration.append(a[c.base :])
+        return {"velocity": np.array(velocity), "acceleration": np.array(acceleration)}
+
+    def _integral_rows(self, i: int, place: Place, integrals: Group, rate: Group) -> None:
+        """A group of integrals over the phase so far, of a group of rates."""
+        s, labels = self.stages[i], integrals.labels
+        integral = integrals[i]
+        for m, w in zip(s.members, s.quadrature, strict=True):
+            integral = integral - rate[m] * w
+        if not s.new_phase:
+            integral = integral - integrals[s.previous]
+        self._b.rows.add(
+            term="collision kinematics",
+            place=place,
+            components=labels,
+            affine=integral,
+            lower=0,
+            upper=0,
+            measure=rates(labels),
+        )
 
 
 class Collision(ContactNumbers, Collocated):

@@ -11,12 +11,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.collision.effects import Effects
+from impactopt.collision.settings import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
 from impactopt.kinematics.stages import Stage, motion_in_stages
-from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, make_block
 
 __all__ = [

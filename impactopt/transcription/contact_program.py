@@ -19,13 +19,23 @@ from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import ApartRow, Held, add_apart_rows, coupled, move_apart
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.constraints import Index, Measure, Place, Rows
 from impactopt.transcription.contact_blocks import DEPTH_SCALE
 from impactopt.transcription.contact_set import Hit
 from impactopt.transcription.contact_state import ContactEnd, DrivePoint, still
-from impactopt.transcription.elimination import Turn, by_choice, determined
-from impactopt.transcription.impulse import InstantImpact
-from impactopt.transcription.layout import Affine, Array, Group, Layout
+from impactopt.transcription.frozen_collision import InstantImpact
+from impactopt.transcription.layout import (
+    Affine,
+    Array,
+    Group,
+    Index,
+    Layout,
+    Measure,
+    Place,
+    Rows,
+    Turn,
+    by_choice,
+    determined,
+)
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.springs import SpringPoint, add_hinges, add_springs
 from impactopt.transcription.structured import StructuredProgram

@@ -18,17 +18,13 @@ from scipy.sparse.linalg import splu
 
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.constraints import Index
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
-from impactopt.transcription.contact_parameters import switches
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_set import Hit, approaches
-from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
-from impactopt.transcription.layout import Affine, Array
-from impactopt.transcription.mesh import CollocationPoint, Elements, halved, lagrange
-from impactopt.transcription.mesh_refinement import GEAR
-from impactopt.transcription.plan import PlannedCollision
-from impactopt.transcription.planned_loads import gear_share
+from impactopt.transcription.contact_state import Contact, ContactState, add_coasting, switches
+from impactopt.transcription.layout import Affine, Array, Index
+from impactopt.transcription.mesh import GEAR, CollocationPoint, Elements, halved, lagrange
+from impactopt.transcription.plan import PlannedCollision, gear_share
 from impactopt.transcription.structured import StructuredProgram
 
 ASKED = 0.5  # [%] of the impulse: the error that does not justify another solve

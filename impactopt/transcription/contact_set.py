@@ -11,15 +11,11 @@ import numpy as np
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.collision import Collision
-from impactopt.transcription.constraints import Index, Place, percent
+from impactopt.transcription.collision import Collision, FirstInstant
 from impactopt.transcription.contact_guess import mass_at_contact
 from impactopt.transcription.contact_state import Contact, ContactEnd, DrivePoint
-from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.frozen_collision import FrozenCollision
-from impactopt.transcription.impact_onset import FirstInstant
-from impactopt.transcription.impulse import InstantImpact
-from impactopt.transcription.layout import Array
+from impactopt.transcription.frozen_collision import FrozenCollision, InstantImpact
+from impactopt.transcription.layout import Array, Index, Place, Turn, determined, percent
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
 

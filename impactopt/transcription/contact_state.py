@@ -1,17 +1,122 @@
-"""State at contact that all collisions of a program start from, and the servo reference that continues.
+"""State at contact that all collisions of a program start from, and parameters of contact law and target.
 
 Also the points at which a program knows the state of joints and drives: nodes, contact and its ends.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from impactopt.contact.laws import ContactLaw
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.scenario import Scenario
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.constraints import Place
-from impactopt.transcription.layout import Affine, Group
+from impactopt.transcription.contact_guess import natural_durations
+from impactopt.transcription.layout import Affine, Array, Group, Place
+from impactopt.transcription.mesh import CollocationPoint
+
+# of the shortest compression that each of the two may last which an event makes of it, and the first of them
+# where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
+SHARE, AT_ONCE = 0.1, 0.05
+# of a phase without a shortest time: share of the natural one, [s] at most, and share of the longest time
+OF_NATURAL, LEAST, HALF = 0.15, 2e-3, 0.5
+ALIKE = 3.0  # factor between numbers that are
+
+
+class ContactNumbers:
+    """Part of a `impactopt.transcription.collision.Collision`, which has its attributes too.
+
+    law, target : numbers by name.  shortest : least durations [s] of the phases.
+    mass : of the robot at its striker [kg].  natural : how long the last phase [s] is of a point mass's blow.
+    """
+
+    _b: Builder
+    scenario: Scenario | None
+    stages: Sequence[CollocationPoint]
+    end: list[int]
+    T: list[Group]
+    mass: float
+    law: dict[str, float]
+    target: dict[str, float]
+    _known: Array
+
+    def renew(self, mass: float | None = None, *, anew: bool = True) -> None:
+        """Take the numbers of the builder's problem.
+
+        mass : of the robot at its striker [kg], if it is another.  anew : the least durations too; else those
+        are kept where numbers are alike, as they are far below what a blow takes.
+        """
+        p = self._b.problem
+        self.mass = self.mass if mass is None else mass
+        self.law, self.target = p.law.parameters, p.target.parameters
+        if self.scenario is not None:
+            self.law, self.target = self.scenario.numbers(p.law, p.target)
+        numbers = np.array([*self.law.values(), *self.target.values(), self.mass])
+        if not anew and alike(numbers, self._known):
+            return
+        self._known = numbers
+        # how long the last phase [s] is of a point mass's blow: the unit of what is too short
+        self.natural = float(natural_durations(*self.alone(), self.mass)[-1])
+        self.shortest = shortest_phases(p, self.natural)
+
+    def alone(self) -> tuple[Any, Any]:
+        """Law and target as one of all strikers has them, which has its share of a mass."""
+        p, numbers = self._b.problem, dict(self.target)
+        numbers |= {"mass": numbers["mass"] / len(p.strikers)} if "mass" in numbers else {}
+        return type(p.law)(**self.law), type(p.target)(**numbers)
+
+    def follow(self) -> None:
+        """Bounds of durations follow the problem."""
+        longest = self._b.problem.contact_duration[1]
+        for T, least in zip(self.T, self.shortest, strict=True):
+            self._b.layout.bound(T, least, longest)
+
+    def force_numbers(self) -> list[list[float]]:
+        """Parameters of the block ``force``, of each stage."""
+        p = self._b.problem
+        phases = np.column_stack([np.eye(len(self.end)), self.shortest])
+        within = phases if p.target.guards else phases[:, :0]
+        numbers = [*self.law.values(), *self.target.values()]
+        numbers += [] if p.second is None else [*p.second.point]
+        return [
+            [*p.point, *p.normal, float(s.phase == len(self.end) - 1), *within[s.phase], *numbers]
+            for s in self.stages
+        ]
+
+
+def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
+    """Least duration [s] of each contact phase; ``natural``: that of a point mass's last phase."""
+    target, (shortest, longest) = problem.target, problem.contact_duration
+    if not shortest:  # no bound: far below what a blow takes, as constraints are over these times
+        shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
+    shares = [SHARE if target.guards else 1.0] * (len(target.phases) - 1) + [1.0]
+    if target.at_once:
+        shares[0] = AT_ONCE
+    return [share * shortest for share in shares]
+
+
+def alike(numbers: Array, others: Array) -> bool:
+    """True if problems with these parameters (k,) can share least durations, as their blows take about as
+    long.
+    """
+    sizes = np.sort(np.abs([numbers, others]), axis=0)
+    return bool(np.all(sizes[1] <= ALIKE * sizes[0]))
+
+
+def switches(law: ContactLaw) -> bool:
+    """True if compression and restitution are different branches of the law."""
+    compression, restitution, _ = law.formula()
+    return bool(compression != restitution)
+
+
+def pulls_apart(law: ContactLaw) -> bool:
+    """True if the law would pull at bodies that separate fast."""
+    # hardly any penetration [m], and separation at 10 m/s: a damper without a spring behind it would pull
+    return float(law.branch(1e-6, -10.0, False)) < 0
+
 
 GAINS = "logarithms of factors on gains"
 

@@ -12,15 +12,14 @@ from scipy.optimize import lsq_linear
 
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
-from impactopt.kinematics.statics import static_wrenches
 from impactopt.problem.terms import TargetSpeed
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.constraints import Row
 from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import carry_contact, same_places
-from impactopt.transcription.layout import Array, Group
+from impactopt.transcription.layout import Array, Group, Row
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription

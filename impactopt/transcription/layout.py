@@ -1,18 +1,68 @@
-"""Named groups of decision variables and affine expressions in them.
+"""Layout of a program: groups of variables, affine expressions in them, constraints, limits, eliminations.
 
 The solver sees scaled variables; everything built from a :class:`Group` is in physical units, because a
 group's affine expressions carry its scale.
+
+A constraint knows its term, its component, its place, whose time is a function of the solution's durations,
+and the measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 % over its limit".
+
+Each part of a program says which of its variables constraints determine, and whose `Turn` they are. Two
+orders hang on that: which variables go first, as others follow from them; and who takes constraints first,
+where a constraint would do for several.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
+
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import (
+    Balance,
+    ContactWrenchCone,
+    Incidence,
+    LegExtension,
+    PositionLimit,
+    TorqueLimit,
+    VelocityLimit,
+)
+from impactopt.problem.terms.grip import WRENCH
+from impactopt.problem.violation import Measure, Place, degrees, millimetres, percent
+from impactopt.robots.tools import inside
+from impactopt.solvers.program import Determined
+
+__all__ = [
+    "DIRECTIONS",
+    "Affine",
+    "Array",
+    "Group",
+    "Index",
+    "Layout",
+    "Limits",
+    "Measure",
+    "Place",
+    "Row",
+    "Rows",
+    "Turn",
+    "add",
+    "along",
+    "by_choice",
+    "by_leg",
+    "degrees",
+    "determined",
+    "millimetres",
+    "percent",
+    "rates",
+    "select",
+    "stack",
+]
 
 Array = NDArray[np.float64]
 
@@ -200,3 +250,199 @@ class Layout:
             if 0 <= k < g.count * g.size:
                 return f"{g.name}[{k // g.size}], {g.labels[k % g.size]}"
         raise IndexError(j)
+
+
+Index = NDArray[np.intp]
+
+
+def by_leg(joints: Index) -> list[Index]:
+    """Numbers of leg joints (6 a leg), leg by leg."""
+    return list(joints.reshape(-1, 6))
+
+
+def along(labels: Sequence[str], phrase: str) -> list[Measure]:
+    """Measures of constraints in [m] for directions x, y, z, else in [rad], told apart by the labels' last
+    words.
+    """
+    return [millimetres(phrase) if _straight(name) else degrees(phrase) for name in labels]
+
+
+def rates(labels: Sequence[str]) -> list[Measure]:
+    """Measures of constraints in [m/s] or [rad/s], likewise."""
+    return [Measure("m/s" if _straight(name) else "rad/s", 1.0, "off") for name in labels]
+
+
+def _straight(label: str) -> bool:
+    return label.split()[-1] in ("x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A constraint's origin: term, place and component, and how its violation is reported.
+
+    whole : what the component is a part of, and what messages name in its place; None: the component.
+    """
+
+    term: str
+    place: Place
+    component: str
+    measure: Measure | None = None
+    whole: str | None = None
+
+    def __str__(self) -> str:
+        return _joined(self.term, self.place.name, self.component)
+
+    def told(self, x: Array, amount: float) -> tuple[str, str]:
+        """Name of this constraint and amount of its violation in words, at solver variables (n,)."""
+        by = f"by {amount:.3g}" if self.measure is None else self.measure.told(x, amount)
+        component = self.component if self.whole is None else self.whole
+        return _joined(self.term, self.place.told(x), component), by
+
+
+def _joined(*parts: str) -> str:
+    return ", ".join(part for part in parts if part)
+
+
+@dataclass
+class Rows:
+    """Constraints under construction: each is at most one block output plus an affine expression of x."""
+
+    outputs: list[Index] = field(default_factory=list)
+    affine: list[Affine] = field(default_factory=list)
+    lower: list[Array] = field(default_factory=list)
+    upper: list[Array] = field(default_factory=list)
+    origins: list[Row] = field(default_factory=list)
+
+    def copy(self) -> Rows:
+        """The same constraints, to which others can be added."""
+        return Rows(*(list(getattr(self, f.name)) for f in fields(self)))
+
+    def bound(self, k: int, lower: ArrayLike, upper: ArrayLike) -> None:
+        """Other bounds for what call number ``k`` of :meth:`add` added, none of which it dropped."""
+        for sides, given in ((self.lower, lower), (self.upper, upper)):
+            sides[k] = np.broadcast_to(np.asarray(given, dtype=float), sides[k].shape)
+
+    def add_each(self, origins: Sequence[Row], *, outputs: Index, lower: float) -> None:
+        """Append constraints of these origins:  lower <= out[outputs]."""
+        n = len(origins)
+        self.outputs.append(np.asarray(outputs, dtype=np.intp))
+        self.affine.append(Affine.zeros(n))
+        self.lower.append(np.full(n, lower))
+        self.upper.append(np.full(n, np.inf))
+        self.origins.extend(origins)
+
+    def add(
+        self,
+        *,
+        term: str,
+        place: Place | str = "",
+        components: Sequence[str],
+        outputs: Index | None = None,
+        affine: Affine | None = None,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
+        measure: Measure | Sequence[Measure] | None = None,
+        whole: str | None = None,
+    ) -> None:
+        """Append ``len(components)`` constraints  lower <= out[outputs] + affine <= upper.
+
+        measure : of all, or one a constraint; place as text: one without a time; whole : of :class:`Row`.
+        Rows that are unbounded on both sides are dropped.
+        """
+        n = len(components)
+        lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
+        hi = np.broadcast_to(np.asarray(upper, dtype=float), (n,))
+        keep = np.flatnonzero(np.isfinite(lo) | np.isfinite(hi))
+        if not keep.size:
+            return
+        out = np.full(n, -1, dtype=np.intp) if outputs is None else np.asarray(outputs, dtype=np.intp)
+        lin = Affine.zeros(n) if affine is None else affine
+        if keep.size < n:
+            out, lin, lo, hi = out[keep], lin[keep], lo[keep], hi[keep]
+        self.outputs.append(out)
+        self.affine.append(lin)
+        self.lower.append(lo)
+        self.upper.append(hi)
+        where = Place.plain(place) if isinstance(place, str) else place
+        measures = [measure] * n if measure is None or isinstance(measure, Measure) else measure
+        self.origins.extend(Row(term, where, components[int(k)], measures[int(k)], whole) for k in keep)
+
+
+GRAVITY = 9.81
+LEVER = 0.1  # [m] scale of sole moments against forces
+BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
+DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+class Limits:
+    """Read by all parts of a program.
+
+    Attributes
+    ----------
+    torque, velocity, position, cone, balance, incidence, extension : the problem's terms.
+    weight : of the robot [N].  units : of base rows, weight [N] and lever [m].  unbalanced : how their
+        violation is reported.
+    wrench_scale (6 a sole) : of sole wrenches [N, N m].
+    y_lower, y_upper (ny,), legs_lower, legs_upper (nl,) : of the coordinates and the legs.
+    rate_limit (n,) : of the joints [rad/s].
+    of_y, of_legs, of_wrenches : what every group of coordinates, of legs and of sole wrenches has.
+    """
+
+    def __init__(self, problem: ImpactProblem, coordinates: StanceCoordinates) -> None:
+        p, c, r = problem, coordinates, problem.robot
+        self.torque, self.velocity = p.term(TorqueLimit), p.term(VelocityLimit)
+        self.position, self.cone = p.term(PositionLimit), p.term(ContactWrenchCone)
+        self.balance, self.incidence = p.term(Balance), p.term(Incidence)
+        self.extension = p.term(LegExtension)
+        self.weight = GRAVITY * float(sum(i.mass for i in r.model.inertias))
+        lower, upper = inside(r, self.position.margin)
+        box, y0 = BASE_BOX[: c.base], c.split(p.start_posture)[0]
+        self.y_lower = np.concatenate([y0[: c.base] - box, lower[c.independent]])
+        self.y_upper = np.concatenate([y0[: c.base] + box, upper[c.independent]])
+        self.legs_lower, self.legs_upper = lower[c.dependent], upper[c.dependent]
+        self.rate_limit = self.velocity.fraction * r.velocity_limit
+        self.units = np.array([self.weight, LEVER])
+        force, moment = Measure("N", self.weight, "off"), Measure("N m", self.weight * LEVER, "off")
+        self.unbalanced = [force if name in "xyz" else moment for name in DIRECTIONS[: c.base]]
+        self.wrench_scale = self.weight * np.array([1, 1, 1, LEVER, LEVER, LEVER] * len(c.legs))
+        self.of_y: dict[str, Any] = {"lower": self.y_lower, "upper": self.y_upper, "labels": c.labels}
+        self.of_legs: dict[str, Any] = {
+            "lower": self.legs_lower,
+            "upper": self.legs_upper,
+            "labels": c.leg_labels,
+        }
+        wrench_labels = [f"{leg.end} {k}" for leg in c.legs for k in WRENCH]
+        self.of_wrenches: dict[str, Any] = {"scale": self.wrench_scale, "labels": wrench_labels}
+
+
+class Turn(IntEnum):
+    """Order of elimination of determined variables; lower ones are eliminated first."""
+
+    NODE = 0  # legs at a node, and the first sole's wrench
+    LIFTED = 1  # what equals outputs of blocks
+    RATE = 2  # the rate at contact
+    FEEDFORWARD = 3  # the torque that makes the robot coast
+    STAGE_LEGS = 4  # legs and reference's legs at a collocation point
+    ELEMENT = 5  # motion, force, target and wrenches of an element, one element after the other
+    AFTER = 6  # what a collision leaves behind: where a follow-through starts, or a position
+
+
+_FIRST_CHOICE = (
+    Turn.NODE,
+    Turn.LIFTED,
+    Turn.STAGE_LEGS,
+    Turn.ELEMENT,
+    Turn.FEEDFORWARD,
+    Turn.AFTER,
+    Turn.RATE,  # of constraints that a collision's legs and motion have left
+)
+
+
+def determined(turn: Turn, variables: Index, step: int = 0) -> Determined:
+    """Variables of one system of constraints.  step : within a turn, those of a lower one go first."""
+    return Determined((turn, step), variables)
+
+
+def by_choice(found: Iterable[Determined]) -> list[Determined]:
+    """Determined variables in the order in which they take constraints: by turn, then part by part."""
+    return sorted(found, key=lambda each: _FIRST_CHOICE.index(Turn(each.rank[0])))

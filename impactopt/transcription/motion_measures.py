@@ -11,7 +11,7 @@ from scipy.signal import find_peaks
 
 from impactopt.bodies.clearance import Places
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.sole_margins import weight_of
+from impactopt.robots.loads import weight_of
 from impactopt.transcription.plan import Plan, Trajectory
 
 __all__ = ["first_touch", "ground_force_share", "motion_measures"]

@@ -1,15 +1,17 @@
-"""The planned motion as numbers: references for the robot's servo, and what the plan predicts.
+"""Planned motion or strike as numbers: references for the robot's servo, predictions, loads.
 
 This is the border to everything that checks, draws or executes a plan: arrays only, no CasADi.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
@@ -17,11 +19,95 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import ContactWrenchCone
-from impactopt.robots.sole_margins import cop_margin, least_margins
-from impactopt.transcription.reference import Completed, complete_reference
+from impactopt.problem.terms import ContactWrenchCone, GearLoad
+from impactopt.robots.loads import BEARS, DriveLoads, cop_margin, gear_torque, least_margins, weight_of
+from impactopt.robots.robot import Robot
+
+__all__ = [
+    "Completed",
+    "Plan",
+    "PlannedCollision",
+    "PlannedScenario",
+    "PlannedStrike",
+    "Trajectory",
+    "complete_reference",
+    "gear_share",
+    "motion_loads",
+    "plan_loads",
+    "sampled",
+    "strike_loads",
+    "total_ground_wrench",
+]
 
 Array = NDArray[np.float64]
+MOMENT_COST = 10.0  # [1/m] of a correction of moments against one of forces
+
+
+class Completed(NamedTuple):
+    """Rows of q (k, nq), v and a (k, nv), torque (k, n) [N m], ground wrench (k, 6) about the world's origin,
+    and wrenches (k, 6 a sole, 6 a hand) in the soles' and hands' own frames [N, N m].
+    """
+
+    q: Array
+    v: Array
+    a: Array
+    torque: Array
+    ground: Array
+    sole_wrench: Array
+
+
+def complete_reference(
+    problem: ImpactProblem, y: Array, yd: Array, ydd: Array, wrench: Array, legs: Array
+) -> Completed:
+    """Full motion, torques and wrenches of a motion in independent coordinates.
+
+    y, yd, ydd (k, ny) are independent coordinates, rates and second rates. wrench (k, 6 a sole) is corrected
+    to balance the base and hinges of soles, by as little as it takes: each sole takes its part of what is
+    lacking by the load that it bears, so that one that bears little keeps its centre of pressure. legs (nl,)
+    starts their inverse kinematics.
+    """
+    c, robot = problem.coordinates, problem.robot
+    model, data = robot.model, robot.model.createData()
+    n = len(y)
+    q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
+    torque, corrected = np.zeros((n, robot.n)), np.zeros((n, 6 * len(c.legs)))
+    cost = _correction_costs(c, wrench, BEARS * weight_of(robot))
+    for k, leg in enumerate(c.closing.follow(y, legs)):
+        q[k], v[k], a[k], jac = c.closing.motion(y[k], yd[k], ydd[k], leg)
+        tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
+        if c.legs:
+            base = jac[:, c.undriven].T / cost[k]
+            miss = tau[c.undriven] - jac[:, c.undriven].T @ wrench[k]
+            corrected[k] = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / cost[k]
+            tau = tau - jac.T @ corrected[k]
+        torque[k] = tau[c.base :]
+    return Completed(q, v, a, torque, total_ground_wrench(c, corrected), corrected)
+
+
+def _correction_costs(c: StanceCoordinates, wrench: Array, least: float) -> Array:
+    """(k, 6 a sole, 6 a hand) Weights of a correction's components, whose squares are minimized.
+
+    A correction is shared as the load is: what minimizes the sum of d_i^2 / load_i. ``least`` [N] is the load
+    that a sole counts for at least. A hand that holds on counts for a sole of mean load.
+    """
+    standing = np.array([leg.sole is not None for leg in c.legs], dtype=bool)
+    load = np.maximum(wrench[:, 2::6], least)
+    load[:, ~standing] = load[:, standing].mean(axis=1, keepdims=True) if standing.any() else least
+    six = np.array([1.0, 1.0, 1.0, MOMENT_COST, MOMENT_COST, MOMENT_COST])
+    return np.asarray((six / np.sqrt(load)[:, :, None]).reshape(len(wrench), -1))
+
+
+def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Array:
+    """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches.
+
+    The soles are where they are held. What hands hold on to is not the ground.
+    """
+    placements = [leg.placement for leg in coordinates.legs if leg.sole is not None]
+    total = np.zeros((len(wrenches), 6))
+    for k, place in enumerate(placements):
+        # the dual action: wrenches to the world's axes and origin
+        total += wrenches[:, 6 * k : 6 * k + 6] @ place.toDualActionMatrix().T
+    return total
 
 
 def sampled(start: float, end: float, step: float) -> Array:
@@ -391,7 +477,7 @@ class Plan:
         """Planned margins of each sole by itself, and what is asked of them, as ``summary.json`` has them.
 
         ``sole_cop_margin_mm`` and ``sole_force_N`` by sole and phase: the least distance of its centre of
-        pressure from its own edges (:func:`impactopt.robots.sole_margins.cop_margin`) and its least normal
+        pressure from its own edges (:func:`impactopt.robots.loads.cop_margin`) and its least normal
         force, every millisecond of swing and follow-through, at the instants of the collision that are known,
         and after a blow that meets nothing. ``sole_cop_margin_asked_mm`` by phase, ``sole_force_asked_N``.
         Nothing of a robot without soles.
@@ -425,3 +511,112 @@ class Plan:
             "sole_cop_margin_asked_mm": {n: 1e3 * m for n, m in asked.items() if m is not None},
             "sole_force_asked_N": cone.minimum_force,
         }
+
+
+STEP = 5e-3  # [s] of motions, whose loads change from one node to the next: a completed millisecond is dear
+
+
+def motion_loads(robot: Robot, way: Trajectory, hit: PlannedCollision) -> DriveLoads:
+    """Loads of a reference before and after contact, and of the collision, at all known instants."""
+    phase, base = way.phase, robot.nv - robot.n
+    rates, outside = way.v[:, base:], phase != 1
+    jump = rates[phase == 2][0] - rates[phase == 0][-1]
+    return _loads(robot, (way.torque[outside], rates[outside], way.a[outside, base:]), hit, jump)
+
+
+def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> list[DriveLoads]:
+    """Loads of a plan's motions every `STEP`, including the one that meets nothing, and of these collisions
+    with its targets.
+    """
+    expected, *others = hits
+    ways = [plan.trajectory(step=STEP, hold=STEP)]
+    if plan.abort is not None:
+        ways.append(plan.trajectory(step=STEP, hold=STEP, missed=True, known=ways[0]))
+    out = [motion_loads(robot, way, expected) for way in ways]
+    still = np.zeros(robot.nv)
+    return out + [strike_loads(robot, still, still, hit) for hit in others]
+
+
+def strike_loads(robot: Robot, before: Array, after: Array, hit: PlannedCollision) -> DriveLoads:
+    """Loads of a collision alone, with the robot's velocities (nv,) before and after it."""
+    none = np.zeros((0, robot.n))
+    return _loads(robot, (none, none, none), hit, (after - before)[-robot.n :])
+
+
+def gear_share(problem: ImpactProblem, torque: Array, acceleration: Array) -> Array:
+    """(k,) Largest load of a gear over what the problem allows, of torques and accelerations (k, n) of the
+    joints; zeros where it bounds none.
+    """
+    term, robot = problem.extra(GearLoad), problem.robot
+    if term is None or not term.active or not acceleration.size:
+        return np.zeros(len(torque))
+    load = gear_torque(robot, torque, acceleration) / robot.torque_limit / term.most(robot)
+    return np.asarray(np.abs(load).max(axis=1, initial=0.0))
+
+
+def _loads(robot: Robot, way: tuple[Array, ...], hit: PlannedCollision, jump: Array) -> DriveLoads:
+    """way, hit : torque, velocity and acceleration of the joints, (k, n) each."""
+    parts = [way, (hit.torque, hit.velocity, hit.acceleration)][: 1 + bool(hit.acceleration.size)]
+    torque, velocity, acceleration = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    gear = gear_torque(robot, torque, acceleration)
+    return DriveLoads.of(robot, gear=gear, torque=torque, velocity=velocity, jump=jump)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedStrike:
+    """State in which a robot hits, and the plan's prediction of the impact.
+
+    posture (nq,) and velocity (nv,), pin's, at contact; posture_after, velocity_after at separation. torque
+    (n,) [N m] that makes the robot coast at contact, and ground (6,) [N, N m], the total ground wrench about
+    the world's origin then. compression, restitution [s]; hand_speed [m/s] along the normal at contact;
+    impulse [N s] to the target; collision, scenarios: as of :class:`impactopt.Plan`.
+    """
+
+    problem: ImpactProblem
+    posture: Array
+    velocity: Array
+    posture_after: Array
+    velocity_after: Array
+    torque: Array
+    ground: Array
+    compression: float
+    restitution: float
+    collision: PlannedCollision
+    hand_speed: float
+    impulse: float
+    scenarios: tuple[PlannedScenario, ...] = ()
+
+    def margins(self) -> dict[str, Any]:
+        """Torque demand over limit and ZMP margin [m] at contact and in the collision; capture point [m].
+
+        The capture point's is that of the state after contact. An impact without duration has no torque and
+        no ZMP.
+        """
+        limit, hit = self.problem.robot.torque_limit, self.collision
+        lasts = len(hit.ground) > 0 or not self.problem.robot.floating
+        torques = {"contact": self.torque, "collision": hit.torque if lasts else hit.torque[:0]}
+        out: dict[str, Any] = {
+            "torque_ratio": {name: float(np.abs(t / limit).max()) for name, t in torques.items() if len(t)}
+        }
+        polygon = support_polygon(self.problem.robot, self.problem.coordinates)
+        if not len(polygon):
+            return out
+        grounds = {"contact": self.ground[None], "collision": hit.ground}
+        out["zmp_margin_m"] = {
+            name: float(margin(polygon, zmp(wrench)).min()) for name, wrench in grounds.items() if len(wrench)
+        }
+        out["capture_margin_m"] = float(margin(polygon, self._capture_point()[None])[0])
+        return out
+
+    def loads(self) -> DriveLoads:
+        """Peak loads of gears and motors in the impact."""
+        before, after = self.velocity, self.velocity_after
+        return strike_loads(self.problem.robot, before, after, self.collision)
+
+    def _capture_point(self) -> Array:
+        """(2,) [m] after contact: c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012)."""
+        model = self.problem.robot.model
+        data = model.createData()
+        pin.centerOfMass(model, data, self.posture_after, self.velocity_after)
+        com, rate = np.array(data.com[0]), np.array(data.vcom[0])
+        return np.asarray(com[:2] + rate[:2] * np.sqrt(com[2] / np.linalg.norm(model.gravity.linear)))

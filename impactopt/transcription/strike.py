@@ -14,21 +14,17 @@ import scipy.sparse as sp
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
-from impactopt.transcription.balance import add_balance
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.constraints import Measure, Place, along, by_leg
-from impactopt.transcription.contact_conditions import add_touch_rows
+from impactopt.transcription.contact_conditions import add_balance, add_touch_rows
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import Hit
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
-from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.layout import Affine, Array, Measure, Place, along, by_leg
 from impactopt.transcription.mesh import Elements, Shares
-from impactopt.transcription.motion_phase import at_node
-from impactopt.transcription.nodes import add_nodes
+from impactopt.transcription.motion_phase import add_nodes, at_node
 from impactopt.transcription.objective import Prices, wrench_prices
-from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.reference import total_ground_wrench
+from impactopt.transcription.plan import PlannedStrike, total_ground_wrench
 
 
 class StrikeTranscription(ContactProgram):

@@ -3,26 +3,325 @@
 Every nonlinear function is ``block(S x + c)`` with a constant sparse S, so the Jacobian's and the Hessian's
 nonzeros are a *constant* linear map of the blocks' own nonzeros.  That map is built once; an evaluation is:
 lift, call the compiled blocks without Python in the loop, and add their numbers up, run by run.
+
+With respect to what it is written with, a function has few derivatives, and so has each stage. Together they
+take fewer operations than those of the function with all that is in it written out.
+
+What stands side by side in a function's output mostly belongs side by side in the matrix. A run says so in
+four numbers, where a sparse matrix that does the same needs two for every product; they are read as quickly
+as memory gives them, once in every iteration.
+
+Blocks take z = S x + c, so the nonzeros of both matrices are sums of multiples of the blocks' own nonzeros,
+with factors that never change. They are added up in runs: a block's variables that stand side by side are
+mostly variables of the program side by side.
 """
 
 from __future__ import annotations
 
+import copy
+import ctypes
+import functools
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 
+from impactopt.codegen.compiler import address, native_library
+from impactopt.kinematics.coordinates import solve_in_order
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.program import Determined
-from impactopt.transcription.batched import Block
-from impactopt.transcription.chain_rule import derivatives
-from impactopt.transcription.constraints import Rows
-from impactopt.transcription.layout import Affine, Array, Layout, stack
-from impactopt.transcription.sparsity import HessianMap, JacobianMap
+from impactopt.transcription.batched import BatchedFunction, Block
+from impactopt.transcription.layout import Affine, Array, Index, Layout, Rows, stack
+
+__all__ = [
+    "Runs",
+    "StructuredProgram",
+    "count_up",
+    "derivative_functions",
+    "derivatives",
+    "union",
+    "with_transposed",
+]
+
+
+def derivatives(z: Any, out: Any, weights: Any, stages: Sequence[Stage] = ()) -> list[Any]:
+    """``out`` (m,) of z (n,), its Jacobian (m, n) and the Hessian (n, n) of ``weights . out``, SX.
+
+    stages : what ``out`` is written with; each may be written with those before it.
+    """
+    symbols = [stage.symbols for stage in stages]
+    both = ca.vertcat(z, *symbols)
+    jac = ca.jacobian(out, both)
+    slopes = ca.gradient(ca.dot(weights, out), both)
+    hess = ca.jacobian(slopes, both)
+    for k in reversed(range(len(stages))):
+        before = ca.vertcat(z, *symbols[:k])
+        n = before.numel()
+        inner, bends = _slopes_and_bends(before, stages[k], slopes[n:])
+        hess += bends
+        crossed = ca.mtimes(inner.T, hess[n:, :n])
+        hess = hess[:n, :n] + crossed + crossed.T + ca.mtimes(ca.mtimes(inner.T, hess[n:, n:]), inner)
+        jac = jac[:, :n] + ca.mtimes(jac[:, n:], inner)
+        slopes = slopes[:n] + ca.mtimes(inner.T, slopes[n:])
+    values: list[Any] = []
+    for k, stage in enumerate(stages):
+        values += ca.substitute([stage.expression], symbols[:k], values)
+    found: list[Any] = ca.substitute([out, jac, hess], symbols, values)
+    return found
+
+
+def _slopes_and_bends(before: Any, stage: Stage, along: Any) -> tuple[Any, Any]:
+    """Slopes (k, n) of a stage's numbers, and what its second derivatives add to a Hessian (n + k, n + k) by
+    what is before them and by them, where they are weighted with ``along`` (k,).
+    """
+    weights = ca.SX.sym("along", along.numel())
+    if stage.zero is None:
+        bends = ca.jacobian(ca.gradient(ca.dot(weights, stage.expression), before), before)
+        k = along.numel()
+        bends = ca.diagcat(bends, ca.SX(k, k))
+        return ca.jacobian(stage.expression, before), ca.substitute(bends, weights, along)
+    both, first = ca.vertcat(before, stage.symbols), 0
+    right, slopes, adjoint = ca.jacobian(stage.zero, before), [], []
+    for matrix, (rows, columns) in stage.blocks:
+        at = slice(first, first + matrix.size1())
+        moved = [j for j in range(before.numel()) if right[at, j].nnz()]
+        solved = solve_in_order(matrix, -right[at, moved], (rows, columns))[0]
+        part = ca.SX(matrix.size1(), before.numel())
+        part[:, moved] = solved
+        slopes.append(ca.sparsify(part))
+        # the same pivots eliminate the transposed
+        adjoint.append(solve_in_order(matrix.T, along[at], (columns, rows))[0])
+        first = at.stop
+    bends = ca.jacobian(ca.gradient(ca.dot(weights, stage.zero), both), both)
+    return ca.vertcat(*slopes), -ca.substitute(bends, weights, ca.vertcat(*adjoint))
+
+
+Places = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Runs (k,): ``factor`` times each of ``length`` entries, from ``entry`` on, goes to the places from
+    ``place`` on. shape : numbers of all places and of all entries.
+    """
+
+    entry: Places
+    place: Places
+    length: Places
+    factor: Array
+    shape: tuple[int, int]
+
+    @classmethod
+    def make(cls, entry: Index, place: Index, length: Index, factor: Array, shape: tuple[int, int]) -> Runs:
+        """Makes runs from index arrays of any integer type."""
+        return cls(entry.astype(np.int32), place.astype(np.int32), length.astype(np.int32), factor, shape)
+
+    def add_to(self, out: Array, entries: Array) -> None:
+        """Add the sums of these entries to ``out``."""
+        library = _library()
+        if library is None:
+            out += self._matrix @ entries
+            return
+        runs = (address(a) for a in (self.entry, self.place, self.length, self.factor))
+        library.runs_add(ctypes.c_int64(self.entry.size), *runs, address(entries), address(out))
+
+    @functools.cached_property
+    def _matrix(self) -> sp.csr_array:
+        within = count_up(self.length)
+        at = np.repeat(self.place, self.length) + within, np.repeat(self.entry, self.length) + within
+        return sp.csr_array((np.repeat(self.factor, self.length), at), shape=self.shape)
+
+
+def with_transposed(values: Array, across: Places) -> Array:
+    """Values (nnz,) of the sum of a matrix with a symmetric pattern and its transpose.
+
+    across (nnz,) : of each place the one across the diagonal.
+    """
+    library = _library()
+    if library is None:
+        return values + values[across]
+    out = np.empty_like(values)
+    library.runs_add_transposed(ctypes.c_int64(values.size), address(across), address(values), address(out))
+    return out
+
+
+def count_up(lengths: Index | Places) -> Index:
+    """0, 1, ... length - 1 of each, one after the other."""
+    ends = np.append(0, np.cumsum(lengths))
+    return np.arange(int(ends[-1])) - np.repeat(ends[:-1], lengths)
+
+
+def union(first: Index, length: Index | int = 1) -> Index:
+    """The numbers (sorted, each once) in the runs that begin with ``first``."""
+    length = np.broadcast_to(length, first.shape)
+    order = np.argsort(first)
+    start, end = first[order], np.maximum.accumulate(first[order] + length[order])
+    begins = np.append(True, start[1:] > end[:-1])[: start.size]
+    start, end = start[begins], end[np.append(begins[1:], True)[: end.size]]
+    return np.repeat(start, end - start) + count_up(end - start)
+
+
+@functools.cache
+def _library() -> Any:
+    """C library, if there is a compiler; None: sparse products replace it."""
+    return native_library(__package__, "scatter_add")
+
+
+class JacobianMap:
+    """Map of the blocks' Jacobians to that of the constraints g = out[...] + A x."""
+
+    def __init__(self, blocks: Sequence[Block], lift: sp.csr_array, row_of: Index, linear: sp.csr_array):
+        """lift : S, of the inputs of all blocks.  row_of : each output's row; -1: none.  linear : A."""
+        self._entries, starts = _shared([b.jacobian for b in blocks])
+        self._shape = m, _ = linear.shape
+        parts, z, out = [], 0, 0
+        for b, start in zip(blocks, starts, strict=False):
+            rows, columns = b.jac_pattern
+            instance = np.arange(b.count)[:, None]
+            row, column = row_of[out + instance * b.n_out + rows], z + instance * b.n_in + columns
+            below = (columns[1:] == columns[:-1]) & (row[:, 1:] == row[:, :-1] + 1) & (row[:, :-1] >= 0)
+            first, length = _runs(row.shape, below)
+            row, column = row.ravel()[first], column.ravel()[first]
+            first, length, row, column = (a[row >= 0] for a in (first, length, row, column))
+            owner, x, factor = _terms(lift, column)
+            parts.append((start + first[owner], x * m + row[owner], length[owner], factor))
+            z, out = z + b.count * b.n_in, out + b.count * b.n_out
+        entry, place, length, factor = _joined(parts)
+        at, values = _placed(linear)
+        places = union(np.concatenate([place, at]), np.concatenate([length, np.ones_like(at)]))
+        self._linear = np.bincount(np.searchsorted(places, at), values, places.size)
+        self._made = sp.csc_array((self._linear, *_csc(places, self._shape)), shape=self._shape)
+        shape = places.size, self._entries.size
+        self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
+
+    def matrix(self) -> sp.csc_array:
+        """Jacobian for the blocks' latest values."""
+        values = self._linear.copy()
+        self._sums.add_to(values, self._entries)
+        return _with(self._made, values)
+
+
+class HessianMap:
+    """Map of the lower triangles of the blocks' Hessians to the Hessian of sigma x'Qx/2 + multipliers . out.
+
+    An entry off the diagonal of z stands for the one across it, too, and so does what it is a part of in x.
+    So entries are added up on one side, those of the diagonal halved, and the whole is that and its
+    transpose.
+    """
+
+    def __init__(self, blocks: Sequence[Block], lift: sp.csr_array, quadratic: sp.csc_array):
+        """lift : S, of the inputs of all blocks.  quadratic : Q (n, n)."""
+        self._entries, starts = _shared([b.hessian for b in blocks])
+        self._shape = n, _ = quadratic.shape
+        parts, z, alike = [], 0, _alike(lift)
+        for b, start in zip(blocks, starts, strict=False):
+            rows, columns = b.hess_pattern
+            instance = np.arange(b.count)[:, None] * b.n_in
+            row, column = z + instance + rows, z + instance + columns
+            below = (columns[1:] == columns[:-1]) & (rows[1:] == rows[:-1] + 1) & (rows[:-1] > columns[:-1])
+            first, length = _runs(row.shape, below & alike[row[:, 1:]])
+            row, column = row.ravel()[first], column.ravel()[first]
+            of_column, c, factor = _terms(lift, column)
+            of_term, r, by = _terms(lift, row[of_column])
+            owner = of_column[of_term]
+            by = by * factor[of_term] * np.where(row == column, 0.5, 1.0)[owner]
+            parts.append((start + first[owner], c[of_term] * n + r, length[owner], by))
+            z += b.count * b.n_in
+        entry, place, length, factor = _joined(parts)
+        at, values = _placed(quadratic)
+        one, other = (_pattern(p, self._shape) for p in (union(place, length), union(at)))
+        whole = sp.csc_array(one + one.T + other)
+        self._made = whole
+        places = np.repeat(np.arange(n), np.diff(whole.indptr)) * n + whole.indices
+        numbers = sp.csc_array((np.arange(places.size), whole.indices, whole.indptr), self._shape)
+        self._across = numbers.T.tocsc().data.astype(np.int32)
+        self._half = np.bincount(np.searchsorted(places, at), 0.5 * values, places.size)
+        shape = places.size, self._entries.size
+        self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
+
+    def matrix(self, sigma: float) -> sp.csc_array:
+        """Hessian for the blocks' latest values."""
+        values: Array = np.multiply(sigma, self._half)
+        self._sums.add_to(values, self._entries)
+        values = with_transposed(values, self._across)
+        return _with(self._made, values)
+
+
+def _shared(functions: Sequence[BatchedFunction]) -> tuple[Array, Index]:
+    """One array that these functions write to from now on, and where each begins in it."""
+    starts = np.cumsum([0, *[f.size for f in functions]])
+    entries = np.zeros(int(starts[-1]))
+    for f, start in zip(functions, starts, strict=False):
+        f.write_to(entries[start : start + f.size])
+    return entries, starts
+
+
+def _with(matrix: sp.csc_array, values: Array) -> sp.csc_array:
+    """The same pattern with other values: SciPy's own way looks at the whole pattern again."""
+    out = copy.copy(matrix)
+    out.data = values
+    return out
+
+
+def _terms(lift: sp.csr_array, z: Index) -> tuple[Index, Index, Array]:
+    """Terms of these inputs: the position in z, the variable, and its coefficient."""
+    count = lift.indptr[z + 1] - lift.indptr[z]
+    owner = np.repeat(np.arange(len(z)), count)
+    at = lift.indptr[z][owner] + count_up(count)
+    return owner, lift.indices[at].astype(np.intp), lift.data[at]
+
+
+def _alike(lift: sp.csr_array) -> npt.NDArray[np.bool_]:
+    """Mask of the inputs that have the coefficients of the input before, each of the next variable."""
+    count = np.diff(lift.indptr)
+    owner = np.repeat(np.arange(count.size), count)
+    out = np.append(False, count[1:] == count[:-1])[: count.size]
+    here = np.flatnonzero(out[owner])
+    before = here - count[owner[here]]
+    differ = (lift.indices[here] != lift.indices[before] + 1) | (lift.data[here] != lift.data[before])
+    out[owner[here[differ]]] = False
+    return out
+
+
+def _runs(shape: tuple[int, ...], follows: npt.NDArray[np.bool_]) -> tuple[Index, Index]:
+    """Beginnings and lengths of the runs of entries.
+
+    shape : instances and entries of each; follows : which of the entries after the first goes on.
+    """
+    begins = np.ones(shape, dtype=bool)
+    begins[:, 1:] = ~follows
+    first = np.flatnonzero(begins)
+    return first, np.diff(np.append(first, begins.size))
+
+
+def _joined(parts: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """Entries, places, lengths and factors of all parts."""
+    none = np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0)
+    return tuple(np.concatenate(of) for of in zip(none, *parts, strict=True))
+
+
+def _placed(matrix: sp.sparray) -> tuple[Index, Array]:
+    """Places ``column * rows + row`` of a matrix's entries, and their values."""
+    entries = matrix.tocoo()
+    rows, columns = entries.coords
+    return columns.astype(np.intp) * matrix.shape[0] + rows, entries.data
+
+
+def _csc(places: Index, shape: tuple[int, int]) -> tuple[Index, Index]:
+    """Rows, and starts of columns, of the places ``column * rows + row``, which are in order."""
+    columns, rows = np.divmod(places, shape[0])
+    starts = np.searchsorted(columns, np.arange(shape[1] + 1))
+    return rows.astype(np.int32), starts.astype(np.int32)
+
+
+def _pattern(places: Index, shape: tuple[int, int]) -> sp.csc_array:
+    return sp.csc_array((np.ones(places.size), *_csc(places, shape)), shape)
 
 
 class StructuredProgram:

@@ -8,40 +8,56 @@ with their durations as variables.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 
-from impactopt.codegen.cache import FunctionGroup, cached_groups
-from impactopt.codegen.hashing import model_hash
+from impactopt.codegen.cache import FunctionGroup, cached_groups, model_hash
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.statics import static_wrenches
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
-from impactopt.transcription.balance import add_balance
+from impactopt.transcription.blocks import ExtraBlock, extra_blocks, own_blocks
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.constraints import Index, Place, along, degrees, percent, rates
+from impactopt.transcription.clearance import SeparationBlock
+from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import typical_state
-from impactopt.transcription.contact_conditions import add_clearance, add_touch_rows
+from impactopt.transcription.contact_conditions import add_balance, add_clearance, add_touch_rows
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import Hit
 from impactopt.transcription.contact_state import Contact, add_coasting
-from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.follow import AbortMotion, FollowThrough
-from impactopt.transcription.layout import Affine, Array, Group
-from impactopt.transcription.mesh import Elements, Shares
-from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
-from impactopt.transcription.nodes import add_nodes
+from impactopt.transcription.layout import (
+    Affine,
+    Array,
+    Group,
+    Index,
+    Place,
+    Turn,
+    along,
+    degrees,
+    determined,
+    percent,
+    rates,
+)
+from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares
+from impactopt.transcription.motion_phase import AbortMotion, FollowThrough, Swing, add_nodes
 from impactopt.transcription.objective import Prices, motion_prices, style_prices
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.simd import in_lanes
-from impactopt.transcription.springs import SpringPoint, follow_springs, swing_springs
+from impactopt.transcription.springs import (
+    SpringPoint,
+    TorqueCourse,
+    follow_springs,
+    swing_springs,
+    torque_courses,
+)
 from impactopt.transcription.structured import derivative_functions
-from impactopt.transcription.swing import Swing
-from impactopt.transcription.term_blocks import ExtraBlock, extra_blocks, own_blocks
-from impactopt.transcription.torque_profiles import TorqueCourse, torque_courses
+
+__all__ = ["Transcription", "block_functions", "statement_of"]
 
 SECOND_BLOCKS = ("second_contact", "second_approach")
 
@@ -345,3 +361,37 @@ class Transcription(ContactProgram):
             coast_wrench=None if abort is None else abort.coast_w.read(x)[0],
             **self.hit.decode(x, self.program.outputs(x)),
         )
+
+
+def statement_of(t: Transcription) -> str:
+    """JSON summary of a program, for a reader that knows nothing of this package.
+
+    `groups`: name, count and size of the variables, in their order. `rows`: term, place and the number of a
+    list of `components`. `more`: nodes beside those of the mesh. `elements`, `guarded`, `shares`,
+    `shortest`: of the contact, its least durations [s] by collision. `apart`: rows between bodies.
+    """
+    lists: dict[tuple[str, ...], int] = {}
+    rows = []
+    for (term, place), found in groupby(t.rows.origins, lambda row: (row.term, row.place.name)):
+        components = tuple(row.component for row in found)
+        rows.append([term, place, lists.setdefault(components, len(lists))])
+    collisions = [c for c in t.hit.collisions if isinstance(c, Collision)]
+    # directions as they are now: begun at those of a first round, other distances than the least are found
+    ways = [way.tolist() for block in t.blocks if isinstance(block, SeparationBlock) for way in block.of.ways]
+    held: list[dict[str, Any]] = [
+        {**row._asdict(), **kept._asdict(), "way": way}
+        for (row, kept), way in zip(t.apart_rows.items(), ways, strict=True)
+    ]
+    return json.dumps(
+        {
+            "groups": [[g.name, g.count, g.size] for g in t.layout.groups.values()],
+            "rows": rows,
+            "components": list(lists),
+            "more": [list(t.nodes.swing), list(t.nodes.follow)],
+            "elements": t.hit.elements if collisions else [],
+            "guarded": t.hit.guarded,
+            "shares": list(t.hit.shares),
+            "shortest": [c.shortest for c in collisions],
+            "apart": held,
+        }
+    )

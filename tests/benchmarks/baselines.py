@@ -16,9 +16,9 @@ import numpy as np
 from benchmarks.crocoddyl_peer import crocoddyl_plan
 from benchmarks.planning import DEMO, controller_in, plan_of
 from benchmarks.report import Report, Say, columns_table
+from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.planning.minimum_jerk import minimum_jerk_baseline
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Balance

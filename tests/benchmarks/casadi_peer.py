@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.solvers.ipopt_functions import BufferFunction, Functions, IterationCallback, Pattern
+from impactopt.solvers.ipopt import BufferFunction, Functions, IterationCallback, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
 __all__ = ["solve_sqpmethod"]

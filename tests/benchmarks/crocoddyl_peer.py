@@ -20,7 +20,7 @@ from impactopt.contact import FreeMass
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, PositionLimit, TorqueLimit, VelocityLimit
-from impactopt.robots.hinges import inside
+from impactopt.robots.tools import inside
 from impactopt.transcription.plan import Trajectory
 
 __all__ = ["CrocoddylPlan", "crocoddyl_plan"]

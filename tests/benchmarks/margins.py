@@ -17,9 +17,9 @@ import numpy as np
 from benchmarks.pictures.margins import margins_picture
 from benchmarks.planning import DEMO
 from benchmarks.report import Report, Say, columns_table
+from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario

@@ -11,10 +11,10 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.report import Report, Say, columns_table
+from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
 from impactopt.files.replay import has_mujoco
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.checks import INSTANT
 from impactopt.problem.problem import ImpactProblem

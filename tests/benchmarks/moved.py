@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Report, Say, columns_table
+from impactopt import Solution, solve
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
-from impactopt.planning.solution import Solution
-from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["run"]

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import Say
+from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import ControllerSettings

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import missing_package
-from impactopt.solvers.ipopt import IPOPT_DEFAULTS
-from impactopt.solvers.ipopt_functions import Functions, Pattern
+from impactopt.solvers.ipopt import IPOPT_DEFAULTS, Functions, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
 __all__ = ["solve_pounce"]

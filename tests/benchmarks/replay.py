@@ -13,8 +13,8 @@ import numpy as np
 from benchmarks.pictures.convergence import convergence_picture
 from benchmarks.planning import DEMO, plan_of
 from benchmarks.report import Report, Say, columns_table
+from impactopt import Solution
 from impactopt.errors import InputError
-from impactopt.planning.solution import Solution
 from impactopt.simulation import Perturbation, Simulation
 
 STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2.5e-5)  # [s]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from benchmarks.kept import Kept
 from benchmarks.report import Report, Say, columns_table
-from impactopt.bodies.striker_face import striker_face
+from impactopt.bodies.robot_bodies import striker_face
 from impactopt.errors import InputError
 from impactopt.files.draft.drafting import draft_problem
 from impactopt.files.problem_file import read_problem_file

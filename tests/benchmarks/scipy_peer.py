@@ -10,12 +10,12 @@ import numpy as np
 import scipy.optimize as so
 import scipy.sparse as sp
 
-from impactopt.solvers.point import TimedProgram
 from impactopt.solvers.program import (
     BestIterate,
     NonlinearProgram,
     SolverResult,
     Status,
+    TimedProgram,
     Vector,
     max_violation,
     stationarity,

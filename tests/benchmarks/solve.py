@@ -29,7 +29,7 @@ ATTEMPTS = Path("results/bench/solve.jsonl")
 VIOLATION, KKT, LOSS = 1e-6, 1e-4, 0.01  # at most, of a success; loss: relative to the best known objective
 NOISE = 0.1  # [rad] of the posture at contact in a perturbed start
 SPEEDS = (0.5, 1.5)  # [m/s] of the strike in a perturbed start
-QUICK = ("sqp:interior", "ipopt")
+QUICK = ("ipm", "ipopt")
 KINDS = ("motion", "strike")
 KEYS = ("problem", "solver", "start", "time_limit")  # of an attempt
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Vector
 from impactopt.solvers.sqp import QP_SOLVERS, SQPOptions, solve_sqp
 
@@ -31,6 +32,10 @@ class Solver:
 
 def _sqp(program: NonlinearProgram, x0: Vector, time_limit: float, *, qp: str) -> SolverResult:
     return solve_sqp(program, x0, options=SQPOptions(qp_solver=qp, time_limit=time_limit))
+
+
+def _ipm(program: NonlinearProgram, x0: Vector, time_limit: float) -> SolverResult:
+    return solve_ipm(program, x0, options=IPMOptions(time_limit=time_limit))
 
 
 def _ipopt(program: NonlinearProgram, x0: Vector, time_limit: float, *, linear: str) -> SolverResult:
@@ -65,7 +70,10 @@ def _scipy(program: NonlinearProgram, x0: Vector, time_limit: float, *, method: 
 
 
 def _table() -> dict[str, Solver]:
-    ours = [Solver(name="sqp", qp=qp, run=partial(_sqp, qp=qp)) for qp in ("interior", *sorted(QP_SOLVERS))]
+    ours = [
+        Solver(name="ipm", qp="", run=_ipm),
+        *(Solver(name="sqp", qp=qp, run=partial(_sqp, qp=qp)) for qp in sorted(QP_SOLVERS)),
+    ]
     others = [
         Solver(name="ipopt", qp="", run=partial(_ipopt, linear="mumps")),
         Solver(name="ipopt-spral", qp="", run=partial(_ipopt, linear="spral")),

@@ -23,9 +23,9 @@ from benchmarks import replay, robustness, truth
 from benchmarks.__main__ import app
 from benchmarks.registry import BENCHES, run_bench
 from benchmarks.report import Report, columns_table, make_table, save_report
+from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile
-from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Simulation
 from impactopt.solvers.program import Status

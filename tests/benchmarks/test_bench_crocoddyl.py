@@ -15,7 +15,7 @@ import pytest
 from benchmarks.crocoddyl_peer import _against_target, _reference, _task, crocoddyl_plan
 from impactopt import FreeMass, ImpactProblem, load_problem
 from impactopt.errors import InputError
-from impactopt.simulation.servo import Servo
+from impactopt.simulation.motors import Servo
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from benchmarks.__main__ import app
 from benchmarks.margins import OPTIONS, Option
 from benchmarks.pictures.margins import margins_picture
 from benchmarks.report import Report
+from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile
-from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit

@@ -77,7 +77,7 @@ def test_a_row_has_the_keys_that_are_promised() -> None:
     ],
 )
 def test_what_counts_as_a_success(change: dict[str, Any], counts: bool) -> None:
-    rows = solve.summary("a", {"sqp:interior": [changed(**change)], "ipopt": [GOOD]})
+    rows = solve.summary("a", {"ipm": [changed(**change)], "ipopt": [GOOD]})
     assert rows[0]["success"] == float(counts)
 
 
@@ -102,7 +102,7 @@ def test_a_solve_that_tells_nothing_is_a_row_without_numbers() -> None:
 
 # ---------------------------------------------------------------- solvers
 def test_every_qp_solver_of_ours_is_compared() -> None:
-    assert {s.qp for s in SOLVERS.values() if s.name == "sqp"} == {"interior", *QP_SOLVERS}
+    assert {s.qp for s in SOLVERS.values() if s.name == "sqp"} == {*QP_SOLVERS}
     assert {"ipopt", "sqpmethod:qpoases", "slsqp", "trust-constr"} <= SOLVERS.keys()
 
 
@@ -191,7 +191,7 @@ def test_what_a_solver_does_costs_its_own_attempt_only(
     how: str, status: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("benchmarks.attempts.GRACE", 0.5)
-    found = attempt(functools.partial(deadly, how), 0, "sqp:interior", 0.1)
+    found = attempt(functools.partial(deadly, how), 0, "ipm", 0.1)
     assert found.status == status
     assert message in found.message
     assert math.isnan(found.objective)
@@ -205,7 +205,7 @@ def textbook(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.chdir(tmp_path)
     for name in ("HS71", "infeasible"):
         (tmp_path / f"{name}.toml").write_text(PROBLEM_FILE, encoding="utf-8")
-    monkeypatch.setattr("impactopt.files.folders.FOLDERS", (tmp_path,))
+    monkeypatch.setattr("impactopt.files.problem_file.names.FOLDERS", (tmp_path,))
     return tmp_path
 
 
@@ -215,7 +215,7 @@ def test_the_command_keeps_every_solve_and_takes_them_up(textbook: Path) -> None
         "--starts",
         "1",
         "--solver",
-        "sqp:interior",
+        "ipm",
         "--solver",
         "ipopt",
         "--json",
@@ -227,9 +227,9 @@ def test_the_command_keeps_every_solve_and_takes_them_up(textbook: Path) -> None
     assert {"rows", "versions", "machine", "seconds"} <= numbers.keys()
     rows = numbers["rows"]
     assert [(r["problem"], r["solver"], r["success"]) for r in rows] == [
-        ("HS71", "sqp", 1.0),
+        ("HS71", "ipm", 1.0),
         ("HS71", "ipopt", 1.0),
-        ("infeasible", "sqp", 1.0),
+        ("infeasible", "ipm", 1.0),
         ("infeasible", "ipopt", 1.0),
     ]
     assert rows[0]["objective"] == pytest.approx(CASES["HS71"].optimum, rel=1e-6)
@@ -240,7 +240,7 @@ def test_the_command_keeps_every_solve_and_takes_them_up(textbook: Path) -> None
     first = json.loads(kept[0])
     (textbook / solve.ATTEMPTS).write_text(json.dumps({**first, "iterations": 1234}) + "\n", encoding="utf-8")
     again = solve.run(
-        quiet, problem="HS71", starts=1, solvers=["sqp:interior"], time_limit=first["time_limit"], resume=True
+        quiet, problem="HS71", starts=1, solvers=["ipm"], time_limit=first["time_limit"], resume=True
     )
     assert again.numbers["rows"][0]["median_iterations"] == 1234
 
@@ -277,7 +277,7 @@ def test_starts_are_plain_first_and_drawn_by_the_seed(
 
 def test_infeasible_programs_are_told_by_our_solvers() -> None:
     program, x0 = infeasible()
-    for solver in ("sqp:interior", "ipopt"):
+    for solver in ("ipm", "ipopt"):
         assert SOLVERS[solver].run(program, x0, 10.0).status is Status.INFEASIBLE
 
 

@@ -22,7 +22,7 @@ from benchmarks.registry import run_bench
 from benchmarks.setup import Setup
 from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, Effects, VirtualMass
-from impactopt.collision.describe import independent_joints
+from impactopt.collision.graph import independent_joints
 from impactopt.errors import InputError
 from impactopt.report.pictures.style import STYLE
 from impactopt.robots.presets import standin

@@ -23,11 +23,10 @@ from typer.testing import CliRunner
 from benchmarks import zoo
 from benchmarks.__main__ import app
 from benchmarks.zoo import BASES, cleanliness, draw, drawn_problem, row, run
-from impactopt import load_problem
+from impactopt import Solution, load_problem
 from impactopt.contact import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile
-from impactopt.planning.solution import Solution
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.presets import standin

@@ -18,10 +18,10 @@ from support.meshes import Meshes
 
 from benchmarks.planning import DEMO, solved
 from benchmarks.report import Report, Say, columns_table
+from impactopt import Solution
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.presets import talos

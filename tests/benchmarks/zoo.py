@@ -20,13 +20,13 @@ from oracle.verdict import verify_record
 from benchmarks.kept import Kept
 from benchmarks.planning import DEMO, solved
 from benchmarks.report import Report, Say, columns_table
+from impactopt import Solution
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import record_of
 from impactopt.files.problem_file import load_problem, read_problem_file
-from impactopt.kinematics.directions import across
-from impactopt.planning.solution import Solution
+from impactopt.kinematics.operational_space import across
 from impactopt.planning.solve import solve
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem

@@ -20,10 +20,17 @@ from support.small_plans import arm_problem, biped_problem
 from impactopt import KeepOut, TargetBody, load_problem
 from impactopt.bodies.clearance import FAR, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.convex_hulls import inertia_box, pieces_of
+from impactopt.bodies.file_shapes import lost_meshes, urdf_root
 from impactopt.bodies.robot_bodies import bodies_of, distance
-from impactopt.bodies.shapes import Obstacle, face_axes
-from impactopt.bodies.urdf import lost_meshes, urdf_root
-from impactopt.bodies.world import BEHIND, WorldBody, ground_body, obstacle_bodies, target_bodies
+from impactopt.bodies.world import (
+    BEHIND,
+    Obstacle,
+    WorldBody,
+    face_axes,
+    ground_body,
+    obstacle_bodies,
+    target_bodies,
+)
 from impactopt.contact import Board, FreeMass, Nail, RigidWall
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem

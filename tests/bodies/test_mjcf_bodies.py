@@ -10,8 +10,8 @@ import pytest
 
 from impactopt import Robot
 from impactopt.bodies.convex_hulls import pieces_of
-from impactopt.bodies.mjcf import geoms_of
-from impactopt.bodies.robot_visuals import visuals_of
+from impactopt.bodies.file_shapes import geoms_of
+from impactopt.bodies.visuals import visuals_of
 
 mujoco = pytest.importorskip("mujoco")
 

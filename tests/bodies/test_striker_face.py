@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from impactopt import g1, talos
-from impactopt.bodies.striker_face import striker_face
+from impactopt.bodies.robot_bodies import striker_face
 from impactopt.robots.robot import Robot
 
 

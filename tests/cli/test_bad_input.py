@@ -33,14 +33,14 @@ from impactopt.codegen.compiler import CompileError, Compiler, find_compiler
 from impactopt.collision import effective_mass
 from impactopt.errors import printable
 from impactopt.files.problem_file import load_problem, read_problem_file
-from impactopt.files.problem_file.changes import parse_settings
 from impactopt.files.problem_file.diagnostics import key_lines
 from impactopt.files.problem_file.names import problem_file
+from impactopt.files.problem_file.reading import parse_settings
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
-from impactopt.problem.phase import FINEST
+from impactopt.problem.scenario import FINEST
 from impactopt.report.page import html_page
 from impactopt.simulation import simulate
-from impactopt.solvers.ipm.ordering import elimination_blocks
+from impactopt.solvers.ipm.newton import elimination_blocks
 from impactopt.sweeps import read_sweep_file
 
 ARM = problem_file("arm_planar").read_text(encoding="utf-8")
@@ -160,7 +160,7 @@ def test_a_robot_without_joints(tmp_path: Path, floating: bool, body: str) -> No
 
 @pytest.mark.parametrize("numbers", ["a b c", "1 1", "", "nan nan nan", "1e400 0 0", "1 2 3 4 5"])
 def test_shapes_and_colours_that_are_none_are_left_out(tmp_path: Path, numbers: str) -> None:
-    from impactopt.bodies.robot_visuals import visuals_of
+    from impactopt.bodies.visuals import visuals_of
 
     shape = (
         '<visual><origin rpy="{0}" xyz="{0}"/><geometry><box size="1 1 1"/></geometry></visual>'

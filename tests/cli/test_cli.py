@@ -17,11 +17,11 @@ from support.fake_solution import PROBLEM_FILE, FakeSolution, MissingSolution, s
 from typer.testing import CliRunner
 
 import impactopt
+from impactopt import Solution
 from impactopt.cli.app import app
 from impactopt.files.output import Record, load_record
 from impactopt.files.problem_file import ProblemFile
 from impactopt.planning.refinement import Attempt
-from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures import PICTURES
 from impactopt.solvers.program import IterationRecord, Status, Violation
@@ -33,7 +33,7 @@ name = "ipopt"
 time_limit_s = 40
 [solver.ipopt]
 max_iter = 7
-[solver.sqp]
+[solver.ipm]
 price = 50.0
 """
 FILES = {"solution.npz", "summary.json", *(f"{name}.png" for name in PICTURES)}
@@ -215,8 +215,8 @@ def test_the_files_solver_settings_reach_the_solver(planner: Planner, file: Path
 
 
 def test_options_go_over_the_file(planner: Planner, file: Path, tmp_path: Path) -> None:
-    run("solve", file, "--out", tmp_path / "out", "--solver", "sqp", "--time-limit", 3)
-    assert (planner.options["solver"], planner.options["time_limit"]) == ("sqp", 3)
+    run("solve", file, "--out", tmp_path / "out", "--solver", "ipm", "--time-limit", 3)
+    assert (planner.options["solver"], planner.options["time_limit"]) == ("ipm", 3)
     assert planner.options["options"] == {"price": 50.0}, "the other solver's options are not its own"
 
 

@@ -16,9 +16,8 @@ from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SpokenProgram, Status, Violation, explain, worst_rows
-from impactopt.transcription.constraints import Measure, Place, along, degrees, millimetres, percent
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.layout import Layout
+from impactopt.transcription.layout import Layout, Measure, Place, along, degrees, millimetres, percent
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

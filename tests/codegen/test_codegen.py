@@ -23,11 +23,12 @@ import pytest
 from support.one_joint import model
 
 from impactopt.codegen import cache as codegen
-from impactopt.codegen import directory, library, private_files
-from impactopt.codegen.cache import FunctionGroup, cached, cached_groups
+from impactopt.codegen import compiler as library
+from impactopt.codegen import files as directory
+from impactopt.codegen import files as private_files
+from impactopt.codegen.cache import FunctionGroup, cached, cached_groups, canonical, model_hash
 from impactopt.codegen.compiler import Compiler, find_compiler
-from impactopt.codegen.directory import cache_directory
-from impactopt.codegen.hashing import canonical, model_hash
+from impactopt.codegen.files import cache_directory
 from impactopt.errors import CacheWarning, InputError, NoCompilerWarning
 
 ROOT = Path(__file__).parents[2]
@@ -600,7 +601,7 @@ def test_compiler_that_fails_is_quoted(cache: Path, tmp_path: Path, monkeypatch:
 
 def test_model_hash_is_the_same_in_another_process() -> None:
     code = (
-        "from support.one_joint import model; from impactopt.codegen.hashing import model_hash; "
+        "from support.one_joint import model; from impactopt.codegen.cache import model_hash; "
         "print(model_hash(model()))"
     )
     env = {

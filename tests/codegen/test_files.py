@@ -12,7 +12,7 @@ import pytest
 from impactopt.codegen.files import open_own, write_atomically
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
-from impactopt.sweeps.journal import Journal
+from impactopt.sweeps.store import Journal
 
 
 @pytest.fixture(params=[0o022, 0o077, 0o007])

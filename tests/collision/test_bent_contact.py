@@ -14,10 +14,9 @@ from support.native_cases import ROBOTS, X, robot_named, situation
 
 from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, Effects, JointFriction
-from impactopt.collision.contact_slopes import law_is_linear
-from impactopt.collision.dense_step import Contact
 from impactopt.collision.graph import collision_graph
-from impactopt.collision.implicit import NODES, STAGES, gamma, node_tables
+from impactopt.collision.implicit import NODES, STAGES, Contact, gamma, node_tables
+from impactopt.collision.stepped import law_is_linear
 from impactopt.contact import CustomLaw, FreeMass, HertzDamped, HuntCrossley, Nail, SpringDamper
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -15,7 +15,7 @@ from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, Effects, VirtualMass
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.robots.arms import planar_arm
+from impactopt.robots.link_tables import planar_arm
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),

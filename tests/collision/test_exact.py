@@ -14,7 +14,7 @@ from support.exact_reference import Case, random_case, robot_named
 from support.small_robots import slider
 
 from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
-from impactopt.collision.bernstein import bernstein_matrix, first_negative, largest
+from impactopt.collision.implicit import bernstein_matrix, first_negative, largest
 from impactopt.contact import FreeMass, HuntCrossley, KelvinVoigt, SpringDamper
 from impactopt.errors import InputError
 

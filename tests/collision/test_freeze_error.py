@@ -11,7 +11,7 @@ from benchmarks import freezes as bench
 from benchmarks.stability_robots import make_robot
 
 from impactopt.collision import SDC, VirtualMass
-from impactopt.collision.freezing import freeze_error, more_often
+from impactopt.collision.checks import freeze_error, more_often
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity

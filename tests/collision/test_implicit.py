@@ -15,9 +15,9 @@ from support.frozen_cases import two_masses
 
 from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
-from impactopt.collision.contact_slopes import law_is_linear, target_is_linear
 from impactopt.collision.graph import collision_graph
 from impactopt.collision.implicit import STAGES, gamma, polynomials
+from impactopt.collision.stepped import law_is_linear, target_is_linear
 from impactopt.contact import (
     Board,
     CustomLaw,

@@ -11,8 +11,7 @@ from support import small_robots
 
 from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
 from impactopt.contact import FreeMass, Nail, SpringDamper, Target
-from impactopt.contact._expressions import choose
-from impactopt.contact.fields import about
+from impactopt.contact.fields import about, choose
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 
 LAW = SpringDamper(stiffness=1e6, damping=512.0)

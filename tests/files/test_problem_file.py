@@ -15,7 +15,7 @@ from support.problem_texts import ARM, write
 
 import impactopt.files.problem_file.robot_sections as robot_sections
 import impactopt.files.problem_file.sections as sections
-from impactopt.bodies.shapes import Obstacle, TargetBody
+from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.contact import (
     Board,
     FreeMass,
@@ -31,7 +31,7 @@ from impactopt.contact.targets import TARGETS
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.files.problem_file.diagnostics import key_lines
-from impactopt.files.problem_file.section import Section, attribute_docs
+from impactopt.files.problem_file.values import Section, attribute_docs
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem import objectives, terms
 from impactopt.problem.problem import COLLISIONS, ImpactProblem, Phase
@@ -81,7 +81,7 @@ def test_the_demos_file_is_the_punch_it_says() -> None:
     np.testing.assert_array_equal(problem.normal, [1, 0, 0])
     assert problem.target == FreeMass(mass=5.0)
     assert problem.law == SpringDamper(stiffness=1e4, damping=300.0)
-    assert read_problem_file(PUNCH).solver.name == "sqp"
+    assert read_problem_file(PUNCH).solver.name == "ipm"
 
 
 def test_the_commented_keys_of_the_demos_file_show_the_defaults(tmp_path: Path) -> None:
@@ -102,7 +102,9 @@ def test_the_commented_keys_of_the_demos_file_show_the_defaults(tmp_path: Path) 
 def test_what_a_docstring_says_of_options_is_read_with_and_without_its_margin() -> None:
     said = attribute_docs(SQPOptions)
     assert {*said} == {option.name for option in dataclasses.fields(SQPOptions)}
-    bare = type("Bare", (), {"__doc__": cleandoc(SQPOptions.__doc__ or "")})  # as Python 3.13 keeps it
+    bare = type(
+        "Bare", SQPOptions.__bases__, {"__doc__": cleandoc(SQPOptions.__doc__ or "")}
+    )  # as Python 3.13 keeps it
     assert attribute_docs(bare) == said
 
 
@@ -163,11 +165,11 @@ weight = 0.5
 weight = 0.1
 [objectives.effort]
 [solver]
-name = "sqp"
+name = "ipm"
 time_limit_s = 12
 [solver.ipopt]
 max_iter = 77
-[solver.sqp]
+[solver.ipm]
 max_iterations = 99
 price = 50.0
 """
@@ -214,8 +216,25 @@ price = 50.0
         objectives.AngularMomentum(weight=0.1),
         objectives.Effort(),
     )
-    assert (solver.name, solver.time_limit) == ("sqp", 12)
-    assert solver.options == {"ipopt": {"max_iter": 77}, "sqp": {"max_iterations": 99, "price": 50.0}}
+    assert (solver.name, solver.time_limit) == ("ipm", 12)
+    assert solver.options == {"ipopt": {"max_iter": 77}, "ipm": {"max_iterations": 99, "price": 50.0}}
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "options"),
+    [
+        ('[solver]\nname = "sqp"\n', "ipm", {}),
+        ("[solver.sqp]\nbarrier = 0.1\n", "ipm", {"ipm": {"barrier": 0.1}}),
+        ('[solver]\nname = "sqp"\n[solver.sqp]\nqp_solver = "interior"\n', "ipm", {"ipm": {}}),
+        ('[solver.sqp]\nqp_solver = "osqp"\n', "sqp", {"sqp": {"qp_solver": "osqp"}}),
+    ],
+)
+def test_solvers_as_they_were_spelled_are_read_with_a_warning(
+    tmp_path: Path, section: str, name: str, options: dict[str, Any]
+) -> None:
+    with pytest.warns(FutureWarning, match="name = "):
+        solver = read_problem_file(write(tmp_path, GOOD + section)).solver
+    assert (solver.name, solver.options) == (name, options)
 
 
 EXTRA = """
@@ -543,8 +562,16 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
         ("[target]", "[scenarios]\nname = 'a'\n[target]", ["scenarios", "list"]),
         ("[target]", "[solver]\nname = 'ipotp'\n[target]", ["ipotp", "did you mean 'ipopt'"]),
         ("[target]", "[solver.ipopt]\nmax_itr = 3\n[target]", ["[solver]", "max_itr"]),
-        ("[target]", "[solver.sqp]\nradus = 3\n[target]", ["[solver.sqp]", "radus", "did you mean 'radius'"]),
-        ("[target]", "[solver.sqp]\nqp_solver = 'osq'\n[target]", ["qp_solver", "did you mean 'osqp'"]),
+        (
+            "[target]",
+            "[solver.ipm]\nbarier = 3\n[target]",
+            ["[solver.ipm]", "barier", "did you mean 'barrier'"],
+        ),
+        (
+            "[target]",
+            "[solver]\nname = 'sqp'\n[solver.sqp]\nqp_solver = 'osq'\n[target]",
+            ["qp_solver", "did you mean 'osqp'"],
+        ),
         ("[target]", "[solver]\ntime_limit_s = 0\n[target]", ["time_limit_s", "> 0"]),
     ],
 )

@@ -18,7 +18,7 @@ from support.term_cases import CASES
 
 import impactopt
 from impactopt import contact
-from impactopt.bodies.shapes import Ground, Obstacle, TargetBody
+from impactopt.bodies.world import Ground, Obstacle, TargetBody
 from impactopt.errors import InputError
 from impactopt.files.problem_file import (
     SolverSettings,
@@ -29,9 +29,8 @@ from impactopt.files.problem_file import (
     read_toml,
     write_problem,
 )
-from impactopt.files.problem_file.reference import reference
-from impactopt.files.problem_file.section import Section
-from impactopt.files.problem_file.template import problem_template
+from impactopt.files.problem_file.reference import problem_template, reference
+from impactopt.files.problem_file.values import Section
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem import objectives, terms
 from impactopt.problem.problem import ImpactProblem, Phase

@@ -14,12 +14,12 @@ from PIL import Image
 from support.fake_solution import still_problem, still_solution
 from typer.testing import CliRunner
 
+from impactopt import Solution
 from impactopt.cli.app import app
 from impactopt.cli.validate import validate
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, record_of, save_record
 from impactopt.files.replay import Planned, Replay, load_planned, replay
-from impactopt.planning.solution import Solution
 from impactopt.report.pictures.animation import AROUND, FPS, SLOW, _Drawing, save_animation, shown_times
 from impactopt.simulation import Perturbation
 from impactopt.simulation.result import REPORT

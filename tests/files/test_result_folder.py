@@ -12,8 +12,17 @@ import pytest
 
 from impactopt.cli.show import PAGE
 from impactopt.errors import InputError
-from impactopt.files.output import DERIVED, Record, load_record, remove_file, save_record, write_file
-from impactopt.files.result_folder import keep_record, keep_series, set_aside
+from impactopt.files.output import (
+    DERIVED,
+    Record,
+    keep_record,
+    keep_series,
+    load_record,
+    remove_file,
+    save_record,
+    set_aside,
+    write_file,
+)
 from impactopt.report.pictures import PICTURES
 from impactopt.solvers.program import Status
 

@@ -8,17 +8,17 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from impactopt import Solution
 from impactopt.cli.app import app
 from impactopt.errors import InputError
 from impactopt.files.output import NUMBERS
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.solution_library import SolvedFolder
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.sweeps import sweep_from_data
+from impactopt.sweeps.design import Unit, Work
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.progress import START, ProgressCounter
-from impactopt.sweeps.units import Unit, Work
 
 ARM = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
 

@@ -24,7 +24,7 @@ _WORDS = (
     "", " ", "x", "nan", "inf", "-", "a" * 5000, "é" * 50, "\u202e", "\x1b[31m", "..", "/", "~",
     "~nobody/x",
     "{{scripts}}", "%s", "$HOME", "punch\n", "'", '"', "\\", "1e400", "true", "None", "hammer", "ready",
-    "talos", "planar_arm", "nail", "wall", "Hertz", "sqp", "ipopt", "[[", "x.urdf", "\x00",
+    "talos", "planar_arm", "nail", "wall", "Hertz", "ipm", "sqp", "ipopt", "[[", "x.urdf", "\x00",
 )  # fmt: skip
 
 

@@ -31,8 +31,7 @@ from impactopt.errors import InputError
 from impactopt.files.replay import Planned, load_planned
 from impactopt.simulation import scene_of
 from impactopt.simulation.collision_geometry import Solids
-from impactopt.simulation.engines import ENGINES
-from impactopt.simulation.step_error import ALLOWED, check_steps, with_step_error
+from impactopt.simulation.engines import ALLOWED, ENGINES, check_steps, with_step_error
 
 __all__ = ["Replayed", "drawn", "follow", "replay_one"]
 

@@ -12,8 +12,7 @@ import numpy as np
 from fuzz.attack_cases import Found, Generator, attempt, odd_number, pick
 from fuzz.attack_files import odd_text, spoil_bytes
 from fuzz.attack_sound import wrong_with_robot
-from impactopt.robots.arms import ARM7, PLANAR
-from impactopt.robots.links import Link
+from impactopt.robots.link_tables import ARM7, PLANAR, Link
 from impactopt.robots.robot import Robot
 
 __all__ = ["URDFS", "attack_urdf", "mutated_urdf", "urdf_of_links"]
@@ -86,7 +85,7 @@ def attack_urdf(text: str, folder: Path, rng: Generator) -> Found:
     floating = bool(rng.random() < 0.2)
 
     def work() -> str:
-        from impactopt.bodies.robot_visuals import visuals_of
+        from impactopt.bodies.visuals import visuals_of
 
         robot = Robot.from_urdf(path, floating=floating, urdf=path)
         for shown in visuals_of(robot):

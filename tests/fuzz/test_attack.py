@@ -446,7 +446,7 @@ def test_what_is_fixed_to_a_link_is_of_matter_too(tmp_path: Path, mass: Any, mom
     "shape", ['cylinder radius="nan" length="1"', 'sphere radius="inf"', 'box size="1 1 1e9"']
 )
 def test_shapes_that_are_nowhere_are_left_out(tmp_path: Path, shape: str) -> None:
-    from impactopt.bodies.robot_visuals import visuals_of
+    from impactopt.bodies.visuals import visuals_of
 
     given = f"<visual><geometry><{shape}/></geometry></visual>"
     path = tmp_path / "r.urdf"

@@ -32,7 +32,7 @@ from impactopt import (
 from impactopt.cli.app import app
 from impactopt.contact.laws import LAWS
 from impactopt.files.problem_file import problem_data, problem_from_data, read_toml
-from impactopt.identification.lump import Lump
+from impactopt.identification.fitting import Lump
 
 MASS = 3.0
 

@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from support.small_robots import arm, biped
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.coordinates import StanceCoordinates, base_motion, elimination_order, solve_in_order
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
-from impactopt.kinematics.leg_closure import base_motion
-from impactopt.kinematics.statics import static_wrenches
-from impactopt.kinematics.symbolic_elimination import elimination_order, solve_in_order
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 

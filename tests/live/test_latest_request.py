@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from impactopt.live.latest_request import LatestRequest
+from impactopt.live.requests import LatestRequest
 
 LONG = 30.0  # [s] nothing here takes so long
 

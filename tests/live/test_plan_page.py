@@ -26,19 +26,17 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from impactopt import load_problem, solve
+from impactopt import Solution, load_problem, moved_solution, solve
 from impactopt.cli.app import app
 from impactopt.contact.targets import RigidWall
 from impactopt.errors import InputError
 from impactopt.files.output import load_record, record_of, save_record
-from impactopt.files.replay import problem_of
-from impactopt.files.resume import resumed
+from impactopt.files.replay import problem_of, resumed
 from impactopt.live import plan_page as look_module
-from impactopt.live.motion import moment_of
+from impactopt.live.drawing import moment_of
 from impactopt.live.plan_page import LiveLook
 from impactopt.live.replanning import Replanning
 from impactopt.live.requests import PlanRequest, numbers_of, request_of
-from impactopt.planning.solution import Solution
 from impactopt.report.tracks import planned_track, tracks_of
 from impactopt.solvers.program import SolverResult, Status
 
@@ -111,7 +109,7 @@ def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
     def broken(*_: object, **__: object) -> Solution:
         raise ZeroDivisionError("by nothing")
 
-    monkeypatch.setattr(Solution, "moved", broken)
+    monkeypatch.setattr("impactopt.live.replanning.moved_solution", broken)
     look.sliders["stiffness"].value = 1.1 * arm.problem.law.stiffness
     assert look.wait(LONG)
     assert look.answer.solution is arm
@@ -201,7 +199,7 @@ def test_a_saved_result_is_a_start_again(arm: Solution, saved: Path) -> None:
     assert again.objectives == arm.objectives
     assert again.trajectory.q == pytest.approx(arm.trajectory.q, abs=1e-12)
     mass = 1.1 * arm.problem.target.mass
-    assert again.moved(mass=mass).impulse == pytest.approx(arm.moved(mass=mass).impulse, rel=1e-9)
+    assert moved_solution(again, mass=mass).impulse == pytest.approx(arm.moved(mass=mass).impulse, rel=1e-9)
 
 
 @pytest.mark.parametrize("without", ["program_statement", "solver_x"])

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from impactopt.kinematics.splines import graded_breaks, knots
-from impactopt.kinematics.wrench_cone import contact_wrench_cone
-from impactopt.problem.phase import Phase
+from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.scenario import Phase
 from impactopt.problem.terms import (
     ContactWrenchCone,
     Grip,
@@ -22,7 +22,7 @@ from impactopt.problem.terms import (
     VelocityLimit,
 )
 from impactopt.problem.terms.grip import WRENCH
-from impactopt.robots.hinges import inside
+from impactopt.robots.tools import inside
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.striker_face import striker_face
-from impactopt.kinematics.support import support_polygon
-from impactopt.kinematics.wrench_cone import inward_edges
+from impactopt.bodies.robot_bodies import striker_face
+from impactopt.kinematics.support import inward_edges, support_polygon
 from impactopt.problem.objectives import (
     AngularMomentum,
     Effort,

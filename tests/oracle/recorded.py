@@ -12,7 +12,7 @@ from impactopt.bodies.clearance import MISSED, Places
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.terms import ContactWrenchCone
-from impactopt.robots.sole_margins import SHARE, cop_margin, least_kept
+from impactopt.robots.loads import SHARE, cop_margin, least_kept
 from oracle.motions import Way
 from oracle.program import Program
 from oracle.variables import Variables

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from impactopt import Solution, solve
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.budget import Budget
 from impactopt.planning.parameter_changes import changed, parameter_of
-from impactopt.planning.parametric_program import bent_of
 from impactopt.planning.reconstruction import program_on
-from impactopt.planning.solution import Solution
-from impactopt.planning.solve import solve
+from impactopt.planning.replanning import bent_of
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import GearLoad, HitRegion, Slide, TargetSpeed

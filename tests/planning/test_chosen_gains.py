@@ -27,8 +27,7 @@ from impactopt import (
 )
 from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import parse_problem_file
-from impactopt.files.replay import problem_of
-from impactopt.files.resume import resumed
+from impactopt.files.replay import problem_of, resumed
 from impactopt.files.verify import verify
 from impactopt.planning.gain_selection import roomy
 from impactopt.planning.models import carried_start

@@ -15,17 +15,17 @@ from typer.testing import CliRunner
 from impactopt import coasting_reference, load_problem, optimize_strike, solve
 from impactopt.cli.app import app
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision.frozen_models import FROZEN, frozen_model
+from impactopt.collision.sdc import FROZEN, frozen_model
 from impactopt.contact import FreeMass, HertzDamped, HuntCrossley, KelvinVoigt, RigidWall, SpringDamper
 from impactopt.errors import InputError
 from impactopt.planning.models import good_enough
 from impactopt.planning.solution import ModelError
 from impactopt.problem.problem import COLLISIONS, ImpactProblem
 from impactopt.problem.scenario import Scenario
-from impactopt.solvers.sqp import solve_sqp
+from impactopt.solvers.ipm import solve_ipm
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.mesh import contact_elements, guessed_shares, place_of
-from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
 
 pytestmark = [
@@ -44,14 +44,14 @@ IMPULSE, ZMP = 1e-4, 0.1  # relative; [mm]
 def planned(problem: ImpactProblem) -> tuple[StrikeTranscription, PlannedStrike]:
     """The strike of a problem, and its program."""
     t = struck(problem)
-    result = solve_sqp(t.program, strike_iterate(t))
+    result = solve_ipm(t.program, strike_iterate(t))
     assert result.status.usable
     shares = t.hit.drifted(result.x)
     if shares is not None:
         t = StrikeTranscription(
             problem, t.coordinates, t.functions, contact_elements(problem, shares), shares
         )
-        result = solve_sqp(t.program, strike_iterate(t))
+        result = solve_ipm(t.program, strike_iterate(t))
         assert result.status.usable and t.hit.drifted(result.x) is None
     return t, t.decode(result.x)
 

@@ -24,10 +24,8 @@ from impactopt import (
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file.writing import write_problem
-from impactopt.files.replay import load_planned
-from impactopt.files.resume import resumed
-from impactopt.planning.cautions import gear_caution, gears_beyond
-from impactopt.planning.lazy_constraints import rows_on_demand, with_rows
+from impactopt.files.replay import load_planned, resumed
+from impactopt.planning.lazy_constraints import gear_caution, gears_beyond, rows_on_demand, with_rows
 from impactopt.report.report import report_of
 from impactopt.simulation import Perturbation
 

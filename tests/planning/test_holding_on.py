@@ -15,8 +15,8 @@ from impactopt.codegen.compiler import find_compiler
 from impactopt.errors import InputError
 from impactopt.files.problem_file import parse_problem_file
 from impactopt.files.problem_file.writing import write_problem
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.stance import BothSoles, OneSole
-from impactopt.kinematics.statics import static_wrenches
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Grip
 from impactopt.robots.presets import load_robot

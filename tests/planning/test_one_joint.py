@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from impactopt import FreeMass, Robot, SpringDamper, Striker
-from impactopt.collision.effective_mass import effective_mass
+from impactopt.collision.frozen import effective_mass
 from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import optimize_strike

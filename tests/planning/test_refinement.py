@@ -64,7 +64,7 @@ class Lacking:
 
 
 def refined(*oracles: Lacking) -> Outcome[Any]:
-    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
     return refine(solved(Guess(program=PROGRAM, start=np.zeros(2))), oracles, solved, budget)
 
 

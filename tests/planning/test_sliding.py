@@ -11,7 +11,7 @@ from support.small_plans import arm_problem, transcribed
 
 from impactopt import solve
 from impactopt.planning import lazy_constraints
-from impactopt.planning.cautions import FAR, slide, slide_caution, slides_beyond
+from impactopt.planning.lazy_constraints import FAR, slide, slide_caution, slides_beyond
 from impactopt.problem import problem as problems
 from impactopt.problem.terms import GearLoad, Slide
 from impactopt.solvers.ipopt import solve_ipopt

@@ -5,14 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from impactopt import optimize_strike, solve
+from impactopt import Solution, optimize_strike, solve
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, SpringDamper
 from impactopt.errors import NotSolvedWarning
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.contact_replay import AGREED, PlannedContact, checked
 from impactopt.planning.diagnosis import second_look
-from impactopt.planning.solution import Solution
 from impactopt.problem.objectives import Impulse, PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
@@ -20,8 +19,8 @@ from impactopt.simulation.reference.full import FullDynamics
 from impactopt.solvers.program import Status
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, fastest, parting
-from impactopt.transcription.contact_parameters import shortest_phases
 from impactopt.transcription.contact_refinement import ASKED
+from impactopt.transcription.contact_state import shortest_phases
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
@@ -285,8 +284,8 @@ def test_a_solve_without_a_verdict_gets_another_solvers() -> None:
     problem = dataclasses.replace(load_problem("arm_planar"), target=FreeMass(mass=1.0), objectives=PUSH)
     t = contact_of(problem)
     start = strike_iterate(t)
-    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
-    stopped = Budget(solver="sqp", options={"max_iterations": 1}, time_limit=None, callback=None)
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
+    stopped = Budget(solver="ipm", options={"max_iterations": 1}, time_limit=None, callback=None)
     old = stopped.run(t.program, start)
     assert old.status is Status.ITERATION_LIMIT
     assert second_look(stopped, t.program, start, old) is old  # a limit that was asked for is an answer

@@ -11,11 +11,10 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import changed
 
-from impactopt.bodies.shapes import Obstacle
+from impactopt.bodies.world import Obstacle
 from impactopt.planning import strike as strikes
 from impactopt.planning.budget import Budget
-from impactopt.planning.clearance_constraints import Margins
-from impactopt.planning.clearance_violations import deepest_penetration
+from impactopt.planning.clearance_constraints import Margins, deepest_penetration
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.initial_guess import strike_iterate
@@ -62,7 +61,7 @@ class Scripted(Budget):
 
 def boxed(arm_transcription: Transcription, strike: StrikeTranscription) -> tuple[Any, Array]:
     """The strike with a box where its elbow is when the arm hits hardest, and that blow."""
-    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
     free = budget.run(strike.program, strike_iterate(strike))
     model = strike.robot.model
     data = model.createData()
@@ -73,15 +72,15 @@ def boxed(arm_transcription: Transcription, strike: StrikeTranscription) -> tupl
     return StrikeTranscription(of_box.problem, of_box.coordinates, of_box.functions), free.x
 
 
-@pytest.mark.parametrize("solver", [{}, {"qp_solver": "active_set"}])
+@pytest.mark.parametrize(("solver", "options"), [("ipm", {}), ("sqp", {"qp_solver": "active_set"})])
 def test_it_ends_with_bodies_apart_though_it_began_with_no_constraint_for_them(
-    arm_transcription: Transcription, strike: StrikeTranscription, solver: dict[str, Any]
+    arm_transcription: Transcription, strike: StrikeTranscription, solver: str, options: dict[str, Any]
 ) -> None:
     """Other solvers than the interior-point method are not asked on the way, but at their end."""
     t, free = boxed(arm_transcription, strike)
     margins = Margins(t.problem)
     assert deepest_penetration(t, free, margins)[0] > 0
-    budget = Budget(solver="sqp", options=solver, time_limit=None, callback=None)
+    budget = Budget(solver=solver, options=options, time_limit=None, callback=None)
     outcome = strikes.clear_strike(budget, margins, Guess(program=t, start=strike_iterate(t)))
     t, result = outcome.program, outcome.result
     assert result.status is Status.SOLVED and result.kkt <= 1e-6 and result.max_violation <= 1e-6
@@ -94,7 +93,7 @@ def test_a_strike_whose_bodies_stay_in_each_other_is_none(
     arm_transcription: Transcription, strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     t, free = boxed(arm_transcription, strike)
-    budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=(Status.SOLVED,))
+    budget = Scripted(solver="ipm", options=None, time_limit=None, callback=None, ends=(Status.SOLVED,))
     solved = budget.run(t.program, free)
     guess = Guess(program=t, start=free)
     monkeypatch.setattr(strikes, "clear_strike", lambda *_: Outcome.of(t, solved, guess))
@@ -104,7 +103,7 @@ def test_a_strike_whose_bodies_stay_in_each_other_is_none(
 
 def test_with_rows_on_demand_it_goes_on_from_the_solution_without_them(strike: StrikeTranscription) -> None:
     ends = Status.SOLVED, Status.FAILED, Status.SOLVED
-    budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
+    budget = Scripted(solver="ipm", options=None, time_limit=None, callback=None, ends=ends)
     solved = budget.run(strike.program, strike_iterate(strike))
     guess = Guess(program=strike, start=solved)
     result = strikes.clear_strike(budget, Margins(strike.problem), guess).result

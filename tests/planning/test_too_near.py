@@ -11,14 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
-from impactopt import Obstacle, load_problem, solve
+from impactopt import Obstacle, Solution, load_problem, solve
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget
-from impactopt.planning.clearance_constraints import Margins, Watch, spots_of
-from impactopt.planning.clearance_violations import clearance_violations
+from impactopt.planning.clearance_constraints import Margins, Watch, clearance_violations, spots_of
 from impactopt.planning.refinement import Guess, Outcome
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import PlanSolver
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status, max_violation
@@ -110,7 +108,7 @@ def test_a_result_that_touches_nothing_goes_before_a_later_one_that_does(free: S
     x, _, z = hammer(free, 0.9 * free.plan.swing.duration)
     problem = with_peg(free.problem, x, z)
     later = dataclasses.replace(free.result, iterations=1000)
-    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
     budget.stop.asked = True  # so nothing is added
     between, found = BetweenNodes(budget, Margins(problem)), Outcome.of(program_of(free, problem), later)
     assert between.refined(found).result.status is Status.FAILED
@@ -123,5 +121,5 @@ def test_a_result_that_touches_nothing_goes_before_a_later_one_that_does(free: S
 def test_a_limit_of_iterations_that_nobody_has_set_is_no_answer(free: Solution) -> None:
     ended = dataclasses.replace(free.result, status=Status.ITERATION_LIMIT)
     for options, stuck in ((None, True), ({"max_iterations": 5}, False)):
-        budget = Budget(solver="sqp", options=options, time_limit=None, callback=None)
+        budget = Budget(solver="ipm", options=options, time_limit=None, callback=None)
         assert PlanSolver(budget=budget, margins=None, refined=True)._stuck(ended) is stuck

@@ -19,7 +19,7 @@ from impactopt.files.problem_file import parse_problem_file
 from impactopt.files.problem_file.writing import write_problem
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.second_striker import SecondStriker
+from impactopt.problem.scenario import SecondStriker
 from impactopt.problem.terms import HitCone
 from impactopt.simulation.result import Scene
 from impactopt.simulation.target_dynamics import Struck

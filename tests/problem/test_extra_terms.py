@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from support.small_plans import changed
 from support.term_cases import CASES, MILD, Solved
 
-from impactopt.bodies.shapes import face_axes
+from impactopt.bodies.world import face_axes
 from impactopt.errors import InputError
 from impactopt.problem.problem import Phase
 from impactopt.problem.terms import (

@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 from support.small_motions import strike
 from support.small_plans import changed, struck
 
-from impactopt import Actuator, Scenario, load_problem, solve
+from impactopt import Actuator, Scenario, Solution, load_problem, solve
 from impactopt.contact.targets import Nail
 from impactopt.errors import InputError
-from impactopt.planning.solution import Solution
 from impactopt.problem.terms import GearLoad, HandOrientation, MotorCurve, PowerLimit, VelocityJump
-from impactopt.robots.actuator_loads import motor_power, motor_use
+from impactopt.robots.loads import motor_power, motor_use
 from impactopt.simulation import simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.transcription.impact_onset import jump
+from impactopt.transcription.collision import jump
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
-from impactopt.transcription.planned_loads import motion_loads
+from impactopt.transcription.plan import motion_loads
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
@@ -153,7 +152,7 @@ def test_a_strike_keeps_its_gears_too(bounded: Any) -> None:
 
 @pytest.mark.parametrize("term", [MotorCurve(fraction=0.2), PowerLimit(limit=30.0)])
 def test_motors_keep_to_their_line_and_their_power(arm_transcription: Transcription, term: Any) -> None:
-    """In the formulas of `impactopt.robots.actuator_loads`, friction included."""
+    """In the formulas of `impactopt.robots.loads`, friction included."""
     t = changed(arm_transcription, terms=(term,))
     result = solve_ipopt(t.program, first_iterate(t))
     assert result.status is Status.SOLVED

@@ -18,15 +18,14 @@ from impactopt.files.problem_file import write_problem
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.objectives import Effort, Impulse, Objective
 from impactopt.problem.terms import Gaze, Term, TorqueLimit
+from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.solvers.sqp import solve_sqp
-from impactopt.transcription.blocks import make_block
-from impactopt.transcription.constraints import millimetres
+from impactopt.transcription.blocks import key_of, make_block
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
+from impactopt.transcription.layout import millimetres
 from impactopt.transcription.objective import Quantity
 from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.term_blocks import key_of
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
@@ -121,7 +120,7 @@ def test_a_plan_obeys_a_term_of_ones_own(arm_transcription: Transcription) -> No
     term = Ceiling(height=float(top - 0.01))
     t = changed(arm_transcription, terms=(term,))
     for result in (
-        solve_sqp(t.program, first_iterate(t)),
+        solve_ipm(t.program, first_iterate(t)),
         solve_ipopt(t.program, first_iterate(t)),
     ):
         assert result.status is Status.SOLVED
@@ -135,7 +134,7 @@ def test_a_plan_obeys_a_term_of_ones_own(arm_transcription: Transcription) -> No
 def test_an_objective_of_ones_own_is_kept_small(arm_transcription: Transcription) -> None:
     objectives = (Impulse(), Strain(weight=10.0))
     t = changed(arm_transcription, objectives=objectives)
-    result = solve_sqp(t.program, first_iterate(t))
+    result = solve_ipm(t.program, first_iterate(t))
     assert result.status is Status.SOLVED
     plan, limit = t.decode(result.x), t.robot.torque_limit
     swing = plan.trajectory(hold=0.0)
@@ -143,15 +142,15 @@ def test_an_objective_of_ones_own_is_kept_small(arm_transcription: Transcription
     exact = float(trapezoid(np.sum((swing.torque[k] / limit) ** 2, axis=1), swing.time[k]))
     assert t.achieved(result.x)["strain"] == pytest.approx(exact, rel=0.1)
     easy = changed(arm_transcription, objectives=(Impulse(), Effort(weight=10.0)))
-    less = solve_sqp(easy.program, first_iterate(easy))
+    less = solve_ipm(easy.program, first_iterate(easy))
     assert t.impulse(result.x) == pytest.approx(easy.impulse(less.x), rel=0.2), "it is the larger part of it"
 
 
 def test_squares_of_variables_are_weighed(arm_transcription: Transcription) -> None:
     plain = changed(arm_transcription)
-    first = solve_sqp(plain.program, first_iterate(plain))
+    first = solve_ipm(plain.program, first_iterate(plain))
     t = changed(arm_transcription, objectives=(Impulse(), Pushes(weight=0.5)))
-    result = solve_sqp(t.program, first_iterate(t))
+    result = solve_ipm(t.program, first_iterate(t))
     push = float(np.sum(t.feedforward.read(result.x) ** 2))
     assert t.achieved(result.x)["push"] == pytest.approx(push)
     assert push < float(np.sum(plain.feedforward.read(first.x) ** 2))

@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import LAW, OPTIONS, Planned, changed, planned
 
+from impactopt import Solution
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.kinematics.support import margin, zmp
-from impactopt.planning.solution import Solution
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
 from impactopt.simulation import scene_of

@@ -16,19 +16,18 @@ from support.fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_so
 from support.small_robots import biped
 from typer.testing import CliRunner
 
+from impactopt import Solution
 from impactopt.bodies.robot_bodies import bodies_of
-from impactopt.bodies.robot_visuals import visuals_of
-from impactopt.bodies.scene_visuals import surroundings_of
-from impactopt.bodies.shapes import Obstacle
+from impactopt.bodies.visuals import surroundings_of, visuals_of
+from impactopt.bodies.world import Obstacle
 from impactopt.cli.app import app
 from impactopt.contact import Board, KelvinVoigt
 from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of, save_record
 from impactopt.files.problem_file.names import problem_file
-from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report import animation_of, bodies_page, report_of
-from impactopt.report.pack import unpack
+from impactopt.report.page import unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
 from impactopt.robots.presets import load_robot

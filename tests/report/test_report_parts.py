@@ -13,21 +13,30 @@ import pytest
 from scipy.integrate import trapezoid
 from support.fake_solution import still_problem, still_solution
 
+from impactopt import Solution
 from impactopt.bodies.convex_hulls import pieces_of
-from impactopt.bodies.meshes import find_mesh, read_mesh
-from impactopt.bodies.robot_visuals import visuals_of
-from impactopt.bodies.scene_visuals import surroundings_of
-from impactopt.bodies.shapes import Obstacle, TargetBody
-from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
+from impactopt.bodies.solids import (
+    Solid,
+    box,
+    capsule,
+    cylinder,
+    find_mesh,
+    joined,
+    read_mesh,
+    rounded_box,
+    simplified,
+    sphere,
+)
+from impactopt.bodies.visuals import surroundings_of, visuals_of
+from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of
-from impactopt.planning.solution import Solution
 from impactopt.report.charts import charts_of
-from impactopt.report.pack import pack, unpack
+from impactopt.report.histories import thinned
+from impactopt.report.page import pack, unpack
 from impactopt.report.stage import stage_of
-from impactopt.report.thinning import thinned
 from impactopt.report.tracks import FAR, tracks_of
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot

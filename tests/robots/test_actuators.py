@@ -15,7 +15,7 @@ from impactopt import Actuator, Robot, load_problem, write_problem
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
-from impactopt.robots.actuator_loads import DriveLoads, gear_torque, motor_power, motor_use
+from impactopt.robots.loads import DriveLoads, gear_torque, motor_power, motor_use
 from impactopt.robots.presets import g1
 
 FILE = """

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from support import urdfs
 
 from impactopt import Robot
-from impactopt.codegen.hashing import model_hash
+from impactopt.codegen.cache import model_hash
 from impactopt.errors import InputError
 
 mujoco = pytest.importorskip("mujoco")

@@ -12,7 +12,7 @@ from support import urdfs
 from impactopt import Robot
 from impactopt.errors import InputError
 from impactopt.files.problem_file import problem_file_from_data
-from impactopt.robots.inertias import repair_inertias
+from impactopt.robots.checks import repair_inertias
 
 LOST = 'ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"'
 FLAT = 'ixx="0.001" iyy="0.002" izz="0.01" ixy="0" ixz="0" iyz="0"'

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 
 import impactopt
 from impactopt import Robot, Sole, Striker, g1, load_robot, talos
-from impactopt.codegen.hashing import model_hash
+from impactopt.codegen.cache import model_hash
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.robots import presets
 

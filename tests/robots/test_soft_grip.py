@@ -27,7 +27,7 @@ from impactopt import (
 )
 from impactopt.collision import Effects
 from impactopt.robots.tools import mapped
-from impactopt.simulation.servo import Servo
+from impactopt.simulation.motors import Servo
 
 ONLY_SERVO = Effects(bias=False, jdot=False, saturation=False, feedforward=False)
 NORMAL = np.array([0.6, 0.0, -0.8])

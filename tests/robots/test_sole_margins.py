@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from support.small_robots import biped
 
-from impactopt.robots.sole_margins import BEARS, cop_margin, least_kept, least_margins, shortfalls, weight_of
+from impactopt.robots.loads import BEARS, cop_margin, least_kept, least_margins, shortfalls, weight_of
 
 Array = NDArray[np.float64]
 CORNERS = np.array([[-0.05, -0.06], [0.15, -0.06], [0.15, 0.06], [-0.05, 0.06]])

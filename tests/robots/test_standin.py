@@ -18,8 +18,8 @@ from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.robots import presets
+from impactopt.robots.link_tables import LINKS, PELVIS
 from impactopt.robots.robot import Robot
-from impactopt.robots.standin import LINKS, PELVIS
 
 Array = NDArray[np.float64]
 LEG = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")

@@ -29,13 +29,9 @@ from impactopt.simulation import (
 from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.controller.clearance import Clearance
-from impactopt.simulation.controller.cones import cone_of
-from impactopt.simulation.controller.constrained_dynamics import HeldDynamics
-from impactopt.simulation.controller.estimate import StateEstimate
-from impactopt.simulation.controller.quadratic import TorqueQP
-from impactopt.simulation.controller.recovery import Recovery
-from impactopt.simulation.controller.sensors import Sensors
-from impactopt.simulation.controller.tracking_reference import Target
+from impactopt.simulation.controller.sensors import Sensors, StateEstimate
+from impactopt.simulation.controller.tracking_reference import Recovery, Target
+from impactopt.simulation.controller.whole_body import HeldDynamics, TorqueQP, cone_of
 from impactopt.simulation.mujoco_engine import _Replay
 from impactopt.simulation.mujoco_world import MujocoOptions
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt import FixedBase, FreeMass, ImpactProblem, Scenario, SpringDamper, planar_arm, solve
-from impactopt.planning.solution import Solution
+from impactopt import FixedBase, FreeMass, ImpactProblem, Scenario, Solution, SpringDamper, planar_arm, solve
 from impactopt.robots.robot import Robot
-from impactopt.simulation.contact_times import FollowedReference
+from impactopt.simulation.result import FollowedReference
 from impactopt.transcription.plan import Trajectory
 
 LATE = 0.06  # [s] after the planned contact that the robot notices

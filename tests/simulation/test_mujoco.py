@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from support.small_motions import blow_motion, reference, scene, standing, strike
 from support.small_robots import arm, biped, slider
 
+from impactopt import Solution
 from impactopt.contact import FreeMass
 from impactopt.errors import InputError
 from impactopt.kinematics.support import margin
-from impactopt.planning.solution import Solution
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 from impactopt.simulation import (

@@ -41,8 +41,8 @@ from impactopt.simulation import (
     simulate_mujoco,
     simulate_pinocchio,
 )
+from impactopt.simulation.engines import check_steps, with_step_error
 from impactopt.simulation.robustness import PerturbationRanges
-from impactopt.simulation.step_error import check_steps, with_step_error
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
 from impactopt.transcription.initial_guess import first_iterate

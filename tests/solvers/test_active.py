@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from impactopt.solvers.active import ActiveSystem, Offset
-from impactopt.solvers.predictor import Predictor
+from impactopt.solvers.predictor import ActiveSystem, Offset, Predictor
 from impactopt.solvers.program import Vector
 
 

@@ -9,12 +9,9 @@ import scipy.sparse as sp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from impactopt.solvers.elimination.compiled import kernels
-from impactopt.solvers.elimination.condense import Condenser, find_eliminations
-from impactopt.solvers.elimination.kernels import Kernels
-from impactopt.solvers.elimination.patterns import Elimination
-from impactopt.solvers.ipm.cholesky import BlockCholesky
-from impactopt.solvers.ipm.newton import NewtonSystem, acquire, release
+from impactopt.solvers.elimination.condense import Condenser, Elimination, find_eliminations
+from impactopt.solvers.elimination.kernels import Kernels, kernels
+from impactopt.solvers.ipm.newton import BlockCholesky, NewtonSystem, acquire, release
 from impactopt.solvers.program import Determined
 from impactopt.transcription.initial_guess import first_iterate
 

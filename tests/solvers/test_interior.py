@@ -13,10 +13,10 @@ from support.small_plans import changed, transcribed
 from support.textbook import CASES, INF, Textbook, assert_optimal
 
 from impactopt import load_problem
+from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipm import interior_point as interior
-from impactopt.solvers.ipm import line_search as search
+from impactopt.solvers.ipm import interior_point as search
 from impactopt.solvers.program import Status
-from impactopt.solvers.sqp import SQPOptions, solve_sqp
 from impactopt.transcription.initial_guess import first_iterate
 
 
@@ -35,7 +35,7 @@ def test_a_slack_that_stops_a_step_alone_stops_alone():
     start = np.array([0.02, *np.ones(19)])
     program = projection(wanted)
     distances = []
-    result = solve_sqp(program, start, callback=lambda r: distances.append(r.step))
+    result = solve_ipm(program, start, callback=lambda r: distances.append(r.step))
     assert result.status is Status.SOLVED
     assert "bent" in result.history[1].note
     assert distances[1] > 1.0  # as without row 0; along the straight step it would be 0.1
@@ -50,7 +50,7 @@ def test_bent_steps_lead_to_the_same_optimum(seed):
     rng = np.random.default_rng(seed)
     wanted, start = rng.normal(size=12), 0.02 + rng.random(12)
     # near a bound that all but holds, the barrier leaves a distance of the root of this
-    result = solve_sqp(projection(wanted), start, options=SQPOptions(complementarity_tolerance=1e-10))
+    result = solve_ipm(projection(wanted), start, options=IPMOptions(complementarity_tolerance=1e-10))
     assert result.status is Status.SOLVED
     np.testing.assert_allclose(result.x, np.maximum(wanted, 0.0), atol=1e-4)
 
@@ -76,16 +76,16 @@ def test_a_run_that_is_left_goes_on_as_it_would_have():
     """With its slacks, multipliers and barrier: what two bounds of one variable share is all that is lost."""
     wanted = np.array([-1.0, 0.5, 2.0, 5.0])
     program, start, whole = projection(wanted), np.ones(4), Watching(-1)
-    solved = solve_sqp(program, start, watch=whole)
+    solved = solve_ipm(program, start, watch=whole)
     assert solved.status is Status.SOLVED
     lengths = np.abs(np.diff(whole.asked[:3], axis=0)).max(axis=1)
     assert lengths[0] <= 0.5 * np.abs(wanted - 1.0).max(), "steps are as short as who watches wants them"
     first = Watching(3)
-    left = solve_sqp(program, start, watch=first)
+    left = solve_ipm(program, start, watch=first)
     assert left.status is Status.ACCEPTABLE and left.iterations == 3
     np.testing.assert_array_equal(left.x, whole.asked[3])
     on = Watching(-1)
-    again = solve_sqp(
+    again = solve_ipm(
         program,
         left.x,
         multipliers=left.multipliers,
@@ -104,7 +104,7 @@ def test_rows_far_off_are_not_bent():
     """Where a row is off by more than one, a step is as straight as ever."""
     wanted = np.array([-1.0, *np.full(19, 5.0)])
     start = np.array([-3.0, *np.ones(19)])
-    result = solve_sqp(projection(wanted), start)
+    result = solve_ipm(projection(wanted), start)
     assert result.status is Status.SOLVED
     assert "bent" not in result.history[1].note
 
@@ -112,12 +112,12 @@ def test_rows_far_off_are_not_bent():
 @pytest.mark.parametrize(("barrier", "follows"), [(1e-2, True), (1e-3, False)])
 def test_a_start_with_multipliers_keeps_to_the_path_from_a_high_barrier_only(barrier, follows):
     """From multipliers of another optimum: a barrier that is low is given up at once, for what is near."""
-    old = solve_sqp(projection(np.full(12, -1.0)), np.ones(12))
+    old = solve_ipm(projection(np.full(12, -1.0)), np.ones(12))
     program = projection(np.linspace(-2.0, 2.0, 12))
-    result = solve_sqp(
+    result = solve_ipm(
         program,
         old.x,
-        options=SQPOptions(barrier_warm=barrier),
+        options=IPMOptions(barrier_warm=barrier),
         multipliers=old.multipliers,
         bound_multipliers=old.bound_multipliers,
     )
@@ -131,7 +131,7 @@ def test_steps_that_crawl_give_way(monkeypatch):
     monkeypatch.setattr(search, "_CRAWL", 2.0)
     monkeypatch.setattr(search, "_PATIENCE", 2)
     case = CASES["HS71"]
-    result = solve_sqp(case.build(), case.x0)
+    result = solve_ipm(case.build(), case.x0)
     assert next(k for k, r in enumerate(result.history) if r.note == "rows become elastic") == 3
 
 
@@ -145,7 +145,7 @@ def test_what_fails_begins_again_from_the_best_iterate(monkeypatch):
 
     monkeypatch.setattr(interior.InteriorRun, "_advance", failing)
     program = case.build()
-    result = solve_sqp(program, case.x0)
+    result = solve_ipm(program, case.x0)
     assert result.status is Status.SOLVED
     assert result.objective == pytest.approx(case.optimum, rel=1e-5)
     assert [r.note for r in result.history].count("again from the best iterate") == 1
@@ -154,7 +154,7 @@ def test_what_fails_begins_again_from_the_best_iterate(monkeypatch):
 def test_what_goes_on_failing_is_said_to_fail(monkeypatch):
     monkeypatch.setattr(interior.InteriorRun, "_advance", lambda self, residual: Status.FAILED)
     case = CASES["HS71"]
-    result = solve_sqp(case.build(), case.x0)
+    result = solve_ipm(case.build(), case.x0)
     assert result.status is Status.FAILED
     assert len(result.history) <= 3
 
@@ -165,5 +165,5 @@ def test_elastic_rows_that_are_met_do_not_keep_it_from_an_end():
     base = transcribed(problem)
     for resistance in (568.1043576449156, 569.6147318929434, 789.978655):
         t = changed(base, target=dataclasses.replace(problem.target, resistance=resistance))
-        result = solve_sqp(t.program, first_iterate(t))
+        result = solve_ipm(t.program, first_iterate(t))
         assert result.status is Status.SOLVED and result.iterations < 200, resistance

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impactopt.solvers.ipm.ordering import elimination_blocks
+from impactopt.solvers.ipm.newton import elimination_blocks
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(0, 60), density=st.floats(0.0, 0.3))

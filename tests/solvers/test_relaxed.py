@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.textbook import INF, Textbook
 
+from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.program import Status
 from impactopt.solvers.relaxed import Relaxation, RelaxedProgram
-from impactopt.solvers.sqp import solve_sqp
 
 NONE = np.zeros(0, dtype=np.intp)
 
@@ -63,7 +63,7 @@ def test_derivatives_are_those_of_differences() -> None:
 def test_bounds_move_as_far_as_they_have_to(relaxations: list[Relaxation], sizes: list[float]) -> None:
     x = np.array([0.5, 0.5])
     relaxed = RelaxedProgram(infeasible(), relaxations, x)
-    result = solve_sqp(relaxed, relaxed.start(x, 1e-2))
+    result = solve_ipm(relaxed, relaxed.start(x, 1e-2))
     assert result.status is Status.SOLVED
     np.testing.assert_allclose(relaxed.sizes(result.x), sizes, atol=2e-3)
 
@@ -74,5 +74,5 @@ def test_both_sides_of_a_row_give_way() -> None:
         program.x_lower, program.x_upper = (np.array([v]) for v in ((3.0, INF) if sign > 0 else (-INF, -3.0)))
         x = np.array([3.0 * sign])
         relaxed = RelaxedProgram(program, [Relaxation(of(0), NONE, 4.0)], x)
-        result = solve_sqp(relaxed, relaxed.start(x, 1e-2))
+        result = solve_ipm(relaxed, relaxed.start(x, 1e-2))
         assert relaxed.sizes(result.x)[0] == pytest.approx(0.5, abs=1e-3)

@@ -7,14 +7,16 @@ import dataclasses
 import casadi as ca
 import numpy as np
 import pytest
-from support.textbook import CASES, INF, Textbook, assert_optimal, infeasible
+from support.textbook import CASES, INF, Textbook, assert_optimal, infeasible, solve_by
 
 from impactopt.errors import InputError
+from impactopt.solvers.ipm import IPMOptions, solve_ipm
+from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import QP_SOLVERS, QPSolution, QPStatus, SQPOptions, solve_sqp
 
 WAYS = {
-    "default": SQPOptions(),
+    "default": IPMOptions(),
     "active_set": SQPOptions(qp_solver="active_set"),
     "osqp": SQPOptions(qp_solver="osqp"),
     "bfgs": SQPOptions(qp_solver="active_set", hessian="bfgs"),
@@ -27,9 +29,10 @@ def test_textbook_programs(name, way):
     case = CASES[name]
     program = case.build()
     options = WAYS[way]
-    if name == "HS10":  # its start is 20 units from the optimum: steps that suit orders of one are many
+    # HS10 starts 20 units from its optimum: steps that suit orders of one are many
+    if name == "HS10" and isinstance(options, SQPOptions):
         options = dataclasses.replace(options, radius=10.0)
-    result = solve_sqp(program, case.x0, options=options)
+    result = solve_by(program, case.x0, options)
     # HS26 has a singular Hessian at its optimum: quasi-Newton creeps
     singular = name == "HS26" and way == "bfgs"
     assert result.status is Status.SOLVED or (singular and result.status is Status.ACCEPTABLE)
@@ -46,14 +49,14 @@ def test_textbook_programs(name, way):
 def test_iterates_stay_within_the_variables_bounds():
     # log x is not defined left of its bound, and the unbounded step leads there
     program = Textbook(1, lambda x: x - 1e-3 * ca.log(x), lower=1e-6)
-    result = solve_sqp(program, [10.0])
+    result = solve_ipm(program, [10.0])
     assert result.status is Status.SOLVED
     assert result.x[0] == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_steps_to_where_functions_are_not_finite_are_shortened():
     program = Textbook(1, lambda x: x - ca.log(x))  # nan at x <= 0
-    result = solve_sqp(program, [8.0], options=SQPOptions(radius=50.0))
+    result = solve_ipm(program, [8.0])
     assert result.status is Status.SOLVED
     assert result.x[0] == pytest.approx(1, abs=1e-5)
 
@@ -66,15 +69,15 @@ def test_arithmetic_errors_count_as_not_finite_and_others_surface():
             return super().objective(x)
 
     program = Fussy(1, lambda x: x - ca.log(x))
-    assert solve_sqp(program, [8.0], options=SQPOptions(radius=50.0)).status is Status.SOLVED
-    assert solve_sqp(program, [-1.0]).status is Status.FAILED
+    assert solve_ipm(program, [8.0]).status is Status.SOLVED
+    assert solve_ipm(program, [-1.0]).status is Status.FAILED
 
     class Broken(Textbook):
         def hessian(self, x, sigma, multipliers):
             raise ValueError("a bug")
 
     with pytest.raises(ValueError, match="a bug"):
-        solve_sqp(Broken(1, lambda x: x**2), [1.0])
+        solve_ipm(Broken(1, lambda x: x**2), [1.0])
 
 
 def test_full_steps_are_taken_along_a_circle():
@@ -115,7 +118,7 @@ def test_rows_come_in_only_when_they_are_needed():
 def test_infeasible_programs_name_the_rows():
     program, x0 = infeasible()
     for options in WAYS.values():
-        result = solve_sqp(program, x0, options=options)
+        result = solve_by(program, x0, options)
         assert result.status is Status.INFEASIBLE
         assert "row 1: by" in result.message
         assert "row 2: by" in result.message
@@ -125,7 +128,7 @@ def test_infeasible_programs_name_the_rows():
 
 def test_infeasible_against_bounds():
     program = Textbook(2, lambda x, y: x**2, lambda x, y: [(4, x * y, INF)], lower=0, upper=1)
-    result = solve_sqp(program, [0.5, 0.5])
+    result = solve_ipm(program, [0.5, 0.5])
     assert result.status is Status.INFEASIBLE
     assert "row 1: by 3" in result.message
     np.testing.assert_allclose(result.x, 1, atol=1e-6)
@@ -133,7 +136,7 @@ def test_infeasible_against_bounds():
 
 def test_a_low_price_still_finds_the_feasible_region():
     case = CASES["HS40"]
-    result = solve_sqp(case.build(), case.x0, options=SQPOptions(price=1e-3))
+    result = solve_ipm(case.build(), case.x0, options=IPMOptions(price=1e-3))
     assert result.status is Status.SOLVED
     assert result.objective == pytest.approx(case.optimum, abs=1e-5)
 
@@ -141,7 +144,7 @@ def test_a_low_price_still_finds_the_feasible_region():
 @pytest.mark.parametrize("x0", [[np.nan, 1], [1, 2, 3]])
 def test_bad_starts_are_refused(x0):
     with pytest.raises(InputError, match="x0"):
-        solve_sqp(CASES["HS6"].build(), x0)
+        solve_ipm(CASES["HS6"].build(), x0)
 
 
 def test_bad_options_are_refused_when_written():
@@ -150,11 +153,11 @@ def test_bad_options_are_refused_when_written():
     with pytest.raises(InputError, match="qp_solver"):
         SQPOptions(qp_solver="qpoases")
     with pytest.raises(InputError, match="kkt_tolerance"):
-        SQPOptions(kkt_tolerance=0.0)
+        IPMOptions(kkt_tolerance=0.0)
     with pytest.raises(InputError, match="price"):
-        SQPOptions(price=2.0, price_max=1.0)
+        IPMOptions(price=2.0, price_max=1.0)
     with pytest.raises(TypeError):
-        SQPOptions(max_iter=3)
+        IPMOptions(max_iter=3)
 
 
 @pytest.mark.parametrize("how", ["raise", "return"])
@@ -170,7 +173,7 @@ def test_interruption_leaves_the_best_iterate(how):
             return True
         return None
 
-    result = solve_sqp(program, case.x0, callback=callback)
+    result = solve_ipm(program, case.x0, callback=callback)
     assert result.status is Status.INTERRUPTED
     assert result.iterations == 3
     best = min(seen, key=lambda record: (max(record.max_violation, 1e-6), record.objective))
@@ -191,37 +194,37 @@ def test_interruption_within_a_function():
     for after in (0, 3):
         program = case.build()
         program.__class__, program.after = Interrupted, after
-        result = solve_sqp(program, case.x0)
+        result = solve_ipm(program, case.x0)
         assert result.status is Status.INTERRUPTED
         assert np.isfinite(result.x).all()
 
 
 def test_limits():
     case = CASES["HS100"]
-    result = solve_sqp(case.build(), case.x0, options=SQPOptions(max_iterations=2))
+    result = solve_ipm(case.build(), case.x0, options=IPMOptions(max_iterations=2))
     assert (result.status, result.iterations) == (Status.ITERATION_LIMIT, 2)
-    result = solve_sqp(case.build(), case.x0, options=SQPOptions(max_iterations=0))
+    result = solve_ipm(case.build(), case.x0, options=IPMOptions(max_iterations=0))
     assert (result.status, result.iterations) == (Status.ITERATION_LIMIT, 0)
     np.testing.assert_array_equal(result.x, case.x0)
-    result = solve_sqp(case.build(), case.x0, options=SQPOptions(time_limit=1e-9))
+    result = solve_ipm(case.build(), case.x0, options=IPMOptions(time_limit=1e-9))
     assert (result.status, result.iterations) == (Status.TIME_LIMIT, 0)
 
 
 def test_functions_not_finite_at_the_start_are_said_so():
-    result = solve_sqp(Textbook(1, lambda x: ca.log(x), lambda x: [(0, ca.sqrt(x), 1)]), [-1.0])
+    result = solve_ipm(Textbook(1, lambda x: ca.log(x), lambda x: [(0, ca.sqrt(x), 1)]), [-1.0])
     assert result.status is Status.FAILED
     assert "not finite" in result.message
 
 
 def test_solutions_start_the_next_solve():
     case = CASES["HS71"]
-    first = solve_sqp(case.build(), case.x0)
-    again = solve_sqp(
+    first = solve_ipm(case.build(), case.x0)
+    again = solve_ipm(
         case.build(), first.x, multipliers=first.multipliers, bound_multipliers=first.bound_multipliers
     )
     assert again.iterations == 0
     with pytest.raises(InputError, match="multipliers"):
-        solve_sqp(case.build(), case.x0, multipliers=[1.0])
+        solve_ipm(case.build(), case.x0, multipliers=[1.0])
 
 
 def test_own_qp_solvers_can_be_added_and_may_fail():
@@ -238,3 +241,17 @@ def test_own_qp_solvers_can_be_added_and_may_fail():
         del QP_SOLVERS["hopeless"]
     assert result.status is Status.FAILED
     np.testing.assert_array_equal(result.x, case.x0)
+
+
+@pytest.mark.parametrize(
+    ("solver", "options", "today"),
+    [
+        ("sqp", None, ("ipm", None)),
+        ("sqp", {"qp_solver": "interior", "push": 1.0}, ("ipm", {"push": 1.0})),
+        ("ipm", {"qp_solver": "osqp"}, ("sqp", {"qp_solver": "osqp"})),
+    ],
+)
+def test_solvers_as_they_were_named_are_taken_with_a_warning(solver, options, today):
+    with pytest.warns(FutureWarning, match='solver "(ipm|sqp)"'):
+        assert with_todays_name(solver, options) == today
+    assert with_todays_name(*today) == today

@@ -10,17 +10,18 @@ import pytest
 from support.degenerate import DEPENDENT, INFEASIBLE, NO_MULTIPLIERS, UNBOUNDED
 from support.hock_schittkowski import BOOK, OUT_OF_SCALE
 from support.maros_meszaros import QPS, quadratic
-from support.textbook import assert_optimal
+from support.textbook import assert_optimal, solve_by
 
+from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, SQPOptions, make_qp_solver, solve_sqp
+from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, SQPOptions, make_qp_solver
 
 # bounds as they are: relaxed by 1e-8, as IPOPT does, optima with large multipliers change in the fifth digit
 EXACT = {"tol": 1e-9, "bound_relax_factor": 0.0}
 # for six digits of an objective however many bounds hold
-SHARP = SQPOptions(complementarity_tolerance=1e-8)
-WAYS = {"default": SQPOptions(), "osqp": SQPOptions(qp_solver="osqp")}
+SHARP = IPMOptions(complementarity_tolerance=1e-8)
+WAYS = {"default": IPMOptions(), "osqp": SQPOptions(qp_solver="osqp")}
 
 
 @functools.cache
@@ -45,7 +46,7 @@ def test_the_books_optima_are_optima(name):
 def test_the_sqp_finds_the_books_optima(name):
     case = BOOK[name]
     program = case.build()
-    result = solve_sqp(program, case.x0, options=SHARP)
+    result = solve_ipm(program, case.x0, options=SHARP)
     assert result.status is Status.SOLVED
     assert result.objective == pytest.approx(case.optimum, rel=1e-5, abs=1e-5)
     assert_optimal(program, result)
@@ -54,7 +55,7 @@ def test_the_sqp_finds_the_books_optima(name):
 @pytest.mark.parametrize("name", OUT_OF_SCALE)
 def test_programs_out_of_scale_are_solved_or_said_not_to_be(name):
     case = BOOK[name]
-    result = solve_sqp(case.build(), case.x0, options=SQPOptions(max_iterations=60))
+    result = solve_ipm(case.build(), case.x0, options=IPMOptions(max_iterations=60))
     assert result.status is not Status.INFEASIBLE
     assert not result.status.usable or result.objective == pytest.approx(case.optimum, rel=1e-5)
 
@@ -81,7 +82,7 @@ def test_convex_qps(name, solver):
 def test_the_sqp_on_convex_qps(name):
     case = QPS[name]
     program = case.build()
-    result = solve_sqp(program, case.x0, options=SHARP)
+    result = solve_ipm(program, case.x0, options=SHARP)
     assert result.status is Status.SOLVED
     assert result.objective == pytest.approx(optimum(name), rel=1e-6, abs=1e-6)
     assert_optimal(program, result)
@@ -93,7 +94,7 @@ def test_the_sqp_on_convex_qps(name):
 def test_dependent_rows(name, way):
     case = DEPENDENT[name]
     program = case.build()
-    result = solve_sqp(program, case.x0, options=WAYS[way])
+    result = solve_by(program, case.x0, WAYS[way])
     assert result.status.usable
     assert result.objective == pytest.approx(case.optimum, abs=1e-4)
     assert_optimal(program, result, tolerance=1e-4)
@@ -103,7 +104,7 @@ def test_dependent_rows(name, way):
 @pytest.mark.parametrize("name", NO_MULTIPLIERS)
 def test_optima_without_multipliers_are_approached(name, way):
     case = NO_MULTIPLIERS[name]
-    result = solve_sqp(case.build(), case.x0, options=WAYS[way])
+    result = solve_by(case.build(), case.x0, WAYS[way])
     assert result.status is not Status.INFEASIBLE
     assert result.max_violation <= 1e-6
     # on the way to the cusp, multipliers of 1e4 meet the KKT conditions to 1e-6 where f is 1.7 % off
@@ -114,7 +115,7 @@ def test_optima_without_multipliers_are_approached(name, way):
 @pytest.mark.parametrize("name", INFEASIBLE)
 def test_rows_that_contradict_each_other_are_named(name, way):
     case, rows = INFEASIBLE[name]
-    result = solve_sqp(case.build(), case.x0, options=WAYS[way])
+    result = solve_by(case.build(), case.x0, WAYS[way])
     assert result.status is Status.INFEASIBLE
     listed = result.message.split("Constraints that cannot be met: ")[1].split("; ")
     named = {part.split(":")[0] for part in listed}
@@ -126,9 +127,10 @@ def test_rows_that_contradict_each_other_are_named(name, way):
 @pytest.mark.parametrize("name", UNBOUNDED)
 def test_unbounded_programs_end_far_out(name, way):
     case = UNBOUNDED[name]
-    result = solve_sqp(
-        case.build(), case.x0, options=dataclasses.replace(WAYS[way], max_iterations=50, radius=100.0)
-    )
+    options = dataclasses.replace(WAYS[way], max_iterations=50)
+    if isinstance(options, SQPOptions):
+        options = dataclasses.replace(options, radius=100.0)
+    result = solve_by(case.build(), case.x0, options)
     assert not result.status.usable
     assert result.status is not Status.INFEASIBLE
     assert result.max_violation <= 1e-6

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from impactopt import Solution
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.files.output import Record
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
-from impactopt.kinematics.statics import static_wrenches
 from impactopt.planning.refinement import Attempt
-from impactopt.planning.solution import Solution
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.robot import Robot

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.robots.names import reduced
+from impactopt.robots.checks import reduced
 from impactopt.robots.robot import Robot
 
 

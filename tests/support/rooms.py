@@ -30,6 +30,7 @@ ROOMS_IN_ORDER = (
     "sweeps",
     "identification",
     "report",
+    "api",
     "live",
     "cli",
     "__main__",
@@ -41,23 +42,23 @@ NUMERIC = (
     "kinematics/operational_space.py",
     "kinematics/inverse_kinematics.py",
     "kinematics/splines.py",
-    "kinematics/statics.py",
+    "kinematics/operational_space.py",
     "kinematics/support.py",
-    "kinematics/wrench_cone.py",
+    "kinematics/support.py",
     "planning/clearance_constraints.py",
     "planning/solution.py",
     "simulation",
     "solvers/elimination",
     "solvers/ipm",
     "solvers/options.py",
-    "solvers/point.py",
+    "solvers/program.py",
     "solvers/program.py",
     "solvers/qp",
-    "solvers/report.py",
+    "solvers/run.py",
     "solvers/run.py",
     "solvers/sqp",
     "transcription/plan.py",
-    "transcription/planned_strike.py",
+    "transcription/plan.py",
 )
 # What an engine may know of this package, so that it can contradict the rest of it.
 ENGINE = {"contact", "errors", "robots", "simulation"}
@@ -97,16 +98,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ROOMS = {room(file) for file in FILES}
 
 
-# methods of a solution that are made above it, imported by the package's own names when they are called
-REACHES_UP = PACKAGE / "planning" / "solution.py"
-
-
 def modules_imported(file: Path) -> set[str]:
     """Modules of the package that a file imports: in functions, for types alone, by its own names too."""
     found = set[str]()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module == "impactopt":
-            found |= set() if file == REACHES_UP else {own_name(alias.name) for alias in node.names}
+            found |= {own_name(alias.name) for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             names = {f"{node.module}.{alias.name}" for alias in node.names}
             # a name of a package is a module in it, or the package's own

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.statics import static_wrenches
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, simulate_pinocchio

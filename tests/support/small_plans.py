@@ -23,12 +23,11 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.blocks import BlockExpression, builders
+from impactopt.transcription.blocks import BlockExpression, builders, extra_blocks, own_blocks
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.structured import derivative_functions
-from impactopt.transcription.term_blocks import extra_blocks, own_blocks
 from impactopt.transcription.transcription import Transcription
 from support.small_robots import arm, biped, striking_point
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from impactopt.sweeps.journal import Entry
+from impactopt.sweeps.store import Entry
 
 
 def entry(unit: int, count: int = 3) -> Entry:

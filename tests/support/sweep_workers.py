@@ -21,7 +21,7 @@ def unlucky(folder: Path, number: int) -> Any:
 def slow(limit: float, _: int) -> None:
     import numpy as np
 
-    from impactopt.sweeps.watchdog import Watchdog
+    from impactopt.sweeps.evaluate import Watchdog
 
     watchdog = Watchdog(limit, 0.1)
     for _ in range(3):  # news put it off
@@ -36,7 +36,7 @@ def pools(_: None, number: int) -> int:
     from threadpoolctl import threadpool_info
 
     from impactopt.sweeps import evaluate
-    from impactopt.sweeps.units import Unit, Work
+    from impactopt.sweeps.design import Unit, Work
 
     def count(*_: Any) -> Any:
         return {"reason": [""], "threads": [max(pool["num_threads"] for pool in threadpool_info())]}, {}

@@ -14,6 +14,11 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from impactopt.solvers.ipm import IPMOptions, solve_ipm
+from impactopt.solvers.options import SolverOptions
+from impactopt.solvers.program import SolverResult
+from impactopt.solvers.sqp import SQPOptions, solve_sqp
+
 INF = np.inf
 
 
@@ -230,6 +235,12 @@ def textbook_program(file, _seed, start):
         return infeasible()
     case = CASES[file.stem]
     return case.build(), np.array(case.x0) + 0.01 * start
+
+
+def solve_by(program: Textbook, x0, options: SolverOptions, **more) -> SolverResult:
+    """Result of the solver whose options these are."""
+    solvers: dict[type, Callable[..., SolverResult]] = {IPMOptions: solve_ipm, SQPOptions: solve_sqp}
+    return solvers[type(options)](program, x0, options=options, **more)
 
 
 def assert_optimal(program: Textbook, result, tolerance: float = 1e-5) -> None:

@@ -19,8 +19,8 @@ from support.sweep_workers import unlucky
 from impactopt.errors import InputError
 from impactopt.sweeps import SweepProgress, sweep, sweep_from_data
 from impactopt.sweeps.cluster import on_cluster
+from impactopt.sweeps.design import Unit, Work
 from impactopt.sweeps.evaluate import evaluate
-from impactopt.sweeps.units import Unit, Work
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")
 RESISTANCES = [500.0, 650.0, 9e3, 600.0, 800.0]
@@ -86,7 +86,7 @@ def test_units_that_kill_every_worker_are_rows_and_closing_forgets_the_rest(
 def lethal(folder: Path, unit: Unit) -> Any:
     unlucky(folder, unit.index)
     time.sleep(0.1)
-    from impactopt.sweeps.units import Found
+    from impactopt.sweeps.design import Found
 
     return Found(columns={"reason": ["", ""]}, peak_mb=0.0)
 

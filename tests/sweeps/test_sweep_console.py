@@ -7,7 +7,8 @@ import io
 import pytest
 from rich.console import Console
 
-from impactopt.sweeps import SweepProgress, console
+from impactopt.sweeps import SweepProgress
+from impactopt.sweeps import progress as console
 
 NOW = SweepProgress(
     cases=8, done=2, failed=1, resumed=0, seconds=3.0, rate=0.5, remaining=12.0, best=4.5, best_case=1

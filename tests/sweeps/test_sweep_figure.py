@@ -16,7 +16,7 @@ from impactopt.report.pictures.style import model_colour
 from impactopt.report.pictures.sweep import sweep_picture
 from impactopt.report.pictures.sweep_columns import Columns
 from impactopt.sweeps import read_sweep_file, sweep_from_data
-from impactopt.sweeps.figure import Figure
+from impactopt.sweeps.sections import Figure
 from impactopt.sweeps.table import read_columns, unit_of, without_unit
 
 STUDIES = sorted((Path(__file__).resolve().parents[2] / "problems" / "sweeps").glob("collision_*.toml"))

@@ -19,10 +19,9 @@ from support.sweep_entries import entry
 
 from impactopt.errors import InputError
 from impactopt.sweeps import sweep_from_data
-from impactopt.sweeps.journal import Entry, Journal
-from impactopt.sweeps.store import Store
+from impactopt.sweeps.design import Found
+from impactopt.sweeps.store import Entry, Journal, Store
 from impactopt.sweeps.table import merge_kinds, unit_of, write_table
-from impactopt.sweeps.units import Found
 
 
 def same(a: Entry, b: Entry) -> None:
@@ -54,7 +53,7 @@ ADDING = """
 import sys
 import zlib
 from pathlib import Path
-from impactopt.sweeps.journal import Journal
+from impactopt.sweeps.store import Journal
 from support.sweep_entries import entry
 journal = Journal(Path(sys.argv[1]))
 for unit in range(10**9):

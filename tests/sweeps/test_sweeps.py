@@ -26,12 +26,10 @@ from impactopt.files.output import load_record
 from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.sweeps import SweepProgress, sweep, sweep_from_data
 from impactopt.sweeps.collisions import collide_many
-from impactopt.sweeps.evaluate import evaluate
-from impactopt.sweeps.journal import Entry, Journal
-from impactopt.sweeps.local_pool import on_processes
+from impactopt.sweeps.design import Found, Unit, Work
+from impactopt.sweeps.evaluate import ENDED_BY_WATCHDOG, evaluate, on_processes
 from impactopt.sweeps.running import TOGETHER
-from impactopt.sweeps.units import Found, Unit, Work
-from impactopt.sweeps.watchdog import ENDED_BY_WATCHDOG
+from impactopt.sweeps.store import Entry, Journal
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")  # which no two runs share
 RESISTANCES = [500.0, 650.0, 9e3, 600.0]
@@ -185,7 +183,7 @@ def test_a_case_that_does_not_stop_is_ended(monkeypatch: pytest.MonkeyPatch) -> 
     units = [Unit(index=k, first=k, count=1, columns={}) for k in range(2)]
     ends = [Died(code=ENDED_BY_WATCHDOG, tries=1), Died(code=-signal.SIGSEGV, tries=3)]
     monkeypatch.setattr(
-        "impactopt.sweeps.local_pool.each_on_workers",
+        "impactopt.sweeps.evaluate.each_on_workers",
         lambda *a, **k: zip(*[[0, 1], ends], strict=True) if list(a[2]) else None,
     )
     late, crashed = (found.columns for _, found in on_processes(work, units, workers=1))

@@ -9,10 +9,10 @@ import pinocchio as pin
 import pytest
 from support.small_plans import Planned, changed
 
+from impactopt import Solution
 from impactopt.errors import InputError
 from impactopt.files.output import load_record, record_of, save_record
 from impactopt.files.replay import load_planned
-from impactopt.planning.solution import Solution
 from impactopt.problem.scenario import Scenario
 from impactopt.simulation import Perturbation
 from impactopt.transcription.transcription import Transcription

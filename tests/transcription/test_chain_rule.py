@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from support.small_plans import biped_problem
 from support.small_robots import biped
 
+from impactopt.kinematics.coordinates import elimination_order, solve_in_order
 from impactopt.kinematics.stages import Stage, motion_in_stages, velocity_in_stages
-from impactopt.kinematics.symbolic_elimination import elimination_order, solve_in_order
 from impactopt.problem.block import BlockExpression
+from impactopt.transcription.blocks import own_blocks
 from impactopt.transcription.structured import derivative_functions
-from impactopt.transcription.term_blocks import own_blocks
 
 Array = NDArray[np.float64]
 

@@ -15,15 +15,20 @@ from support.derivative_checks import check_derivatives
 from support.small_plans import BODILESS, changed, rod_hammer
 from support.small_robots import arm, biped, table
 
-from impactopt import KeepOut, Obstacle, SelfCollision, load_problem, solve
+from impactopt import KeepOut, Obstacle, SelfCollision, Solution, load_problem, solve
 from impactopt.bodies.clearance import Places
 from impactopt.bodies.separation import THIN
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.planning.budget import Budget
-from impactopt.planning.clearance_constraints import Margins, Watch, solved_apart, spots_of
-from impactopt.planning.clearance_violations import clearance_violations, deepest_penetration
+from impactopt.planning.clearance_constraints import (
+    Margins,
+    Watch,
+    clearance_violations,
+    deepest_penetration,
+    solved_apart,
+    spots_of,
+)
 from impactopt.planning.refinement import Guess
-from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos
@@ -344,7 +349,7 @@ def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, ba
     assert clearance_violations(program_of(barred, problem), barred.result.x, margins) is None
     depth, pairs = deepest_penetration(t, x, margins)
     assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}
-    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
     fixed = solved_apart(budget, margins, Guess(program=t, start=free.result))
     assert fixed.result.status is Status.SOLVED
     assert deepest_penetration(fixed.program, fixed.result.x, margins)[0] <= 0

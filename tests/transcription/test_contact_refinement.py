@@ -13,15 +13,15 @@ from scipy.integrate import solve_ivp
 from support.small_plans import BODILESS, Planned, changed, transcribed
 from support.small_robots import table
 
+from impactopt import Solution
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.kinematics.stance import FixedBase
 from impactopt.planning import reconstruction
-from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
+from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.program import Status
-from impactopt.solvers.sqp import solve_sqp
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_refinement import (
     ContactError,
@@ -134,10 +134,10 @@ def test_each_scenario_counts(transcription: Transcription) -> None:
     stiff = Scenario(name="stiff", stiffness=3e4)
     t = changed(transcription, scenarios=(stiff,), collision_elements=halved(COARSE))
     alone = changed(transcription, collision_elements=halved(COARSE))
-    x = solve_sqp(t.program, first_iterate(t)).x
+    x = solve_ipm(t.program, first_iterate(t)).x
     both, one = (
         contact_error(t, x),
-        contact_error(alone, solve_sqp(alone.program, first_iterate(alone)).x),
+        contact_error(alone, solve_ipm(alone.program, first_iterate(alone)).x),
     )
     assert both is not None and one is not None
     assert abs(both.pct) >= abs(one.pct) * 0.9
@@ -147,7 +147,7 @@ def test_each_scenario_counts(transcription: Transcription) -> None:
 def test_a_contact_that_ends_at_another_time(transcription: Transcription, factor: float) -> None:
     """It ends where the force is zero, whatever a plan says; the impulse that was planned is right."""
     t = changed(transcription, collision_elements=((0.25,) * 4, (0.25,) * 4), collision_stages=3)
-    x = solve_sqp(t.program, first_iterate(t)).x
+    x = solve_ipm(t.program, first_iterate(t)).x
     assert isinstance(t.expected, Collision)
     last = t.expected.T[-1].index(0)
     x[last] *= factor
@@ -214,9 +214,9 @@ def test_finer_elements_start_where_the_old_ones_ended(biped_plan: Planned) -> N
 
 def test_the_old_contact_is_a_warm_start(transcription: Transcription) -> None:
     t = changed(transcription, collision_elements=((0.25,) * 4, (0.25,) * 4))
-    first = solve_sqp(t.program, first_iterate(t))
+    first = solve_ipm(t.program, first_iterate(t))
     new = Transcription(t.problem, t.coordinates, t.functions, elements=halved(t.hit.elements))
     x, y, z = carried_over(new, t, first.x, first.multipliers, first.bound_multipliers)
-    again = solve_sqp(new.program, x, multipliers=y, bound_multipliers=z)
+    again = solve_ipm(new.program, x, multipliers=y, bound_multipliers=z)
     assert again.status is Status.SOLVED and again.iterations < first.iterations
     assert again.objective == pytest.approx(first.objective, rel=0.02)

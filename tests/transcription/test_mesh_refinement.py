@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from support.small_plans import BODILESS, Planned, changed
 from support.term_cases import MILD
 
-from impactopt.bodies.shapes import Obstacle, TargetBody
+from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.errors import InputError
+from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
-from impactopt.kinematics.statics import static_wrenches
 from impactopt.planning import between_nodes, reconstruction
 from impactopt.planning.solve import solve
 from impactopt.problem.objectives import (
@@ -43,13 +43,12 @@ from impactopt.problem.terms import (
     TorqueRate,
 )
 from impactopt.simulation.result import distance_inside
+from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.program import Status
-from impactopt.solvers.sqp import solve_sqp
-from impactopt.transcription import mesh_refinement as between
+from impactopt.transcription import mesh as between
 from impactopt.transcription.initial_guess import carried_over, first_iterate
-from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes, nodes_to_add
-from impactopt.transcription.plan import Plan
-from impactopt.transcription.reference import complete_reference
+from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.transcription.plan import Plan, complete_reference
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
@@ -199,10 +198,10 @@ def test_a_program_with_more_nodes_starts_where_the_old_one_ended(biped_plan: Pl
 
 def test_the_old_solution_is_a_warm_start(arm_plan: Planned) -> None:
     old = arm_plan.transcription
-    first = solve_sqp(old.program, arm_plan.result.x)
+    first = solve_ipm(old.program, arm_plan.result.x)
     new = finer(old)
     x, y, z = carried_over(new, old, first.x, first.multipliers, first.bound_multipliers)
-    again = solve_sqp(new.program, x, multipliers=y, bound_multipliers=z)
+    again = solve_ipm(new.program, x, multipliers=y, bound_multipliers=z)
     assert again.status is Status.SOLVED
     assert again.objective == pytest.approx(first.objective, rel=0.02)
 
@@ -277,11 +276,11 @@ def test_more_nodes_go_together_with(arm_transcription: Transcription, name: str
     """The finer program has what the old one had where it was, and is solved from there in fewer steps."""
     old = with_more(arm_transcription, ON_TOP[name])
     check_carried_over(old)
-    first = solve_sqp(old.program, first_iterate(old))
+    first = solve_ipm(old.program, first_iterate(old))
     assert first.status is Status.SOLVED
     new = finer(old)
     x, y, z = carried_over(new, old, first.x, first.multipliers, first.bound_multipliers)
-    again = solve_sqp(new.program, x, multipliers=y, bound_multipliers=z)
+    again = solve_ipm(new.program, x, multipliers=y, bound_multipliers=z)
     assert again.status is Status.SOLVED and again.iterations < first.iterations
     assert again.objective == pytest.approx(first.objective, rel=0.02)
     for o, quantity in new.objectives:

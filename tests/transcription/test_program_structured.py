@@ -16,8 +16,7 @@ from impactopt.kinematics.stages import Stage
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import NonlinearProgram, Status
 from impactopt.transcription.batched import Block, pattern
-from impactopt.transcription.constraints import Rows
-from impactopt.transcription.layout import Affine, Layout, select, stack
+from impactopt.transcription.layout import Affine, Layout, Rows, select, stack
 from impactopt.transcription.structured import StructuredProgram, derivative_functions
 
 Array = NDArray[np.float64]

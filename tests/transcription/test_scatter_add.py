@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from impactopt.transcription import scatter_add
-from impactopt.transcription.scatter_add import Runs, count_up, union, with_transposed
+from impactopt.transcription import structured as scatter_add
+from impactopt.transcription.structured import Runs, count_up, union, with_transposed
 
 seeds = st.integers(0, 2**31)
 

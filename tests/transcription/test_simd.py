@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from support.small_plans import arm_problem, transcribed
 
 from impactopt.codegen.cache import cached
-from impactopt.codegen.compiler import find_compiler
-from impactopt.codegen.library import NativeCode
+from impactopt.codegen.compiler import NativeCode, find_compiler
 from impactopt.errors import NoCompilerWarning
-from impactopt.transcription import instruction_table, simd
+from impactopt.transcription import simd
+from impactopt.transcription import simd as instruction_table
 from impactopt.transcription.batched import BatchedFunction
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.simd import LANES, in_lanes

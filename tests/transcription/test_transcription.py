@@ -17,8 +17,7 @@ from support.derivative_checks import check_derivatives
 from support.small_plans import LAW, Planned, changed
 
 from impactopt.kinematics.splines import Radau
-from impactopt.kinematics.support import zmp
-from impactopt.kinematics.wrench_cone import contact_wrench_cone
+from impactopt.kinematics.support import contact_wrench_cone, zmp
 from impactopt.problem.problem import Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import ContactWrenchCone, Incidence, TorqueLimit, VelocityLimit
@@ -27,7 +26,7 @@ from impactopt.solvers.program import Status, check_program
 from impactopt.transcription.contact_conditions import rotation_rows
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import collision_mesh, with_middles
-from impactopt.transcription.reference import total_ground_wrench
+from impactopt.transcription.plan import total_ground_wrench
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

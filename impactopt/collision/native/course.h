@@ -1,4 +1,4 @@
-/* The course of a collision over its freezes; see collision/course.py. */
+/* The course of a collision over its freezes; see collision/model.py. */
 
 typedef struct {
   Frozen frozen;
@@ -49,7 +49,7 @@ static void load_data(const double **arg, Data *d) {
 }
 
 /* the servo's reference: frozen at a time since contact, and what its velocities had gained at the begin; see
-   collision/course.py */
+   collision/model.py */
 static void follow(const double **arg, double time, double begin, Work *w) {
 #if REFERENCE
   const double *given = arg[ARG_reference], until = arg[ARG_reference_until] ? *arg[ARG_reference_until] : 0.0;

@@ -1,35 +1,299 @@
-"""Sizes and switches of a model for the kernel, as C macros and tables."""
+"""Sizes, switches and generated C of a model: macros, tables, tree, law and target, derivatives in lanes.
+
+Most of what CasADi's forward mode writes does not depend on the direction. That part becomes a function of
+its own, called once; the rest is linear, and is written here with a vector of directions where CasADi has a
+number.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from impactopt.collision.checks import LEAST_PIVOT
-from impactopt.collision.contact_slopes import law_is_linear, target_is_linear
-from impactopt.collision.course import GIVES_WAY, cuts
-from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model
+from impactopt.collision.frozen import FrozenDynamics
+from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model, target_start
 from impactopt.collision.implicit import NODES, STAGES, gamma, tables
-from impactopt.collision.loop import BLOCK
-from impactopt.collision.model import shape_of
-from impactopt.collision.native.generated import TreeFunctions, gamma_of
+from impactopt.collision.model import GIVES_WAY, JointSpaceModel, cuts, shape_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
-from impactopt.collision.runge_kutta import LEFT_OUT_BY_RK4
-from impactopt.collision.stepped import SteppedModel, number_of_steps
+from impactopt.collision.runge_kutta import BLOCK, LEFT_OUT_BY_RK4
+from impactopt.collision.stepped import (
+    SteppedModel,
+    contact_functions,
+    law_is_linear,
+    number_of_steps,
+    target_is_linear,
+)
+from impactopt.contact import ContactLaw
+from impactopt.kinematics.stance import Stance
 
 __all__ = [
+    "TreeFunctions",
+    "backwards",
+    "c_code",
     "directions",
+    "gamma_of",
     "names_table",
+    "scalar_functions",
     "shapes_in",
     "shapes_out",
     "shapes_table",
+    "simd_forward",
+    "simd_tree",
     "sizes",
+    "tangent_back",
+    "tree_functions",
     "with_derivatives",
     "with_jacobians",
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TreeFunctions:
+    """Functions of the robot's tree, and where their sparse results go.
+
+    Attributes
+    ----------
+    functions : `tree` (q, v, normal) -> nonzeros of the roots W of all velocities and the hand, of those of
+        what is held, hand speed, and further ones; `drift` (q, v, normal) -> bias force, drifts of the hand
+        and of what is held, as far as they act; `integrate` (q, d) and `hand_speed_at` (q, v, normal).
+    root, held : (row, column) of the nonzeros. Columns of `root` are joints, hand, other velocities.
+    """
+
+    functions: list[Any]
+    root: list[tuple[int, int]]
+    held: list[tuple[int, int]]
+
+
+def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool) -> TreeFunctions:
+    """Functions of the robot's tree, with those for the ground's wrench on request; n is the number of
+    servos.
+    """
+    tree, robot = frozen._tree, frozen.robot
+    rb, normal = tree.rb, tree.normal
+    root = tree.inverse_root(tree.mass_matrix)
+    hand = ca.mtimes(root, ca.sparsify(tree.hand_row.T))
+    held = ca.mtimes(root, ca.sparsify(tree.held_jacobian.T))
+    others = robot.nv - n
+    columns = [i - others if i >= others else n + 1 + i for i in range(robot.nv)]
+    places = [(r, columns[c]) for r, c in _nonzeros(root)] + [(r, n) for r, _ in _nonzeros(hand)]
+    out = [ca.vertcat(root.nz[:], hand.nz[:]), ca.densify(held.nz[:]), tree.hand_speed]
+    if ground:
+        out += [ca.densify(tree.sole_positions)]
+        out += [] if frozen.bias else [tree.carrying_wrench]
+    drifts = [ca.densify(tree.bias_force)] if frozen.bias else []
+    drifts += [tree.hand_drift, ca.densify(tree.held_drift)] if frozen.jdot else []
+    d = ca.SX.sym("d", robot.nv)
+    known = [rb.q, rb.v, normal]
+    functions = [
+        ca.Function("tree", known, out),
+        ca.Function("drift", known, drifts),
+        ca.Function("integrate", [rb.q, d], [rb.integrate(d)]),
+        ca.Function("hand_speed_at", known, [tree.hand_speed]),
+    ]
+    return TreeFunctions(functions=functions, root=places, held=_nonzeros(held))
+
+
+def _nonzeros(matrix: Any) -> list[tuple[int, int]]:
+    rows, columns = matrix.sparsity().get_triplet()
+    return list(zip(map(int, rows), map(int, columns), strict=True))
+
+
+def gamma_of(stance: Stance, held: int) -> list[float]:
+    """Compliance of each row of what is held."""
+    return [float(x) for x in stance.compliance] * held
+
+
+def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
+    """Law and target as SX functions; with implicit steps also their values and slopes (`contact_functions`).
+
+    `law` and `target` are the numbers of both, z the target's state:
+
+        left_force (x, rate, law) : above zero while contact lasts in restitution
+        contact_force (x, rate, law) -> force
+        target_velocity (z, target), target_rates (z, force, target), target_energy, target_result (z, target)
+        target_yield, target_before (target): the numbers of `target_start`
+    """
+    law_numbers, target_numbers = list(model.law.parameters), list(model.target.parameters)
+    law, target = ca.SX.sym("law", len(law_numbers)), ca.SX.sym("target", len(target_numbers))
+    of_law = {name: law[i] for i, name in enumerate(law_numbers)}
+    of_target = {name: target[i] for i, name in enumerate(target_numbers)}
+    x, rate, force = ca.SX.sym("x"), ca.SX.sym("rate"), ca.SX.sym("force")
+    z = ca.SX.sym("z", model.target.n_states)
+    states = [z[i] for i in range(model.target.n_states)]
+    thing = model.target
+    left = model.law.separation if method == "implicit" else partial(_restitution, model.law)
+
+    def column(values: Any) -> Any:
+        return ca.densify(ca.vertcat(ca.SX(0, 1), *values))
+
+    start = target_start(thing, of_target)
+    functions = [
+        ca.Function("left_force", [x, rate, law], [_number(left(x, rate, of_law))]),
+        ca.Function("contact_force", [x, rate, law], [model.law.force(x, rate, of_law)]),
+        ca.Function("target_velocity", [z, target], [_number(thing.velocity(states, of_target))]),
+        ca.Function("target_rates", [z, force, target], [column(thing.derivative(states, force, of_target))]),
+        ca.Function("target_energy", [z, target], [_number(thing.energy(states, of_target))]),
+        ca.Function("target_result", [z, target], [column(thing.result(states, of_target))]),
+        ca.Function("target_yield", [target], [_number(start[0])]),
+        ca.Function("target_before", [target], [_number(start[1])]),
+    ]
+    return functions + (contact_functions(model.law, model.target) if method == "implicit" else [])
+
+
+def _restitution(law: ContactLaw, x: Any, rate: Any, numbers: Any) -> Any:
+    return law.branch(x, rate, False, numbers)
+
+
+def _number(expression: Any) -> Any:
+    return ca.densify(ca.SX(expression))
+
+
+# of each function, the inputs that it is differentiated by
+_BACK: dict[str, tuple[int, ...]] = {"contact_force": (0, 1), "target_rates": (0, 1)}
+_BACK |= {"target_velocity": (0,), "target_energy": (0,), "tree": (0, 1), "drift": (0, 1)}
+
+
+def backwards(functions: list[Any]) -> list[Any]:
+    """<name>_back (inputs, derivatives by the outputs) -> derivatives by some of the inputs, where used."""
+    made = []
+    for function in functions:
+        if function.name() in _BACK:
+            x = [ca.SX.sym(name, *function.size_in(name)) for name in function.name_in()]
+            y = function.call(x)
+            seeds = [ca.SX.sym("seed", *part.shape) for part in y]
+            by = [x[i] for i in _BACK[function.name()]]
+            (out,) = ca.reverse(y, by, [seeds])
+            out = [ca.densify(part) for part in out]
+            made.append(ca.Function(f"{function.name()}_back", [*x, *seeds], out))
+    return made
+
+
+def tangent_back(frozen: FrozenDynamics) -> Any:
+    """ca.Function tangent_back (q, derivatives by q (nq)) -> the same in v's basis (nv)."""
+    rb = frozen._tree.rb
+    by_q = ca.SX.sym("by_q", rb.q.size1())
+    return ca.Function("tangent_back", [rb.q, by_q], [ca.densify(ca.mtimes(rb.tangent_map().T, by_q))])
+
+
+def c_code(name: str, functions: list[Any]) -> str:
+    """C of static functions f(arg, res, iw, w, mem); several such texts go into one file."""
+    generator = ca.CodeGenerator(f"{name}.c", {"with_header": False})
+    for function in functions:
+        generator.add(function)
+    # its helpers too: several such files go into one library
+    static = re.sub(
+        r"^(casadi_real|casadi_int|void|int) casadi_", r"static \g<0>", generator.dump(), flags=re.M
+    )
+    return f"#undef CASADI_PREFIX\n{static}\n"
+
+
+_LINEAR = {
+    ca.OP_ASSIGN: "{0}",
+    ca.OP_ADD: "{0} + {1}",
+    ca.OP_SUB: "{0} - {1}",
+    ca.OP_MUL: "{0} * {1}",
+    ca.OP_DIV: "{0} / {1}",
+    ca.OP_NEG: "-{0}",
+    ca.OP_TWICE: "{0} + {0}",
+}
+
+
+def simd_tree(frozen: FrozenDynamics, tree: TreeFunctions, *, ground: bool) -> list[tuple[Any, str]]:
+    """`simd_forward` of `tree` by q, of `approach`, which is what of it depends on v, by v, and of
+    `drift` by both; q's directions are in the basis of v."""
+    parts = frozen._tree
+    known = [parts.rb.q, parts.rb.v, parts.normal]
+    basis = ca.Function("basis", [parts.rb.q], [parts.rb.tangent_map()])
+    out = [parts.hand_speed] + ([parts.carrying_wrench] if ground and not frozen.bias else [])
+    whole, drift, *_ = tree.functions
+    made = [simd_forward(whole, {0: basis})]
+    made.append(simd_forward(ca.Function("approach", known, out), {1: None}))
+    if drift.n_out():
+        made.append(simd_forward(drift, {0: basis, 1: None}))
+    return made
+
+
+def simd_forward(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
+    """(ca.Function <name>_parts, C of <name>_forward) of an SX function with dense outputs.
+
+    <name>_parts (the function's inputs) -> the numbers that its derivatives need, <NAME>_PARTS of them.
+    <name>_forward (parts, seeds, out) : seeds[i] has a vector of seed directions for each entry of the i-th
+    input that moves; out[i] gets one for each entry of the i-th output.
+
+    Parameters
+    ----------
+    seeds : by number of an input that moves: ca.Function of the input to the matrix that takes directions to
+        its changes; or None, where they are the same.
+    """
+    name, inputs = function.name(), function.sx_in()
+    directions, changes = [], []
+    for number, basis in seeds.items():
+        matrix = ca.SX.eye(inputs[number].size1()) if basis is None else basis(inputs[number])
+        directions.append(ca.SX.sym("direction", matrix.size2()))
+        changes.append(ca.mtimes(matrix, directions[-1]))
+    (out,) = ca.forward(function.call(inputs), [inputs[number] for number in seeds], [changes])
+    whole = ca.Function("whole", [*inputs, *directions], [ca.densify(part) for part in out])
+    numbers, lines = _split(whole, len(inputs))
+    registers = sorted({line.split(" ", 1)[0] for line in lines if line.startswith("a")})
+    code = [
+        f"#define {name.upper()}_PARTS {max(len(numbers), 1)}",
+        f"static void {name}_forward(",
+        "  const double *c, const vec *const *seeds, vec *const *out) {",
+        f"  vec {', '.join(registers or ['a'])};",
+        *[f"  {line};" for line in lines],
+        "}\n",
+    ]
+    return ca.Function(f"{name}_parts", inputs, [ca.vertcat(ca.SX(0, 1), *numbers)]), "\n".join(code)
+
+
+def _split(whole: Any, n_given: int) -> tuple[list[Any], list[str]]:
+    """Part that does not depend on the directions, as far as the rest needs it; and the rest's lines of C.
+
+    The inputs from `n_given` on are directions.
+    """
+    expressions = whole.instructions_sx()
+    held: dict[int, str] = {}  # by register: what it holds, in C; or
+    since: dict[int, int] = {}  # the instruction that it has a number from
+    places: dict[int, int] = {}  # by instruction: where that number is kept
+    numbers: list[Any] = []
+    lines: list[str] = []
+
+    def operand(register: int) -> str:
+        if register in held:
+            return held[register]
+        made = since[register]
+        if whole.instruction_id(made) == ca.OP_CONST:
+            return f"({whole.instruction_constant(made)!r})"
+        if made not in places:
+            places[made] = len(numbers)
+            numbers.append(expressions[made])
+        return f"c[{places[made]}]"
+
+    for k in range(whole.n_instructions()):
+        kind, read, write = whole.instruction_id(k), whole.instruction_input(k), whole.instruction_output(k)
+        if kind == ca.OP_OUTPUT:
+            value = operand(read[0]) if read[0] in held else f"(vec){{0}} + {operand(read[0])}"
+            lines.append(f"out[{write[0]}][{write[1]}] = {value}")
+        elif kind == ca.OP_INPUT and read[0] >= n_given:
+            held[write[0]] = f"a{write[0]}"
+            lines.append(f"a{write[0]} = seeds[{read[0] - n_given}][{read[1]}]")
+        elif kind not in (ca.OP_INPUT, ca.OP_CONST) and any(register in held for register in read):
+            lines.append(f"a{write[0]} = " + _LINEAR[kind].format(*map(operand, read)))
+            held[write[0]] = f"a{write[0]}"
+        else:
+            held.pop(write[0], None)
+            since[write[0]] = k
+            if kind == ca.OP_INPUT:
+                expressions[k] = whole.sx_in(read[0]).nz[read[1]]
+    return numbers, lines
 
 
 def shapes_in(collision: SteppedModel) -> dict[str, tuple[int, int]]:

@@ -9,24 +9,22 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.codegen.library import NativeCode
+from impactopt.codegen.compiler import NativeCode
 from impactopt.collision.checks import LEAST_PIVOT
 from impactopt.collision.graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
-from impactopt.collision.native.generated import (
+from impactopt.collision.native.sizes import (
     backwards,
     c_code,
-    scalar_functions,
-    tangent_back,
-    tree_functions,
-)
-from impactopt.collision.native.simd import simd_tree
-from impactopt.collision.native.sizes import (
     directions,
     names_table,
+    scalar_functions,
     shapes_in,
     shapes_out,
     shapes_table,
+    simd_tree,
     sizes,
+    tangent_back,
+    tree_functions,
     with_derivatives,
     with_jacobians,
 )

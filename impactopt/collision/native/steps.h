@@ -1,4 +1,4 @@
-/* The loop over steps of one length; see collision/loop.py. */
+/* The loop over steps of one length; see collision/runge_kutta.py. */
 
 /* states at the begin of all steps, for those who go back */
 typedef struct {

@@ -14,8 +14,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from impactopt.contact._expressions import Parameters, check_numbers, choose, numbers_of, text_of
-from impactopt.contact.fields import Described
+from impactopt.contact.fields import Described, Parameters, check_numbers, choose, numbers_of, text_of
 
 __all__ = ["ContactLaw", "rough_at"]
 

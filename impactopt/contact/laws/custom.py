@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from impactopt.contact._expressions import Parameters, choose
+from impactopt.contact.fields import Parameters, choose
 from impactopt.contact.laws.base import ContactLaw, rough_at
 from impactopt.errors import InputError, check_array
 

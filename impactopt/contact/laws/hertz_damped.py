@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from math import sqrt
 from typing import Any, ClassVar
 
-from impactopt.contact._expressions import Parameters, choose, power
-from impactopt.contact.fields import about
+from impactopt.contact.fields import Parameters, about, choose, power
 from impactopt.contact.laws.base import ContactLaw
 from impactopt.errors import InputError, check_array
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from impactopt.contact._expressions import Parameters, power
-from impactopt.contact.fields import about
+from impactopt.contact.fields import Parameters, about, power
 from impactopt.contact.laws.base import ContactLaw
 
 __all__ = ["HuntCrossley"]

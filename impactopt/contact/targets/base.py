@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from impactopt.contact._expressions import Parameters, check_numbers, numbers_of, text_of
-from impactopt.contact.fields import Described
+from impactopt.contact.fields import Described, Parameters, check_numbers, numbers_of, text_of
+from impactopt.contact.laws.base import ContactLaw
 from impactopt.errors import InputError
 
-__all__ = ["UNITS", "Target"]
+__all__ = ["UNITS", "Target", "scaled_numbers"]
 
 UNITS = {"speed": "m_s", "depth": "m"}  # of targets' results
 
@@ -177,3 +177,35 @@ class Target(Described, ABC):
             ]
         made = [f"{name}: {text_of(expressions)}" for name, expressions in parts.items()]
         return (*made, f"results: {', '.join(self.results)}")
+
+
+def scaled_numbers(
+    where: str,
+    law: ContactLaw,
+    target: Target,
+    *,
+    mass: float = 1.0,
+    stiffness: float = 1.0,
+    damping: float = 1.0,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """The contact law's and the target's numbers by name, with factors of some.
+
+    where : what asks for it, for messages.  mass : factor of the target's.  stiffness, damping : of the
+        law's.
+
+    Raises
+    ------
+    InputError : a factor of a number that they do not have.
+    """
+    of_law, of_target = dict(law.parameters), dict(target.parameters)
+    for name, factor, of, numbers in (
+        ("stiffness", stiffness, law, of_law),
+        ("damping", damping, law, of_law),
+        ("mass", mass, target, of_target),
+    ):
+        if name in numbers:
+            numbers[name] *= factor
+        elif factor != 1:
+            what = "law" if of is law else "target"
+            raise InputError(f"{where}: the {what} {type(of).__name__} has no {name}; leave it out")
+    return of_law, of_target

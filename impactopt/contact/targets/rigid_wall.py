@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from impactopt.contact._expressions import Parameters
+from impactopt.contact.fields import Parameters
 from impactopt.contact.targets.base import Target
 
 __all__ = ["RigidWall"]

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.robots.build import effort_limit, is_floating, joint_names, velocity_limit
-from impactopt.robots.rotors import USUAL_ROTOR
+from impactopt.robots.gains import USUAL_ROTOR
 
 __all__ = ["Drives", "guess_drives"]
 

@@ -16,9 +16,8 @@ from impactopt.errors import InputError
 from impactopt.files.draft.default_drives import Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints
-from impactopt.robots.checks import LEG
+from impactopt.robots.checks import LEG, REPAIRED, check_inertias
 from impactopt.robots.description import Description, Tie
-from impactopt.robots.inertias import REPAIRED, check_inertias
 from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.robot import Robot
 from impactopt.robots.urdf import read_urdf

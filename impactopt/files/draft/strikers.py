@@ -9,8 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.convex_hulls import Piece, inertia_box
-from impactopt.bodies.plausible import is_far
+from impactopt.bodies.convex_hulls import Piece, inertia_box, is_far
 from impactopt.files.draft.limbs import Limb
 from impactopt.robots.attachments import Striker
 

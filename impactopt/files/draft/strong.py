@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import Places
 from impactopt.errors import InputError
 from impactopt.files.draft.target_placement import LOWEST, Arm
+from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.stance import FixedBase
-from impactopt.kinematics.striking_point import striking_point
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem

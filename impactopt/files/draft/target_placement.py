@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb
 from impactopt.files.draft.postures import arm_length, bend_arm, shoulder
-from impactopt.kinematics.striking_point import striking_point
+from impactopt.kinematics.operational_space import striking_point
 from impactopt.robots.robot import Robot
 
 __all__ = ["Arm", "aims", "ready"]

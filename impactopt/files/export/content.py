@@ -1,11 +1,17 @@
-"""Content of an export: a plan's motions, the robot's servo, the target, and metadata in words."""
+"""Content of an export: a plan's motions, servo, target, metadata in words; and the directory it goes to."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt import __version__
+from impactopt.codegen.files import read_plain
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
@@ -22,10 +29,90 @@ from impactopt.files.output import plain
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
-from impactopt.simulation.contact_times import parts_from
+from impactopt.simulation.result import parts_from
 from impactopt.solvers.program import Status
+from impactopt.transcription.plan import Trajectory
 
-__all__ = ["Export", "body_name", "check_export", "export_of", "joint_order"]
+__all__ = ["META", "Export", "body_name", "check_export", "export_of", "joint_order", "write_directory"]
+
+META = "meta.json"
+MADE_BY = "impactopt export"
+LARGEST = 1 << 24  # bytes of a meta.json
+
+
+def write_directory(
+    directory: Path, to: str, meta: Mapping[str, Any], write: Callable[[Path], object]
+) -> list[Path]:
+    """Let `write` fill a new directory that then takes the place of `directory`; the files, `META` first.
+
+    to : the format's name.
+
+    Raises
+    ------
+    InputError : it is there, and is no earlier export of this format; it cannot be written. What was there
+        is still there then, and nothing beside it.
+    """
+    _check_replaceable(directory, to)
+    directory = Path(os.path.abspath(directory))
+    new, old = (
+        directory.with_name(f".{directory.name[:64]}.{secrets.token_hex(8)}.{x}") for x in ("new", "old")
+    )
+    above = [folder for folder in directory.parents if not folder.exists()]  # the nearest first
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        new.mkdir()
+        write(new)
+        names = sorted(str(p.relative_to(new)) for p in new.rglob("*") if p.is_file())
+        whole = {"made_by": MADE_BY, "to": to, "files": [META, *names], **meta}
+        (new / META).write_text(f"{json.dumps(whole, indent=2, allow_nan=False)}\n", encoding="utf-8")
+        if directory.exists():
+            directory.rename(old)
+        new.rename(directory)
+    except BaseException as error:
+        shutil.rmtree(new, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            if old.exists() and not directory.exists():
+                old.rename(directory)
+            for folder in above:
+                folder.rmdir()
+        if not isinstance(error, OSError):
+            raise
+        raise InputError(f"cannot write {directory}: {error.strerror or error}; give another one") from error
+    shutil.rmtree(old, ignore_errors=True)
+    return [directory / name for name in whole["files"]]
+
+
+def _check_replaceable(directory: Path, to: str) -> None:
+    """InputError for what is no directory, or one with something else in it than an export of this format."""
+    if not os.path.lexists(directory):
+        return
+    if directory.is_symlink() or not directory.is_dir():
+        raise InputError(f"{directory} is there, and no directory; give another one with --out")
+    try:
+        there = sorted(str(p.relative_to(directory)) for p in directory.rglob("*") if not p.is_dir())
+    except OSError as error:
+        raise InputError(f"cannot read {directory}: {error.strerror}; give another one") from error
+    if not there:
+        return
+    made = _made(directory / META)
+    own = made.get("files") if made.get("made_by") == MADE_BY else None
+    if not isinstance(own, list):
+        raise InputError(f"{directory} holds something else ({there[0]}); give another directory with --out")
+    if made.get("to") != to:
+        raise InputError(
+            f"{directory} holds an export to {made.get('to')}; give another directory with --out"
+        )
+    others = [name for name in there if name not in own]
+    if others:
+        raise InputError(f"{directory} holds {others[0]} too, which no export made; give another directory")
+
+
+def _made(path: Path) -> dict[str, Any]:
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        found = json.loads(read_plain(path, LARGEST))
+        return found if isinstance(found, dict) else {}
+    return {}
+
 
 Array = NDArray[np.float64]
 SLOWEST, FASTEST = 1.0, 1e5  # [Hz]
@@ -37,7 +124,7 @@ class Export:
     """Data that all writers get.
 
     planned : the plan, its problem and its references.  joints : names, in the order of all columns.
-    order (n,) : where these are in the robot's own arrays.  rate [Hz].
+    order (n,) : where these are in the robot's own arrays.  rate [Hz].  gravity : effort bears it.
     motion : as planned.  missed : if nothing is hit, on the same time axis: both coast from contact on, one
     until its contact ends, the other until the abort motion begins.  None where the plan has none.
     """
@@ -46,6 +133,7 @@ class Export:
     joints: tuple[str, ...]
     order: NDArray[np.intp]
     rate: float
+    gravity: bool
     motion: Motion
     missed: Motion | None
 
@@ -84,6 +172,7 @@ class Export:
                 "robot": robot.name,
                 "rate_Hz": self.rate,
                 "jump_s": JUMP,
+                "effort_holds_gravity": self.gravity,
                 "phases": list(PHASES),
                 "joints": self._joints(),
                 "base": None
@@ -136,26 +225,45 @@ class Export:
         return rows
 
 
-def export_of(planned: Planned, *, rate: float, joints: Sequence[str] | None = None) -> Export:
+def export_of(
+    planned: Planned, *, rate: float, joints: Sequence[str] | None = None, gravity: bool = True
+) -> Export:
     """A plan at a rate [Hz].
 
-    joints : their order in all columns; the robot's own if left out.
+    joints : their order in all columns; the robot's own if left out.  gravity : whether effort bears it.
 
     Raises
     ------
-    InputError : the plan is not finished; joints that are no order of the robot's; a rate out of its range.
+    InputError : the plan is not finished; joints that are no order of the robot's; a rate out of its range;
+        a robot on soles without gravity.
     """
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
-    missed = planned.missed
+    reference, missed = planned.reference, planned.missed
+    if not gravity:
+        reference = _without_gravity(reference, robot)
+        missed = None if missed is None else _without_gravity(missed, robot)
     return Export(
         planned=planned,
         joints=tuple(robot.joint_names[k] for k in order),
         order=order,
         rate=rate,
-        motion=motion_at(planned.reference, robot, rate, order, planned.record.arrays),
+        gravity=gravity,
+        motion=motion_at(reference, robot, rate, order, planned.record.arrays),
         missed=None if missed is None else motion_at(missed, robot, rate, order, {}),
     )
+
+
+def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
+    """The reference with less feed-forward: without g(q) of each of its postures."""
+    if robot.floating:
+        raise InputError(
+            "gravity: the legs of a robot on soles bear it, so no torque is gravity's alone; leave it at its "
+            "default"
+        )
+    model, data = robot.model, robot.model.createData()
+    held = np.array([pin.computeGeneralizedGravity(model, data, q) for q in reference.q])
+    return dataclasses.replace(reference, torque=reference.torque - held)
 
 
 def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] | None) -> NDArray[np.intp]:

@@ -12,9 +12,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from impactopt.bodies.robot_visuals import visuals_of
-from impactopt.bodies.shapes import face_axes
 from impactopt.bodies.solids import Solid, joined, simplified
+from impactopt.bodies.visuals import visuals_of
+from impactopt.bodies.world import face_axes
 from impactopt.contact.targets import Board, FreeMass, Nail, RigidWall
 from impactopt.errors import InputError
 from impactopt.files.export.content import Export

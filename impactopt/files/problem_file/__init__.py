@@ -1,26 +1,24 @@
 """Problem files: an `impactopt.problem.problem.ImpactProblem` written in TOML, in SI units.
 
-* section.py    what all sections have in common
-* contacts.py   [target] and [contact], of which there are several kinds
-* robot_sections.py, term_sections.py, solver_sections.py   [robot]; [terms]; [solver]
-* sections.py   the other sections and keys of a file, and what they make
-* values.py     ranges of the keys' values
+* values.py     what all sections have in common, and ranges of the keys' values
+* robot_sections.py   [robot]
+* sections.py   the other sections and keys of a file, what they make, and what they are in words
 * diagnostics.py   what is wrong in a file, in words: where, what was meant, what is allowed
-* reading.py    from file to problem
-* changes.py    other values by key paths
+* reading.py    from file to problem, with other values by key paths; writing.py: back
 * toml.py       text from and to plain data
-* robot_writing.py, writing.py   from problem to file
-* key_docs.py, reference.py, template.py   keys in words: comments, docs/problem_files.md, `impactopt new`
+* reference.py  docs/problem_files.md, and the comments of `impactopt new`
 * names.py      the files that come with the package, by name
 """
 
-from impactopt.files.problem_file.changes import change_data, key_place, parse_settings
 from impactopt.files.problem_file.names import problem_names
 from impactopt.files.problem_file.reading import (
     ProblemFile,
     SolverSettings,
+    change_data,
+    key_place,
     load_problem,
     parse_problem_file,
+    parse_settings,
     problem_file_from_data,
     problem_from_data,
     read_problem_file,

@@ -1,4 +1,4 @@
-"""Problems and sweeps by name: the files that come with the package."""
+"""Problems, robots and sweeps by name: the files that come with the package."""
 
 from __future__ import annotations
 
@@ -8,9 +8,27 @@ from pathlib import Path
 
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
-from impactopt.files.folders import SWEEPS, named_files
 
-__all__ = ["problem_file", "problem_names", "problem_summary", "sweep_file", "sweep_names"]
+__all__ = [
+    "FOLDERS",
+    "SWEEPS",
+    "named_files",
+    "problem_file",
+    "problem_names",
+    "problem_summary",
+    "sweep_file",
+    "sweep_names",
+]
+
+SWEEPS = "sweeps"  # the folder among the problems
+_PACKAGE = Path(__file__).resolve().parents[2]
+FOLDERS = (_PACKAGE / "_problems", _PACKAGE.parent / "problems")
+
+
+def named_files(inside: str = "") -> dict[str, Path]:
+    """The problem files by name, in order; with a folder's name those inside it."""
+    folder = next((folder for folder in FOLDERS if folder.is_dir()), None)
+    return {} if folder is None else {path.stem: path for path in sorted((folder / inside).glob("*.toml"))}
 
 
 def problem_names() -> tuple[str, ...]:

@@ -10,8 +10,6 @@ import pinocchio as pin
 from pydantic import model_validator
 
 from impactopt.errors import InputError
-from impactopt.files.problem_file.field_sections import section_of
-from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import (
     Factor,
     Inertia,
@@ -23,17 +21,21 @@ from impactopt.files.problem_file.values import (
     Preset,
     Range,
     Rotation,
+    Section,
     Vector,
+    optional,
+    required,
+    section_of,
 )
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.build import add_frame, check_count, lock_joints
 from impactopt.robots.checks import check_legs
 from impactopt.robots.gains import GainFactor, scaled_gains
-from impactopt.robots.hinges import hinged
 from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
+from impactopt.robots.tools import hinged
 from impactopt.robots.urdf import read_urdf
 
 

@@ -7,23 +7,24 @@ stand nowhere twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import MISSING, fields
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, TypeVar, cast, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from impactopt.bodies.shapes import Ground, Obstacle
+from impactopt.bodies.world import Ground, Obstacle, TargetBody
+from impactopt.contact import laws, targets
+from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
-from impactopt.files.problem_file.contacts import Contact, Target
-from impactopt.files.problem_file.field_sections import section_of
+from impactopt.files.problem_file.diagnostics import section_at
 from impactopt.files.problem_file.robot_sections import RobotSection
-from impactopt.files.problem_file.section import Section, optional, required
-from impactopt.files.problem_file.solver_sections import SolverSection
-from impactopt.files.problem_file.term_sections import ObjectiveSections, TermSections
+from impactopt.files.problem_file.toml import Place
 from impactopt.files.problem_file.values import (
     AtLeastOne,
     ContactDuration,
@@ -31,20 +32,202 @@ from impactopt.files.problem_file.values import (
     Fractions,
     Freezes,
     HandNames,
+    IpoptOptions,
     NotNegative,
     Positive,
     Posture,
     Preset,
     Restitution,
+    Section,
     UnitVector,
     Vector,
+    attribute_docs,
+    one_of,
+    optional,
+    required,
+    section_of,
+    sections_of,
 )
 from impactopt.kinematics.stance import BothSoles, FixedBase, Free, OneSole, Stance
+from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.second_striker import SecondStriker
+from impactopt.problem.scenario import Scenario, SecondStriker
+from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS, TERMS
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
+from impactopt.solvers.options import INTERIOR, IPMOptions, SolverOptions, SQPOptions
+
+
+def _section(kind: type[SolverOptions], about: str) -> Any:
+    """A section with a key for each option but the time limit, as the options' own docstring describes it."""
+    said, hints = attribute_docs(kind), get_type_hints(kind)
+    keys: dict[str, Any] = {n: (hints[n], optional(said[n])) for n in hints if n != "time_limit"}
+    section: Any = create_model(kind.__name__, __base__=Section, __doc__=about, **keys)
+    section.kind = kind
+    return section
+
+
+IPM: Any = _section(IPMOptions, "Options of the interior-point method.")
+SQP: Any = _section(SQPOptions, "Options of the SQP.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverSettings:
+    """Solver settings of a file's [solver] section.
+
+    name : of the solver.  time_limit [s] : None for no limit.  options : by solver, the solver's own.
+    """
+
+    name: str = "ipm"
+    time_limit: float | None = None
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def arguments(self, solver: str | None = None, time_limit: float | None = None) -> dict[str, Any]:
+        """Solver arguments of `solve` and its like; given ones take precedence over the file's."""
+        chosen = self.name if solver is None else solver
+        limit = self.time_limit if time_limit is None else time_limit
+        # for one version "sqp" without a QP solver means "ipm": `with_todays_name`
+        options = self.options.get(chosen, self.options.get("ipm") if chosen == "sqp" else None)
+        return {"solver": chosen, "options": options, "time_limit": limit}
+
+
+def with_todays_names(
+    data: Mapping[str, Any], lines: Mapping[Place, int]
+) -> tuple[Mapping[str, Any], Mapping[Place, int]]:
+    """Data of a file, and its lines, with the section [solver] as it is spelled now.
+
+    For one version "sqp" without a QP solver means "ipm", as it did, and "sqp" with one needs no name.
+
+    Warns
+    -----
+    FutureWarning : the spelling has changed; it says what to write.
+    """
+    section = data.get("solver")
+    if not isinstance(section, Mapping) or "ipm" in section or section.get("name") not in (None, "sqp"):
+        return data, lines
+    options = section.get("sqp")
+    named = options.get("qp_solver") if isinstance(options, Mapping) else None
+    if named not in (None, INTERIOR):
+        if "name" in section:
+            return data, lines
+        write, new = 'give [solver] name = "sqp" beside [solver.sqp] qp_solver', {**section, "name": "sqp"}
+    elif options is None and "name" not in section:
+        return data, lines
+    else:
+        write = 'the interior-point method, the default, is now name = "ipm", its options [solver.ipm]'
+        new = {key: value for key, value in section.items() if key not in ("name", "sqp")}
+        if isinstance(options, Mapping):
+            new["ipm"] = {key: value for key, value in options.items() if key != "qp_solver"}
+        here = {place: n for place, n in lines.items() if place[:2] == ("solver", "sqp")}
+        lines = {**lines, **{("solver", "ipm", *place[2:]): n for place, n in here.items()}}
+    warnings.warn(write, FutureWarning, stacklevel=2)
+    return {**data, "solver": new}, lines
+
+
+class SolverSection(Section):
+    """Solver, and its options."""
+
+    name: Literal["ipm", "sqp", "ipopt"] = optional("name of the solver")
+    time_limit: Positive = optional(
+        "longest time of the solver, after which its best iterate is kept [s]", "time_limit_s"
+    )
+    ipopt: IpoptOptions = optional("IPOPT's own options by name")
+    ipm: IPM = optional("")
+    sqp: SQP = optional("")
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        return {"name": SolverSettings.name}
+
+
+_TERMS = {snake_case(kind.__name__): kind for kind in TERMS}
+_FIRST, *_, _LAST = list(_TERMS)[: len(DEFAULT_TERMS)]
+_ON_DEMAND = " and ".join(snake_case(type(term).__name__) for term in ON_DEMAND_TERMS)
+
+TermSections: Any = sections_of(
+    "TermSections",
+    f"Constraints. Those from {_FIRST} to {_LAST}, and {_ON_DEMAND}, hold with their defaults if they are "
+    "left out.",
+    _TERMS,
+)
+ObjectiveSections: Any = sections_of(
+    "ObjectiveSections",
+    "What is maximized: the impulse, or if there are sections here, only these.",
+    {snake_case(kind.__name__): kind for kind in OBJECTIVES},
+)
+
+
+_FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # of a file that names none
+TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)
+LawKind: Any = one_of(kind.word for kind in laws.LAWS)
+
+
+Body: Any = section_of(TargetBody)
+
+
+class Target(Section):
+    """Target of the impact; the keys depend on its kind."""
+
+    model_config = ConfigDict(extra="ignore")
+    choice: ClassVar[str] = "target_kind"
+    apart: ClassVar[tuple[str, ...]] = ("body",)
+    target_kind: TargetKind = Field(default=_FIRST_TARGET, alias="kind", description="what it is")
+    body: Body = optional("")
+
+
+class _KnownTarget(Target):
+    """One whose keys are its own."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Contact(Section):
+    """Contact between hand and target; the keys depend on the law."""
+
+    model_config = ConfigDict(extra="ignore")
+    choice: ClassVar[str] = "law"
+    law: LawKind = Field(default=_FIRST_LAW, description="what gives the force")
+
+
+class _KnownContact(Contact):
+    """One whose keys are its own."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+TARGETS: dict[str, type[Target]] = {kind.word: section_of(kind, _KnownTarget) for kind in targets.TARGETS}
+LAWS: dict[str, type[Contact]] = {kind.word: section_of(kind, _KnownContact) for kind in laws.LAWS}
+
+AnyFile = TypeVar("AnyFile", bound=Section)
+
+
+def with_kinds(file: type[AnyFile], data: Mapping[str, Any]) -> type[AnyFile]:
+    """The model of a file whose [target] and [contact] are of the kinds that its data name."""
+    found = {
+        "target": _chosen(data, "target", "kind", TARGETS, Target, _FIRST_TARGET),
+        "contact": _chosen(data, "contact", "law", LAWS, Contact, _FIRST_LAW),
+    }
+    return cast(type[AnyFile], _file_with(file, found["target"], found["contact"]))
+
+
+@cache  # a sweep reads thousands
+def _file_with(file: type[Section], target: type[Section], contact: type[Section]) -> type[Section]:
+    fields: dict[str, Any] = {"target": (target, ...), "contact": (contact, ...)}
+    return create_model(file.__name__, __base__=file, **fields)
+
+
+def _chosen(
+    data: Mapping[str, Any],
+    section: str,
+    key: str,
+    kinds: Mapping[str, type[Section]],
+    unknown: type[Section],
+    default: str,
+) -> type[Section]:
+    given = data.get(section)
+    name = given.get(key, default) if isinstance(given, Mapping) else default
+    return kinds.get(name, unknown) if isinstance(name, str) else unknown
+
 
 ELEMENTS = ("compression", "restitution")  # keys of ImpactProblem.collision_elements
 
@@ -276,3 +459,19 @@ class File(Section):
                 found = (getattr(section, field) for field in type(section).model_fields)
                 out[name] = tuple(part.build() for part in found if part is not None)
         return out
+
+
+def about_section(section: type[BaseModel]) -> str:
+    """Description of a section: its docstring's first sentence."""
+    return " ".join((section.__doc__ or "").split("\n\n")[0].split()).rstrip(".")
+
+
+def comment_at(data: Mapping[str, Any], place: Place) -> str:
+    """The comment to a key or a section of a file with these data; "" where there is nothing to say."""
+    section, sections = section_at(with_kinds(File, data), place)
+    if sections == len(place):
+        return about_section(section)
+    for name, info in section.model_fields.items():
+        if len(place) == sections + 1 and place[-1] in (info.alias, name):
+            return info.description or ""
+    return ""

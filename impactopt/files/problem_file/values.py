@@ -1,4 +1,4 @@
-"""The kinds of values that keys of a problem file have: ranges, and what is said of a value outside.
+"""Sections of a problem file: their base class, the values of their keys, sections made from dataclasses.
 
 Validators raise ValueError, which pydantic collects, with the value and the fix in the message. Their
 docstrings are what the reference says of such values.
@@ -6,17 +6,89 @@ docstrings are what the reference says of such values.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+import dataclasses
+import inspect
+import re
+import types
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Annotated, Any, ClassVar, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import casadi as ca
 import numpy as np
-from pydantic import AfterValidator, Field, PlainValidator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    create_model,
+    model_validator,
+)
 
+from impactopt.contact.fields import About, abouts
 from impactopt.errors import did_you_mean, shortened
-from impactopt.files.problem_file.ipopt_options import ALLOWED
 from impactopt.problem.checks import MOST_FREEZES
 from impactopt.robots.presets import robot_names
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS
+
+# A problem file is data: with it IPOPT loads no library, and writes and reads no file. So this lists what is
+# known to do neither, not what does: a new IPOPT may bring more of that, and knows each option under prefixes
+# too ("resto.hsllib"). Not here, as they load HSL or Pardiso from wherever the loader finds them, or write
+# files: linear_solver, linear_system_scaling, nlp_scaling_method, dependency_detector, and the own options of
+# those solvers.
+_NAMES = """
+tol s_max max_iter max_wall_time max_cpu_time dual_inf_tol constr_viol_tol compl_inf_tol acceptable_tol
+acceptable_iter acceptable_dual_inf_tol acceptable_constr_viol_tol acceptable_compl_inf_tol
+acceptable_obj_change_tol diverging_iterates_tol mu_target
+
+print_level print_timing_statistics print_info_string inf_pr_output print_frequency_iter print_frequency_time
+sb
+
+nlp_lower_bound_inf nlp_upper_bound_inf fixed_variable_treatment kappa_d bound_relax_factor
+honor_original_bounds check_derivatives_for_naninf grad_f_constant jac_c_constant jac_d_constant
+hessian_constant
+
+obj_scaling_factor
+
+bound_push bound_frac slack_bound_push slack_bound_frac constr_mult_init_max bound_mult_init_val
+bound_mult_init_method least_square_init_primal least_square_init_duals
+
+warm_start_init_point warm_start_same_structure warm_start_bound_push warm_start_bound_frac
+warm_start_slack_bound_push warm_start_slack_bound_frac warm_start_mult_bound_push warm_start_mult_init_max
+warm_start_entire_iterate warm_start_target_mu
+
+mu_max_fact mu_max mu_min adaptive_mu_globalization adaptive_mu_kkterror_red_iters
+adaptive_mu_kkterror_red_fact filter_margin_fact filter_max_margin adaptive_mu_monotone_init_factor
+adaptive_mu_kkt_norm_type mu_strategy mu_oracle fixed_mu_oracle mu_init barrier_tol_factor
+mu_linear_decrease_factor mu_superlinear_decrease_power tau_min sigma_max sigma_min quality_function_norm_type
+quality_function_centrality quality_function_balancing_term quality_function_max_section_steps
+quality_function_section_sigma_tol quality_function_section_qf_tol
+
+line_search_method alpha_red_factor accept_every_trial_step accept_after_max_steps alpha_for_y alpha_for_y_tol
+tiny_step_tol tiny_step_y_tol watchdog_shortened_iter_trigger watchdog_trial_iter_max theta_max_fact
+theta_min_fact eta_phi delta s_phi s_theta gamma_phi gamma_theta alpha_min_frac max_soc kappa_soc obj_max_inc
+max_filter_resets filter_reset_trigger corrector_type skip_corr_if_neg_curv skip_corr_in_monotone_mode
+corrector_compl_avrg_red_fact soc_method nu_init nu_inc rho kappa_sigma recalc_y recalc_y_feas_tol slack_move
+
+mehrotra_algorithm fast_step_computation min_refinement_steps max_refinement_steps residual_ratio_max
+residual_ratio_singular residual_improvement_factor neg_curv_test_tol neg_curv_test_reg
+max_hessian_perturbation min_hessian_perturbation perturb_inc_fact_first perturb_inc_fact perturb_dec_fact
+first_hessian_perturbation jacobian_regularization_value jacobian_regularization_exponent perturb_always_cd
+
+expect_infeasible_problem expect_infeasible_problem_ctol expect_infeasible_problem_ytol start_with_resto
+soft_resto_pderror_reduction_factor max_soft_resto_iters required_infeasibility_reduction max_resto_iter
+evaluate_orig_obj_at_resto_trial resto_penalty_parameter resto_proximity_weight bound_mult_reset_threshold
+constr_mult_reset_threshold resto_failure_feasibility_threshold
+
+limited_memory_aug_solver limited_memory_max_history limited_memory_update_type limited_memory_initialization
+limited_memory_init_val limited_memory_init_val_max limited_memory_init_val_min limited_memory_max_skipping
+limited_memory_special_for_resto hessian_approximation hessian_approximation_space
+
+mumps_print_level mumps_pivtol mumps_pivtolmax mumps_mem_percent mumps_permuting_scaling mumps_pivot_order
+mumps_scaling mumps_dep_tol
+"""
+ALLOWED = frozenset(_NAMES.split())
 
 
 def _known_robot(name: str) -> str:
@@ -178,7 +250,6 @@ def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
 Positive = Annotated[float, Field(gt=0)]
 Freezes = Annotated[int, Field(ge=0, le=MOST_FREEZES)]
 NotNegative = Annotated[float, Field(ge=0)]
-NotNegativeOrAny = Annotated[float, Field(ge=0, allow_inf_nan=True)]  # inf: any; nan is refused by ge
 AtLeastOne = Annotated[float, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Restitution = Annotated[float, Field(ge=0, le=1)]
@@ -201,3 +272,120 @@ JointNames = Annotated[list[str], AfterValidator(_joint_names)]
 HandNames = Annotated[list[str], AfterValidator(_hand_names)]
 Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
 IpoptOptions = Annotated[dict[str, Any], AfterValidator(_ipopt_options)]
+
+
+def optional(about: str, key: str | None = None) -> Any:
+    """A key that may be left out; the class that is built has the default.
+
+    about : what it is, with its unit in brackets.  key : its name in the file, if a unit belongs to it.
+    """
+    return Field(default=None, alias=key, description=about)
+
+
+def required(about: str, key: str | None = None) -> Any:
+    """A key that has to be there; see `optional`."""
+    return Field(alias=key, description=about)
+
+
+def attribute_docs(kind: type) -> dict[str, str]:
+    """Description of each attribute in the docstrings of a class and its bases, on one line; `a, b : text`
+    describes both.
+    """
+    out: dict[str, str] = {}
+    for each in reversed(kind.__mro__):
+        said = inspect.cleandoc(each.__doc__ or "")  # Python 3.13 takes the margin away, older ones keep it
+        section = re.split(r"\nAttributes\n-+\n", said)[-1]
+        entries = re.split(r"\n(?=[a-z_]+(?: \[\w+\])?(?:, [a-z_]+(?: \[\w+\])?)* : )", "\n" + section)
+        for entry in entries[1:]:
+            names, _, text = entry.partition(" : ")
+            for name in names.split(","):
+                out[name.split()[0]] = " ".join(text.split()).rstrip(".")
+    return out
+
+
+class Section(BaseModel):
+    """A section; unknown keys, NaN, infinity and text where a number belongs are refused.
+
+    Of a class below, the docstring's first sentence says in the reference what the section is about.
+    kind : the class that it describes.  choice : the field that only says which kind of section this is.
+    apart : fields that are sections of something else.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+    kind: ClassVar[Any] = None
+    choice: ClassVar[str] = ""
+    apart: ClassVar[tuple[str, ...]] = ()
+
+    def given(self) -> dict[str, Any]:
+        """The keys that the file has, by the names of the class's fields."""
+        return self.model_dump(exclude_unset=True, exclude={self.choice, *self.apart})
+
+    def build(self) -> Any:
+        """The thing that this section describes."""
+        return self.kind(**self.given())
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        """Default values of optional keys, by field; a field without a default is not in it."""
+        if not is_dataclass(cls.kind):
+            return {}
+        made = {f.name: f.default_factory() for f in fields(cls.kind) if f.default_factory is not MISSING}
+        return made | {f.name: f.default for f in fields(cls.kind) if f.default is not MISSING}
+
+    @model_validator(mode="after")
+    def _can_be_built(self) -> Section:
+        if self.kind is not None:
+            self.build()
+        return self
+
+
+def section_of(kind: type, base: type[Section] = Section) -> Any:
+    """The section that describes a dataclass: a key for each field that says what it is.
+
+    What the section is about is the first sentence of the class's docstring.
+    """
+    hints = get_type_hints(kind)
+    keys: dict[str, Any] = {}
+    for field, told in abouts(kind):
+        needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        key = told.key_of(field.name)
+        alias = None if key == field.name else key
+        give = required if needed else optional
+        keys[field.name] = (_value(hints[field.name], told), give(told.text, alias))
+    made = create_model(kind.__name__, __base__=base, __doc__=kind.__doc__, **keys)
+    made.kind = kind
+    return made
+
+
+def sections_of(name: str, doc: str, kinds: Mapping[str, type]) -> Any:
+    """A section with one for each of these classes below it, all of which may be left out."""
+    parts: dict[str, Any] = {key: (section_of(kind), optional("")) for key, kind in kinds.items()}
+    return create_model(name, __base__=Section, __doc__=doc, **parts)
+
+
+def one_of(words: Iterable[str]) -> Any:
+    """Type annotation for one of these words."""
+    return Literal[tuple(words)]
+
+
+def _value(hint: Any, told: About) -> Any:
+    """Type annotation of a field for pydantic: its own without None, with its range."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    kind = next(k for k in kinds if k is not type(None))
+    if told.by_joint:
+        return Annotated[Any, PlainValidator(per_joint)]
+    if told.none:
+        return Annotated[Any, PlainValidator(any_margin)]
+    if told.choices:
+        return one_of(told.choices)
+    bounds = {"gt": told.above, "ge": told.least, "le": told.most}
+    limits: dict[str, Any] = {name: bound for name, bound in bounds.items() if bound is not None}
+    if get_args(kind) == (float, ...):
+        return list[Annotated[float, Field(**limits)]]
+    if get_origin(kind) is tuple:
+        size = len(get_args(kind))
+        numbers = Annotated[list[float], Field(min_length=size, max_length=size)]
+        return Annotated[numbers, AfterValidator(unit_vector)] if told.direction else numbers
+    if kind is float:
+        return Annotated[float, Field(**limits, allow_inf_nan=True if told.endless else None)]
+    return cast(Any, kind)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from impactopt.bodies.shapes import vector
+from impactopt.bodies.world import vector
 from impactopt.contact.fields import About, Described, abouts
 from impactopt.errors import MOST, InputError, check_number, shortened
 

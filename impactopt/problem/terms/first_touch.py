@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.striker_face import StrikerFace, striker_face
+from impactopt.bodies.robot_bodies import StrikerFace, striker_face
 from impactopt.contact.fields import about
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term

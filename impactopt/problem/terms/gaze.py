@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from impactopt.bodies.shapes import Vector
+from impactopt.bodies.world import Vector
 from impactopt.contact.fields import about
 from impactopt.errors import InputError
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from impactopt.bodies.shapes import face_axes
+from impactopt.bodies.world import face_axes
 from impactopt.contact.fields import about
-from impactopt.kinematics.striking_point import striker_kinematics
+from impactopt.kinematics.coordinates import striker_kinematics
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import Measure

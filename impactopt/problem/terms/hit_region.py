@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from impactopt.bodies.shapes import face_axes
+from impactopt.bodies.world import face_axes
 from impactopt.contact.fields import about
 from impactopt.errors import InputError, check_array
-from impactopt.kinematics.striking_point import striker_kinematics
+from impactopt.kinematics.coordinates import striker_kinematics
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import Place, millimetres
@@ -27,7 +27,7 @@ REACH = 0.2  # [m] further off the replays' target has ended
 class HitRegion(Term):
     """The hit point may be anywhere in a disc or a rectangle about `point_m`; give one of the two keys.
 
-    In the plane of the normal: see :func:`impactopt.bodies.shapes.face_axes`. It reaches no further than
+    In the plane of the normal: see :func:`impactopt.bodies.world.face_axes`. It reaches no further than
     0.2 m, where the replays' target ends.
     """
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from impactopt.contact.fields import about
-from impactopt.kinematics.directions import across
+from impactopt.kinematics.operational_space import across
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import millimetres
 

@@ -1,4 +1,4 @@
-// The page's numbers: base64 of a zlib stream of a JSON header and typed arrays (impactopt/report/pack.py).
+// The page's numbers: base64 of a zlib stream of a JSON header and typed arrays (impactopt/report/page.py).
 const KINDS = { "<f4": Float32Array, "<u2": Uint16Array, "<u4": Uint32Array, "|u1": Uint8Array };
 
 async function unpack(text) {

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 from scipy.spatial import ConvexHull
 
-from impactopt.bodies.scene_visuals import surroundings_of
+from impactopt.bodies.visuals import surroundings_of
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
 from impactopt.files.replay import Replay
 from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
-from impactopt.robots.sole_margins import BEARS, weight_of
+from impactopt.robots.loads import BEARS, weight_of
 from impactopt.simulation import scene_of
 from impactopt.simulation.result import centre_of_pressure
 

@@ -23,7 +23,7 @@ from impactopt.report.pictures.style import (
     styled,
     title,
 )
-from impactopt.robots.sole_margins import BEARS
+from impactopt.robots.loads import BEARS
 
 SOLE_COLOURS = (BLUE, VERMILION)
 PHASE_COLOURS = (ORANGE, BLACK, GREEN)

@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 from matplotlib.collections import PolyCollection
 
-from impactopt.bodies.scene_visuals import Part, surroundings_of
 from impactopt.bodies.solids import Solid, simplified
+from impactopt.bodies.visuals import Part, surroundings_of
 from impactopt.files.output import Record
 from impactopt.problem.motion_style import joints_to
 from impactopt.problem.problem import ImpactProblem

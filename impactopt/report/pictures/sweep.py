@@ -37,7 +37,7 @@ from impactopt.report.pictures.sweep_columns import (
     name_of_error,
 )
 from impactopt.sweeps.definition import Sweep
-from impactopt.sweeps.figure import Figure as Section
+from impactopt.sweeps.sections import Figure as Section
 from impactopt.sweeps.table import read_columns
 
 __all__ = ["drawn_table", "save_sweep_picture", "sweep_picture"]

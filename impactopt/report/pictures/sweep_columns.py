@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.report.pictures.style import joint_label
-from impactopt.sweeps.figure import Figure as Section
+from impactopt.sweeps.sections import Figure as Section
 from impactopt.sweeps.table import unit_of, without_unit
 
 __all__ = ["Columns", "SweepColumns", "combined", "errors_against", "name_of_error"]

@@ -6,6 +6,6 @@ axes).
 """
 
 from impactopt.robots.rigid_body._body import RigidBody
-from impactopt.robots.rigid_body._factor import Factor
+from impactopt.robots.rigid_body._dynamics import Factor
 
 __all__ = ["Factor", "RigidBody"]

@@ -9,12 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError
-from impactopt.robots.rigid_body import _dynamics, _momentum
-from impactopt.robots.rigid_body._coordinates import Coordinates
-from impactopt.robots.rigid_body._factor import Factor, add_to_diagonal, tree_entries
-from impactopt.robots.rigid_body._kinematics import Kinematics
-from impactopt.robots.rigid_body._motion import Accelerations, Velocities
-from impactopt.robots.rigid_body._scalar import (
+from impactopt.robots.rigid_body import _dynamics
+from impactopt.robots.rigid_body import _dynamics as _momentum
+from impactopt.robots.rigid_body._dynamics import (
+    Accelerations,
+    Factor,
+    Kinematics,
+    Velocities,
+    add_to_diagonal,
+    tree_entries,
+)
+from impactopt.robots.rigid_body._spatial import (
     Scalar,
     Vector,
     as_sx,
@@ -24,7 +29,7 @@ from impactopt.robots.rigid_body._scalar import (
     pack_vector,
     unpack_vector,
 )
-from impactopt.robots.rigid_body._tree import Tree
+from impactopt.robots.rigid_body._tree import Coordinates, Tree
 
 
 class RigidBody:

@@ -1,26 +1,342 @@
-"""Composite inertias, generalized inertia H (CRBA) and inverse dynamics (RNEA), all in link frames.
+"""Kinematics and dynamics of a tree: placements, Jacobians, velocities; inertias, H, its factors, momentum.
 
 H does not contain the base's pose, so neither do its derivatives. Algorithms after Featherstone, Rigid Body
 Dynamics Algorithms (2008), chapters 5 and 6.
+
+They are in link frames; the world's axes enter at the end only, by one rotation.
 """
 
 from __future__ import annotations
 
-from impactopt.robots.rigid_body._kinematics import Kinematics
-from impactopt.robots.rigid_body._motion import Accelerations
-from impactopt.robots.rigid_body._scalar import Number, Vector, is_zero
+from collections.abc import Mapping
+from typing import Any
+
+from impactopt.errors import InputError
 from impactopt.robots.rigid_body._spatial import (
+    IDENTITY,
+    Matrix,
+    Number,
+    Vector,
     add,
+    as_sx,
+    column,
     cross,
+    is_zero,
     move_tensor,
+    pack_entries,
+    product,
+    rotate_back_z,
+    rotate_z,
     scale,
+    subtract,
     tensor_matrix,
     tensor_rotate,
     tensor_rotate_z,
     times,
+    transpose_times,
+    unpack_entries,
     zero_vector,
 )
-from impactopt.robots.rigid_body._tree import Kind
+from impactopt.robots.rigid_body._tree import Coordinates, Kind, Tree
+
+
+class Kinematics:
+    """Placements and velocities of links and frames."""
+
+    def __init__(self, tree: Tree, coordinates: Coordinates) -> None:
+        self.tree, self.coordinates = tree, coordinates
+        self._placements: dict[int, tuple[Matrix, Vector]] = {0: (IDENTITY, zero_vector())}
+        self._frames: dict[str, tuple[Matrix, Vector]] = {}
+
+    def offset(self, i: int) -> Vector:
+        """Origin of link i in its parent's frame [m]."""
+        joint = self.tree.joints[i]
+        if joint.kind is Kind.PRISMATIC:
+            return add(joint.translation, scale(self.coordinates.travel(i), column(joint.rotation, 2)))
+        return joint.translation
+
+    def up(self, i: int, a: Vector) -> Vector:
+        """A vector given in link i's frame, in its parent's."""
+        joint = self.tree.joints[i]
+        if joint.kind is Kind.REVOLUTE:
+            a = rotate_z(*self.coordinates.cos_sin(i), a)
+        return times(joint.rotation, a)
+
+    def down(self, i: int, a: Vector) -> Vector:
+        """A vector given in the frame of link i's parent, in link i's."""
+        joint = self.tree.joints[i]
+        a = transpose_times(joint.rotation, a)
+        return rotate_back_z(*self.coordinates.cos_sin(i), a) if joint.kind is Kind.REVOLUTE else a
+
+    def placement(self, i: int) -> tuple[Matrix, Vector]:
+        """(R, p [m]) of link i in the world."""
+        for j in self.tree.support(i):
+            if j not in self._placements:
+                self._placements[j] = self._place(j)
+        return self._placements[i]
+
+    def _place(self, i: int) -> tuple[Matrix, Vector]:
+        joint = self.tree.joints[i]
+        if joint.kind is Kind.FREE:
+            return self.coordinates.base_pose()
+        R, p = self._placements[joint.parent]
+        p = add(p, times(R, self.offset(i)))
+        R = product(R, joint.rotation)
+        if joint.kind is Kind.REVOLUTE:
+            c, s = self.coordinates.cos_sin(i)
+            R = [rotate_back_z(c, s, row) for row in R]
+        return R, p
+
+    def frame(self, name: str) -> tuple[Matrix, Vector]:
+        """(R, p [m]) of a frame in the world."""
+        if name not in self._frames:
+            i, rotation, translation = self.tree.frame(name)
+            R, p = self.placement(i)
+            self._frames[name] = product(R, rotation), add(p, times(R, translation))
+        return self._frames[name]
+
+    def jacobian(self, name: str) -> dict[tuple[int, int], Number]:
+        """Entries of the frame's Jacobian, (6, nv), LOCAL_WORLD_ALIGNED; other joints have no column."""
+        _, point = self.frame(name)
+        entries: dict[tuple[int, int], Number] = {}
+        for j in self.tree.support(self.tree.frame(name)[0]):
+            joint, (R, p) = self.tree.joints[j], self.placement(j)
+            arm = subtract(point, p)
+            if joint.kind is Kind.FREE:
+                columns = [(column(R, c), zero_vector()) for c in range(3)]
+                columns += [(cross(column(R, c), arm), column(R, c)) for c in range(3)]
+            elif joint.kind is Kind.REVOLUTE:
+                columns = [(cross(column(R, 2), arm), column(R, 2))]
+            else:
+                columns = [(column(R, 2), zero_vector())]
+            for c, (linear, angular) in enumerate(columns):
+                for r in range(3):
+                    entries[r, joint.v + c], entries[3 + r, joint.v + c] = linear[r], angular[r]
+        return entries
+
+
+class Velocities:
+    """Link velocities, in link frames, for one v (a list of nv numbers)."""
+
+    def __init__(self, kinematics: Kinematics, v: Vector) -> None:
+        self.kinematics, self.tree, self.v = kinematics, kinematics.tree, v
+        self._angular: dict[int, Vector] = {0: zero_vector()}
+        self._linear: dict[int, Vector] = {0: zero_vector()}
+
+    def angular(self, i: int) -> Vector:
+        """Angular velocity of link i [rad/s]."""
+        for j in self.tree.support(i):
+            if j not in self._angular:
+                joint = self.tree.joints[j]
+                if joint.kind is Kind.FREE:
+                    self._angular[j] = self.v[joint.v + 3 : joint.v + 6]
+                    continue
+                x, y, z = self.kinematics.down(j, self._angular[joint.parent])
+                self._angular[j] = [x, y, z + self.v[joint.v]] if joint.kind is Kind.REVOLUTE else [x, y, z]
+        return self._angular[i]
+
+    def linear(self, i: int) -> Vector:
+        """Velocity of link i's origin [m/s]."""
+        for j in self.tree.support(i):
+            if j not in self._linear:
+                joint = self.tree.joints[j]
+                if joint.kind is Kind.FREE:
+                    self._linear[j] = self.v[joint.v : joint.v + 3]
+                    continue
+                above = add(
+                    self._linear[joint.parent], cross(self.angular(joint.parent), self.kinematics.offset(j))
+                )
+                x, y, z = self.kinematics.down(j, above)
+                self._linear[j] = [x, y, z + self.v[joint.v]] if joint.kind is Kind.PRISMATIC else [x, y, z]
+        return self._linear[i]
+
+    def frame(self, name: str) -> Vector:
+        """Six numbers J v: [linear; angular] velocity of a frame at its origin, along the world's axes."""
+        i, _, translation = self.tree.frame(name)
+        R, _ = self.kinematics.placement(i)
+        w = self.angular(i)
+        return times(R, add(self.linear(i), cross(w, translation))) + times(R, w)
+
+
+class Accelerations:
+    """Link accelerations, in link frames, for one v and a: dw/dt, and the *point* acceleration of the origin.
+
+    Linear velocity is not needed for them, except the base's own.
+    """
+
+    def __init__(self, velocities: Velocities, a: Vector) -> None:
+        self.velocities, self.a = velocities, a
+        self.kinematics, self.tree = velocities.kinematics, velocities.tree
+        self._angular: dict[int, Vector] = {0: zero_vector()}
+        self._spin: dict[int, Matrix] = {0: [zero_vector() for _ in range(3)]}
+        self._linear: dict[bool, dict[int, Vector]] = {
+            False: {0: zero_vector()},
+            True: {0: scale(-1.0, self.tree.gravity)},
+        }
+
+    def angular(self, i: int) -> Vector:
+        """Angular acceleration of link i [rad/s2]."""
+        for j in self.tree.support(i):
+            if j not in self._angular:
+                joint = self.tree.joints[j]
+                if joint.kind is Kind.FREE:
+                    self._angular[j] = self.a[joint.v + 3 : joint.v + 6]
+                    continue
+                x, y, z = self.kinematics.down(j, self._angular[joint.parent])
+                if joint.kind is Kind.REVOLUTE:
+                    w, rate = self.velocities.angular(j), self.velocities.v[joint.v]
+                    x, y, z = x + w[1] * rate, y - w[0] * rate, z + self.a[joint.v]
+                self._angular[j] = [x, y, z]
+        return self._angular[i]
+
+    def spin(self, i: int) -> Matrix:
+        """U = [dw/dt]x + [w]x [w]x: a point at r in link i accelerates by U r against the origin."""
+        if i not in self._spin:
+            (x, y, z), (ax, ay, az) = self.velocities.angular(i), self.angular(i)
+            xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+            self._spin[i] = [
+                [0.0 - (yy + zz), xy - az, xz + ay],
+                [xy + az, 0.0 - (xx + zz), yz - ax],
+                [xz - ay, yz + ax, 0.0 - (xx + yy)],
+            ]
+        return self._spin[i]
+
+    def linear(self, i: int, *, gravity: bool) -> Vector:
+        """Acceleration of link i's origin [m/s2]; less gravity's (an accelerometer's) where `gravity`."""
+        known = self._linear[gravity]
+        for j in self.tree.support(i):
+            if j not in known:
+                known[j] = self._accelerate(j, known[self.tree.joints[j].parent])
+        return known[i]
+
+    def _accelerate(self, i: int, above: Vector) -> Vector:
+        joint, v = self.tree.joints[i], self.velocities.v
+        if joint.kind is Kind.FREE:
+            R, _ = self.kinematics.placement(i)
+            # Pinocchio's a is dv/dt along the base's own, turning axes.
+            turning = cross(v[joint.v + 3 : joint.v + 6], v[joint.v : joint.v + 3])
+            return add(add(self.a[joint.v : joint.v + 3], turning), transpose_times(R, above))
+        at_joint = add(above, times(self.spin(joint.parent), self.kinematics.offset(i)))
+        x, y, z = self.kinematics.down(i, at_joint)
+        if joint.kind is Kind.PRISMATIC:
+            w, rate = self.velocities.angular(i), v[joint.v]
+            x, y, z = x + 2.0 * (w[1] * rate), y - 2.0 * (w[0] * rate), z + self.a[joint.v]
+        return [x, y, z]
+
+    def frame(self, name: str) -> Vector:
+        """Six numbers: acceleration of a frame's origin and angular acceleration, along the world's axes."""
+        i, _, translation = self.tree.frame(name)
+        R, _ = self.kinematics.placement(i)
+        origin = self.linear(i, gravity=False)
+        return times(R, add(origin, times(self.spin(i), translation))) + times(R, self.angular(i))
+
+
+class Factor:
+    """The factorization H = L' D L of a symmetric positive definite matrix with a tree's pattern.
+
+    L is unit lower triangular, D diagonal. Structural zeros of right-hand sides stay zeros, so a sparse one
+    costs what its own branch of the tree costs.
+    """
+
+    def __init__(self, parents: list[int], upper: Mapping[tuple[int, int], Number]) -> None:
+        self._parents, self.nv = parents, len(parents)
+        A: dict[tuple[int, int], Number] = {}
+        for k in range(self.nv):
+            for j in (k, *self._ancestors(k)):
+                A[k, j] = upper.get((j, k), 0.0)
+        self._L: dict[tuple[int, int], Number] = {}
+        self._D: list[Number] = [0.0] * self.nv
+        for k in range(self.nv - 1, -1, -1):
+            if is_zero(A[k, k]):
+                raise InputError(
+                    f"H: nothing resists velocity {k} (its row is zero); give the link inertia or armature"
+                )
+            self._D[k] = A[k, k]
+            above = [i for i in self._ancestors(k) if not is_zero(A[k, i])]
+            for i in above:
+                self._L[k, i] = A[k, i] / A[k, k]
+            for i in above:
+                for j in (i, *self._ancestors(i)):
+                    A[i, j] = A[i, j] - self._L[k, i] * A[k, j]
+
+    def _ancestors(self, k: int) -> list[int]:
+        chain = []
+        k = self._parents[k]
+        while k >= 0:
+            chain.append(k)
+            k = self._parents[k]
+        return chain
+
+    def half_solve(self, b: Any) -> Any:
+        """L^-T b, SX (nv, k): with y = half_solve(b), b' H^-1 b = y' D^-1 y."""
+        return self._pack([self._half(x) for x in self._columns(b, "b")])
+
+    def solve(self, b: Any) -> Any:
+        """H^-1 b, SX (nv, k)."""
+        return self._pack([self._back(self._half(x)) for x in self._columns(b, "b")])
+
+    @property
+    def diagonal(self) -> Any:
+        """D, SX (nv)."""
+        return self._pack([dict(enumerate(self._D))])
+
+    # ------------------------------------------------------------ sparse columns {row: number}
+    def _columns(self, b: Any, name: str) -> list[dict[int, Number]]:
+        b = as_sx(name, b)
+        if b.size1() != self.nv:
+            raise InputError(f"{name}: expected {self.nv} rows, got shape {b.shape}")
+        columns: list[dict[int, Number]] = [{} for _ in range(b.size2())]
+        for (r, c), number in unpack_entries(b).items():
+            if not is_zero(number):
+                columns[c][r] = number
+        return columns
+
+    def _pack(self, columns: list[dict[int, Number]]) -> Any:
+        entries = {(r, c): x for c, column in enumerate(columns) for r, x in column.items()}
+        return pack_entries((self.nv, len(columns)), entries)
+
+    def _half(self, b: dict[int, Number]) -> dict[int, Number]:
+        y = dict(b)
+        for k in range(self.nv - 1, -1, -1):
+            if k in y:
+                for i in self._ancestors(k):
+                    if (k, i) in self._L:
+                        y[i] = y.get(i, 0.0) - self._L[k, i] * y[k]
+        return y
+
+    def _back(self, y: dict[int, Number]) -> dict[int, Number]:
+        x: dict[int, Number] = {}
+        for k in range(self.nv):
+            value: Number = y[k] / self._D[k] if k in y else 0.0
+            for i in self._ancestors(k):
+                if i in x and (k, i) in self._L:
+                    value = value - self._L[k, i] * x[i]
+            if not is_zero(value):
+                x[k] = value
+        return x
+
+
+def tree_entries(parents: list[int], H: Any) -> dict[tuple[int, int], Number]:
+    """The upper triangle of H, SX (nv, nv), checked to have the tree's pattern."""
+    upper = {place: x for place, x in unpack_entries(H).items() if place[0] <= place[1] and not is_zero(x)}
+    for i, j in upper:
+        k = j
+        while k > i:
+            k = parents[k]
+        if k != i:
+            raise InputError(
+                f"H: entry ({i}, {j}) couples two branches of the tree; factorize such a matrix densely"
+            )
+    return upper
+
+
+def add_to_diagonal(
+    upper: Mapping[tuple[int, int], Number], damping: Vector
+) -> dict[tuple[int, int], Number]:
+    damped = dict(upper)
+    for k, x in enumerate(damping):
+        damped[k, k] = damped.get((k, k), 0.0) + x
+    return damped
 
 
 class CompositeInertias:
@@ -171,3 +487,56 @@ def rnea(accelerations: Accelerations, *, gravity: bool) -> Vector:
             forces[joint.parent] = add(forces[joint.parent], force)
             moments[joint.parent] = add(moments[joint.parent], moment)
     return tau
+
+
+def com_in_root(composites: CompositeInertias) -> Vector:
+    """Centre of mass in the root link's frame [m]."""
+    root = composites.tree.root
+    if composites.mass[root] <= 0.0:
+        raise InputError(
+            "model: its moving links have no mass, so there is no centre of mass; give them inertias"
+        )
+    return scale(1.0 / composites.mass[root], composites.first_moment(root))
+
+
+def com(composites: CompositeInertias) -> Vector:
+    """Centre of mass in the world [m]."""
+    R, p = composites.kinematics.placement(composites.tree.root)
+    return add(p, times(R, com_in_root(composites)))
+
+
+def centroidal_map(mass_matrix: MassMatrix) -> dict[tuple[int, int], Number]:
+    """Entries of A_g, (6, nv): the forces that CRBA hands to the root, taken to the centre of mass."""
+    composites = mass_matrix.composites
+    R, _ = composites.kinematics.placement(composites.tree.root)
+    c = com_in_root(composites)
+    floating = composites.tree.floating
+    entries: dict[tuple[int, int], Number] = {}
+    for k, (force, moment) in mass_matrix.root_forces.items():
+        # A free-flyer that only translates has no momentum about the centre of mass, whatever rounding says.
+        about_com = zero_vector() if floating and k < 3 else subtract(moment, cross(c, force))
+        linear, angular = times(R, force), times(R, about_com)
+        for r in range(3):
+            entries[r, k], entries[3 + r, k] = linear[r], angular[r]
+    return entries
+
+
+def centroidal_momentum(composites: CompositeInertias, velocities: Velocities) -> Vector:
+    """Six numbers A_g v = [linear [kg m/s]; angular [kg m2/s]] from the links' momenta, without A_g."""
+    kinematics, tree = composites.kinematics, composites.tree
+    linear: list[Vector] = [zero_vector()]
+    angular: list[Vector] = [zero_vector()]
+    for i, joint in enumerate(tree.joints[1:], start=1):
+        u, w, h = velocities.linear(i), velocities.angular(i), joint.first_moment
+        linear.append(add(scale(joint.mass, u), cross(w, h)))
+        angular.append(add(times(tensor_matrix(joint.tensor), w), cross(h, u)))
+    for i in range(len(tree) - 1, 0, -1):
+        joint = tree.joints[i]
+        if joint.kind is not Kind.FREE:
+            lifted = kinematics.up(i, linear[i])
+            moment = add(kinematics.up(i, angular[i]), cross(kinematics.offset(i), lifted))
+            linear[joint.parent] = add(linear[joint.parent], lifted)
+            angular[joint.parent] = add(angular[joint.parent], moment)
+    R, _ = kinematics.placement(tree.root)
+    about_com = subtract(angular[tree.root], cross(com_in_root(composites), linear[tree.root]))
+    return times(R, linear[tree.root]) + times(R, about_com)

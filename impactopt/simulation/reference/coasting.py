@@ -7,8 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.settings import REFERENCE_ORDER, no_bend
 from impactopt.errors import InputError, check_array
-from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.leg_closure import base_motion
+from impactopt.kinematics.coordinates import StanceCoordinates, base_motion
 
 __all__ = ["coasting_reference", "independent_rates"]
 

@@ -8,13 +8,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.collision.result import Collision
+from impactopt.collision.interface import Collision
 from impactopt.errors import InputError, did_you_mean
 from impactopt.simulation.pinocchio_robot import FORMS
-from impactopt.simulation.reference.base import ReferenceModel, converge
-from impactopt.simulation.reference.equations_of_motion import Motion, Run
-from impactopt.simulation.reference.forces import Forces
-from impactopt.simulation.reference.record import collision_from
+from impactopt.simulation.reference.base import Forces, ReferenceModel, converge
+from impactopt.simulation.reference.equations_of_motion import Motion, Run, collision_from
 
 __all__ = ["FullDynamics"]
 

@@ -8,13 +8,13 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.result import Collision
+from impactopt.collision.interface import Collision
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
-from impactopt.simulation.mujoco_robot import MujocoRobot
-from impactopt.simulation.mujoco_welds import Welds
 from impactopt.simulation.mujoco_world import (
     MujocoOptions,
+    MujocoRobot,
+    Welds,
     add_welds,
     mujoco_module,
     no_log_file,
@@ -22,10 +22,8 @@ from impactopt.simulation.mujoco_world import (
     spec_of,
 )
 from impactopt.simulation.pinocchio_robot import DenseBody
-from impactopt.simulation.reference.base import ReferenceModel, converge
-from impactopt.simulation.reference.equations_of_motion import Instant, Scales, contact_scales
-from impactopt.simulation.reference.forces import Forces, Phase
-from impactopt.simulation.reference.record import collision_from
+from impactopt.simulation.reference.base import Forces, Phase, ReferenceModel, converge
+from impactopt.simulation.reference.equations_of_motion import Instant, Scales, collision_from, contact_scales
 
 __all__ = ["HeldRobot", "MujocoDynamics", "march"]
 

@@ -1,27 +1,308 @@
-"""The barrier problem: what a program is while mu keeps its variables and slacks off their bounds.
+"""Barrier problem: a program while mu keeps its variables off their bounds; elastic rows; the filter.
 
 Rows are those that `Condenser` leaves; g - s = 0 for an inequality row with its slack s. Here are its
 residual, its error, its barrier function, the Newton step and what a part of that leads to. Which step is
-taken is the line search's business (`line_search`), when rows may be violated that of `elastic_phase`.
+taken is the line search's business, when rows may be violated that of the elastic phase (`interior_point`).
+An elastic row = p - n with p, n >= 0 under the barrier, and price (p + n) in the objective.
 
-Source: Waechter and Biegler 2006; equation numbers are that paper's.
+Source: Waechter and Biegler, On the implementation of an interior-point filter line-search algorithm for
+large-scale nonlinear programming, Mathematical Programming 106, 2006; equation numbers are that paper's.
+Elastic rows: section 3.3.1, whose restoration phase does this without the objective; the filter: section 2.3.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from impactopt.solvers.ipm.barrier import Bounded
-from impactopt.solvers.ipm.elastic_constraints import Elastic
-from impactopt.solvers.ipm.filter import SearchStart
 from impactopt.solvers.ipm.newton import acquire, release
-from impactopt.solvers.options import SQPOptions
-from impactopt.solvers.point import Point, TimedProgram
-from impactopt.solvers.program import Determined, Vector, scaled_residual
+from impactopt.solvers.options import IPMOptions
+from impactopt.solvers.program import Determined, Point, TimedProgram, Vector, scaled_residual
 from impactopt.solvers.run import Path
+
+_SAFEGUARD = 1e10  # multipliers stay within this factor of mu / distance (eq. 16)
+
+
+class Bounded:
+    """Values v (k,) strictly between bounds, which may be infinite.
+
+    Attributes
+    ----------
+    values : v.
+    below, above : multipliers of the lower and the upper bound, 0 where there is none.
+    """
+
+    def __init__(
+        self,
+        values: Vector,
+        lower: Vector,
+        upper: Vector,
+        *,
+        push: float,
+        multipliers: Vector,
+        mu: float,
+        kept: bool = False,
+    ):
+        """values : moved inside by `push`, relative to the bound and to the room between both (section 3.6).
+
+        multipliers (k,) : positive at the upper bound, negative at the lower; each gets mu / distance at
+        least.  kept : only where it has none.
+        """
+        # 1 where there is a bound, else 0; and the bound, else 0
+        self._has_lower, self._has_upper = np.isfinite(lower).astype(float), np.isfinite(upper).astype(float)
+        self._lower = np.where(self._has_lower > 0, lower, 0.0)
+        self._upper = np.where(self._has_upper > 0, upper, 0.0)
+        self._take(self._inside(values, push))
+        low, high = mu / self._to_lower, mu / self._to_upper
+        if kept:
+            low, high = np.where(multipliers < 0, 0.0, low), np.where(multipliers > 0, 0.0, high)
+        self.below = self._has_lower * np.maximum(-multipliers, low)
+        self.above = self._has_upper * np.maximum(multipliers, high)
+
+    def _take(self, values: Vector) -> None:
+        self.values = values
+        self._to_lower, self._to_upper = self._distances(values)
+
+    def _inside(self, values: Vector, push: float) -> Vector:
+        has_lower, has_upper, low, high = self._has_lower > 0, self._has_upper > 0, self._lower, self._upper
+        room = np.where(has_lower & has_upper, push * (high - low), np.inf)
+        least = low + np.minimum(push * np.maximum(1.0, np.abs(low)), room)
+        most = high - np.minimum(push * np.maximum(1.0, np.abs(high)), room)
+        return np.clip(values, np.where(has_lower, least, -np.inf), np.where(has_upper, most, np.inf))
+
+    def _distances(self, values: Vector) -> tuple[Vector, Vector]:
+        """Distances to both bounds; 1 where there is none."""
+        return (
+            self._has_lower * (values - self._lower) + (1.0 - self._has_lower),
+            self._has_upper * (self._upper - values) + (1.0 - self._has_upper),
+        )
+
+    @property
+    def multiplier(self) -> Vector:
+        """Multipliers of both bounds together: positive where the upper one holds."""
+        return self.above - self.below
+
+    @property
+    def bounds(self) -> int:
+        """Number of finite bounds."""
+        return int(self._has_lower.sum() + self._has_upper.sum())
+
+    def total(self) -> float:
+        """Sum of the multipliers."""
+        return float(self.below.sum() + self.above.sum())
+
+    def barrier(self, values: Vector) -> float:
+        """- sum of the logarithms of the distances to the bounds."""
+        low, high = self._distances(values)
+        if low.min(initial=1.0) <= 0.0 or high.min(initial=1.0) <= 0.0:
+            return np.inf
+        return -float(np.log(low).sum() + np.log(high).sum())
+
+    def slope(self, mu: float) -> Vector:
+        """Gradient of mu times the barrier."""
+        out: Vector = mu * (self._has_upper / self._to_upper - self._has_lower / self._to_lower)
+        return out
+
+    def stiffness(self) -> Vector:
+        """Part that the multipliers add to the Hessian's diagonal (eq. 13)."""
+        return self.below / self._to_lower + self.above / self._to_upper
+
+    def off(self, mu: float) -> float:
+        """Largest |multiplier x distance - mu|."""
+        gaps = (
+            self.below * self._to_lower - mu * self._has_lower,
+            self.above * self._to_upper - mu * self._has_upper,
+        )
+        return max(float(np.abs(g).max(initial=0.0)) for g in gaps)
+
+    def longest(self, step: Vector, keep: float) -> float:
+        """The longest part <= 1 of a step that leaves 1 - keep of every distance (eq. 15a)."""
+        return min(
+            longest(self._to_lower, self._has_lower * step, keep),
+            longest(self._to_upper, -self._has_upper * step, keep),
+        )
+
+    def short_of_bounds(self, values: Vector, keep: float) -> Vector:
+        """New values, each moved to where it takes no more than a part `keep` of its distance to a bound."""
+        least = np.where(self._has_lower > 0, self.values - keep * self._to_lower, -np.inf)
+        most = np.where(self._has_upper > 0, self.values + keep * self._to_upper, np.inf)
+        return np.clip(values, least, most)
+
+    def dual_step(self, step: Vector, mu: float, keep: float) -> tuple[Vector, Vector, float]:
+        """Both multipliers' steps for a step of the values, eq. 12, and the longest part of them, eq. 15b."""
+        below = (mu * self._has_lower - self.below * step) / self._to_lower - self.below
+        above = (mu * self._has_upper + self.above * step) / self._to_upper - self.above
+        return below, above, min(longest(self.below, below, keep), longest(self.above, above, keep))
+
+    def move(self, values: Vector, below: Vector, above: Vector, mu: float) -> None:
+        """Take new values, and multipliers kept near mu / distance."""
+        self._take(values)
+        low, high = mu / self._to_lower, mu / self._to_upper
+        self.below = self._has_lower * np.clip(below, low / _SAFEGUARD, low * _SAFEGUARD)
+        self.above = self._has_upper * np.clip(above, high / _SAFEGUARD, high * _SAFEGUARD)
+
+
+def longest(room: Vector, step: Vector, keep: float) -> float:
+    """The longest part <= 1 of a step that leaves 1 - keep of the room that it shrinks."""
+    shrinks = step < 0.0
+    return min(1.0, float((keep * room[shrinks] / -step[shrinks]).min(initial=1.0)))
+
+
+_LEAST = 1e-14  # of the price: no multiplier is nearer to it
+
+
+class Elastic:
+    """Excess p and lack n of all rows (k,), eliminated from the Newton system.
+
+    Attributes
+    ----------
+    price : of a unit of violation; multipliers y stay below it.
+    """
+
+    def __init__(self, residual: Vector, price: float, mu: float):
+        """residual (k,) of the rows."""
+        self.price = price
+        # on the central path for p - n = residual (eq. 33)
+        half = (mu - self.price * residual) / (2.0 * self.price)
+        root = np.sqrt(half**2 + mu * residual / (2.0 * self.price))
+        with np.errstate(divide="ignore", invalid="ignore"):  # two forms, each where it does not cancel
+            low = np.where(half > 0, half + root, -mu * residual / (2.0 * self.price) / (half - root))
+        self._n = np.maximum(low, mu / (2e3 * self.price))
+        self._p = np.maximum(residual + self._n, mu / (2e3 * self.price))
+
+    def clip(self, y: Vector) -> Vector:
+        """Multipliers moved strictly inside the price."""
+        return np.clip(y, -0.9 * self.price, 0.9 * self.price)
+
+    def residual(self, residual: Vector) -> Vector:
+        """Part of a residual that is neither excess nor lack."""
+        return residual - self._p + self._n
+
+    def largest(self) -> float:
+        """The largest violation of a row."""
+        return float(np.abs(self._p - self._n).max(initial=0.0))
+
+    def compliance(self, y: Vector, mu: float) -> tuple[Vector, Vector]:
+        """Compliance of a row per unit of multiplier, and the offset that goes with it."""
+        zp, zn = self._below_price(y)
+        give = self._p / zp + self._n / zn
+        return give, give * y - (mu / zp - self._p) + (mu / zn - self._n)
+
+    def _below_price(self, y: Vector) -> tuple[Vector, Vector]:
+        """Distance of the multipliers below the price, and above its opposite: more than rounding."""
+        least = _LEAST * self.price
+        return np.maximum(self.price - y, least), np.maximum(self.price + y, least)
+
+    def step(self, new: Vector, y: Vector, mu: float) -> None:
+        """Find the steps of p and n for new multipliers."""
+        dy, (zp, zn) = new - y, self._below_price(y)
+        self._dp = (mu - self._p * zp + self._p * dy) / zp
+        self._dn = (mu - self._n * zn - self._n * dy) / zn
+
+    def longest(self, keep: float) -> float:
+        """The longest part <= 1 of the steps of p and n that keeps them positive."""
+        return min(longest(self._p, self._dp, keep), longest(self._n, self._dn, keep))
+
+    def longest_dual(self, new: Vector, y: Vector, keep: float) -> float:
+        """The longest part <= 1 of the multipliers' step that keeps them below the price."""
+        return min(longest(self.price - y, y - new, keep), longest(self.price + y, new - y, keep))
+
+    def moved(self, length: float) -> tuple[Vector, Vector]:
+        """p and n after a part of their steps."""
+        return self._p + length * self._dp, self._n + length * self._dn
+
+    def cost(self, p: Vector, n: Vector, mu: float) -> float:
+        """Part that p and n add to the barrier function."""
+        return float(self.price * (p + n).sum() - mu * (np.log(p).sum() + np.log(n).sum()))
+
+    def now(self, mu: float) -> float:
+        """Part that they add now."""
+        return self.cost(self._p, self._n, mu)
+
+    def slope(self, mu: float) -> float:
+        """Its slope along the steps."""
+        return float((self.price - mu / self._p) @ self._dp + (self.price - mu / self._n) @ self._dn)
+
+    def take(self, length: float, residual: Vector) -> None:
+        """Move p and n; the larger of the two makes up for what is left of the residual there."""
+        p, n = self.moved(length)
+        left = residual - (p - n)
+        least = 1e-3 * np.minimum(p, n)
+        self._p = np.where(p >= n, np.maximum(p + left, least), p)
+        self._n = np.where(p >= n, n, np.maximum(n - left, least))
+
+    def off(self, y: Vector, mu: float) -> float:
+        """Largest |multiplier x p - mu|, and likewise of n."""
+        gaps = np.abs(self._p * (self.price - y) - mu), np.abs(self._n * (self.price + y) - mu)
+        return max(float(g.max(initial=0.0)) for g in gaps)
+
+
+_VIOLATION, _OBJECTIVE = 1e-5, 1e-8  # gamma_theta, gamma_phi of eq. 18
+_ARMIJO, _SWITCH, _VIOLATION_POWER, _SLOPE_POWER = 1e-8, 1.0, 1.1, 2.3  # eta, delta, s_theta, s_phi
+_SHORTEST = 0.05  # gamma_alpha of eq. 23
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchStart:
+    """Start of a line search: violation theta, barrier function phi and its slope along the step."""
+
+    theta: float
+    phi: float
+    slope: float
+
+    def switches(self, length: float) -> bool:
+        """True if a step of that length is to lessen phi rather than theta (eq. 19)."""
+        return (
+            self.slope < 0.0
+            and length * (-self.slope) ** _SLOPE_POWER > _SWITCH * self.theta**_VIOLATION_POWER
+        )
+
+    def falls(self, length: float, phi: float) -> bool:
+        """True if phi falls as its slope lets expect: Armijo's condition, eq. 20, but for rounding."""
+        return phi <= self.phi + _ARMIJO * length * self.slope + 1e-13 * abs(self.phi)
+
+
+@dataclass
+class Filter:
+    """Pairs (theta, phi) that no later point may be worse than in both."""
+
+    least: float
+    most: float
+    pairs: list[tuple[float, float]] = field(default_factory=list)
+
+    @classmethod
+    def around(cls, theta: float) -> Filter:
+        """A filter for a run that starts with this violation (section 3.3)."""
+        return cls(least=1e-4 * max(1.0, theta), most=1e4 * max(1.0, theta))
+
+    def shortest(self, at: SearchStart) -> float:
+        """The length below which no step will do (eq. 23)."""
+        length = _VIOLATION
+        if at.slope < 0.0:
+            length = min(length, _OBJECTIVE * at.theta / -at.slope)
+            if at.theta <= self.least:
+                length = min(length, _SWITCH * at.theta**_VIOLATION_POWER / (-at.slope) ** _SLOPE_POWER)
+        return max(_SHORTEST * length, 1e-14)
+
+    def accepts(self, at: SearchStart, length: float, theta: float, phi: float) -> bool:
+        """True if a trial point is taken (steps A-5.3 and A-5.4)."""
+        if not (np.isfinite(theta) and np.isfinite(phi)) or theta > self.most:
+            return False
+        if any(theta >= t and phi >= p for t, p in self.pairs):
+            return False
+        if at.theta <= self.least and at.switches(length):
+            return at.falls(length, phi)
+        return theta <= (1.0 - _VIOLATION) * at.theta or phi <= at.phi - _OBJECTIVE * at.theta
+
+    def remember(self, at: SearchStart, length: float, phi: float) -> None:
+        """Augment the filter, but after a step for phi's sake (eq. 22)."""
+        if at.switches(length) and at.falls(length, phi):
+            return
+        pair = (1.0 - _VIOLATION) * at.theta, at.phi - _OBJECTIVE * at.theta
+        self.pairs = [(t, p) for t, p in self.pairs if t < pair[0] or p < pair[1]] + [pair]
+
 
 _FASTER = 0.2  # mu becomes min(0.2 mu, mu^power) (eq. 7)
 # the barrier problem is solved to so many mu (kappa_epsilon); then mu falls with this power: gently and
@@ -74,7 +355,7 @@ class BarrierProblem:
     def __init__(
         self,
         program: TimedProgram,
-        options: SQPOptions,
+        options: IPMOptions,
         point: Point,
         y: Vector,
         z: Vector,

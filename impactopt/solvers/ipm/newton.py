@@ -1,19 +1,200 @@
-"""The Newton system of one interior-point iteration, condensed and factored."""
+"""Newton system of one interior-point iteration, condensed; ordering and Cholesky factor of the rest."""
 
 from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from impactopt.solvers.elimination.compiled import kernels as fastest
 from impactopt.solvers.elimination.condense import Condenser, Mask, find_eliminations
-from impactopt.solvers.elimination.kernels import Index, Kernels, Products
-from impactopt.solvers.ipm.cholesky import BlockCholesky
+from impactopt.solvers.elimination.kernels import Index, Kernels, Panels, Places, Products
+from impactopt.solvers.elimination.kernels import kernels as fastest
 from impactopt.solvers.program import Determined, Matrix, Vector
+
+_WIDEST = 24  # variables of a block that is made of several
+_ZEROS = 0.1  # part of a block's panel that may be zeros, so that it is one block instead of two
+
+
+def elimination_blocks(pattern: Any) -> list[Index]:
+    """Variables in blocks, those to be eliminated first in front.
+
+    Variables that touch the same others are one group. The order is found for groups: the one that touches
+    the fewest variables first (minimum degree; Davis, Direct Methods for Sparse Linear Systems, 2006, section
+    7.1). Then groups that touch nearly the same become one block, as a few large products take less time than
+    many small ones.
+
+    pattern (n, n) : which entries may be nonzero, symmetric.
+    """
+    touches = np.asarray(pattern, dtype=bool) | np.eye(len(pattern), dtype=bool)
+    members: dict[bytes, list[int]] = {}
+    for i, row in enumerate(np.packbits(touches, axis=1)):
+        members.setdefault(row.tobytes(), []).append(i)
+    groups = [np.array(same) for same in members.values()]
+    first, sizes = (np.array([of(g) for g in groups], dtype=np.intp) for of in (np.min, np.size))
+    order, below = _minimum_degree(touches[np.ix_(first, first)], sizes)
+    blocks = _blocks(order, below, sizes)
+    return [np.concatenate([groups[g] for g in b.groups]) for root in blocks for b in root.in_order()]
+
+
+def _minimum_degree(touches: Any, sizes: Index) -> tuple[Index, Any]:
+    """Groups in order, and which others the elimination of each touches (g, g)."""
+    touches, left = touches.copy(), np.ones(sizes.size, dtype=bool)
+    order, below = np.zeros_like(sizes), np.zeros_like(touches)
+    degree = touches @ sizes
+    for i in range(sizes.size):
+        k = order[i] = int(np.argmin(np.where(left, degree, np.inf)))
+        left[k] = False
+        below[k] = touches[k] & left
+        rows = np.flatnonzero(below[k])
+        touches[np.ix_(rows, rows)] = True
+        degree[rows] = (touches[rows] & left) @ sizes
+    return order, below
+
+
+@dataclass
+class _Block:
+    """Groups to be eliminated one after the other.
+
+    below : groups that they touch.  width, height : variables of both.  entries : of the groups' own panels,
+    which are not zero.  children : blocks that have to be eliminated before.
+    """
+
+    groups: list[int]
+    below: Any
+    width: int
+    height: int
+    entries: float
+    children: list[_Block] = field(default_factory=list)
+
+    def in_order(self) -> list[_Block]:
+        """This block after all that are below it, without recursion: a long motion's are thousands deep."""
+        out, waiting = list[_Block](), [self]
+        while waiting:  # parents before their children, and the last child first
+            out.append(block := waiting.pop())
+            waiting += block.children
+        return out[::-1]
+
+    def joined(self, other: _Block, sizes: Index) -> _Block | None:
+        """Panel joined with one that comes after it; None where that would be too many zeros."""
+        width = self.width + other.width
+        below = self.below | other.below
+        below[other.groups] = False
+        height = int(below @ sizes)
+        entries = self.entries + other.entries
+        if width > _WIDEST or entries < (1.0 - _ZEROS) * _entries(width, height):
+            return None
+        groups, children = self.groups + other.groups, self.children + other.children
+        return _Block(groups, below, width, height, entries, children)
+
+
+def _entries(width: int, height: int) -> float:
+    """Number of entries of a panel, with the lower triangle of its own block."""
+    return width * (height + 0.5 * (width + 1))
+
+
+def _blocks(order: Index, below: Any, sizes: Index) -> list[_Block]:
+    """The last of them, with their children."""
+    place = np.empty_like(order)
+    place[order] = np.arange(order.size)
+    waiting: dict[int, list[_Block]] = {}  # by the first group that they touch
+    for k in map(int, order):
+        width, height = int(sizes[k]), int(below[k] @ sizes)
+        block = _Block([k], below[k], width, height, _entries(width, height))
+        for child in _of_equal_size(waiting.pop(k, []), sizes):
+            joined = child.joined(block, sizes)
+            if joined is None:
+                block.children.append(child)
+            else:
+                block = joined
+        touched = np.flatnonzero(block.below)
+        parent = int(touched[np.argmin(place[touched])]) if touched.size else -1
+        waiting.setdefault(parent, []).append(block)
+    return waiting.get(-1, [])
+
+
+def _of_equal_size(blocks: list[_Block], sizes: Index) -> list[_Block]:
+    """Blocks that touch nearly the same, and not each other, as one."""
+    out: list[_Block] = []
+    for block in blocks:
+        for i, other in enumerate(out):
+            joined = other.joined(block, sizes)
+            if joined is not None:
+                out[i] = joined
+                break
+        else:
+            out.append(block)
+    return out
+
+
+class BlockCholesky:
+    """L L' = K for matrices whose pattern does not change.
+
+    Variables come in blocks; of each block of columns the blocks of rows that become nonzero are
+    kept as one panel, so that the work is a few dense products a panel (Davis, Direct Methods for Sparse
+    Linear Systems, 2006, chapter 4: a supernodal factorization).
+
+    Attributes
+    ----------
+    size : of the array of all panels' numbers.
+    """
+
+    def __init__(self, pattern: Any, kernels: Kernels):
+        """pattern: which entries may be nonzero (n, n), symmetric."""
+        n, self._kernels = pattern.shape[0], kernels
+        blocks = elimination_blocks(pattern)
+        count, sizes = len(blocks), np.array([b.size for b in blocks], dtype=np.intp)
+        self._n, self._order = n, np.concatenate([np.zeros(0, np.intp), *blocks])
+        self._place = np.empty(n, dtype=np.intp)
+        self._place[self._order] = np.arange(n)
+        self._block = np.repeat(np.arange(count), sizes)  # of each place
+        start = np.append(0, np.cumsum(sizes))
+        i, j = np.nonzero(pattern)
+        filled = np.zeros((count, count), dtype=bool)
+        filled[self._block[self._place[i]], self._block[self._place[j]]] = True
+        below: list[Places] = []
+        for k in range(count):
+            rows = (np.flatnonzero(filled[k + 1 :, k]) + k + 1).astype(np.int32)
+            filled[np.ix_(rows, rows)] = True
+            below.append(rows)
+        row_at = np.full((count, count), -1, dtype=np.int32)
+        height, at = np.zeros(count, dtype=np.int32), np.zeros(count + 1, dtype=np.intp)
+        for k, rows in enumerate(below):
+            stacked = np.concatenate([[k], rows]).astype(np.intp)
+            ends = np.cumsum(sizes[stacked])
+            row_at[stacked, k] = ends - sizes[stacked]
+            height[k] = ends[-1]
+            at[k + 1] = at[k] + ends[-1] * sizes[k]
+        self._panels = Panels(
+            start=start.astype(np.int32), at=at, height=height, below=tuple(below), row_at=row_at
+        )
+        self.size = int(at[-1])
+
+    def places(self, i: Index, j: Index) -> Index:
+        """Places of the entries (i, j) of the lower triangle, or (j, i)."""
+        low, high = np.maximum(self._place[i], self._place[j]), np.minimum(self._place[i], self._place[j])
+        row, column = self._block[low], self._block[high]
+        p = self._panels
+        across, down = high - p.start[column], p.row_at[row, column] + low - p.start[row]
+        out: Index = p.at[column] + p.height[column] * across + down
+        return out
+
+    def factor(self, values: Vector) -> bool:
+        """Factor the matrix with these values (size,), overwriting them; False: not positive definite."""
+        self._values = values
+        return self._kernels.factor(self._panels, values)
+
+    def solve(self, right: Vector) -> Vector:
+        """K^-1 times a vector (n,) or columns (n, k)."""
+        x = np.asfortranarray(right[self._order].reshape(self._n, -1))
+        x = self._kernels.solve(self._panels, self._values, x)
+        out = np.empty(x.shape)
+        out[self._order] = x
+        return out.reshape(right.shape)
+
 
 _KEPT = 3  # structures
 _PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step

@@ -12,8 +12,7 @@ import numpy as np
 import scipy.linalg as la
 
 from impactopt.solvers.program import Vector
-from impactopt.solvers.qp.quadratic_program import QPSolution, QPStatus, QuadraticProgram
-from impactopt.solvers.qp.refine import solve_equality_qp
+from impactopt.solvers.qp.quadratic_program import QPSolution, QPStatus, QuadraticProgram, solve_equality_qp
 
 _FEASIBLE = 1e-10  # violation of a unit row that counts as none, relative to its bound
 _DEPENDENT = 1e-9  # sine of the angle to the active rows below which a row is one of their combinations

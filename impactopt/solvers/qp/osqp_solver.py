@@ -12,8 +12,7 @@ import scipy.sparse as sp
 
 from impactopt.solvers.program import Vector
 from impactopt.solvers.qp.active_set import ActiveSetSolver
-from impactopt.solvers.qp.quadratic_program import QPSolution, QPStatus, QuadraticProgram
-from impactopt.solvers.qp.refine import active_set, refine
+from impactopt.solvers.qp.quadratic_program import QPSolution, QPStatus, QuadraticProgram, active_set, refine
 
 _USABLE = (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE)
 _INFEASIBLE = (osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE, osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE)

@@ -1,6 +1,6 @@
 """Sequential quadratic programming in few variables: reduced QPs, solved to their end, and a filter.
 
-What rows determine is eliminated from every QP (`reduction`), the rows that a QP needs are added to it when
+What rows determine is eliminated from every QP (`reduced_qp`), the rows that a QP needs are added to it when
 they are missed, and what cannot be met is elastic. Its step is shortened until a filter takes it (Waechter
 and Biegler 2006, section 2.3, with a QP's step in the place of a barrier problem's); where none is taken, and
 rows are violated, only these count for a while.
@@ -8,16 +8,19 @@ rows are violated, only these count for a while.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from impactopt.solvers.point import Point
+from impactopt.solvers.options import SQPOptions
 from impactopt.solvers.program import (
-    Determined,
+    Callback,
+    NonlinearProgram,
+    Point,
+    SolverResult,
     Status,
     Vector,
     complementarity,
@@ -25,10 +28,8 @@ from impactopt.solvers.program import (
     stationarity,
 )
 from impactopt.solvers.qp.registry import make_qp_solver
-from impactopt.solvers.run import Run, Task
-from impactopt.solvers.sqp.reduced_hessian import ReducedModel, make_model
-from impactopt.solvers.sqp.reduced_qp import ReducedQP, Solved
-from impactopt.solvers.sqp.reduction import Reduction
+from impactopt.solvers.run import Run
+from impactopt.solvers.sqp.reduced_qp import ReducedModel, ReducedQP, Reduction, Solved, make_model
 
 _HALVINGS = 12  # of a step
 _ARMIJO = 1e-4
@@ -73,12 +74,30 @@ class Taken:
     foreseen: bool = False
 
 
-class ReducedRun(Run):
+def solve_sqp(
+    program: NonlinearProgram,
+    x0: npt.ArrayLike,
+    *,
+    options: SQPOptions | None = None,
+    callback: Callback | None = None,
+    multipliers: npt.ArrayLike | None = None,
+    bound_multipliers: npt.ArrayLike | None = None,
+) -> SolverResult:
+    """Solve a nonlinear program by SQP, whose QPs are solved to their end.
+
+    Parameters, result and errors are those of :func:`impactopt.solvers.ipm.solve_ipm`.
+    options : see `SQPOptions`.
+    """
+    given = program, x0, options or SQPOptions(), callback, multipliers, bound_multipliers
+    return ReducedRun(*given).solve()
+
+
+class ReducedRun(Run[SQPOptions]):
     """One solve. Between iterations: the point, its multipliers, the filter, the radius of the QPs."""
 
-    def __init__(self, task: Task, determined: Sequence[Determined]):
-        super().__init__(task)
-        self._determined, self._filter = determined, list[Pair]()
+    def __init__(self, *given: Any):
+        super().__init__(*given)
+        self._filter = list[Pair]()
         self._radius = self._widest = self.options.radius
         self._price, self._raised = self.options.price, 0
         self._patient = self._creeps = self._proved = False
@@ -91,7 +110,7 @@ class ReducedRun(Run):
             return Status.FAILED
         start, y, z = self.point, self.y.copy(), self.z.copy()
         dense = self.options.hessian == "bfgs"
-        self._reduction = Reduction(self.program, start.jacobian, self._determined, dense=dense)
+        self._reduction = Reduction(self.program, start.jacobian, self.determined, dense=dense)
         self._model = make_model(self.program, self.options, self._reduction)
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
         try:

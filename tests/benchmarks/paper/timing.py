@@ -25,8 +25,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from benchmarks.clock import medians, runner
-from impactopt.codegen.cache import cached
-from impactopt.codegen.hashing import model_hash
+from impactopt.codegen.cache import cached, model_hash
 from impactopt.collision import SDC
 from impactopt.collision.graph import frozen_dynamics, joint_space_model
 from impactopt.collision.runge_kutta import rk4_step

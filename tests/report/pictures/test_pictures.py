@@ -19,11 +19,11 @@ from support.picture_checks import frowns
 from support.small_plans import Planned
 from typer.testing import CliRunner
 
+from impactopt import Solution
 from impactopt.collision import effective_mass
 from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of
 from impactopt.kinematics.support import zmp
-from impactopt.planning.solution import Solution
 from impactopt.report.pictures import PICTURES, hierarchy, overview
 from impactopt.report.pictures.ellipsoid import effective_masses
 from impactopt.report.pictures.style import DPI, PAGE, Picture

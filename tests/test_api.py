@@ -10,14 +10,14 @@ import pytest
 
 import impactopt
 from impactopt import InputError, load_problem
-from impactopt.files import entry_points as by_file
+from impactopt import api as by_file
 from impactopt.files.problem_file.names import problem_file
 from impactopt.problem.problem import ImpactProblem
 
 FILE = """
 [solver]
 time_limit_s = 7
-[solver.sqp]
+[solver.ipm]
 max_iterations = 5
 """
 

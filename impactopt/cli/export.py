@@ -55,6 +55,13 @@ def export(
             metavar="A,B,C", help="Order of the joints, each of the robot's once (default: the robot's own)."
         ),
     ] = None,
+    gravity: Annotated[
+        bool,
+        typer.Option(
+            "--gravity/--no-gravity",
+            help="Whether effort holds the arm against gravity; not, if its controller does.",
+        ),
+    ] = True,
     problem: OtherProblem = None,
     as_json: AsJson = False,
 ) -> None:
@@ -75,7 +82,7 @@ def export(
         beside = folder.parent if folder.name.strip(".") else folder.resolve().parent  # not in "."
         directory = out if out is not None else beside / f"{folder.resolve().name}_{to.value}"
         names = None if joints is None else [name.strip() for name in joints.split(",")]
-        written = export_planned(planned, to.value, directory, rate=rate, joints=names)
+        written = export_planned(planned, to.value, directory, rate=rate, joints=names, gravity=gravity)
         if as_json:
             told = {"to": to.value, "directory": str(directory), "files": [str(path) for path in written]}
             typer.echo(json.dumps(told, indent=2))

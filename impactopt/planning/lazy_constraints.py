@@ -136,6 +136,7 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
     )
 
 
+_BARRIER = 1e-2  # a plan within such limits is another one: at a low barrier the way there is a crawl
 _KINDS: dict[str, type[Term]] = {snake_case(type(term).__name__): type(term) for term in ON_DEMAND_TERMS}
 
 
@@ -176,7 +177,9 @@ class LazyTerms(Generic[Program]):
         bounded, said = with_rows(t.problem, broken), "; ".join(broken.values())
 
         def guesses() -> Iterator[Guess[Program]]:
-            yield Guess.mapped(program_for(t, bounded, report=self._report), t, outcome.result)
+            yield Guess.mapped(
+                program_for(t, bounded, report=self._report), t, outcome.result, barrier=_BARRIER
+            )
             cold = program_for(origin.program, bounded, constraints={}, report=self._report)
             yield Guess(program=cold, start=start_of(cold, origin.program, origin.x))
 

@@ -36,7 +36,7 @@ class MotionPrices:
 # Chosen on `punch` (docs/howto/natural.md has the figures): jerk takes out reversals and peaks, idle speed
 # the travel of limbs that bring nothing, speed the detours of all others.
 STYLES: dict[str, MotionPrices] = {
-    "natural": MotionPrices(jerk=7e-7, speed=7.5e-3, idle_speed=3e-2, end=2.0),
+    "natural": MotionPrices(jerk=7e-7, speed=7.5e-3, idle_speed=8e-2, end=2.0),
     "strongest": MotionPrices(),
 }
 

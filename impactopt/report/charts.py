@@ -11,6 +11,7 @@ from impactopt.files.output import Record
 from impactopt.kinematics.support import margin
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import BUCKETS, at_contact, ground_wrenches, planned_torque, thinned
+from impactopt.report.result_rows import replay_name
 from impactopt.report.tracks import planned_hand_speed
 from impactopt.simulation.result import centre_of_pressure
 
@@ -33,7 +34,9 @@ def charts_of(record: Record, problem: ImpactProblem | None = None) -> tuple[lis
     arrays: Arrays = {}
     charts: list[dict[str, Any] | None] = []
     if record.completed:
-        present = [s for s in SOURCES if f"{s[1]}_time" in record.arrays]
+        free = replay_name(record.summary)
+        names = [(free if key == "replayed" else name, key, style) for name, key, style in SOURCES]
+        present = [s for s in names if f"{s[1]}_time" in record.arrays]
         charts += [
             _force(record, arrays, present),
             _speed(record, arrays, present, problem),

@@ -50,18 +50,25 @@ class Row:
     cells: tuple[Cell, ...]
 
 
+def replay_name(summary: Mapping[str, Any]) -> str:
+    """Heading of MuJoCo's replay: nothing holds the soles of a robot that has some."""
+    return "free soles" if summary.get("sole_cop_margin_mm") else "MuJoCo"
+
+
 def result_columns(summary: Mapping[str, Any]) -> Columns:
     """The plan, its simulation on fixed soles, and its replay on free ones, as far as there are any.
 
     summary : the content of ``summary.json``.
     """
     replayed = _by_phase(summary.get("replayed", {}))
-    return _said({"planned": summary, "simulated": summary.get("simulated", {}), "free soles": replayed})
+    simulated = summary.get("simulated", {})
+    return _said({"planned": summary, "simulated": simulated, replay_name(summary): replayed})
 
 
 def replay_columns(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Columns:
     """The plan and one replay; `report` as in `impactopt validate --json`."""
-    name = "free soles" if report["engine"] == "mujoco" else "held soles"
+    held = "held soles" if summary.get("sole_cop_margin_mm") else "Pinocchio"
+    name = replay_name(summary) if report["engine"] == "mujoco" else held
     return _said({"planned": summary, name: _by_phase(report)})
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from impactopt.files.output import Record
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
+from impactopt.report.result_rows import replay_name
 from impactopt.simulation.result import centre_of_pressure, travelled
 from impactopt.transcription.plan import Trajectory
 
@@ -65,9 +66,9 @@ def tracks_of(record: Record, problem: ImpactProblem) -> list[Track]:
     The servo's reference coasts through contact; the planned robot does not. In contact it is drawn on the
     cubic between the planned states before and after, whose ends and velocities are the plan's.
     """
-    return [
-        _track(record, problem, name, prefix) for name, prefix in MOTIONS if f"{prefix}_q" in record.arrays
-    ]
+    there = [(name, prefix) for name, prefix in MOTIONS if f"{prefix}_q" in record.arrays]
+    free = replay_name(record.summary)
+    return [_track(record, problem, free if p == "replayed" else name, p) for name, p in there]
 
 
 def planned_track(solution: Solution, reference: Trajectory | None = None) -> Track:

@@ -45,6 +45,7 @@ THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after 
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
+TOUCHING = 1e-9  # [m] that the robot starts lower: soles that rounding has above the floor bear nothing
 SLID = 0.05  # [m] of a sole along the floor, about half of one's width: it stands where it was not to
 
 
@@ -117,6 +118,8 @@ class _Replay(MujocoRobot):
 
     def start(self, q: Array) -> None:
         self.put(q)
+        if self.floating:
+            self.data.qpos[2] -= TOUCHING
         self.mujoco.mj_kinematics(self.world, self.data)
         self.grips.put(self.data)
         self.mujoco.mj_forward(self.world, self.data)

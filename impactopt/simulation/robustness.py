@@ -29,15 +29,15 @@ Z95 = 1.959964  # of the normal distribution: 95 % lie within
 STEP = 5e-4  # [s]: tells who stands as 1e-4 does, and costs a fifth
 MOST_SEED = 10**9
 MOST_DRAWS = 1_000_000  # each is a replay of a second
-LOGARITHMIC = ("mass", "stiffness", "kp", "kd")  # factors: half is as far from 1 as twice
+LOGARITHMIC = ("mass", "stiffness", "kp", "kd", "floor_time")  # half is as far from planned as twice
 
 
 @dataclass(frozen=True, kw_only=True)
 class PerturbationRanges:
     """Ranges (lower, upper) from which perturbations are drawn independently; see :class:`Perturbation`.
 
-    mass, stiffness, kp, kd : factors, log-uniform.  distance [m], payload [kg], friction, torque_limit
-        (a factor) : uniform.
+    mass, stiffness, kp, kd : factors, log-uniform.  floor_time [s] : the floor's time constant, log-uniform.
+    distance [m], payload [kg], friction, torque_limit (a factor) : uniform.
     period [s] : sampling period of the servo, the same in every draw.
 
     Raises
@@ -53,6 +53,7 @@ class PerturbationRanges:
     kp: tuple[float, float] = (0.7, 1.4)
     kd: tuple[float, float] = (0.7, 1.4)
     torque_limit: tuple[float, float] = (0.85, 1.0)
+    floor_time: tuple[float, float] = (1e-3, 6e-3)
     period: float = 1e-3
 
     def __post_init__(self) -> None:
@@ -62,7 +63,7 @@ class PerturbationRanges:
             if not low <= high:
                 raise InputError(f"ranges: {name} is from {low:g} to {high:g}; give the lower bound first")
             if name in LOGARITHMIC and not low > 0:
-                raise InputError(f"ranges: {name} starts at {low:g}; a factor that is drawn must be > 0")
+                raise InputError(f"ranges: {name} starts at {low:g}; it is drawn by its logarithm: give > 0")
             for bound in (low, high):
                 _changed(Perturbation(), {name: bound})  # refuses what is out of range
         Perturbation(period=self.period)

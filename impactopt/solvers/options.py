@@ -72,7 +72,8 @@ class IPMOptions(SolverOptions):
     barrier : first barrier parameter of an initial guess without multipliers.
     barrier_warm : the same of one with multipliers. Below 5e-3 it falls at once where the initial guess is
         near a solution.
-    push : how far the initial guess is moved inside its bounds.
+    push : how far the initial guess is moved inside its bounds; one with multipliers no farther than its
+        barrier.
     """
 
     complementarity_tolerance: float = 1e-6

@@ -14,6 +14,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import pinocchio as pin
 import pytest
 import yaml
 from mcap.reader import make_reader
@@ -217,6 +218,28 @@ def test_ros2_is_a_goal_that_replays_as_the_plan_does(arm: Solution, tmp_path: P
     assert replayed(arm.problem, read).impulse == pytest.approx(memory.impulse, rel=NEAR)
     # controllers refuse goals that do not end at rest
     np.testing.assert_allclose(trajectory["points"][-1]["velocities"], 0.0, atol=1e-9)
+
+
+def test_effort_without_gravity_is_for_arms_that_hold_themselves(
+    arm: Solution, still: Solution, tmp_path: Path
+) -> None:
+    """At rest at the start nothing is left of it; at speed, what inertia and velocity ask for."""
+    robot, motions = arm.problem.robot, {}
+    for gravity in (True, False):
+        meta, path = arm.export("csv", tmp_path / str(gravity), gravity=gravity)
+        assert json.loads(meta.read_text())["effort_holds_gravity"] is gravity
+        motions[gravity] = np.genfromtxt(path, delimiter=",", names=True, deletechars="")
+    less = [motions[True][n] - motions[False][n] for n in motions[True].dtype.names if n.startswith("effort")]
+    where = [motions[True][n] for n in motions[True].dtype.names if n.startswith("position")]
+    data = robot.model.createData()
+    for k in (0, len(less[0]) // 2, -1):
+        q = np.array([column[k] for column in where])
+        held = pin.computeGeneralizedGravity(robot.model, data, q)
+        np.testing.assert_allclose([column[k] for column in less], held, atol=2e-3 * np.abs(held).max())
+    with pytest.raises(InputError, match="bear it"):
+        still.export("csv", tmp_path / "legs", gravity=False)
+    with pytest.raises(InputError, match="needs the whole effort"):
+        arm.export("mujoco", tmp_path / "scene", gravity=False)
 
 
 def test_mcap_is_what_ros_reads(arm: Solution, tmp_path: Path) -> None:

@@ -211,6 +211,15 @@ def test_a_robot_at_rest_bears_its_weight_where_statics_says(make: Any) -> None:
         assert sim.cop_margin[-1, k] == pytest.approx(margin(sole.polygon, at[None])[0], abs=1e-5)
 
 
+def test_soles_bear_the_robot_from_the_first_instant_where_rounding_has_them_above_the_floor() -> None:
+    robot = biped()
+    motion, there, wrench = standing(robot)
+    higher = motion.q[0] + np.where(np.arange(robot.model.nq) == 2, 1e-12, 0.0)
+    motion = reference([0.0, 1.0], higher, torque=motion.torque[0], nv=robot.nv, n=robot.n, end=0.05)
+    sim = simulate_mujoco(robot, motion, there, until=1e-3)
+    assert (sim.sole_normal[0] > 0.2 * wrench[2::6]).all()
+
+
 def test_a_robot_falls_when_its_centre_of_mass_is_not_over_its_soles() -> None:
     """A load in the hand moves the centre of mass: inside the soles it stands, outside it falls."""
     robot = biped()

@@ -229,6 +229,8 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         f"# A first strike of {robot.name}, drafted by `impactopt new`.",
         f"# What is {DOUBT} is marked so: put the maker's numbers there. `impactopt check FILE` says more.",
     ]
+    if _guessed_gains(robot).any():
+        head.append(f"# Servo gains, kp and kd, are {DOUBT}: give those of your servos in [robot].")
     for text in drafted.drives.said:
         head.append(f"# {text}.")
     if drafted.wrong:
@@ -291,6 +293,11 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
         if key in data["robot"]:
             count = len(data["robot"][key])
             yield f"guessed, as the {robot_kind(drafted)} has none: {what} of {count} joints"
+    if guessed := int(_guessed_gains(robot).sum()):
+        yield (
+            f"guessed: servo gains of {guessed} joints, kd = 1.5 s x torque limit, at most 150, and kp = "
+            "30/s x kd; give kp_N_m_rad and kd_N_m_s_rad"
+        )
     yield from drafted.drives.said[:3]
     if len(drafted.drives.said) > 3:
         yield f"... and {len(drafted.drives.said) - 3} more such limits: see the file's head"
@@ -299,6 +306,12 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
             f"{len(drafted.wrong)} inertias are none of matter, listed at the file's head: correct them, or "
             'say `inertias = "repaired"` there'
         )
+
+
+def _guessed_gains(robot: Robot) -> NDArray[np.bool_]:
+    """(n,) : joints whose gains are the defaults of a description that has none."""
+    default = np.isclose(robot.kd, 1.5 * np.minimum(100.0, robot.torque_limit)) & ~robot.hinges
+    return np.asarray(default & np.isclose(robot.kp, 30.0 * robot.kd))
 
 
 def _wide(polygon: list[list[float]]) -> bool:

@@ -22,18 +22,19 @@ __all__ = ["FORMATS", "Format", "export", "export_planned"]
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """module : of this package that writes it.  rate [Hz] : usual."""
+    """module : of this package that writes it.  rate [Hz] : usual.  whole : effort is all that moves it."""
 
     module: str
     rate: float = 1000.0
+    whole: bool = False
 
 
 FORMATS: Mapping[str, Format] = {
     "csv": Format(module="csv_files"),
     "ros2": Format(module="ros2"),
     "mcap": Format(module="mcap_file"),
-    "mujoco": Format(module="mujoco_scene"),
-    "mjlab": Format(module="mjlab", rate=50.0),  # policies act at 50 Hz, a frame each time
+    "mujoco": Format(module="mujoco_scene", whole=True),
+    "mjlab": Format(module="mjlab", rate=50.0, whole=True),  # policies act at 50 Hz, a frame each time
 }
 
 
@@ -44,6 +45,7 @@ def export(
     *,
     rate: float | None = None,
     joints: Sequence[str] | None = None,
+    gravity: bool = True,
 ) -> list[Path]:
     """Write a plan for other programs; the files.
 
@@ -51,11 +53,14 @@ def export(
     directory : is made; an earlier export to the same format in it is replaced.
     rate [Hz] : of its rows; 1000, for mjlab 50.
     joints : their order in all columns, each of the robot's once; the robot's own if left out.
+    gravity : False: effort is without the torque that holds the posture against gravity, for arms whose
+        controller adds that itself.
 
     Raises
     ------
     InputError : an unknown format, a plan that is not finished, joints that are no order of the robot's, a
-        directory with something else in it, a package that is missing. Nothing is written then.
+        directory with something else in it, a package that is missing; a robot on soles, or a format that
+        needs the whole effort, without gravity. Nothing is written then.
     """
     usual = _format(to).rate
     # before the record's numbers are computed
@@ -65,7 +70,7 @@ def export(
         raise InputError(f"there is no motion to export: {record.summary['note']}")
     missed = solution.missed_trajectory if solution.plan.abort is not None else None
     planned = Planned(record=record, problem=solution.problem, reference=solution.trajectory, missed=missed)
-    return export_planned(planned, to, directory, rate=rate, joints=joints)
+    return export_planned(planned, to, directory, rate=rate, joints=joints, gravity=gravity)
 
 
 def export_planned(
@@ -75,10 +80,14 @@ def export_planned(
     *,
     rate: float | None = None,
     joints: Sequence[str] | None = None,
+    gravity: bool = True,
 ) -> list[Path]:
     """The same of a plan that was read from a disk."""
     chosen = _format(to)
-    content = export_of(planned, rate=chosen.rate if rate is None else rate, joints=joints)
+    if chosen.whole and not gravity:
+        raise InputError(f"gravity: {to} needs the whole effort; leave gravity at its default")
+    rate = chosen.rate if rate is None else rate
+    content = export_of(planned, rate=rate, joints=joints, gravity=gravity)
     writer = importlib.import_module(f"impactopt.files.export.{chosen.module}")
     return write_directory(Path(directory), to, content.meta, lambda new: writer.write(content, new))
 

@@ -31,6 +31,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import parts_from
 from impactopt.solvers.program import Status
+from impactopt.transcription.plan import Trajectory
 
 __all__ = ["META", "Export", "body_name", "check_export", "export_of", "joint_order", "write_directory"]
 
@@ -123,7 +124,7 @@ class Export:
     """Data that all writers get.
 
     planned : the plan, its problem and its references.  joints : names, in the order of all columns.
-    order (n,) : where these are in the robot's own arrays.  rate [Hz].
+    order (n,) : where these are in the robot's own arrays.  rate [Hz].  gravity : effort bears it.
     motion : as planned.  missed : if nothing is hit, on the same time axis: both coast from contact on, one
     until its contact ends, the other until the abort motion begins.  None where the plan has none.
     """
@@ -132,6 +133,7 @@ class Export:
     joints: tuple[str, ...]
     order: NDArray[np.intp]
     rate: float
+    gravity: bool
     motion: Motion
     missed: Motion | None
 
@@ -170,6 +172,7 @@ class Export:
                 "robot": robot.name,
                 "rate_Hz": self.rate,
                 "jump_s": JUMP,
+                "effort_holds_gravity": self.gravity,
                 "phases": list(PHASES),
                 "joints": self._joints(),
                 "base": None
@@ -222,26 +225,45 @@ class Export:
         return rows
 
 
-def export_of(planned: Planned, *, rate: float, joints: Sequence[str] | None = None) -> Export:
+def export_of(
+    planned: Planned, *, rate: float, joints: Sequence[str] | None = None, gravity: bool = True
+) -> Export:
     """A plan at a rate [Hz].
 
-    joints : their order in all columns; the robot's own if left out.
+    joints : their order in all columns; the robot's own if left out.  gravity : whether effort bears it.
 
     Raises
     ------
-    InputError : the plan is not finished; joints that are no order of the robot's; a rate out of its range.
+    InputError : the plan is not finished; joints that are no order of the robot's; a rate out of its range;
+        a robot on soles without gravity.
     """
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
-    missed = planned.missed
+    reference, missed = planned.reference, planned.missed
+    if not gravity:
+        reference = _without_gravity(reference, robot)
+        missed = None if missed is None else _without_gravity(missed, robot)
     return Export(
         planned=planned,
         joints=tuple(robot.joint_names[k] for k in order),
         order=order,
         rate=rate,
-        motion=motion_at(planned.reference, robot, rate, order, planned.record.arrays),
+        gravity=gravity,
+        motion=motion_at(reference, robot, rate, order, planned.record.arrays),
         missed=None if missed is None else motion_at(missed, robot, rate, order, {}),
     )
+
+
+def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
+    """The reference with less feed-forward: without g(q) of each of its postures."""
+    if robot.floating:
+        raise InputError(
+            "gravity: the legs of a robot on soles bear it, so no torque is gravity's alone; leave it at its "
+            "default"
+        )
+    model, data = robot.model, robot.model.createData()
+    held = np.array([pin.computeGeneralizedGravity(model, data, q) for q in reference.q])
+    return dataclasses.replace(reference, torque=reference.torque - held)
 
 
 def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] | None) -> NDArray[np.intp]:

@@ -32,7 +32,7 @@ class GroundForce(Term):
         metadata=about("largest normal force of all soles, as a share of the weight", least=1.1),
     )
     sole: float = field(
-        default=0.1,
+        default=0.2,
         metadata=about("least normal force of each sole, as a share of the weight", least=0, most=0.45),
     )
 

@@ -392,6 +392,8 @@ class BarrierProblem:
         lower, upper = lower[c.rows], upper[c.rows]
         self._unequal, self._level = np.flatnonzero(lower < upper), lower[c.equal]
         push = options.push if path is None else _PUSH
+        if warm and path is None:  # where multipliers of order one have it
+            push = min(push, self.mu)
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
         kept = path is not None
         self.x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self.mu, kept=kept)

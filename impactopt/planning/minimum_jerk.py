@@ -94,6 +94,7 @@ def minimum_jerk_baseline(
 
 def _fastest(problem: ImpactProblem, duration: float, slow: float, fast: float, tolerance: float) -> float:
     """Speed [m/s] of the fastest reach without contact between one that keeps the limits and a bound."""
+    # limits without contact are cheap, and monotonic in speed
     while fast > (1 + tolerance) * slow:
         middle = float(np.sqrt(fast * slow))
         slow, fast = (middle, fast) if _holds(problem, duration, middle) else (slow, middle)

@@ -42,8 +42,6 @@ NUMERIC = (
     "kinematics/operational_space.py",
     "kinematics/inverse_kinematics.py",
     "kinematics/splines.py",
-    "kinematics/operational_space.py",
-    "kinematics/support.py",
     "kinematics/support.py",
     "planning/clearance_constraints.py",
     "planning/solution.py",
@@ -52,12 +50,9 @@ NUMERIC = (
     "solvers/ipm",
     "solvers/options.py",
     "solvers/program.py",
-    "solvers/program.py",
     "solvers/qp",
     "solvers/run.py",
-    "solvers/run.py",
     "solvers/sqp",
-    "transcription/plan.py",
     "transcription/plan.py",
 )
 # What an engine may know of this package, so that it can contradict the rest of it.

@@ -94,6 +94,8 @@ class Margins:
         ways = np.zeros((1, len(shapes), 3))
         found = shapes.look(self.bodies.placed(self._start), self.most / OF_START, ways, self.wanted)
         exact = np.array([self.bodies.exact_piece(self._start, 0, n) for n in found.pair.tolist()])
+        # constraints are on rounded distances, which are less than the exact ones by up to ROUNDED: so much
+        # less is required of them, or a posture that is allowed would violate them
         least = OF_START * exact - np.minimum(exact - found.gap, ROUNDED)
         least = np.where(found.gap > 0, np.clip(least, 0.0, found.gap / 2), found.gap - SLIP)
         self.pieces[found.pair] = np.minimum(self.pieces[found.pair], least)
@@ -356,6 +358,8 @@ def clearance_violations(
         if here:  # at a place: as bodies are near there, it has constraints from then on
             asked.more(here, pair, found.apart)
             continue
+        # Between nodes a node helps, constraints at the nodes beside it do not, unless no node fits. Normals
+        # that turn round say that one body passes through the other, from one node to the next.
         normals = [bodies.closest(spots.at, k, pair).normal for k in beside]
         if not nodes.add(found, bool(normals[0] @ normals[-1] < 0)):
             asked.more(beside, pair, found.apart)

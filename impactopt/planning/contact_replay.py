@@ -184,6 +184,7 @@ def checked(result: SolverResult, replay: ContactReplay | None) -> SolverResult:
     off, message = replay.off, f"The planned contact is off by {replay.off:.2g} %: {replay}."
     if off <= REFUTED:
         return replace(result, status=Status.ACCEPTABLE, message=message)
+    # counted as a violation, so that other guesses rank before it (`rank_of`), and `Outcome.refused` knows it
     worst = max(result.max_violation, min(off / 100, 1.0), 2 * VIOLATED)
     return replace(result, status=Status.FAILED, max_violation=worst, message=message)
 

@@ -73,6 +73,8 @@ def minimum_jerk_baseline(
 
 
 def _hardest(problem: ImpactProblem, duration: float, fastest: float, tolerance: float) -> Baseline | None:
+    # Limits without contact are cheap, and monotonic in speed: bisection. Those in contact take a replay: a
+    # few, from there downwards.
     slow, fast = 0.01, fastest
     if not _holds(problem, duration, slow):
         return None

@@ -245,6 +245,7 @@ def refine(
     oracle = oracles[-1]
     outcome = refine(outcome, before, solve, budget)
 
+    # an addition changes the motion, so earlier oracles have to agree to it again before this one is asked
     def refined(guess: Guess[Program]) -> Outcome[Program]:
         return refine(solve(guess), before, solve, budget)
 

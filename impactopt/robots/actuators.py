@@ -39,7 +39,7 @@ class Actuator(Described):
     viscous_friction: float | None = field(
         default=None,
         metadata=about(
-            "that the motor overcomes beside the servo's torque; left out: the robot's own",
+            "viscous friction in motor and gear; left out: the robot's own",
             unit="N m s/rad",
             least=0,
             most=STRONGEST,
@@ -48,27 +48,32 @@ class Actuator(Described):
     coulomb_friction: float | None = field(
         default=None,
         metadata=about(
-            "that the motor overcomes beside the servo's torque; left out: the robot's own",
+            "coulomb friction in motor and gear; left out: the robot's own",
             unit="N m",
             least=0,
             most=STRONGEST,
         ),
     )
     continuous_torque: float | None = field(
-        default=None, metadata=about("that the gear bears all the time", unit="N m", above=0, most=STRONGEST)
+        default=None,
+        metadata=about("torque that the gear carries all the time", unit="N m", above=0, most=STRONGEST),
     )
     peak_torque: float | None = field(
         default=None,
-        metadata=about("that the gear bears at each start and stop", unit="N m", above=0, most=STRONGEST),
+        metadata=about(
+            "torque that the gear carries at each start and stop", unit="N m", above=0, most=STRONGEST
+        ),
     )
     momentary_torque: float | None = field(
         default=None,
-        metadata=about("that the gear bears now and then, in a blow", unit="N m", above=0, most=STRONGEST),
+        metadata=about(
+            "torque that the gear carries now and then, in an impact", unit="N m", above=0, most=STRONGEST
+        ),
     )
     stall_torque: float | None = field(
         default=None,
         metadata=about(
-            "where the line of the motor's torque over its speed begins, at rest",
+            "torque of the motor at rest",
             unit="N m",
             above=0,
             most=STRONGEST,
@@ -76,7 +81,12 @@ class Actuator(Described):
     )
     no_load_speed: float | None = field(
         default=None,
-        metadata=about("where that line ends, without torque", unit="rad/s", above=0, most=STRONGEST),
+        metadata=about(
+            "speed of the motor without torque; between the two its torque is linear",
+            unit="rad/s",
+            above=0,
+            most=STRONGEST,
+        ),
     )
     power_limit: float | None = field(
         default=None, metadata=about("mechanical power of the motor", unit="W", above=0, most=STRONGEST)
@@ -84,12 +94,15 @@ class Actuator(Described):
     bandwidth: float | None = field(
         default=None,
         metadata=about(
-            "of the motor's torque, a lag of first order; left out: at once", unit="Hz", above=0, most=FASTEST
+            "bandwidth of the motor's torque, a lag of first order; left out: no lag",
+            unit="Hz",
+            above=0,
+            most=FASTEST,
         ),
     )
     delay: float | None = field(
         default=None,
-        metadata=about("from reading the joint to setting its torque", unit="s", least=0, most=LATEST),
+        metadata=about("delay from reading the joint to setting its torque", unit="s", least=0, most=LATEST),
     )
 
     def __post_init__(self) -> None:

@@ -24,9 +24,9 @@ class SolverOptions:
     acceptable_tolerance : tolerance in place of kkt_tolerance for the status ACCEPTABLE, if no step helps.
     max_iterations : most iterations; then the best iterate is returned.
     time_limit : [s]; then the best iterate is returned.
-    price : first price of violations. It rises by itself; if it is too low, it takes more iterations.
-    price_max : largest price of violations. If it is too low, the end may be infeasible.
-    second_order_correction : whether a refused step is corrected for the curvature of the constraints.
+    price : first price of violations; it rises by itself.
+    price_max : largest price of violations; if it is too low, the end may be infeasible.
+    second_order_correction : whether a refused step is corrected for the constraints' curvature.
     """
 
     violation_tolerance: float = 1e-6
@@ -70,8 +70,7 @@ class IPMOptions(SolverOptions):
     complementarity_tolerance : largest product of a multiplier and the distance to its bound at a solution.
         The objective's error is at most this times the number of active bounds.
     barrier : first barrier parameter of an initial guess without multipliers.
-    barrier_warm : the same of one with multipliers. Below 5e-3 it falls at once where the initial guess is
-        near a solution.
+    barrier_warm : the same of one with multipliers; below 5e-3 it falls at once near a solution.
     push : how far the initial guess is moved inside its bounds; one with multipliers no farther than its
         barrier.
     """

@@ -106,6 +106,7 @@ class ActiveSystem:
         if proximal:
             H = sp.csc_array(H + proximal * sp.eye_array(n))
         soft = np.concatenate([self._soft_rows[self._rows], self._soft_bounds[self._bounds]])
+        # A dx - (slack / multiplier) dy = -off: the linearization of slack x multiplier = mu
         self._matrix = sp.csc_array(sp.block_array([[H, A.T], [A, sp.diags_array(-soft)]]))
         self._factors: dict[float, Any] = {}
 
@@ -310,6 +311,8 @@ class _QP:
             if d is None or not np.isfinite(d).all():
                 return False
             moved = np.concatenate([self._jacobian @ d, d])[rows]
+            # later steps end where the augmented Lagrangian is least: full ones may jump between active sets
+            # for ever
             part = 1.0 if not k else self._length(d - self.d, at, moved - at)
             short += part < _SHORT
             if short == _JAMMED:

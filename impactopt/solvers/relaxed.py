@@ -56,6 +56,8 @@ class RelaxedProgram:
         size = m
         for k, relaxed in enumerate(relaxations):
             i, j, unit = relaxed.rows, relaxed.variables, relaxed.unit
+            # A constraint with both bounds cannot move both by one coefficient: its lower side becomes a
+            # constraint of its own, as bounds of variables do.
             both = np.isfinite(lower[i]) & np.isfinite(upper[i])
             coupled += [(i[np.isfinite(upper[i])], k, -unit), (i[~np.isfinite(upper[i])], k, unit)]
             parts = [

@@ -206,6 +206,8 @@ class Collocated:
         slope = Affine.zeros(group.size)
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + group[m] * w
+        # the slope of the polynomial through the element's begin and its stages, by Radau's A^-1: the values
+        # at the stages with `weights`, that at the begin with `start`
         begins = s.previous < 0 or (anew and s.new_phase)
         before = start if begins else group[s.previous]
         return group[i], slope + before * s.start

@@ -322,11 +322,14 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
         push, change
     )  # speed that the impulse takes from the hand; I over it is the effective mass
     approach = ca.dot(push, c.velocity(y, legs, u0)) - before
+    # zeta = d / (2 sqrt(k mu)), with 1/mu = 1/m_a + 1/m_t
     stiff = damping / 2 * ca.sqrt((lost / blow + inverse_mass) / stiffness)
     e = rigid * given + (1 - rigid) * two_mass_restitution(stiff)
     out = {
+        # 0.1 s of the limits' forces: impulses of order one
         "base": balance[: c.base, :] / (0.1 * base_scale(c, weight, lever)),
         "joints": balance[c.base :] / (0.1 * limit),
+        # the target gains I / m_t, the hand loses I / m_a: what approached with v_c parts with e v_c
         "blow": blow * inverse_mass + lost - (1 + e) * approach,
     }
     p = [normal, rigid, given, stiffness, damping, inverse_mass, before, limit, weight, lever]
@@ -383,6 +386,8 @@ def two_mass_restitution(ratio: Any) -> Any:
     ratio: the damping over the critical one, of the reduced mass: zeta = d / (2 sqrt(k mu)).
     e = exp(-zeta arccos(zeta) / sqrt(1 - zeta^2)), continued through zeta = 1 by its series.
     """
+    # Near zeta = 1 both forms are 0/0; the series is right to 3e-10 there. All branches are evaluated, so
+    # each gets an argument at which it is finite.
     below, above = ca.fmin(ratio, 0.99), ca.fmax(ratio, 1.01)
     x = 1 - ratio
     near = 1 + x / 3 + 2 * x**2 / 15 + 2 * x**3 / 35
@@ -409,5 +414,5 @@ def chosen_gains(stiffness: Any, damping: Any, logs: Any, chosen: Joints) -> tup
     for k, joints in enumerate(chosen):
         for joint in joints:
             stiffness[joint] *= ca.exp(logs[k])
-            damping[joint] *= ca.exp(logs[k] / 2)
+            damping[joint] *= ca.exp(logs[k] / 2)  # the damping ratio stays
     return stiffness, damping

@@ -69,6 +69,8 @@ def effective_mass(
     speed, m = float((rows @ v).mean()), len(held)
     both = np.vstack([held, rows])
     inner = both @ np.linalg.solve(bodies[0].inertia, both.T)
+    # j P j' with the P of docs/notation.md: the inverse mass of the strikers on fixed soles, whose Delassus
+    # matrix is singular at a straight knee: least squares
     yields = inner[m:, m:] - inner[m:, :m] @ np.linalg.lstsq(inner[:m, :m], inner[:m, m:], rcond=1e-12)[0]
     mass = float(np.linalg.solve(yields, np.ones(len(rows))).mean())
     return mass, speed if abs(speed) > SLOW else SLOW
@@ -163,6 +165,7 @@ def blow(
     """
     speed = max(speed, float(target.speed_before()) + CLOSING)
     for k in range(2 * TRIES if target.guards else 1):
+        # nearest speeds first, slower and faster in turn
         at = speed * FASTER ** ((k + 1) // 2 * (1 if k % 2 else -1))
         time, rows = _histories(law, target, mass, at)
         ends = _phases(time, rows, target)

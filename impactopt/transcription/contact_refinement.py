@@ -104,6 +104,7 @@ def refined_elements(error: ContactError | None, elements: Elements, asked: floa
     for lengths, errors, loads in zip(elements, error.of_elements, error.strained or none, strict=True):
         phase: list[float] = []
         for h, e, load in zip(lengths, errors, loads, strict=True):
+            # p parts of an element have 1 / p^order of its error: as many as bring it to its share
             parts = int(np.clip(np.ceil((e / share) ** (1 / _ORDER)), 1, _PARTS))
             parts = max(parts, 2) if error.missed or load else parts
             phase += [h / parts] * parts
@@ -174,6 +175,8 @@ class _Again:
             free = np.setdiff1d(np.arange(program.n), np.concatenate([*held, *times]))
             return free, np.flatnonzero(equal & (timed | ~events))
 
+        # With free durations each phase ends at its event; where an event does not come, or two strikers have
+        # one each, phases last as long as in the plan.
         before = z.copy()
         try:
             if self._builder.problem.second is not None:

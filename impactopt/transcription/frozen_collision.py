@@ -224,8 +224,10 @@ class FrozenCollision(Collision):
     def _freeze(self, k: int) -> _Freeze:
         state, u0 = self.contact.state, self.contact.u0[0]
         if not self.freezes:
+            # v_meet of docs/notation.md: hand and target move at one speed, after the impulse that this takes
             met = u0 if self._meeting is None else u0 + self._meeting.du[0]
             return _Freeze(0, 0.0, state.y, met, state.legs)
+        # in the middle of its segment: the midpoint rule, whose error falls with 1 / freezes^2
         phase, place = place_of((k + 0.5) / self.freezes, self.shares)
         s = self._element_at(phase, place)
         at = [self._ends(s)[0], *(self.stages[m].place for m in s.members)]

@@ -51,6 +51,7 @@ def strike_rates(
 
     h = 1e-6
     jac = np.stack([(point(y + h * e) - point(y - h * e)) / (2 * h) for e in np.eye(c.ny)], axis=1)
+    # least |rates / weight|, by the substitution rates = weight r
     weight = np.ones(c.ny)
     weight[: c.base] = base
     return np.asarray(weight * np.linalg.lstsq(jac * weight, np.tile(velocity, len(frames)), rcond=None)[0])
@@ -95,6 +96,7 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     hit = reached(t, speed=speed, noise=noise, seed=seed)
     zero, (swing_T, follow_T) = np.zeros(len(t.y0)), _durations(t)
     swing = quintic(t.y0, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
+    # half of the rates is left after contact, as where two like masses meet
     back = quintic(hit.y, 0.5 * hit.rates, t.y0, zero, follow_T, t.follow.breaks)
     x = _motion(
         t,
@@ -289,6 +291,7 @@ def _least_accelerations(
     """
     factors, count = rate_weights(breaks), len(breaks) + 2
     nodes = with_middles(breaks)
+    # weighted by the root of a node's part of the time, so that squares sum up to the integral
     accelerations = basis(breaks, nodes)[2] * np.sqrt(np.gradient(nodes))[:, None]
     c, limits = t.coordinates, t.builder.limits
     limit = np.concatenate([np.full(c.base, np.inf), limits.rate_limit[c.independent]])
@@ -306,6 +309,7 @@ def _least_accelerations(
                 points[2] = points[1]
                 held.append(2)
             points[-1] = end[k]
+            # three points with the end's rate between them: no acceleration there
             points[-2] = points[-1] - u1 / factors[-1]
             points[-3] = points[-2] - u1 / factors[-2]
             free = np.setdiff1d(np.arange(count), held)

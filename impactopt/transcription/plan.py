@@ -76,6 +76,7 @@ def complete_reference(
         q[k], v[k], a[k], jac = c.closing.motion(y[k], yd[k], ydd[k], leg)
         tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
         if c.legs:
+            # least |cost dw|^2 with B' dw = miss: dw = C^-2 B (B' C^-2 B)^-1 miss, base = B' C^-1
             base = jac[:, c.undriven].T / cost[k]
             miss = tau[c.undriven] - jac[:, c.undriven].T @ wrench[k]
             corrected[k] = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / cost[k]

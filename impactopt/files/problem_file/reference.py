@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
@@ -95,9 +96,9 @@ def _left_out(data: dict[str, Any]) -> list[str]:
 _INTRODUCTION = """\
 # Problem files
 
-A problem file has all arguments of `impactopt.ImpactProblem`, in [TOML](https://toml.io). It is data: nothing
-in it is executed. Units are SI; the unit of a quantity is part of its key's name. Keys and sections that are
-left out keep their defaults.
+A problem file has all arguments of `impactopt.ImpactProblem`, in [TOML](https://toml.io); nothing
+in it is executed. Units are SI, and part of a key's name. Keys and sections that are left out keep their
+defaults. In parentheses below: what is permitted, and the default.
 
 ```sh
 impactopt new                                 # lists the problems that come with the package
@@ -106,49 +107,40 @@ impactopt check my.toml                       # names all mistakes: where, what 
 impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit may be left out
 ```
 
-`--set` takes a key path and a value as in TOML, and can be repeated. An entry of a list has its index from 0
+`--set` takes a key path and a value as in TOML. An entry of a list has its index from 0
 (`--set problem.point.1=-0.2`); one of several sections has its index or its name
 (`--set scenarios.missing.abort_after=0.03`).
 
 In Python `impactopt.load_problem("my.toml")` reads a file, and `impactopt.write_problem(problem)` writes one
-without defaults. `problem.hash` does not depend on how a problem was written. A contact law, target, term or
-robot that is made in Python, of functions or models, cannot be written to a file.
+without defaults. What is made in Python, of functions or models, cannot be written to a file.
 
 ## Limits
 
-Larger values are mistakes in a unit or a key, or would keep a machine busy for hours. They are refused before
-work starts, and the message names the limit.
+Larger values are refused before work starts: they are mistakes in a unit or a key, or would take hours.
 
-| what | at most | why |
-|---|---|---|
+| | at most |
+|---|---|
 {limits}
 
 This page is made by `impactopt new --reference`.
 """
-# what, how much, and why
+# what, and how much at most
 _LIMITS = (
-    ("a file", f"{LONGEST_TEXT / 2**20:g} MiB", "400 times the longest of the package's; read in seconds"),
-    (
-        "tables and lists in each other",
-        f"{DEEPEST} deep",
-        "files are five deep; parsers end at some hundred",
-    ),
-    ("a key of `--set`", f"{LONGEST_KEY} characters", "the longest has 50"),
-    ("any number", f"{MOST:g}", "products of three such numbers are still numbers"),
-    ("numbers of law and target, where not 0", f"at least {1 / MOST:g}", "likewise, of quotients"),
-    ("a place or a length [m]", f"{FARTHEST:g}", "farther from the robot no rounding is small beside a gap"),
-    ("a mass [kg] or an inertia [kg m2] of the robot", f"{HEAVIEST:g}", "a ship"),
-    (
-        "a phase's duration [s]",
-        f"{SHORTEST:g} to {LONGEST:g}",
-        "no servo is faster, no blow takes longer",
-    ),
-    ("a phase's `intervals`", f"{FINEST}", "at 1 s as often as a servo of 4 kHz samples"),
-    ("a phase's `grading`", f"1 to {STEEPEST:g}", "steeper ones leave intervals of no length"),
-    ("`[collision] duration_s` [s]", f"{LONGEST_CONTACT:g}", "a blow takes some milliseconds"),
-    ("`[collision] elements`", f"{MOST_ELEMENTS} a phase", "two are within a few per mille"),
-    ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each", "each is part of the program"),
+    ("a file", f"{LONGEST_TEXT / 2**20:g} MiB"),
+    ("tables and lists in each other", f"{DEEPEST} deep"),
+    ("a key of `--set`", f"{LONGEST_KEY} characters"),
+    ("any number", f"{MOST:g}"),
+    ("parameters of law and target, where not 0", f"at least {1 / MOST:g}"),
+    ("a position or a length [m]", f"{FARTHEST:g}"),
+    ("a mass [kg] or an inertia [kg m2] of the robot", f"{HEAVIEST:g}"),
+    ("a phase's duration [s]", f"{SHORTEST:g} to {LONGEST:g}"),
+    ("a phase's `intervals`", f"{FINEST}"),
+    ("a phase's `grading`", f"1 to {STEEPEST:g}"),
+    ("`[collision] duration_s` [s]", f"{LONGEST_CONTACT:g}"),
+    ("`[collision] elements`", f"{MOST_ELEMENTS} a phase"),
+    ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each"),
 )
+_SEVERAL = 4  # keys that sections share are listed once
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
 
@@ -156,16 +148,18 @@ def reference() -> str:
     """The page, in Markdown."""
     limits = "\n".join(f"| {' | '.join(row)} |" for row in _LIMITS)
     parts = [_INTRODUCTION.replace("{limits}", limits)]
+    seen: dict[tuple[str, ...], str] = {}
     several: dict[str, Mapping[str, type[Section]]] = {"target": TARGETS, "contact": LAWS}
     for name, info in File.model_fields.items():
         kinds = several.get(name, {})
         for kind, section in kinds.items():
             (choice,) = (i.alias or n for n, i in section.model_fields.items() if n == section.choice)
-            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section))
+            usual = ". The default" if kind == section.model_fields[section.choice].default else ""
+            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, seen, usual))
         below = _sections(name, info)
         if kinds:
             next(below)  # the section itself, which its kinds have said all of
-        parts += [_part(header, section) for header, section in below]
+        parts += [_part(header, section, seen) for header, section in below]
     return "\n".join(parts)
 
 
@@ -188,21 +182,41 @@ def _inner(info: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
     return (kind, many) if isinstance(kind, type) and issubclass(kind, BaseModel) else (None, many)
 
 
-def _part(header: str, section: type[BaseModel]) -> str:
-    keys = {n: i for n, i in section.model_fields.items() if _inner(i)[0] is None}
-    lines = [f"## `{header}`", "", f"{about_section(section)}.", ""]
-    if keys:
-        lines += ["| key | | value | default |", "|---|---|---|---|"]
+def _part(header: str, section: type[BaseModel], seen: dict[tuple[str, ...], str], usual: str = "") -> str:
+    """A section and its keys; `seen` has those of earlier sections, so that none is listed twice."""
+    lines = [f"## `{header}`", "", f"{about_section(section)}{usual}."]
+    keys = list(_keys(section))
+    known = max(seen, key=lambda other: _alike(keys, other), default=())
+    same = _alike(keys, known)
+    if same >= _SEVERAL or (same > 1 and same == len(keys) == len(known)):
+        last = "" if same == len(known) else f" up to {known[same - 1].split()[1]}"
+        lines[-1] += f" Keys: as in `{seen[known]}`{last}{', and' if same < len(keys) else '.'}"
+        keys = keys[same:]
+    elif keys:
+        seen[tuple(keys)] = header
+    lines += ["", *keys] if keys else []
+    return "\n".join([*lines, ""])
+
+
+def _alike(keys: Sequence[str], others: Sequence[str]) -> int:
+    """Number of keys that two sections begin with."""
+    return next(
+        (k for k, (a, b) in enumerate(zip(keys, others, strict=False)) if a != b), min(len(keys), len(others))
+    )
+
+
+def _keys(section: type[BaseModel]) -> Iterator[str]:
+    """A line for each key that stands in the section itself."""
     usual = section.defaults() if issubclass(section, Section) else {}
-    for name, info in keys.items():
+    for name, info in section.model_fields.items():
+        if _inner(info)[0] is not None or name == getattr(section, "choice", ""):
+            continue  # a section of its own; or the header has it
         if info.is_required():
-            default = "**needed**"
+            default = "; **needed**"
         else:
             value = usual.get(name, info.default)
-            default = "" if value is None or np.size(value) == 0 else f"`{_show(value)}`"
-        about = (info.description or "").replace("|", "\\|")
-        lines.append(f"| `{info.alias or name}` | {about} | {_allowed(info)} | {default} |")
-    return "\n".join([*lines, ""] if keys else lines)
+            default = "" if value is None or np.size(value) == 0 else f"; `{_show(value)}`"
+        yield f"- `{info.alias or name}` ({_allowed(info)}{default}): {info.description}"
 
 
 def _allowed(info: FieldInfo) -> str:
@@ -213,7 +227,10 @@ def _allowed(info: FieldInfo) -> str:
     if get_origin(info.annotation) is Literal:
         return ", ".join(f"`{_show(choice)}`" for choice in get_args(info.annotation))
     if info.annotation in _TYPES:
-        return f"{_TYPES[info.annotation]} {range_of(info)}".strip()
+        limits = re.sub(r"^>= (\S+) and <= (\S+)$", r"\1 to \2", range_of(info))
+        return (
+            limits if limits and info.annotation is float else f"{_TYPES[info.annotation]} {limits}".strip()
+        )
     if get_origin(info.annotation) is dict:
         return "table by name" if str in get_args(info.annotation) else "table"
     length = next((m.min_length for m in info.metadata if hasattr(m, "min_length")), None)

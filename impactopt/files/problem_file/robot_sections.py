@@ -53,11 +53,10 @@ class SoleSection(Section):
     rotation: Rotation = optional("rotation of a new frame in its parent: a matrix by rows; left out: none")
 
     hinge: Literal["x", "y", "z"] = optional(
-        "axis of the frame about which the foot may turn on the sole, where five joints hold it: the sole "
-        "bears no moment about it"
+        "axis of the frame about which the foot may turn on the sole, of a leg of five joints"
     )
     hinge_range: Positive = optional(
-        "how far a plan may turn the foot so, either way; left out: 0.005 [rad]", "hinge_range_rad"
+        "how far a plan may turn the foot so, either way [rad]", "hinge_range_rad"
     )
 
     @model_validator(mode="after")
@@ -90,10 +89,10 @@ class GripSection(Section):
 
     kind = SoftGrip
     axis: Vector = required("unit vector in the frame that the tool turns about")
-    stiffness: Positive = required("of the spring [N m/rad]", "stiffness_N_m_rad")
-    damping: Positive = required("of the damper [N m s/rad]", "damping_N_m_s_rad")
-    point: Vector = optional("on the axis, in the frame; left out: its origin [m]", "point_m")
-    range: Positive = optional("how far the tool may turn either way; left out: 1 [rad]", "range_rad")
+    stiffness: Positive = required("stiffness of the spring [N m/rad]", "stiffness_N_m_rad")
+    damping: Positive = required("damping of the damper [N m s/rad]", "damping_N_m_s_rad")
+    point: Vector = optional("a point on the axis, in the frame [m]", "point_m")
+    range: Positive = optional("how far the tool may turn either way [rad]", "range_rad")
 
 
 class ToolSection(Section):
@@ -157,7 +156,7 @@ class RobotSection(Section):
     A preset keeps its own strikers beside the section's.
     """
 
-    preset: Preset = optional("name of a preset: see `impactopt robots`")
+    preset: Preset = optional("see `impactopt robots`")
     urdf: str = optional("the robot's URDF, in place of a preset")
     mjcf: str = optional(
         "the robot's MJCF, in place of a preset: with its armature, friction, actuators, keyframes, sites"
@@ -169,15 +168,11 @@ class RobotSection(Section):
     inertias: Literal["given", "repaired"] = optional(
         '"repaired": those that no body can have are changed to ones that it can; `check` lists them'
     )
-    armature: PerJoint = optional(
-        "reflected rotor inertia, of all joints or by joint [kg m2]", "armature_kg_m2"
-    )
-    kp: PerJoint = optional("servo stiffness, of all joints or by joint [N m/rad]", "kp_N_m_rad")
-    kd: PerJoint = optional("servo damping, of all joints or by joint [N m s/rad]", "kd_N_m_s_rad")
-    torque_limit: PerJoint = optional("torque limit, of all joints or by joint [N m]", "torque_limit_N_m")
-    velocity_limit: PerJoint = optional(
-        "velocity limit, of all joints or by joint [rad/s]", "velocity_limit_rad_s"
-    )
+    armature: PerJoint = optional("reflected rotor inertia, of all or by joint [kg m2]", "armature_kg_m2")
+    kp: PerJoint = optional("servo stiffness, of all or by joint [N m/rad]", "kp_N_m_rad")
+    kd: PerJoint = optional("servo damping, of all or by joint [N m s/rad]", "kd_N_m_s_rad")
+    torque_limit: PerJoint = optional("torque limit, of all or by joint [N m]", "torque_limit_N_m")
+    velocity_limit: PerJoint = optional("velocity limit, of all or by joint [rad/s]", "velocity_limit_rad_s")
     position_limit: dict[str, Range] = optional("limits [lower, upper] by joint [rad]", "position_limit_rad")
     disable_collisions: list[Pair] = optional("pairs of links that may pass through each other")
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")

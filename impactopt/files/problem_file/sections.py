@@ -242,12 +242,12 @@ class ProblemSection(Section):
     """The robot, its striker, and where it hits."""
 
     name: str = optional("what reports call the problem")
-    robot: Preset = optional("a preset: see `impactopt robots`; or there is a section [robot]")
+    robot: Preset = optional("see `impactopt robots`; or there is a section [robot]")
     striker: str = required("name of the robot's striker that hits")
     point: Vector = required(
         "where the striking point meets the target: x forward, y left, z up from the ground [m]", "point_m"
     )
-    normal: UnitVector = required("direction in which the target is pushed: a unit vector")
+    normal: UnitVector = required("direction in which the target is pushed")
     start: Posture = Field(
         default=ImpactProblem.start,
         description="posture to start from, at rest: its name, or a configuration, as Pinocchio has them",
@@ -338,8 +338,8 @@ class ObjectiveSection(Section):
     """The motion's style, and small prices that make the optimum unique."""
 
     style: Literal["natural", "strongest"] = optional(
-        '"natural": prices on jerk, on the travel of joints, above all of idle ones, and on ending away from '
-        'the start posture; "strongest": none'
+        '"natural": prices on jerk, on the travel of joints and on ending away from the start posture; '
+        '"strongest": none'
     )
     motion_price: NotNegative = optional("largest share of the objective that the style's prices may take")
     price_scale: NotNegative = optional("factor on the style's prices, as a plan has reduced them")

@@ -16,7 +16,7 @@ from impactopt.problem.terms.base import check_known, kind_of
 
 __all__ = ["WEIGHT", "Objective", "check_objectives"]
 
-WEIGHT = about("value of one unit of the quantity", unit="N s a unit", key="weight")
+WEIGHT = about("value of one unit", unit="N s", key="weight")
 
 
 @dataclass(frozen=True, kw_only=True)

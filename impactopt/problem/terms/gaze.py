@@ -30,7 +30,7 @@ class Gaze(Term):
     name: ClassVar[str] = "gaze"
     unit: ClassVar[str] = "rad"
     frame: str = field(metadata=about("name of the robot's frame"))
-    axis: Vector = field(metadata=about("direction of view: a unit vector in the frame", direction=True))
+    axis: Vector = field(metadata=about("direction of view, in the frame", direction=True))
     angle: float = field(
         default=0.5,
         metadata=about(

@@ -24,13 +24,11 @@ class HandOrientation(Term):
 
     name: ClassVar[str] = "hand orientation"
     unit: ClassVar[str] = "rad"
-    axis: Vector = field(
-        metadata=about("axis of the hand: a unit vector in the striker's frame", direction=True)
-    )
+    axis: Vector = field(metadata=about("axis of the hand, in the striker's frame", direction=True))
     direction: Vector | None = field(
         default=None,
         metadata=about(
-            "where the axis points at contact: a unit vector in the world frame; left out: the normal",
+            "where the axis points at contact, in the world frame; left out: the normal",
             direction=True,
         ),
     )

@@ -29,7 +29,8 @@ class ControllerSettings(Described):
     """
 
     rate: float = field(
-        default=1000.0, metadata=about("of control", unit="Hz", least=100, most=10_000, key="rate_Hz")
+        default=1000.0,
+        metadata=about("sampling rate of the control", unit="Hz", least=100, most=10_000, key="rate_Hz"),
     )
     delay: float = field(
         default=1e-3,
@@ -38,34 +39,33 @@ class ControllerSettings(Described):
     noise: float = field(
         default=1.0, metadata=about("factor of the sensors' errors; 0: none", least=0, most=100)
     )
-    seed: int = field(default=0, metadata=about("of the sensors' errors", least=0))
+    seed: int = field(default=0, metadata=about("seed of the sensors' errors", least=0))
     impact: str = field(
         default="planned",
         metadata=about(
-            "about the blow: feedback on (none); without what an impulse at the hand does to velocities "
-            "(project); the motion before it goes on until the hand is free (spread); both; in contact the "
-            "joints' servos, which the plan counts on, and both (planned)",
+            "feedback about the impact: as always (none), impact-invariant projection (project), reference "
+            "spreading (spread), both, or both with the plan's servos in contact (planned)",
             choices=IMPACTS,
         ),
     )
     follow: str = field(
         default="recover",
         metadata=about(
-            "after the blow: the plan's follow-through (plan), or soon the same at a slower pace, with the "
-            "centre of mass farther from the soles' edges (recover)",
+            "after the impact: the plan's follow-through (plan), or the same, slower and with the centre of "
+            "mass farther inside the soles (recover)",
             choices=FOLLOWS,
         ),
     )
     recovery_start: float = field(
-        default=0.2, metadata=about("of the recovery, after the blow", unit="s", least=0, most=1000)
+        default=0.2, metadata=about("begin of the recovery, after the impact", unit="s", least=0, most=1000)
     )
     recovery_pace: float = field(
-        default=0.5, metadata=about("of the recovery; 1: the plan's", above=0, most=1)
+        default=0.5, metadata=about("pace of the recovery; 1: the plan's", above=0, most=1)
     )
     recovery_margin: float = field(
         default=0.1,
         metadata=about(
-            "of the centre of mass to the soles' edges after it, or the most they have",
+            "distance of the centre of mass to the soles' edges after it, or the most that they have",
             unit="m",
             least=0,
             most=1,
@@ -74,7 +74,7 @@ class ControllerSettings(Described):
     draw_back: float = field(
         default=0.03,
         metadata=about(
-            "of a hand with a tool in a soft grip after the blow: the tool swings on, and would touch again",
+            "how far a hand with a tool in a soft grip draws back after the impact",
             unit="m",
             least=0,
             most=1,
@@ -90,35 +90,41 @@ class ControllerSettings(Described):
     )
     sole_bandwidth: float = field(
         default=25.0,
-        metadata=about("of the feedback that keeps the soles flat", unit="rad/s", least=0, most=1000),
+        metadata=about(
+            "bandwidth of the feedback that keeps the soles flat", unit="rad/s", least=0, most=1000
+        ),
     )
     blow: float = field(default=1000.0, metadata=_weight("torques in contact, against the plan's servos"))
     capture_gain: float = field(
-        default=4.0, metadata=about("of the divergent component of motion", unit="1/s", least=0, most=1000)
+        default=4.0,
+        metadata=about("gain of the divergent component of motion", unit="1/s", least=0, most=1000),
     )
     momentum_gain: float = field(
-        default=5.0, metadata=about("of the angular momentum", unit="1/s", least=0, most=1000)
+        default=5.0, metadata=about("gain of the angular momentum", unit="1/s", least=0, most=1000)
     )
     hand_bandwidth: float = field(
-        default=20.0, metadata=about("of the hand's feedback", unit="rad/s", least=0, most=1000)
+        default=20.0, metadata=about("bandwidth of the hand's feedback", unit="rad/s", least=0, most=1000)
     )
     posture_bandwidth: float = field(
-        default=15.0, metadata=about("of the posture's feedback", unit="rad/s", least=0, most=1000)
+        default=15.0, metadata=about("bandwidth of the posture's feedback", unit="rad/s", least=0, most=1000)
     )
     recovery_bandwidth: float = field(
-        default=12.0, metadata=about("of the same in the recovery", unit="rad/s", least=0, most=1000)
+        default=12.0,
+        metadata=about("bandwidth of the same in the recovery", unit="rad/s", least=0, most=1000),
     )
     friction: float = field(
-        default=0.6, metadata=about("coefficient between soles and floor that it counts on", above=0, most=10)
+        default=0.6, metadata=about("friction coefficient of the floor that it counts on", above=0, most=10)
     )
     cop_margin: float = field(
         default=0.003,
-        metadata=about("of a sole's centre of pressure from its edges", unit="m", least=0, most=1),
+        metadata=about("distance of a sole's centre of pressure from its edges", unit="m", least=0, most=1),
     )
     least_force: float = field(
-        default=10.0, metadata=about("normal force of each sole", unit="N", least=0, most=1e6)
+        default=10.0, metadata=about("least normal force of each sole", unit="N", least=0, most=1e6)
     )
-    iterations: int = field(default=30, metadata=about("of OSQP in each QP", least=1, most=100_000))
+    iterations: int = field(
+        default=30, metadata=about("iterations of OSQP in each QP", least=1, most=100_000)
+    )
 
     def __post_init__(self) -> None:
         for f, told in abouts(type(self)):

@@ -406,6 +406,7 @@ class Condenser:
 
     def expand_basis(self, Z: np.ndarray) -> None:
         """Steps of eliminated variables for those of the free ones, each a column of Z (n, k), in place."""
+        # backwards: what a system determines may depend on variables that later ones determine
         for a in reversed(self._stages):
             Z[a.e] = -(a.X.swapaxes(1, 2) @ Z[a.c])
 

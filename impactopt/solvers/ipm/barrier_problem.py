@@ -186,6 +186,8 @@ class Elastic:
 
     def compliance(self, y: Vector, mu: float) -> tuple[Vector, Vector]:
         """Compliance of a row per unit of multiplier, and the offset that goes with it."""
+        # p (price - y) = mu and n (price + y) = mu, linearized, give the steps of p and n as in `step`. Put
+        # into J d + r = (p + dp) - (n + dn), they leave J d + (r - p + n) + offset = give y_new.
         zp, zn = self._below_price(y)
         give = self._p / zp + self._n / zn
         return give, give * y - (mu / zp - self._p) + (mu / zn - self._n)
@@ -292,6 +294,8 @@ class Filter:
             return False
         if any(theta >= t and phi >= p for t, p in self.pairs):
             return False
+        # Where a step is to lessen phi, a little less violation is not enough: the iterates would go to a
+        # feasible point that is no optimum.
         if at.theta <= self.least and at.switches(length):
             return at.falls(length, phi)
         return theta <= (1.0 - _VIOLATION) * at.theta or phi <= at.phi - _OBJECTIVE * at.theta
@@ -420,6 +424,7 @@ class BarrierProblem:
             kept=kept,
         )
         if not warm:
+            # without multipliers from before: one for each bound (section 3.6)
             for values in (self.x, self.s):
                 values.below, values.above = np.sign(values.below), np.sign(values.above)
 
@@ -458,6 +463,7 @@ class BarrierProblem:
         z[c.free] = self.x.multiplier
         z[c.bounded] = everything[p.m :]
         dual = self.sigma * point.gradient + point.jacobian.T @ y + z
+        # what does not move is stationary with whatever multiplier of its bound makes it so
         held = c.free[self.newton.held]
         z[held] -= dual[held]
         dual[held] = 0.0
@@ -478,7 +484,7 @@ class BarrierProblem:
         if self.elastic is not None:
             off, left = max(off, self.elastic.off(self.y, mu)), self.elastic.residual(left)
         violation = max(float(np.abs(v).max(initial=0.0)) for v in (left, residual[c.eliminated]))
-        off /= max(_LARGE, bounds / count) / _LARGE
+        off /= max(_LARGE, bounds / count) / _LARGE  # s_c of eq. 6; `scale` is its s_d
         if not mu:  # in units of the one tolerance that all is compared with
             off *= self.options.kkt_tolerance / self.options.complementarity_tolerance
         return max(max(self._dual, slack) / scale, violation, off)
@@ -532,6 +538,8 @@ class BarrierProblem:
         q[c.free] += self.x.slope(self.mu)
         if self.elastic is not None:
             r[c.rows] = self.elastic.residual(r[c.rows])
+        # A slack's own equation y = slope + stiffness ds, put into its constraint J d + r = ds, leaves
+        # y = stiffness (J d + r + slope / stiffness): a weight and an offset, and no slack in the matrix.
         r[c.rows] += self._offsets
         d, everything = self.newton.solve(q, r, _LEFT * self.mu)
         y = everything[c.rows]
@@ -595,6 +603,7 @@ class BarrierProblem:
         x, s, mu, keep = self.x, self.s, self.mu, self.keep
         below_x, above_x, dual_x = x.dual_step(step.free, mu, keep)
         below_s, above_s, dual_s = s.dual_step(step.slack, mu, keep)
+        # multipliers of constraints go as far as the variables do, those of bounds as they may (eq. 14)
         dual, part = min(dual_x, dual_s), length
         if self.elastic is not None:
             part = dual = min(dual, self.elastic.longest_dual(step.y, self.y, keep))

@@ -125,6 +125,7 @@ def _searched(
         trial = problem.trial(step, length)
         if _accepts(among, at, length, trial):
             return Found(step, trial, length, [])
+        # only a first trial with more violation is corrected (step ): a shorter one is nearly linear
         if trials == 1 and trial.theta >= at.theta and problem.options.second_order_correction:
             found = _corrected(problem, among, at, residual, trial, longest)
             if found is not None:
@@ -144,6 +145,7 @@ def _corrected(
     for k in range(_CORRECTIONS):
         if not trial.point.finite:
             break
+        # c_soc = alpha c(x) + c(x + alpha d): the same matrix, another right-hand side (section 2.4)
         left = longest * left + problem.residual(trial.point, trial.slack)
         step = problem.step_again(left)
         trial = problem.trial(step, problem.longest(step))

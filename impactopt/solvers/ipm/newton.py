@@ -203,7 +203,7 @@ _HELD = 1e15  # on the diagonal of variables that must not move
 _FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
 _SMALL = 1e-5  # none is tried before a shift that would be smaller
 _RELATIVE = 0.1  # the first shift is at most this part of the Hessian's largest entry
-_GROW, _GROW_FIRST, _SHRINK = 8.0, 100.0, 3.0
+_GROW, _GROW_FIRST, _SHRINK = 8.0, 100.0, 3.0  # kappa_w+, its first value, 1 / kappa_w- (same section)
 
 
 class NewtonSystem:
@@ -292,6 +292,9 @@ class NewtonSystem:
 
     def _penalty(self) -> Vector:
         """Weights of the equalities left: far above the curvature along them, and no farther."""
+        # The term is constant on steps that meet A d = -off, so it changes none. And a matrix that is
+        # positive definite on A's null space becomes so altogether for a weight that is large enough
+        # (Debreu's lemma): then Cholesky's success says that the inertia is right.
         squares = self._A**2
         length = np.maximum(1e-30, squares.sum(axis=1))
         curvature = squares @ np.abs(self.condenser.curvature) / length
@@ -300,6 +303,8 @@ class NewtonSystem:
 
     def _first(self) -> float:
         """The shift to try first: after an iteration that needed one, a smaller one instead of none."""
+        # The paper tries none first. Where the Hessian was indefinite it mostly still is, and that try costs
+        # a factorization an iteration.
         shift = self._smaller() if self.shift else 0.0
         return shift if shift > _SMALL else 0.0
 
@@ -364,6 +369,7 @@ class NewtonSystem:
         rows = np.concatenate([self._jacobian @ d, d[c.bounded]])
         y = w * rows
         dual = g + self._hessian @ d + self._diagonal * d + self._pulled(y)
+        # the penalty's pull is a part of these multipliers
         y[equal] = own * (self._A @ free + off) + extra
         y[c.eliminated] = c.multipliers(dual, y[equal])
         return d, y, rows, dual

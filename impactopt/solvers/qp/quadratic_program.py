@@ -244,6 +244,8 @@ def solve_equality_qp(P: Matrix, q: Vector, A: Matrix, b: Vector) -> tuple[Vecto
             solve = spla.splu(sp.csc_matrix(K + sp.diags_array(shift))).solve
         except RuntimeError:  # singular
             return None
+    # The shift makes the system quasidefinite, and with it regular also for dependent rows; refinement with
+    # the true matrix removes what it changes.
     s = solve(right)
     for _ in range(5):
         s = s + solve(right - K @ s)

@@ -215,7 +215,7 @@ class ReducedRun(Run[SQPOptions]):
     def _search(self, model: ReducedModel, solved: Solved) -> Taken | None:
         """Shorten the step until it is taken; a full one is corrected for the rows' curvature first."""
         length = 1.0
-        for attempt in range(_HALVINGS):
+        for attempt in range(_HALVINGS):  # then the radius shrinks
             trial = self._back(self.program.point(self._inside(self.point.x + length * solved.d)))
             verdict = self._judge(trial, length, solved)
             if verdict is not None:
@@ -260,12 +260,15 @@ class ReducedRun(Run[SQPOptions]):
             relief = before.violation - solved.linear_violation
             enough = relief > 1e-10 * before.violation and h <= before.violation - _ARMIJO * length * relief
             return False if enough else None
+        # margins about the filter: iterates that creep along it would never have to become feasible
         if h > self._most or any(
             h > 0.999 * p.violation and f > p.objective - _GAIN * h for p in self._filter
         ):
             return None
         slope = float(before.gradient @ solved.d)
         noise = _ROUNDING * (1.0 + abs(before.objective))
+        # The switching condition (Waechter and Biegler 2006, eq. 19) with a QP's slope: near the feasible
+        # set a step has to lower the objective.
         leads = slope < 0 and before.violation < _NEAR and -length * slope > 1e-2 * before.violation**1.2
         if leads:
             return True if f <= before.objective + _ARMIJO * length * slope + noise else None

@@ -312,6 +312,8 @@ class BFGSModel:
         sBs, sy = float(step @ Bs), float(step @ change)
         if sBs < 1e-16:
             return
+        # procedure 18.2: a change of the gradient that shows too little curvature is mixed with Bs until
+        # s'r is 0.2 s'Bs, so that B stays positive definite
         theta = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
         r = theta * change + (1.0 - theta) * Bs
         if float(r @ r) > _STEEPEST * float(step @ r):
@@ -453,6 +455,8 @@ class ReducedQP:
         reach = radius * abs(every).sum(axis=1)  # how much a row can change
         off = np.maximum(lower, -upper)
         soft = off > _SOFT
+        # A constraint that no step inside the radius can meet, or whose multiplier was at its price, is given
+        # up: its violation is linear in t then, so its price is a part of the gradient, without a slack.
         lost = soft & ((off > _BEYOND * reach) | (np.abs(self._unit) > 0.99 * prices))
         late = np.argsort(-off / np.maximum(reach, 1e-12))[_NEAREST * T.shape[1] :]
         working = off > -_NEAR * reach
@@ -515,7 +519,7 @@ def _elastic(
     small = isinstance(A, np.ndarray)
     if k:
         sign = np.where(np.arange(k) < below.size, 1.0, -1.0)
-        bend = _SLACK_CURVATURE * prices[elastic]
+        bend = _SLACK_CURVATURE * prices[elastic]  # as the dual method needs a positive definite P
         c = np.concatenate([c, prices[elastic]])
         if small:
             S = np.zeros((lower.size, k))

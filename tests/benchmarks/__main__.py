@@ -189,6 +189,18 @@ def _moved(
     """Plans bent for other points, masses and stiffnesses: first order, and polished by the solver."""
 
 
+@_command("rounding")
+def _rounding(
+    problems: Problems = None,
+    draws: Annotated[int, typer.Option(min=1, help="Runs of each problem.")] = 5,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Resume from results/bench/rounding.jsonl.")
+    ] = False,
+    seed: Seed = 0,
+) -> None:
+    """Does rounding decide which plan comes out? Hit points moved by 1e-10 m."""
+
+
 @_command("causes")
 def _causes(draws: Draws = 26, seed: Seed = 0) -> None:
     """Drawn variants of the arms that ask too much: is there a plan where the message says there is?"""

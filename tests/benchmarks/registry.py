@@ -25,6 +25,7 @@ BENCHES = {
     "feedback": "benchmarks.feedback",
     "models": "benchmarks.models",
     "moved": "benchmarks.moved",
+    "rounding": "benchmarks.rounding",
     "causes": "benchmarks.causes",
     "fidelity": "benchmarks.fidelity",
     "freezes": "benchmarks.freezes",

@@ -62,10 +62,10 @@ __all__ = [
 FORMAT = 1  # of solution.npz; raised when a reader of the old one would go wrong
 LARGEST, MOST_ARRAYS = 1 << 29, 1000  # bytes and arrays of solution.npz; ours have some MB, and a hundred
 NUMBERS, SUMMARY = "solution.npz", "summary.json"
-# Bits that histories are kept with, by prefix, of the largest value of each channel: 24, all that single
-# precision has, of what a servo is to follow (at 2 rad 6e-8 rad, a hundredth of what `verify` allows); 15 of
-# what a replay has measured (3e-5 rad, 15 mN of 1 kN): less than any picture shows or anybody measures.
-BITS = {"reference": 24, "missed": 24, "pose": 24, "simulated": 15, "replayed": 15}
+# Bits that histories are kept with, by prefix, of the largest value of each channel: 32 of what a servo is to
+# follow (at 2 rad 5e-10 rad: with 24 accelerations miss what `verify` allows); 15 of what a replay has
+# measured (3e-5 rad, 15 mN of 1 kN): less than any picture shows or anybody measures.
+BITS = {"reference": 32, "missed": 32, "pose": 32, "simulated": 15, "replayed": 15}
 SMALLEST = 1e-30  # of a channel that is zero
 # what is made of the numbers beside them: by `impactopt show`, by `impactopt validate`, pictures
 DERIVED = (
@@ -210,7 +210,7 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
 
 
 def rounded(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Arrays whose histories of many channels, (k, ...), are rounded to what single precision holds (`BITS`).
+    """Arrays whose histories of many channels, (k, ...), are rounded (`BITS`).
 
     That is a fifth of the file's size. Times and single curves stay as they are.
     """

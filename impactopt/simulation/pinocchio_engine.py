@@ -246,7 +246,7 @@ def simulate_pinocchio(
     reference: Any,
     scene: Scene,
     *,
-    step: float = 2e-4,
+    step: float = 1e-4,
     settle: float = 0.3,
     record: int = 5,
     missing: bool = False,

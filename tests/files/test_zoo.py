@@ -26,8 +26,8 @@ from impactopt import (
 )
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
+from impactopt.files import folders
 from impactopt.files.problem_file import names, read_problem_file
-from impactopt.files.problem_file import names as folders
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem, Phase

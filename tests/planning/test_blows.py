@@ -150,7 +150,7 @@ def test_the_command_drives_the_nail_in(
     assert "the nail is in after 3 blows" in table.output and "7.8" in table.output
     kept = json.loads((tmp_path / "blows.json").read_text(encoding="utf-8"))
     as_json = CliRunner().invoke(app, [*base, "--json"])
-    assert json.loads(as_json.stdout) == kept and kept["done"]
+    assert json.loads(as_json.stdout) == {"ok": True, **kept} and kept["done"]
     assert [round(1e3 * blow["driven_m"], 1) for blow in kept["blows"]] == [7.8, 7.0, 6.4]
     early = CliRunner().invoke(app, [*base, "--most", "1"])
     assert early.exit_code == 1 and "the nail is not in yet" in early.output

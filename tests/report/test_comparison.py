@@ -135,7 +135,7 @@ def test_the_command_prints_and_writes(saved: list[Path], tmp_path: Path) -> Non
     with Image.open(tmp_path / "new" / "place" / "compare.png") as image:
         assert image.size[0] > 1000
     told = json.loads(run(*saved, "--json")[0])
-    assert told == json.loads((tmp_path / "new" / "place" / "compare.json").read_text())
+    assert told == {"ok": True, **json.loads((tmp_path / "new" / "place" / "compare.json").read_text())}
     assert [row["name"] for row in told["results"]] == ["one", "<two>"]
     assert told["results"][0]["replayed"]["standing"] is True and "replayed" not in told["results"][1]
     assert told["problem"]["target.mass_kg"] == {"one": "5", "<two>": "8"}

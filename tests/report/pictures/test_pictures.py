@@ -150,7 +150,7 @@ def test_poses_are_the_motions_by_forward_kinematics(biped_plan: Planned, punch_
     np.testing.assert_allclose([sole[..., 2] for sole in soles], 0.0, atol=1e-6)
     # links are rigid
     lengths = np.linalg.norm(np.diff(a["pose_links"], axis=2), axis=-1)[..., 0]
-    np.testing.assert_allclose(lengths, np.tile(lengths[0], (len(lengths), 1)), atol=1e-8)
+    np.testing.assert_allclose(lengths, np.tile(lengths[0], (len(lengths), 1)), atol=1e-9)
     np.testing.assert_allclose(a["pose_path"][0], a["pose_links"][0][0][1])
 
 
@@ -172,7 +172,7 @@ def test_the_strobe_draws_the_target_as_large_as_it_is(biped_plan: Planned, punc
     assert len(drawn) == len(punch_record.arrays["pose_time"])
     for corners in drawn:
         deep, high = 2 * target.half[2], 2 * target.half[1]
-        np.testing.assert_allclose(np.ptp(corners, axis=0), [deep, high], atol=1e-8)
+        np.testing.assert_allclose(np.ptp(corners, axis=0), [deep, high], atol=1e-9)
         assert corners[:, 1].mean() == pytest.approx(target.place[2], abs=0.5 * high)
 
 

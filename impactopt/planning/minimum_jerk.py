@@ -104,7 +104,7 @@ def _fastest(problem: ImpactProblem, duration: float, slow: float, fast: float, 
 def _replayed(problem: ImpactProblem, duration: float, speed: float) -> Baseline | None:
     """The reach in full dynamics; None if it does not keep the limits there."""
     scene, reference = scene_of(problem), _reference(problem, duration, speed)
-    simulation = simulate_pinocchio(problem.robot, reference, scene)
+    simulation = simulate_pinocchio(problem.robot, reference, scene, step=2e-4)
     summary = simulation.summary(
         torque_limit=problem.robot.torque_limit, polygon=scene.polygon, planned_impulse=np.nan
     )

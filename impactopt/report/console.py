@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
@@ -25,7 +24,7 @@ from impactopt.report.result_rows import (
     result_rows,
     worst_rows,
 )
-from impactopt.solvers.program import IterationRecord
+from impactopt.solvers.program import IterationRecord, without_violations
 
 if TYPE_CHECKING:
     from impactopt.report.comparison import Comparison
@@ -266,7 +265,7 @@ def reason_message(summary: Mapping[str, Any]) -> str:
     """Sentences about why a plan is not called solved, without its violations; "" of one that is."""
     if summary["status"] == "solved":
         return ""
-    return re.split(r" Constraints (?:that cannot be|not) met: ", str(summary["message"]))[0]
+    return without_violations(str(summary["message"]))
 
 
 def switched_off_message(summary: Mapping[str, Any]) -> str:

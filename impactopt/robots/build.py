@@ -307,3 +307,13 @@ def read_postures(model: pin.Model, given: Mapping[str, Mapping[str, float] | Ar
         else:
             postures[name] = check_configuration(model, value, what)
     return postures
+
+
+def default_kd(torque_limit: Array) -> Array:
+    """Servo damping (n,) [N m s/rad] of joints that have none of their own."""
+    return np.asarray(1.5 * np.minimum(100.0, torque_limit))
+
+
+def default_kp(kd: Array) -> Array:
+    """Servo stiffness (n,) [N m/rad] beside a damping (n,)."""
+    return np.asarray(30.0 * kd)

@@ -226,14 +226,14 @@ class Robot:
         limit = build.per_joint("torque_limit", torque_limit, joints, build.effort_limit(model)[base:])
         speed = build.per_joint("velocity_limit", velocity_limit, joints, build.velocity_limit(model)[base:])
         lower, upper = build.position_limit(model, joints, position_limit)
-        damping = build.per_joint("kd", kd, joints, 1.5 * np.minimum(100.0, limit))
+        damping = build.per_joint("kd", kd, joints, build.default_kd(limit))
         for sole in soles:
             if sole.parent is not None:
                 build.add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")
         for striker in strikers:
             build.add_striker(model, striker)
         numbers: dict[str, Any] = {"torque_limit": limit, "velocity_limit": speed, "lower": lower}
-        stiffness = build.per_joint("kp", kp, joints, 30.0 * damping)
+        stiffness = build.per_joint("kp", kp, joints, build.default_kp(damping))
         numbers |= {"upper": upper, "kp": stiffness, "kd": damping, "actuators": drives}
         read = build.read_postures(model, postures or {})
         model, numbers, read = with_hinges(model, soles, numbers, read)

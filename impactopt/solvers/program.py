@@ -330,6 +330,9 @@ def worst_rows(
     return out
 
 
+_HEADINGS = ("Constraints not met", "Constraints that cannot be met")  # the second of an infeasible program
+
+
 def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, tolerance: float) -> str:
     """The status as a sentence, followed by what is violated, in words: where each term is worst."""
     rows = worst_rows(program, x, g, tolerance=tolerance, once_a_term=True)
@@ -338,13 +341,20 @@ def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, 
     # constraints are of order one, so what is off by so much less only follows from the others
     rows = [violation for violation in rows if violation.amount >= MINOR * rows[0].amount]
     listed = "; ".join(str(violation) for violation in rows)
-    heading = "Constraints that cannot be met" if status is Status.INFEASIBLE else "Constraints not met"
+    heading = _HEADINGS[status is Status.INFEASIBLE]
     more = int(
         np.sum(~(row_violations(program, g) <= tolerance))
         + np.sum(~(bound_violations(program, x) <= tolerance))
     )
     tail = f"; {more} constraints in all" if more > len(rows) else ""
     return f"{status.message} {heading}: {listed}{tail}."
+
+
+def without_violations(message: str) -> str:
+    """A result's message as far as `explain` has not listed what is violated."""
+    for heading in _HEADINGS:
+        message = message.partition(f" {heading}: ")[0]
+    return message
 
 
 class BestIterate:

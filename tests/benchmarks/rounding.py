@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.kept import Kept
-from benchmarks.planning import DEMO
 from benchmarks.report import Report, Say, columns_table
-from impactopt.files.problem_file import load_problem
+from impactopt.files.problem_file import load_problem, problem_names
 from impactopt.planning.solve import solve
 
 __all__ = ["run"]
@@ -49,9 +48,7 @@ def run(
     problems : names; all that are solved by default.  draws : runs of each, the first of them as it is.
     resume : do not repeat rows that the file has.
     """
-    names = list(problems or ()) or [
-        p.stem for p in sorted(DEMO.parent.glob("*.toml")) if "infeasible" not in p.stem
-    ]
+    names = problems or [name for name in problem_names() if not name.endswith("infeasible")]
     kept = Kept(rows, ("problem", "runs"), resume=resume)
     found = []
     for name in names:

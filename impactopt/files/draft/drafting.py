@@ -30,6 +30,7 @@ from impactopt.files.problem_file.writing import sole_data, striker_data
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import far_shapes
 from impactopt.robots.attachments import Sole, Striker
+from impactopt.robots.build import default_kd, default_kp
 from impactopt.robots.checks import REPAIRED
 from impactopt.robots.gains import USUAL_ROTOR
 from impactopt.robots.robot import Robot
@@ -310,8 +311,8 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
 
 def _guessed_gains(robot: Robot) -> NDArray[np.bool_]:
     """(n,) : joints whose gains are the defaults of a description that has none."""
-    default = np.isclose(robot.kd, 1.5 * np.minimum(100.0, robot.torque_limit)) & ~robot.hinges
-    return np.asarray(default & np.isclose(robot.kp, 30.0 * robot.kd))
+    damping, stiffness = default_kd(robot.torque_limit), default_kp(robot.kd)
+    return np.isclose(robot.kd, damping) & np.isclose(robot.kp, stiffness) & ~robot.hinges
 
 
 def _wide(polygon: list[list[float]]) -> bool:

@@ -26,7 +26,7 @@ from impactopt.robots.robot import Robot, Sole, Striker
 
 P = ParamSpec("P")
 
-__all__ = ["arm7", "g1", "load_robot", "planar_arm", "robot_names", "standin", "talos"]
+__all__ = ["arm7", "example_robots", "g1", "load_robot", "planar_arm", "robot_names", "standin", "talos"]
 
 
 def _preset(make: Callable[P, Robot]) -> Callable[P, Robot]:
@@ -59,7 +59,7 @@ def talos(**overrides: Any) -> Robot:
 
     `overrides` go to `Robot.from_urdf`.
     """
-    folder = _robots() / "talos_data"
+    folder = example_robots() / "talos_data"
     options: dict[str, Any] = {
         "srdf": folder / "srdf" / "talos.srdf",
         "name": "talos",
@@ -183,7 +183,7 @@ def g1(**overrides: Any) -> Robot:
         "postures": {"half_sitting": posture},
     }
     return Robot.from_urdf(
-        _robots() / "g1_description" / "urdf" / "g1_29dof_rev_1_0.urdf", **{**options, **overrides}
+        example_robots() / "g1_description" / "urdf" / "g1_29dof_rev_1_0.urdf", **{**options, **overrides}
     )
 
 
@@ -296,9 +296,15 @@ def robot_names() -> tuple[str, ...]:
     return tuple(_PRESETS)
 
 
-def _robots() -> Path:
+def example_robots(what: str = "this robot (not 'standin')") -> Path:
+    """Folder of the robots of example-robot-data; what : is to be read there, in words.
+
+    Raises
+    ------
+    InputError : the package is not installed.
+    """
     try:
         package = distribution("example-robot-data")
     except PackageNotFoundError as error:
-        raise missing_package("this robot (not 'standin')", "example-robot-data", "robots") from error
+        raise missing_package(what, "example-robot-data", "robots") from error
     return Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))

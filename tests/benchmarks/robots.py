@@ -12,7 +12,6 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.presets import example_robots
 
 __all__ = ["ROBOTS", "best_of_random", "run"]
 
@@ -106,13 +106,13 @@ def run(
     for name in chosen:
         if name not in ROBOTS:
             raise InputError(f"there is no robot {name!r} in this bench: there are {', '.join(ROBOTS)}")
-    share = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share")))
+    folder = example_robots("this bench")
     kept = Kept(rows, ("robot",), resume=resume)
     drafts.mkdir(parents=True, exist_ok=True)
     found = []
     for name in chosen:
         if (name,) not in kept.found:
-            file = share / "example-robot-data" / "robots" / ROBOTS[name]
+            file = folder / ROBOTS[name]
             kept.add(_row(name, file, drafts, np.random.default_rng(seed), targets))
         found.append(kept.found[(name,)])
         row = found[-1]

@@ -163,7 +163,7 @@ def test_missing_robot_files_name_the_extra(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_locked_joints_leave_the_dynamics_of_the_whole_robot(talos_robot: Robot) -> None:
     """The reduced model's inverse dynamics are the whole one's with the grippers held still."""
-    folder = presets._robots() / "talos_data"
+    folder = presets.example_robots() / "talos_data"
     whole = pin.buildModelFromUrdf(str(folder / "robots" / "talos_reduced.urdf"), pin.JointModelFreeFlyer())
     whole.armature[6:] = 0.1
     locked = [whole.getJointId(f"gripper_{side}_joint") for side in ("left", "right")]
@@ -316,7 +316,7 @@ def test_matter_that_cannot_be(mass: float, moments: tuple[float, float, float],
 
 def test_published_robot_with_impossible_inertias_is_refused() -> None:
     with pytest.raises(InputError, match=r"joint '\w+' .*(not positive definite|exceeds the sum)"):
-        Robot.from_urdf(presets._robots() / "icub_description" / "robots" / "icub.urdf", armature=0.1)
+        Robot.from_urdf(presets.example_robots() / "icub_description" / "robots" / "icub.urdf", armature=0.1)
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 from impactopt.codegen.files import is_plain_file
-from impactopt.errors import InputError, did_you_mean, missing_package, shortened
+from impactopt.errors import InputError, did_you_mean, shortened
+from impactopt.robots.presets import example_robots
 
 __all__ = ["find_description"]
 
@@ -39,9 +39,5 @@ def find_description(given: str) -> Path:
 
 def _examples() -> dict[str, Path]:
     """URDFs by their names without suffix."""
-    try:
-        package = distribution("example-robot-data")
-    except PackageNotFoundError as error:
-        raise missing_package("a robot by its name", "example-robot-data", "robots") from error
-    folder = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
+    folder = example_robots("a robot by its name")
     return {path.stem: path for path in sorted(folder.glob("*/*/*.urdf"))}

@@ -183,8 +183,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
             "torque_ratio": max(held["torque_ratio"].values()),
             "gear_planned": told.get("gear_ratio"),
             "gear_held": held.get("gear_ratio"),
-            **_kept(told, told, "planned"),
-            **_kept(held, told, "held"),
+            **sole_shares(told, told, "planned"),
+            **sole_shares(held, told, "held"),
             "soles": {name: _soles(found) for name, found in (("planned", told), ("held", held))},
             **{key: told[key] for _, key, _ in MOTION[1:] if key in told},
         }
@@ -210,8 +210,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         return out
     out["soles"]["free"] = _soles(free)
     out |= {
-        "cop_free_mm": _least_of(free.get("sole_cop_margin_mm")),
-        "force_free_N": _least_of(free.get("sole_force_N")),
+        "cop_free_mm": least_of_soles(free.get("sole_cop_margin_mm")),
+        "force_free_N": least_of_soles(free.get("sole_force_N")),
         "replay_impulse_error_pct": free["impulse_error_pct"],
         "gear_free": free.get("gear_ratio"),
         "replay_slip_mm": free.get("sole_slip_mm"),
@@ -238,8 +238,8 @@ def _missed(solution: Solution, free: Mapping[str, Any]) -> dict[str, Any]:
         "missed_torque_planned": solution.margins()["torque_ratio"].get("missed"),
         "missed_torque": max(free["torque_ratio"].values()),
         "missed_gear": free.get("gear_ratio"),
-        "missed_cop_mm": _least_of(free.get("sole_cop_margin_mm")),
-        "missed_force_N": _least_of(free.get("sole_force_N")),
+        "missed_cop_mm": least_of_soles(free.get("sole_cop_margin_mm")),
+        "missed_force_N": least_of_soles(free.get("sole_force_N")),
         "missed_slip_mm": free.get("sole_slip_mm"),
         "missed_clearance_mm": free["clearance_mm"],
         "missed_touches": len(free["contacts_besides"] or ()),
@@ -263,11 +263,11 @@ def _soles(found: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in found.items() if key.startswith(("sole_cop_margin", "sole_force"))}
 
 
-def _least_of(soles: Mapping[str, Mapping[str, float]] | None) -> float | None:
+def least_of_soles(soles: Mapping[str, Mapping[str, float]] | None) -> float | None:
     return _least(*(kept for phases in (soles or {}).values() for kept in phases.values()))
 
 
-def _kept(found: Mapping[str, Any], told: Mapping[str, Any], name: str) -> dict[str, float | None]:
+def sole_shares(found: Mapping[str, Any], told: Mapping[str, Any], name: str) -> dict[str, float | None]:
     """Least share of what is asked of a sole; a centre of pressure of which nothing is asked is left out."""
     asked, force = told.get("sole_cop_margin_asked_mm") or {}, told.get("sole_force_asked_N")
     shares = [
@@ -276,7 +276,7 @@ def _kept(found: Mapping[str, Any], told: Mapping[str, Any], name: str) -> dict[
         for phase, kept in phases.items()
         if asked.get(phase)
     ]
-    least = _least_of(found.get("sole_force_N"))
+    least = least_of_soles(found.get("sole_force_N"))
     return {
         f"cop_{name}": _least(*shares),
         f"force_{name}": least / force if force and least is not None else None,

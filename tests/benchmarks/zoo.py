@@ -20,6 +20,7 @@ from oracle.verdict import verify_record
 from benchmarks.kept import Kept
 from benchmarks.planning import DEMO, solved
 from benchmarks.report import Report, Say, columns_table
+from benchmarks.truth import least_of_soles, sole_shares
 from impactopt import Solution
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
@@ -82,6 +83,10 @@ FOUND = (
     ("stands", "stands", 0),
     ("clean", "clean", 0),
     ("mm", "clearance_mm", 0),
+    ("CoP planned", "cop_planned", 2),
+    ("held", "cop_held", 2),
+    ("force held", "force_held", 2),
+    ("free N", "force_free_N", 0),
 )
 
 
@@ -272,12 +277,25 @@ def row(name: str, plan: PlanOf) -> dict[str, Any]:
             "stands": said["standing"],
             "reason": said["reason"],
             **cleanliness(solution, replay),
+            **_soles(solution, said),
             **_verified(solution),
         }
     except Exception as error:  # one of a hundred must not end the others
         out["status"] = out["status"] or "error"
         out["error"] = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     return out
+
+
+def _soles(solution: Solution, free: Mapping[str, Any]) -> dict[str, Any]:
+    """Least shares of what is asked of a sole, planned and held; least force on free soles; as in `truth`."""
+    replay = solution.validate()
+    told = solution.summary(replay)
+    return {
+        "error_held_pct": told["simulated"]["impulse_error_pct"],
+        **sole_shares(told, told, "planned"),
+        **sole_shares(told["simulated"], told, "held"),
+        "force_free_N": least_of_soles(free.get("sole_force_N")),
+    }
 
 
 def _verified(solution: Solution) -> dict[str, Any]:

@@ -173,13 +173,17 @@ def new(
 
 
 def _draft(given: str, mjcf: bool, bolted: bool, out: Path | None, as_json: bool) -> None:
+    from rich.console import Console
+
     from impactopt.errors import printable
     from impactopt.files.draft.description import find_description
     from impactopt.files.draft.drafting import draft_problem
+    from impactopt.report.console import SolveConsole
 
     path = Path(given) if mjcf else find_description(given)
     folder = Path() if out is None else out.parent
-    draft = draft_problem(path, folder=folder, mjcf=mjcf, bolted=bolted)
+    with SolveConsole(Console(stderr=True)) as progress:
+        draft = draft_problem(path, folder=folder, mjcf=mjcf, bolted=bolted, report=progress.say)
     _give(draft.text, out, as_json)
     for line in draft.said:
         typer.echo(printable(line), err=True)

@@ -32,7 +32,7 @@ FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
 
 def _drafted(folder: Path, text: str, **options: Any) -> Draft:
     (folder / "robot.urdf").write_text(text)
-    return draft_problem(folder / "robot.urdf", folder=folder, **options)
+    return draft_problem(folder / "robot.urdf", folder=folder, **{"planned": False, **options})
 
 
 def _problem(folder: Path, text: str, **options: Any) -> ImpactProblem:

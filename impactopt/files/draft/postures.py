@@ -9,16 +9,18 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
 from impactopt.robots.checks import LEG
 from impactopt.robots.robot import Robot, Sole
 
-__all__ = ["arm_length", "bend_arm", "half_sitting", "rested", "shoulder"]
+__all__ = ["arm_length", "bend_arm", "eased", "half_sitting", "rested", "shoulder"]
 
 Array = NDArray[np.float64]
 BENT = 0.06  # of the legs' length: how much lower than straight it sits
 STARTS = 10
+HELD = 0.5  # of its torque limit: what gravity may ask of a joint that does not strike
 INSIDE = 0.1  # of a joint's range that is left to its limits
 REST = 0.02  # [m] that the whole range of a joint costs: postures in the middle of their ranges
 LONG = 0.2  # of an arm's length: an upper arm at least
@@ -186,6 +188,32 @@ def rested(robot: Robot) -> Array:
     q, every = pin.neutral(robot.model), np.arange(robot.n)
     low, high = _limits(robot, every)
     return _set(robot, q, every, np.clip(robot.joint_positions(q), low, high))
+
+
+def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
+    """The configuration (nq,) near q with limbs bent or hanging, so that gravity asks little of them.
+
+    Of several the one in which the fewest links touch.
+    """
+    own = _rows(robot, [joint for limb in limbs for joint in limb.own])
+    model, data = robot.model, robot.model.createData()
+    low, high = _limits(robot, own)
+    rest, rng = robot.joint_positions(q)[own], np.random.default_rng(0)
+
+    def errors(angles: Array) -> Array:
+        weight = pin.computeGeneralizedGravity(model, data, _set(robot, q, own, angles))
+        share = np.abs(np.array(weight)[robot.nv - robot.n + own]) / robot.torque_limit[own]
+        return np.concatenate([np.maximum(share - HELD, 0.0), REST * (angles - rest) / (high - low)])
+
+    if not errors(rest)[: len(own)].any():
+        return q
+    tries = []
+    for _ in range(STARTS):
+        start = np.clip(rest + 0.25 * (high - low) * rng.standard_normal(len(own)), low, high)
+        found = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), max_nfev=60)
+        posture = _set(robot, q, own, found.x)
+        tries.append((len(bodies_of(robot).piece_pairs(posture)[1]), float(found.cost), posture))
+    return min(tries, key=lambda one: one[:2])[2]
 
 
 def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:

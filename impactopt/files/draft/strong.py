@@ -50,30 +50,31 @@ class Strong:
     impulse: float
 
 
-def strongest(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True, **given: Any) -> Strong | None:
-    """The best strike of the blows that are estimated best; None: check finds a fault with all of them, or
-    none of the strikes is solved.
+def strongest(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True, **given: Any) -> list[Strong]:
+    """Strikes of the blows that are estimated best, the hardest first; none: check finds a fault with all of
+    them, or none of the strikes is solved.
 
     q (nq,) : what does not strike stays as in it.  with_face : the link's face meets the target; else any
     part of it may touch first.  given : law and target, as of `ImpactProblem`.
     """
     given["terms"] = () if with_face else (FirstTouch(enabled=False),)
     strength = Strength(robot=robot, striker=arm.name, law=given["law"], target=given["target"])
-    best: Strong | None = None
+    found = []
     for problem, blow in _sound(robot, arm, drawn_blows(strength, q, with_face=with_face), given):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
             solved = optimize_strike(problem, time_limit=SECONDS)
-        if not solved.status.usable or (best is not None and solved.impulse <= best.impulse):
-            continue
-        best = Strong(
-            start=problem.start_posture,
-            contact=blow.q,
-            point=problem.point,
-            normal=problem.normal,
-            impulse=solved.impulse,
-        )
-    return best
+        if solved.status.usable:
+            found.append(
+                Strong(
+                    start=problem.start_posture,
+                    contact=blow.q,
+                    point=problem.point,
+                    normal=problem.normal,
+                    impulse=solved.impulse,
+                )
+            )
+    return sorted(found, key=lambda strong: -strong.impulse)
 
 
 def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:

@@ -255,7 +255,7 @@ def _saved(solid: Solid) -> bytes:
 
 
 def _loaded(path: Path) -> Solid:
-    """What coal reads of a mesh: seconds for a large one."""
+    """A mesh by coal: seconds for a large one."""
     try:
         mesh = coal.MeshLoader().load(str(path), np.ones(3))
     except (ValueError, RuntimeError) as error:  # the reader's own words come after the file's name

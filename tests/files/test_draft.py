@@ -194,6 +194,42 @@ def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
     assert found is not None and found[0] > 0.6
 
 
+def _two_arms() -> str:
+    """Two arms that lie level in the zero posture, which their shoulders cannot bear, and a head."""
+    parts = [urdfs.link("base", 30.0, (0.3, 0.3, 0.8), (0.0, 0.0, 0.4))]
+    for side, y in (("left", 0.35), ("right", -0.35)):
+        parent = "base"
+        for name, axis, at, long in (
+            ("turn", "0 0 1", (0.0, y, 0.9), 0.05),
+            ("lift", "0 1 0", (0.05, 0.0, 0.0), 0.3),
+            ("elbow", "0 1 0", (0.3, 0.0, 0.0), 0.3),
+            ("wrist", "0 1 0", (0.3, 0.0, 0.0), 0.1),
+        ):
+            child = f"{side}_{name}_link"
+            parts += [urdfs.link(child, 6 * long, (long, 0.06, 0.06), (long / 2, 0.0, 0.0))]
+            parts += [urdfs.joint(f"{side}_{name}", parent, child, axis, at, (-2.2, 2.2), effort=12.0)]
+            parent = child
+    parts += [urdfs.link("head", 1.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.1))]
+    parts += [urdfs.joint("head_pan", "base", "head", "0 0 1", (0.0, 0.0, 0.9), (-1.0, 1.0))]
+    return urdfs.robot("two arms", *parts)
+
+
+def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path) -> None:
+    draft = _drafted(tmp_path, _two_arms(), planned=True)
+    assert any("a whole motion leads to" in line for line in draft.said)
+    (tmp_path / "robot.toml").write_text(draft.text)
+    problem = load_problem(tmp_path / "robot.toml")
+    robot, q = problem.robot, problem.start_posture
+    assert "head_pan" not in robot.joint_names and problem.striker == "right_hand"
+    weight, asked = (
+        np.abs(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), posture))
+        for posture in (np.zeros(robot.nq), q)
+    )
+    left = [k for k, name in enumerate(robot.joint_names) if name.startswith("left")]
+    assert (weight > robot.torque_limit)[left].any() and (asked <= 0.6 * robot.torque_limit)[left].all()
+    assert solve(problem).status.usable
+
+
 @pytest.mark.parametrize("still", [("turn", "wrist"), ("wrist",)])
 def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) -> None:
     """It cannot turn its hand at will: with the hand's face, or else with what comes first."""
@@ -449,6 +485,10 @@ def test_robots_of_example_robot_data_go_by_name() -> None:
         find_description("pnada")
     with pytest.raises(InputError, match=r"several robots 'alex'.*alex_nub_hands"):
         find_description("alex")
+    with pytest.raises(InputError, match=r"did you mean 'g1_29dof_rev_1_0'"):  # a dot makes it no file
+        find_description("g1_29dof_rev_1.0")
+    with pytest.raises(InputError, match=r"there is no file gone.urdf$"):
+        find_description("gone.urdf")
 
 
 def test_the_command_writes_a_file_once(tmp_path: Path) -> None:

@@ -40,6 +40,37 @@ def _problem(folder: Path, text: str, **options: Any) -> ImpactProblem:
     return load_problem(folder / "robot.toml")
 
 
+@pytest.mark.parametrize("arms", [False, True], ids=["legs", "arms"])
+def test_a_biped_kicks_where_it_has_no_arms_or_is_told_to(tmp_path: Path, arms: bool) -> None:
+    """From one foot, with the weight above it and the other foot in the air, behind the ball."""
+    problem = _problem(tmp_path, urdfs.biped(arms=arms), **({"motion": "kick"} if arms else {}))
+    robot, q = problem.robot, problem.start_posture
+    (sole,) = problem.stance.soles(robot)
+    assert sole.name == "left" and problem.striker == "right_toe" and not hopeless(problem)
+    data = robot.model.createData()
+    centre = pin.centerOfMass(robot.model, data, q)
+    pin.framesForwardKinematics(robot.model, data, q)
+    at = data.oMf[robot.model.getFrameId(sole.frame)]
+    low, high = sole.polygon.min(axis=0), sole.polygon.max(axis=0)
+    assert np.all(centre[:2] > at.translation[:2] + low + 0.01)
+    assert np.all(centre[:2] < at.translation[:2] + high - 0.01)
+    toe = data.oMf[robot.model.getFrameId("striker:right_toe")].translation
+    other = data.oMf[robot.model.getFrameId(robot.sole("right").frame)].translation
+    assert at.translation[2] == pytest.approx(0.0, abs=1e-6) and other[2] > 0.03
+    assert toe[0] < problem.point[0] - 0.05 and toe[1] == pytest.approx(problem.point[1], abs=1e-3)
+
+
+def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
+    for text, motion, why in (
+        (urdfs.arm(), "kick", "does not stand on legs"),
+        (urdfs.biped(arms=False), "punch", "no limb beside the legs"),
+        (urdfs.biped(legs=5, arms=False), None, "would swing on its hinge"),
+        (urdfs.arm(), "slap", "give punch or kick"),
+    ):
+        with pytest.raises(InputError, match=why):
+            _drafted(tmp_path, text, motion=motion)
+
+
 @pytest.mark.parametrize("behind", [False, True], ids=["ahead", "behind"])
 def test_a_biped_stands_on_the_soles_of_its_feet(tmp_path: Path, behind: bool) -> None:
     problem = _problem(tmp_path, urdfs.biped(behind=behind))

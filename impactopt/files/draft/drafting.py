@@ -29,6 +29,7 @@ from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.files.problem_file.writing import sole_data, striker_data
+from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import far_shapes
@@ -46,6 +47,12 @@ TRIED = 8  # targets
 STIFFNESS, DAMPING = 1e4, 300.0  # [N/m], [N s/m] of a drafted contact
 SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # [s] of fast robots
 START = "ready"
+MOTIONS = ("punch", "kick")
+TOE = 0.02  # [m] of the point of a toe above the sole
+BALL, KICKS = (
+    0.22,
+    (0.3, 0.2, 0.4),
+)  # [m] of a ball; of the hip's height: how far ahead it lies
 ITERATIONS, SECONDS = 150, 10.0  # of a plan that is tried: most are there in a third of it
 
 
@@ -63,20 +70,24 @@ def draft_problem(
     folder: Path,
     mjcf: bool = False,
     bolted: bool = False,
+    motion: str | None = None,
     planned: bool = True,
     report: Callable[[str], None] | None = None,
 ) -> Draft:
     """The text of a problem file for the robot of a URDF, or an MJCF.
 
-    folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.  planned : the
-    whole motion to a bolted arm's blow is solved, too, and the next blow taken where there is none.
+    folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.  motion :
+    "punch" or "kick"; None: a robot on legs kicks where it has no arm to strike with.  planned : the whole
+    motion to a bolted arm's blow is solved, too, and the next blow taken where there is none.
     report : is told what is done.
 
     Raises
     ------
     InputError : the file cannot be read; the robot is none that can be planned for, with the reason; no
-        posture or no target is found.
+        posture or no target is found; an unknown motion, or a kick of a robot without legs.
     """
+    if motion not in (None, *MOTIONS):
+        raise InputError(f"motion: {motion!r}; give {' or '.join(MOTIONS)}")
     say = report or (lambda text: None)
     say("reading the robot and the shapes of its links")
     drafted = draft_robot(path, mjcf=mjcf, bolted=bolted)
@@ -84,7 +95,13 @@ def draft_problem(
     soles: list[Sole] = []
     if drafted.legs:
         soles, forward = find_soles(model, drafted.legs, drafted.pieces)
+    if motion == "kick" and not soles:
+        raise InputError(f"{path}: it does not stand on legs, so it cannot kick")
     arms, strikers = _arms(drafted)
+    if motion == "punch" and not arms:
+        raise InputError(f"{path}: there is no limb beside the legs to punch with; let it kick")
+    if soles and (motion == "kick" or not arms):
+        return _kick(drafted, soles, strikers, forward, folder)
     robot = drafted.made(soles=soles, strikers=strikers)
     legs = tuple(renumbered(leg, model, robot.model) for leg in drafted.legs)
     arms = [replace(arm, limb=renumbered(arm.limb, model, robot.model)) for arm in arms]
@@ -111,9 +128,14 @@ def draft_problem(
                 "so another part of the link may touch first"
             )
     else:
-        q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
+        try:
+            q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
+        except InputError:
+            if not soles or motion == "punch":
+                raise
+            return _kick(drafted, soles, strikers, forward, folder)
         data = _data(drafted, robot, soles, strikers, q, folder)
-        data = _aimed(data, robot, arms[0], aims(robot, arms[0], q, way), way, folder)
+        data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
     return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
 
 
@@ -139,7 +161,50 @@ def _struck(
         data[phase]["duration_s"] = duration(robot, way, usual)
     if edgewise:
         data["terms"] = {"first_touch": {"enabled": False}}
-    return _aimed(data, robot, arm, iter([strong.point]), strong.normal, folder)
+    return _aimed(data, arm.name, iter([strong.point]), strong.normal, folder)
+
+
+def _kick(
+    drafted: Drafted,
+    soles: list[Sole],
+    strikers: list[Striker],
+    forward: Array,
+    folder: Path,
+) -> Draft:
+    """A draft of a kick: from one foot, with the toe of the other one, against a ball on the ground.
+
+    Raises
+    ------
+    InputError : a sole has a hinge; no posture or no target is found.
+    """
+    if any(sole.hinge is not None for sole in soles):
+        raise InputError(
+            f"{drafted.path}: there is nothing to strike with but the feet, and legs of five joints cannot "
+            "kick: a foot in the air would swing on its hinge"
+        )
+    lifted = max(range(len(soles)), key=lambda k: soles[k].name == "right")
+    foot, stands = soles[lifted], soles[1 - lifted]
+    place, corners = foot.placement, foot.polygon
+    point = place.act(np.array([corners[:, 0].max(), corners[:, 1].mean(), TOE]))
+    assert foot.parent is not None  # it is drafted
+    toe = Striker(name=f"{foot.name}_toe", frame=foot.parent, point=np.round(point, 4) + 0.0)
+    strikers = [*strikers, toe]
+    robot = drafted.made(soles=soles, strikers=strikers)
+    legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
+    q = half_sitting(robot, legs, soles, forward, lifted=lifted)
+    at = striking_point(robot, toe.name, q)
+    hip = robot.model.createData()
+    pin.forwardKinematics(robot.model, hip, q)
+    length = float(hip.oMi[legs[1 - lifted].own[0]].translation[2])
+    data = _data(drafted, robot, soles, strikers, q, folder)
+    size = float(f"{min(BALL, 0.3 * length):.2g}")
+    mass = float(f"{np.clip(0.005 * sum(body.mass for body in robot.model.inertias), 0.1, 0.45):.2g}")
+    data["stance"] = {"soles": stands.name}
+    data["target"] = {"mass_kg": mass, "body": {"shape": "ball", "size_m": [size]}}
+    data["contact"] = {"stiffness_N_m": 2 * STIFFNESS, "damping_N_s_m": 20.0}
+    points = (np.round([part * length, at[1], size / 2], 3) + 0.0 for part in KICKS)
+    data = _aimed(data, toe.name, points, np.array(WAYS[0]), folder)
+    return Draft(text=_text(data, drafted, robot), said=tuple(_said(data, drafted, robot)))
 
 
 def _planned(tries: Sequence[dict[str, Any]], folder: Path, say: Callable[[str], None]) -> int | None:
@@ -237,7 +302,7 @@ def _data(
 
 
 def _aimed(
-    data: dict[str, Any], robot: Robot, arm: Arm, points: Iterator[Array], way: Array, folder: Path
+    data: dict[str, Any], striker: str, points: Iterator[Array], way: Array, folder: Path
 ) -> dict[str, Any]:
     """The data with a target that check finds no fault with.
 
@@ -249,7 +314,7 @@ def _aimed(
     for k, point in enumerate(points):
         if k == TRIED:
             break
-        problem = {"striker": arm.name, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
+        problem = {"striker": striker, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
         aimed = {**data, "problem": {"name": data["problem"]["name"], **problem, "start": START}}
         try:
             wrong = hopeless(_built(aimed, folder))
@@ -259,7 +324,7 @@ def _aimed(
             return aimed
         first = first or wrong[0]
     raise InputError(
-        f"no target is found that {arm.name!r} can hit from the drafted posture; write the problem file by "
+        f"no target is found that {striker!r} can hit from the drafted posture; write the problem file by "
         f"hand (docs/howto/robot.md){f': {first}' if first else ''}"
     )
 
@@ -284,6 +349,8 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         if len(place) == 2 and place[0] == "robot" and str(place[1]) in guessed:
             return guessed[str(place[1])]
         if place == ("robot", "postures_rad", START):
+            if "stance" in data:
+                return "on one foot, the other one behind it, knees ahead"
             return "soles level, knees ahead, arms bent" if data["robot"].get("soles") else "bent"
         return comment_at(data, place)
 

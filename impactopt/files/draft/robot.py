@@ -69,7 +69,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     Raises
     ------
     InputError : it cannot be read; it has legs that no plan can hold, with the reason; its root has no mass,
-        and legs bear it; nothing can strike.
+        and legs bear it; it is bolted, and nothing can strike.
     """
     first = _floating(path, mjcf, bolted)
     locked = _locked(first)
@@ -92,8 +92,8 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if idle := {} if legs else _idle(found.robot.model, arms):
         found = _made(path, mjcf, False, {**found.locked, **idle})
         arms = arms_of(found.robot.model, legs)
-    if not arms:
-        raise InputError(f"{path}: there is no limb beside the legs, so nothing to strike with")
+    if not arms and not legs:
+        raise InputError(f"{path}: there is no limb, so nothing to strike with")
     return replace(found, legs=legs, arms=arms)
 
 

@@ -21,7 +21,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 from impactopt.robots.loads import cop_margin, least_kept, weight_of
 from impactopt.transcription.contact_guess import mass_at_contact, natural_durations
-from impactopt.transcription.plan import Plan, complete_reference, gear_share, sampled
+from impactopt.transcription.plan import Plan, Trajectory, gear_share
 
 Array = NDArray[np.float64]
 STEP = 1e-3  # [s] at which a motion is looked at: as the servo's reference is sampled
@@ -54,35 +54,31 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     friction than it may; where torques give up half of the room to all that the motors have; where a joint of
     a constrained leg is faster than it may be; and where a gear carries 3 % more than it may.
     """
-    start = plan.coordinates.split(plan.problem.start_posture)[1]
-    swing, legs = _middles_outside(plan, 0, start)
-    follow = _middles_outside(plan, 2, legs)[0]
+    swing = _middles_outside(plan, plan.reference, 0)
+    follow = _middles_outside(plan, plan.reference, 2)
     if plan.abort is not None:
-        follow += _middles_outside(plan, 2, legs, missed=True)[0]
+        follow += _middles_outside(plan, plan.missed_reference, 2, missed=True)
     return MoreNodes(
         tuple(sorted({*known.swing, *swing})),
         tuple(sorted({*known.follow, *follow})),
     )
 
 
-def _middles_outside(
-    plan: Plan, phase: int, legs: Array, *, missed: bool = False
-) -> tuple[list[float], Array]:
-    """Middles between nodes between which the plan is out of its limits, and the legs at its end."""
+def _middles_outside(plan: Plan, way: Trajectory, phase: int, *, missed: bool = False) -> list[float]:
+    """Middles between nodes between which a reference is out of its limits."""
     p, c = plan.problem, plan.coordinates
     curve, begin, nodes, _ = plan.segment(phase, missed=missed)
-    time = sampled(0.0, curve.duration, STEP)
-    at = complete_reference(p, *plan.independent(phase, begin + time, missed=missed), legs)
+    at = np.flatnonzero((way.phase == phase) & (way.time <= begin + curve.duration))
     limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)
-    ratio = np.abs(at.torque / p.robot.torque_limit).max(axis=1, initial=0.0)
+    ratio = np.abs(way.torque[at] / p.robot.torque_limit).max(axis=1, initial=0.0)
     outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
     # the others' rates are bounded by their splines' control points
-    outside |= (np.abs(at.v[:, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
-    outside |= gear_share(p, at.torque, at.a[:, joints]) > 1.0 + GEAR
-    outside |= _soles_outside(plan, at.sole_wrench)
-    between = np.searchsorted(nodes, time[outside] / curve.duration, side="right").clip(1, len(nodes) - 1)
-    middles = [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
-    return middles, c.split(at.q[-1])[1]
+    outside |= (np.abs(way.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
+    outside |= gear_share(p, way.torque[at], way.a[at, joints]) > 1.0 + GEAR
+    outside |= _soles_outside(plan, way.sole_wrench[at])
+    time = (way.time[at[outside]] - begin) / curve.duration
+    between = np.searchsorted(nodes, time, side="right").clip(1, len(nodes) - 1)
+    return [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
 
 
 def _soles_outside(plan: Plan, wrenches: Array) -> NDArray[np.bool_]:

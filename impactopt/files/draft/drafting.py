@@ -23,7 +23,7 @@ from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_striker
-from impactopt.files.draft.strong import Strong, duration, strongest
+from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest
 from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
@@ -53,7 +53,6 @@ BALL, KICKS = (
     0.22,
     (0.3, 0.2, 0.4),
 )  # [m] of a ball; of the hip's height: how far ahead it lies
-ITERATIONS, SECONDS = 150, 10.0  # of a plan that is tried: most are there in a third of it
 
 
 @dataclass(frozen=True, kw_only=True)

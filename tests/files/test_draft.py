@@ -20,6 +20,7 @@ from impactopt.errors import InputError
 from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.draft.robot import draft_robot
+from impactopt.files.draft.strikers import find_striker
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.toml import read_toml
 from impactopt.problem.feasibility import hopeless
@@ -338,6 +339,17 @@ def test_a_tool_frame_wins_over_shapes(tmp_path: Path, name: str, place: str, po
     problem = _problem(tmp_path, _flange(_fixed("flange", name, place)))
     striker = problem.robot.striker(problem.striker)
     assert striker.frame == name and striker.point == pytest.approx(point, abs=1e-6)
+
+
+def test_of_a_tool_at_the_joint_itself_a_long_hand_strikes(tmp_path: Path) -> None:
+    """Where it ends, though the arm comes from another side."""
+    hand = urdfs.link("hand", 0.3, (0.2, 0.05, 0.05), (0.1, 0.0, 0.0))
+    held = _fixed("flange", "hand", 'xyz="0 0 0"').replace('<link name="hand"/>', hand)
+    (tmp_path / "robot.urdf").write_text(_flange(held + _fixed("flange", "tool0", 'xyz="0 0 0"')))
+    drafted = draft_robot(tmp_path / "robot.urdf")
+    striker, axis = find_striker(drafted.robot.model, drafted.arms[0], "hand", drafted.pieces)
+    assert striker.frame == "tool0" and striker.point == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
+    assert axis == pytest.approx([1.0, 0.0, 0.0])
 
 
 def test_a_shape_far_from_its_link_is_told_and_does_not_strike(tmp_path: Path) -> None:

@@ -151,7 +151,7 @@ class Watch:
         self._t, self._margins, self._shapes = t, margins, margins.bodies.shapes
         spots = spots_of(t, x)
         self._names, self._travel, self._phase = spots.names, spots.at.travel, spots.at.phase
-        slots = {place.name: parts for place, parts in [*t.swing_spots(), *t.follow_spots()]}
+        slots = {place.name: parts for place, parts in t.body_spots()}
         lift = stack([part for name in self._names for part in slots[name]])
         self._lift, self._const = lift.matrix(t.layout.n), lift.const
         shape = len(self._names), len(self._shapes)

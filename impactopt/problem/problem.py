@@ -369,13 +369,6 @@ class ImpactProblem:
         return np.array(found or [[True] * len(names)], dtype=bool)
 
     @property
-    def fading(self) -> NDArray[np.bool_]:
-        """(phases, soles) Which of those stand that do not before or after it: they may bear nothing."""
-        on = self.standing
-        beside = [~on[[j for j in (k - 1, k + 1) if 0 <= j < len(on)]].all(axis=0) for k in range(len(on))]
-        return np.asarray(on & np.array(beside))
-
-    @property
     def soles(self) -> tuple[Sole, ...]:
         """The soles that stand at some time, in the robot's order."""
         if not self.stances:

@@ -37,6 +37,7 @@ from impactopt.simulation.result import (
     check_not_diverged,
     posture_error,
     simulation_of,
+    stance_at,
 )
 from impactopt.simulation.target_dynamics import Push, Struck
 
@@ -62,6 +63,10 @@ class _Replay(MujocoRobot):
     ) -> None:
         self.scene, self.perturbation = perturbation.scene(scene), perturbation
         self.wbc: WholeBodyController | None = None
+        if controller is not None and scene.standing.size:
+            raise InputError(
+                "the whole-body controller keeps one stance: follow stance phases with the servo"
+            )
         if controller is not None:
             world = perturbation
             self.wbc = WholeBodyController(
@@ -378,7 +383,9 @@ def simulate_mujoco(
                 ground = replay.ground()
                 assert state is not None
                 contact = force, replay.struck.speed(target_before), float(speeds[0])
-                rows.append((t, *state, *contact, demand, torque, ground, corners, gears.taken()))
+                rows.append(
+                    (t, *state, *contact, demand, torque, ground, corners, gears.taken(), stance_at(now, t))
+                )
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(t)
                 if fall:

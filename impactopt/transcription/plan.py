@@ -20,7 +20,7 @@ from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, GearLoad
-from impactopt.robots.loads import BEARS, DriveLoads, cop_margin, gear_torque, weight_of
+from impactopt.robots.loads import BEARS, DriveLoads, cop_margin, gear_torque, least_margins, weight_of
 from impactopt.robots.robot import Robot
 
 __all__ = [
@@ -616,29 +616,27 @@ class Plan:
         hit = self.collision if collision is None else collision
         of_hit = self._wrench_of_all(p.blow, hit.sole_wrench) if p.stances else hit.sole_wrench
         parts = {
-            "swing": (ref, ref.phase == 0),
-            "collision": (None, np.ones(len(of_hit), dtype=bool)),
-            "follow": (ref, ref.phase == 2),
+            "swing": (ref.sole_wrench[ref.phase == 0], ref.stance[ref.phase[: len(ref.stance)] == 0]),
+            "collision": (of_hit, np.full(len(of_hit), p.blow)),
+            "follow": (ref.sole_wrench[ref.phase == 2], ref.stance[ref.phase[: len(ref.stance)] == 2]),
         }
         if self.abort is not None:
             way = self.trajectory(missed=True, known=ref) if missed is None else missed
-            parts["missed"] = way, way.phase > 0
+            parts["missed"] = way.sole_wrench[way.phase > 0], way.stance[way.phase[: len(way.stance)] > 0]
+        labels = np.repeat(list(parts), [len(part) for part, _ in parts.values()])
+        wrench = np.concatenate([part for part, _ in parts.values()])
+        wrench = wrench.reshape(len(labels), -1, 6)[:, : len(p.soles)]
+        stance = np.concatenate([numbers for _, numbers in parts.values()])
+        margins = cop_margin(p.robot, [sole.polygon for sole in p.soles], wrench)
         asked = {name: cone.collision_margin if name == "collision" else cone.margin for name in parts}
-        out: dict[str, Any] = {"sole_cop_margin_mm": {}, "sole_force_N": {}}
-        for k, sole in enumerate(p.soles):
-            margins, forces = dict[str, float](), dict[str, float]()
-            for name, (way, chosen) in parts.items():
-                wrench = (of_hit if way is None else way.sole_wrench)[chosen, 6 * k : 6 * k + 6][:, None]
-                known = way is not None and way.stance.size
-                phase = way.stance[chosen] if known else np.full(len(wrench), p.blow)
-                on, bears = p.standing[phase, k], ~p.fading[phase, k]
-                if on.any():
-                    margins[name] = 1e3 * float(cop_margin(p.robot, [sole.polygon], wrench[on]).min())
-                if (on & bears).any():
-                    forces[name] = float(wrench[on & bears, 0, 2].min())
-            out["sole_cop_margin_mm"][sole.name], out["sole_force_N"][sole.name] = margins, forces
         return {
-            **out,
+            **least_margins(
+                [sole.name for sole in p.soles],
+                margins,
+                wrench[:, :, 2],
+                {name: labels == name for name in parts},
+                *((p.standing, stance) if p.stances else ()),
+            ),
             "sole_cop_margin_asked_mm": {n: 1e3 * m for n, m in asked.items() if m is not None},
             "sole_force_asked_N": cone.minimum_force,
         }

@@ -20,6 +20,7 @@ import numpy as np
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import graded_breaks
+from impactopt.robots.loads import fading
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import (
     Affine,
@@ -120,7 +121,7 @@ class Course:
     def fading(self, number: int) -> set[str]:
         """Soles of a phase that do not stand in a neighbour of it."""
         p = self._b.problem
-        return {sole.name for sole, fades in zip(p.soles, p.fading[number], strict=True) if fades}
+        return {sole.name for sole, fades in zip(p.soles, fading(p.standing)[number], strict=True) if fades}
 
     def _soles(self, number: int) -> tuple[str, ...]:
         stances = self._b.problem.stances

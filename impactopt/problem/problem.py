@@ -55,7 +55,7 @@ from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
-from impactopt.problem.stances import StancePhase, check_stances
+from impactopt.problem.stances import StancePhase, check_stances, names_of
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -502,6 +502,8 @@ class ImpactProblem:
             out["collision"] = self.collision + more.get(self.collision, "")
         if self.second is not None:
             out["second"] = {"striker": self.second.striker, "point_m": self.second.point.tolist()}
+        if self.stances:
+            out["stances"] = names_of(self.stances)
         if hands := self.stance.held_hands(self.robot):
             out["holds_on_with"] = [hand.name for hand in hands]
         if self.robot.source and self.robot.source.repairs:

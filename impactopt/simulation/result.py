@@ -517,9 +517,7 @@ def simulation_of(
         stance=stance,
         stands=scene.standing,
         polygons=scene.polygons,
-        landing_speed=landing_speeds(scene, time, corners, sole_ground, stance)
-        if stance.size
-        else np.zeros(0),
+        landing_speed=landings,
         **rest,
     )
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -408,6 +409,7 @@ class Plan:
         stance = np.zeros(0, dtype=np.intp)
         for piece in pieces[: len(self.before) + 1] if known is None else ():
             times = sampled(piece.start, piece.start + piece.spline.duration, step)
+            times = times if piece.number == problem.blow else times[:-1]  # the last one is the next one's
             parts.append((0, times, *self._completed(piece, times, q)))
             stance = np.append(stance, np.full(len(times), piece.number))
             q = parts[-1][2][-1]
@@ -424,6 +426,7 @@ class Plan:
         for piece in pieces[len(self.before) + 1 :]:
             end = piece.start + piece.spline.duration + (hold if piece is pieces[-1] else 0.0)
             times = sampled(piece.start, end, step)
+            times = times if piece is pieces[-1] else times[:-1]
             parts.append((2, times, *self._completed(piece, times, q)))
             stance = np.append(stance, np.full(len(times), piece.number))
             q = parts[-1][2][-1] if self.after else q
@@ -494,6 +497,7 @@ class Plan:
             for phase in (2,) if missed else (0, 2):
                 pieces = [piece for piece in self.pieces(missed=missed) if piece.phase == phase]
                 times = [sampled(p.start, p.start + p.spline.duration, step) for p in pieces]
+                times = [*(at[:-1] for at in times[:-1]), times[-1]]
                 rows = [
                     self.closed(piece.sample(at)[0], self.problem.stance_coordinates[piece.number])
                     for piece, at in zip(pieces, times, strict=True)
@@ -534,6 +538,35 @@ class Plan:
         before = float(self.problem.target.speed_before()) * np.minimum(since, 0.0)
         within = np.interp(since, hit.time, gone, left=0.0)
         return before + within + last * np.maximum(since - hit.time[-1], 0.0)
+
+    def stances(self) -> list[dict[str, Any]]:
+        """Stance phases with the soles that stand in each, from when till when [s]; nothing where the problem
+        has none.
+        """
+        out = []
+        for k, stance in enumerate(self.problem.stances):
+            own = [piece for piece in self.pieces() if piece.number == k]
+            end = own[-1].start + own[-1].spline.duration
+            out.append({"soles": list(stance.soles), "from_s": own[0].start, "to_s": end})
+        return out
+
+    def landing_speeds(self) -> dict[str, float]:
+        """Planned speed [m/s] of the corner that is fastest of each sole that touches down, by name."""
+        p, out = self.problem, dict[str, float]()
+        robot, data = p.robot, p.robot.model.createData()
+        for one, other in pairwise(self.pieces()):
+            landed = p.standing[other.number] & ~p.standing[one.number]
+            for sole in (sole for sole, down in zip(p.soles, landed, strict=True) if down):
+                c, end = p.stance_coordinates[one.number], one.start + one.spline.duration
+                (y,), (yd,), (ydd,), _ = one.sample(np.array([end]))
+                q, v, _ = c.complete_motion(y, yd, ydd, c.solve_legs(y, c.split(p.start_posture)[1]))
+                pin.forwardKinematics(robot.model, data, q, v)
+                frame = robot.model.getFrameId(sole.frame)
+                twist = pin.getFrameVelocity(robot.model, data, frame, pin.LOCAL)
+                corners = np.column_stack([sole.polygon, np.zeros(len(sole.polygon))])
+                speeds = twist.linear + np.cross(twist.angular, corners)
+                out[sole.name] = max(out.get(sole.name, 0.0), float(np.linalg.norm(speeds, axis=1).max()))
+        return out
 
     def closed(self, y: Array, coordinates: StanceCoordinates | None = None) -> Array:
         """Configurations (k, nq) of independent coordinates (k, ny), one near the next; coordinates : if not

@@ -50,9 +50,7 @@ def add_nodes(
     of another, whose constraints close their legs.  fading : names of soles that may bear nothing.
     """
     c, part = b.coordinates, b.parts("node")
-    limits, rates = b.robot.torque_limit, b.robot.velocity_limit[c.dependent]
-    numbers = np.concatenate([limits, rates, b.limits.units, c.start_determinants])
-    first, torques = b.add_block("node", instances, numbers), []
+    first, torques = b.add_block("node", instances, node_numbers(b)), []
     closure = [f"{leg.end} {d}" for leg in c.legs for d in DIRECTIONS]
     fast = percent("over its limit", of=b.limits.velocity.fraction)
     for i, (place, slots) in enumerate(zip(places, instances, strict=True)):
@@ -84,6 +82,12 @@ def add_nodes(
         add_cone_rows(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force, fading)
         torques.append(at + part["torque"])
     return torques
+
+
+def node_numbers(b: Builder) -> Array:
+    """Parameters of the block ``node``."""
+    limits, rates = b.robot.torque_limit, b.robot.velocity_limit[b.coordinates.dependent]
+    return np.concatenate([limits, rates, b.limits.units, b.coordinates.start_determinants])
 
 
 def add_cone_rows(

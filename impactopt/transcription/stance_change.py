@@ -34,7 +34,7 @@ from impactopt.transcription.layout import (
     stack,
 )
 from impactopt.transcription.mesh import with_middles
-from impactopt.transcription.motion_phase import FREE, REST, MotionPhase, add_nodes
+from impactopt.transcription.motion_phase import FREE, REST, MotionPhase, add_nodes, node_numbers
 from impactopt.transcription.plan import PlannedStand
 
 # [m] that a sole in the air is above the ground, from so long [s] after it has left it until so long before
@@ -78,8 +78,6 @@ class Course:
     Attributes
     ----------
     numbers : of the phases.  builders, phases : of each.
-    torques : outputs of the block ``node``, of each phase at each node; that of the blow has its from the
-        program.
     """
 
     def __init__(
@@ -99,7 +97,6 @@ class Course:
             if k in numbers
         }
         self.phases: dict[int, MotionPhase] = {}
-        self.torques: dict[int, list[Index]] = {}
         for k in sorted(numbers, key=lambda k: -len(self._soles(k))):  # of neighbours the heavier one first
             ends = [REST if other not in numbers else self._meets(k, other) for other in (k - 1, k + 1)]
             stand = k != p.blow
@@ -149,8 +146,8 @@ class Course:
         limit, names = self._b.limits.torque.fraction, self._b.robot.joint_names
         for k, phase in self.stands.items():
             b, (slots, places) = self.builders[k], phase.instances()
-            self.torques[k] = add_nodes(b, slots, places, fading=self.fading(k))
-            for place, torque in zip(places, self.torques[k], strict=True):
+            torques = add_nodes(b, slots, places, fading=self.fading(k))
+            for place, torque in zip(places, torques, strict=True):
                 b.rows.add(
                     term=b.limits.torque.name,
                     place=place,
@@ -189,9 +186,17 @@ class Course:
             upper=0,
             measure=rates(its.labels),
         )
-        torques = {k: self.torques[k][self._node(k, one, other)] for k in (light, heavy)}
-        part = self.builders[heavy].parts("node")
-        legs = torques[heavy][0] - part["torque"][0] + part["leg_rate"]
+        # once more by itself: an output is of one row, and those of the nodes have theirs
+        node = {
+            k: self.builders[k].add_block(
+                "node",
+                [self.phases[k].instances()[0][self._node(k, one, other)]],
+                node_numbers(self.builders[k]),
+            )
+            for k in (light, heavy)
+        }
+        torques = {k: at + self.builders[k].parts("node")["torque"] for k, at in node.items()}
+        legs = node[heavy] + self.builders[heavy].parts("node")["leg_rate"]
         freed = np.flatnonzero(~np.isin(its.dependent, mine.dependent))
         limit = b.robot.velocity_limit[its.dependent[freed]]
         labels = [its.leg_labels[k] for k in freed]

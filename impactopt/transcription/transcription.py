@@ -243,8 +243,6 @@ class Transcription(ContactProgram):
         for follow in self.follows:
             follow.add_rate_rows(b)
         for course in (self.before, *self.after):
-            nodes = len(course.phases[self.problem.blow].nodes)
-            course.torques[self.problem.blow], outputs = outputs[:nodes], outputs[nodes:]
             course.add_stands()
             course.add_changes()
 

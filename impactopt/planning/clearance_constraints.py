@@ -419,10 +419,11 @@ class _Nodes:
 
     def __init__(self, t: Transcription, plan: Plan) -> None:
         self._plan, self._places = plan, {0: set(t.nodes.swing), AFTER: set(t.nodes.follow)}
+        self._stands = t.nodes.stands
 
     @property
     def all(self) -> MoreNodes:
-        return MoreNodes(tuple(sorted(self._places[0])), tuple(sorted(self._places[AFTER])))
+        return MoreNodes(tuple(sorted(self._places[0])), tuple(sorted(self._places[AFTER])), self._stands)
 
     def add(self, found: _Between, jumps: bool) -> bool:
         """One at that instant, or as near to it as others are not; two beside it, where bodies jump from one

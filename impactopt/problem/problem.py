@@ -363,7 +363,7 @@ class ImpactProblem:
 
     @property
     def standing(self) -> NDArray[np.bool_]:
-        """(phases, soles) Which of its `soles` stand in each stance phase."""
+        """Mask (phases, soles) of its `soles` that stand in each stance phase."""
         names = [sole.name for sole in self.soles]
         found = [[name in stance.soles for name in names] for stance in self.stances]
         return np.array(found or [[True] * len(names)], dtype=bool)

@@ -169,7 +169,7 @@ def least_kept(asked: float) -> float:
 
 
 def fading(standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(phases, soles) Which soles stand that do not in the phase before or after, of (phases, soles)."""
+    """Mask (phases, soles) of soles that stand, but not in the phase before or after; of what stands."""
     away = ~np.pad(standing, ((1, 1), (0, 0)), mode="edge")
     return np.asarray(standing & (away[:-2] | away[2:]))
 

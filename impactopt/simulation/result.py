@@ -271,12 +271,18 @@ class Simulation:
         return out
 
     def _inside(self, polygon: Array) -> Array:
-        """Distance (k,) [m] of the ZMP from the edges of what stands; polygon : of one stance."""
+        """Distance (k,) [m] of the ZMP from the edges of what stands, or presses on the ground all the same;
+        polygon : of one stance.
+        """
         zmp = self.zmp()
         if not self.stance.size:
             return distance_inside(polygon, zmp)
-        found = [distance_inside(own, zmp) for own in self.polygons]
-        return np.asarray(np.array(found)[self.stance, np.arange(len(zmp))])
+        found = np.array([distance_inside(own, zmp) for own in self.polygons])
+        on = self.stands[self.stance] | (self.sole_normal > 0)
+        # the smallest stance that has all of these soles
+        lacks = (on[:, None] & ~self.stands).any(axis=2)
+        size = np.where(lacks, self.stands.shape[1] + 1, self.stands.sum(axis=1))
+        return np.asarray(found[size.argmin(axis=1), np.arange(len(zmp))])
 
     def _cut_numbers(self) -> dict[str, Any]:
         """Summary of the joint that was cut longest; None if no motor's line is known, 0 if none was cut."""
@@ -422,7 +428,7 @@ def slip_and_lift(scene: Scene, corners: Array, stance: NDArray[np.intp]) -> tup
 
 
 def _corners_of(scene: Scene) -> list[slice]:
-    """Where each sole's corners are among all."""
+    """Slices of each sole's corners among all."""
     return [slice(a, b) for a, b in itertools.pairwise(np.cumsum([0, *(len(c) for c in scene.corners)]))]
 
 

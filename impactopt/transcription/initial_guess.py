@@ -171,6 +171,8 @@ def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: 
     if isinstance(t, Transcription) and isinstance(old, Transcription):
         places = {"swing": (old.swing_nodes, t.swing_nodes)}
         places |= dict.fromkeys(("follow", "abort"), (old.follow_nodes, t.follow_nodes))
+        for mine, its in zip((t.before, *t.after), (old.before, *old.after), strict=True):
+            places |= {one.kind: (its.stands[k].nodes, one.nodes) for k, one in mine.stands.items()}
     new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
     for name, group in t.layout.groups.items():
         known = old.layout.groups.get(name)

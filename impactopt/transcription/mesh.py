@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.contact.targets import Target
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
-from impactopt.robots.loads import cop_margin, least_kept, weight_of
+from impactopt.robots.loads import BEARS, cop_margin, fading, least_kept, weight_of
 from impactopt.transcription.contact_guess import mass_at_contact, natural_durations
-from impactopt.transcription.plan import Plan, complete_reference, gear_share, sampled
+from impactopt.transcription.plan import Piece, Plan, complete_reference, gear_share, sampled
 
 Array = NDArray[np.float64]
 STEP = 1e-3  # [s] at which a motion is looked at: as the servo's reference is sampled
@@ -32,15 +33,21 @@ GEAR = 0.03  # of what a gear may bear: what it may carry more between nodes, or
 
 
 class MoreNodes(NamedTuple):
-    """Places on [0, 1] of nodes beside the ends and middles of a spline's intervals: of the swing, and of all
-    ways to rest."""
+    """Places on [0, 1] of nodes beside the ends and middles of a spline's intervals: of the swing, of all
+    ways to rest, and of each stance phase beside the one with the blow.
+    """
 
     swing: tuple[float, ...] = ()
     follow: tuple[float, ...] = ()
+    stands: tuple[tuple[float, ...], ...] = ()
 
     @property
     def total(self) -> int:
-        return len(self.swing) + len(self.follow)
+        return len(self.swing) + len(self.follow) + sum(map(len, self.stands))
+
+    def of_stand(self, number: int) -> tuple[float, ...]:
+        """Places of a stance phase beside the one with the blow."""
+        return self.stands[number] if number < len(self.stands) else ()
 
 
 NO_MORE = MoreNodes()
@@ -54,46 +61,66 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     friction than it may; where torques give up half of the room to all that the motors have; where a joint of
     a constrained leg is faster than it may be; and where a gear carries 3 % more than it may.
     """
-    start = plan.coordinates.split(plan.problem.start_posture)[1]
-    swing, legs = _middles_outside(plan, 0, start)
-    follow = _middles_outside(plan, 2, legs)[0]
+    blow, q = plan.problem.blow, plan.problem.start_posture
+    at_contact = q
+    found: dict[tuple[int, int], set[float]] = {}
+    for piece in plan.pieces():
+        middles, q = _middles_outside(plan, piece, q)
+        found[piece.phase, piece.number] = set(middles)
+        at_contact = q if (piece.phase, piece.number) == (0, blow) else at_contact
     if plan.abort is not None:
-        follow += _middles_outside(plan, 2, legs, missed=True)[0]
+        q = at_contact
+        for piece in plan.pieces(missed=True)[len(plan.before) + 1 :]:
+            middles, q = _middles_outside(plan, piece, q)
+            found[piece.phase, piece.number] |= set(middles)
+    stands = [
+        {*known.of_stand(k), *(found[0 if k < blow else 2, k] if k != blow else ())}
+        for k in range(len(plan.problem.stances))
+    ]
     return MoreNodes(
-        tuple(sorted({*known.swing, *swing})),
-        tuple(sorted({*known.follow, *follow})),
+        tuple(sorted({*known.swing, *found[0, blow]})),
+        tuple(sorted({*known.follow, *found[2, blow]})),
+        tuple(tuple(sorted(places)) for places in stands),
     )
 
 
-def _middles_outside(
-    plan: Plan, phase: int, legs: Array, *, missed: bool = False
-) -> tuple[list[float], Array]:
-    """Middles between nodes between which the plan is out of its limits, and the legs at its end."""
-    p, c = plan.problem, plan.coordinates
-    curve, begin, nodes, _ = plan.segment(phase, missed=missed)
-    time = sampled(0.0, curve.duration, STEP)
-    at = complete_reference(p, *plan.independent(phase, begin + time, missed=missed), legs)
+def _middles_outside(plan: Plan, piece: Piece, q: Array) -> tuple[list[float], Array]:
+    """Middles between nodes between which a piece of a plan is out of its limits, and the configuration at
+    its end; q (nq,) : near that at its start.
+    """
+    p, c = plan.problem, plan.problem.stance_coordinates[piece.number]
+    time = sampled(0.0, piece.spline.duration, STEP)
+    at = complete_reference(p, *piece.sample(piece.start + time), c.split(q)[1], c)
     limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)
     ratio = np.abs(at.torque / p.robot.torque_limit).max(axis=1, initial=0.0)
     outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
     # the others' rates are bounded by their splines' control points
     outside |= (np.abs(at.v[:, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
     outside |= gear_share(p, at.torque, at.a[:, joints]) > 1.0 + GEAR
-    outside |= _soles_outside(plan, at.sole_wrench)
-    between = np.searchsorted(nodes, time[outside] / curve.duration, side="right").clip(1, len(nodes) - 1)
+    fades = {sole.name for sole, on in zip(p.soles, fading(p.standing)[piece.number], strict=True) if on}
+    outside |= _soles_outside(p, c, at.sole_wrench, fades)
+    nodes = piece.nodes
+    between = np.searchsorted(nodes, time[outside] / piece.spline.duration, side="right")
+    between = between.clip(1, len(nodes) - 1)
     middles = [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
-    return middles, c.split(at.q[-1])[1]
+    return middles, at.q[-1]
 
 
-def _soles_outside(plan: Plan, wrenches: Array) -> NDArray[np.bool_]:
-    """Instants (k,) at which some sole keeps too little of its limits, from wrenches (k, 6 a sole)."""
-    robot, soles, cone = plan.problem.robot, plan.coordinates.soles, plan.problem.term(ContactWrenchCone)
+def _soles_outside(
+    problem: ImpactProblem, c: StanceCoordinates, wrenches: Array, fades: Collection[str]
+) -> NDArray[np.bool_]:
+    """Instants (k,) at which some sole keeps too little of its limits, from wrenches (k, 6 a sole).
+
+    fades : names of soles that may bear nothing, and have no friction to speak of then.
+    """
+    robot, soles, cone = problem.robot, c.soles, problem.term(ContactWrenchCone)
     own, least = wrenches.reshape(len(wrenches), -1, 6)[:, : len(soles)], least_kept(cone.margin)
     outside = (cop_margin(robot, [sole.polygon for sole in soles], own) < least).any(axis=1)
-    outside |= (own[:, :, 2] < _SHARE * cone.minimum_force).any(axis=1)
     for k, sole in enumerate(soles):
+        bears = own[:, k, 2] >= (BEARS * weight_of(robot) if sole.name in fades else -np.inf)
+        outside |= bears & (own[:, k, 2] < _SHARE * cone.minimum_force) & (sole.name not in fades)
         rows = contact_wrench_cone(sole.polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
-        outside |= (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)
+        outside |= bears & (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)
     return np.asarray(outside)
 
 

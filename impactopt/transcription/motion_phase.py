@@ -153,7 +153,8 @@ class MotionPhase:
 
     Attributes
     ----------
-    name : what constraints and messages call it.  phase : what the problem asks of it.
+    kind : first word of its variables' names.  name : what constraints and messages call it.
+    phase : what the problem asks of it.
     breaks : of the spline, from 0 to 1.  nodes (k,) : where legs and sole wrenches are, and constraints hold.
     more : which of these are beside the ends and middles of the spline's intervals.
     c, legs, w, T : variables: control points, legs and sole wrenches at the nodes, duration [s].
@@ -179,7 +180,7 @@ class MotionPhase:
 
         begins : `REST`, `FREE` or the coordinates (ny) that it begins at.  ends : likewise, or `COASTING`.
         """
-        kind, self.name = names
+        self.kind, self.name = names
         self.phase, (self.breaks, self.nodes, self.more) = phase, mesh
         self._begins, self._ends = begins, ends
         self._at: dict[float, tuple[Affine, Affine, Affine]] = {}
@@ -190,10 +191,10 @@ class MotionPhase:
         self.lead = _control_points(begins, {REST: 3, FREE: 0})
         points = self._last + 1 - self.lead - _control_points(ends, {REST: 2, FREE: 0, COASTING: 1})
         nodes, limits = len(self.nodes), b.limits
-        self.c = b.layout.add(f"{kind} control point", points, b.ny, **limits.of_y)
-        self.legs = b.layout.add(f"{kind} legs", nodes, b.nl, **limits.of_legs)
-        self.w = b.layout.add(f"{kind} sole wrench", nodes, b.nw, **limits.of_wrenches)
-        self.T = b.duration(f"{kind} duration", self.phase.duration, 0.1)
+        self.c = b.layout.add(f"{self.kind} control point", points, b.ny, **limits.of_y)
+        self.legs = b.layout.add(f"{self.kind} legs", nodes, b.nl, **limits.of_legs)
+        self.w = b.layout.add(f"{self.kind} sole wrench", nodes, b.nw, **limits.of_wrenches)
+        self.T = b.duration(f"{self.kind} duration", self.phase.duration, 0.1)
 
     def control(self, j: int) -> Affine:
         """Control point j = 0 .. N+2 of the spline.

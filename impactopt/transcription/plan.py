@@ -325,7 +325,7 @@ class Plan:
         return self.end()
 
     def end(self, *, missed: bool = False) -> float:
-        """When the motion is over [s]; ``missed``: that of a robot that hits nothing."""
+        """End of the motion [s]; ``missed``: of that of a robot that hits nothing."""
         last = self.pieces(missed=missed)[-1]
         return last.start + last.spline.duration
 

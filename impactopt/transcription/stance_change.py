@@ -33,7 +33,7 @@ from impactopt.transcription.layout import (
     select,
     stack,
 )
-from impactopt.transcription.mesh import with_middles
+from impactopt.transcription.mesh import MoreNodes, with_middles
 from impactopt.transcription.motion_phase import FREE, REST, MotionPhase, add_nodes, node_numbers
 from impactopt.transcription.plan import PlannedStand
 
@@ -46,18 +46,24 @@ class Stand(MotionPhase):
     """A phase on other soles, before or after those with the blow."""
 
     def __init__(
-        self, b: Builder, number: int, missed: bool, begins: str | Affine, ends: str | Affine
+        self,
+        b: Builder,
+        number: int,
+        more: tuple[float, ...],
+        missed: bool,
+        begins: str | Affine,
+        ends: str | Affine,
     ) -> None:
         p = b.problem
         stance = p.stances[number]
         assert stance.phase is not None
         breaks = graded_breaks(stance.phase.intervals, stance.phase.grading, fine_end=number < p.blow)
         places = with_middles(breaks)
-        mesh = breaks, places[1:] if begins == REST else places, ()
+        mesh = breaks, np.union1d(places[1:] if begins == REST else places, more), more
         soles = " and ".join(stance.soles)
-        names = (f"stance {number}", f"on {soles}, phase {number + 1}")
+        names = (f"stance{number}", f"on {soles}, phase {number + 1}")
         if missed:
-            names = (f"{names[0]} abort", f"{names[1]}, if nothing is hit")
+            names = (f"{names[0]}-abort", f"{names[1]}, if nothing is hit")
         super().__init__(b, names, stance.phase, mesh, begins, ends)
 
 
@@ -85,6 +91,7 @@ class Course:
         b: Builder,
         numbers: range,
         main: Callable[[str | Affine, str | Affine], MotionPhase],
+        nodes: MoreNodes,
         *,
         missed: bool = False,
     ) -> None:
@@ -100,7 +107,10 @@ class Course:
         for k in sorted(numbers, key=lambda k: -len(self._soles(k))):  # of neighbours the heavier one first
             ends = [REST if other not in numbers else self._meets(k, other) for other in (k - 1, k + 1)]
             stand = k != p.blow
-            self.phases[k] = Stand(self.builders[k], k, missed, *ends) if stand else main(ends[0], ends[1])
+            more = nodes.of_stand(k)
+            self.phases[k] = (
+                Stand(self.builders[k], k, more, missed, *ends) if stand else main(ends[0], ends[1])
+            )
         for one, other in self._changes():
             heavy = max(one, other, key=lambda k: len(self._soles(k)))
             node, phase = self._node(heavy, one, other), self.phases[heavy]
@@ -132,7 +142,7 @@ class Course:
         return len(self.phases[k].nodes) - 1 if k == one else 0
 
     def _meets(self, k: int, other: int) -> str | Affine:
-        """How phase k begins or ends at a neighbour."""
+        """Beginning or end of phase k at a neighbour."""
         if len(self._soles(k)) > len(self._soles(other)):
             return FREE
         phase, before = self.phases[other], other < k
@@ -160,7 +170,7 @@ class Course:
             phase.add_rate_rows(b)
 
     def add_changes(self) -> None:
-        """What holds where soles lift off or touch down, and on the way between."""
+        """Rows where soles lift off or touch down, and while they are in the air."""
         for one, other in self._changes():
             self._add_change(one, other)
         for k in self.numbers if len(self.numbers) > 1 else ():

@@ -112,7 +112,7 @@ def block_functions(
 
 
 def _coordinates_recipe(c: StanceCoordinates) -> tuple[Any, ...]:
-    """What shapes a block beside its formula: the model, and how legs hold what."""
+    """Recipe of a block beside its formula: the model, and what its legs hold how."""
     return (
         model_hash(c.robot.model),
         tuple((leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12))) for leg in c.legs),
@@ -147,16 +147,20 @@ class Transcription(ContactProgram):
     ) -> None:
         b, self.nodes = Builder(problem, coordinates, functions), nodes
         before, after = range(problem.blow + 1), range(problem.blow, max(1, len(problem.stances)))
-        self.before = Course(b, before, lambda begins, _: Swing(b, nodes.swing, begins))
+        self.before = Course(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
         self.swing = cast(Swing, self.before.phases[problem.blow])
         contact = Contact(self.swing.end, *add_coasting(b))
         super().__init__(b, Hit(b, contact, elements, shares, after=False))
-        self.after = [Course(b, after, lambda _, ends: FollowThrough(b, nodes.follow, ends=ends))]
+        self.after = [Course(b, after, lambda _, ends: FollowThrough(b, nodes.follow, ends=ends), nodes)]
         self.follow = cast(FollowThrough, self.after[0].phases[problem.blow])
         self.abort: AbortMotion | None = None
         if (late := problem.abort_after) is not None:
             aborted = Course(
-                b, after, lambda _, ends: AbortMotion(b, nodes.follow, after=late, ends=ends), missed=True
+                b,
+                after,
+                lambda _, ends: AbortMotion(b, nodes.follow, after=late, ends=ends),
+                nodes,
+                missed=True,
             )
             self.abort = cast(AbortMotion, aborted.phases[problem.blow])
             self.after.append(aborted)
@@ -431,8 +435,8 @@ def statement_of(t: Transcription) -> str:
     """JSON summary of a program, for a reader that knows nothing of this package.
 
     `groups`: name, count and size of the variables, in their order. `rows`: term, place and the number of a
-    list of `components`. `more`: nodes beside those of the mesh. `elements`, `guarded`, `shares`,
-    `shortest`: of the contact, its least durations [s] by collision. `apart`: rows between bodies.
+    list of `components`. `more`: nodes beside those of the mesh, as of `MoreNodes`. `elements`, `guarded`,
+    `shares`, `shortest`: of the contact, its least durations [s] by collision. `apart`: rows between bodies.
     """
     lists: dict[tuple[str, ...], int] = {}
     rows = []
@@ -451,7 +455,7 @@ def statement_of(t: Transcription) -> str:
             "groups": [[g.name, g.count, g.size] for g in t.layout.groups.values()],
             "rows": rows,
             "components": list(lists),
-            "more": [list(t.nodes.swing), list(t.nodes.follow)],
+            "more": [list(t.nodes.swing), list(t.nodes.follow), *map(list, t.nodes.stands)],
             "elements": t.hit.elements if collisions else [],
             "guarded": t.hit.guarded,
             "shares": list(t.hit.shares),

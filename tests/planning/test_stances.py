@@ -12,18 +12,30 @@ from support.small_plans import BODILESS, biped_problem, transcribed
 from support.small_robots import arm, biped
 
 from impactopt.errors import InputError
+from impactopt.files.export.motion import motion_at
+from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
+from impactopt.files.verify import motion_of_record
 from impactopt.kinematics.stance import FixedBase
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.stances import StancePhase
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.transcription.initial_guess import first_iterate
+from impactopt.transcription.initial_guess import carried_over, first_iterate
+from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.transcription import Transcription
 
 BOTH = StancePhase(soles=("left", "right"), phase=Phase(duration=(0.4, 0.9), intervals=6, grading=1.0))
 STEPS = (BOTH, StancePhase(soles=("left",)), BOTH)
+
+
+def changed_nodes(program: Transcription, nodes: MoreNodes) -> Transcription:
+    return Transcription(program.problem, program.coordinates, program.functions, nodes)
+
+
+def no_multipliers(program: Transcription) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(program.program.m), np.zeros(program.program.n)
 
 
 def stepping(**changes: object) -> ImpactProblem:
@@ -141,7 +153,19 @@ def test_a_replay_that_holds_the_soles_by_the_schedule_does_what_is_planned(
         torque_limit=plan.problem.robot.torque_limit, polygon=plan.polygon, planned_impulse=plan.impulse
     )
     assert numbers["landing_speed_m_s"].keys() == {"right"}
-    assert min(numbers["zmp_margin_m"].values()) > 0
+    planned, found = plan.margins()["zmp_margin_m"], numbers["zmp_margin_m"]
+    assert found["swing"] == pytest.approx(planned["swing"], abs=1e-3)
+    assert found["follow"] > planned["follow"] - 1e-3
+
+
+def test_nodes_are_added_in_phases_beside_the_one_with_the_blow(plan: Plan, program: Transcription) -> None:
+    more = nodes_to_add(plan, NO_MORE)  # of six intervals, some margin is gone between two nodes
+    assert len(more.stands) == 3 and not more.stands[1] and any(more.stands)
+    finer = changed_nodes(program, more)
+    names = set(finer.layout.groups)
+    assert finer.program.n > program.program.n and names == set(program.layout.groups)
+    x = carried_over(finer, program, first_iterate(program), *no_multipliers(program))[0]
+    assert np.abs(finer.decode(x).before[0].spline.control).max() > 0.1
 
 
 def test_what_is_said_of_each_phase(plan: Plan) -> None:
@@ -211,3 +235,45 @@ def test_the_stance_of_a_problem_is_that_of_the_blow() -> None:
     assert [sole.name for sole in problem.soles] == ["left", "right"]
     assert problem.hash != stepping(stances=STEPS[:2]).hash
     assert biped_problem(biped()).hash == dataclasses.replace(biped_problem(biped()), stances=()).hash
+
+
+# ---- what is made of such a plan
+
+
+def test_a_verdict_holds_the_soles_of_each_phase_to_their_places(
+    plan: Plan, ways: tuple[Trajectory, Trajectory]
+) -> None:
+    arrays = {f"reference_{f.name}": getattr(ways[0], f.name) for f in dataclasses.fields(ways[0])}
+    found = list(motion_of_record(plan.problem, arrays))
+    worst = max(found, key=lambda off: off[1])
+    assert worst[1] < 2e-2, worst  # [1] of its size: what a program's tolerance leaves
+    assert max(off for name, off, _ in found if name.endswith("held soles")) < 1e-6
+    moved = {**arrays, "reference_stance": np.zeros_like(ways[0].stance)}
+    assert max(off for name, off, _ in motion_of_record(plan.problem, moved) if "held soles" in name) > 0.01
+
+
+def test_an_export_says_which_sole_stands(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> None:
+    robot = plan.problem.robot
+    for jumps in (True, False):
+        motion = motion_at(ways[0], robot, 500.0, np.arange(robot.n), {}, jumps=jumps)
+        assert motion.stance is not None
+        changes = motion.time[np.flatnonzero(np.diff(motion.stance)) + 1]
+        planned = [each["from_s"] for each in plan.stances()[1:]]
+        np.testing.assert_allclose(changes, planned, atol=2e-3)
+
+
+def test_a_problem_file_has_the_phases() -> None:
+    problem = load_problem("kick_two_feet")
+    again = problem_from_data(problem_data(problem), where="again.toml")
+    assert again.hash == problem.hash and again.stances == problem.stances
+    data = problem_data(problem)
+    for stances, message in (
+        ([{"soles": ["left"], "duration_s": 1.0}], "the blow falls in one phase"),
+        ([{"soles": []}, *data["stances"]], "no soles"),
+        ([{"soles": ["left"], "intervals": 8}, *data["stances"]], "no duration_s"),
+        ([*data["stances"], {"soles": ["up"], "duration_s": 1.0}], "no sole 'up'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            problem_from_data({**data, "stances": stances}, where="wrong.toml")
+    with pytest.raises(InputError, match=r"\[stance\] holds one stance"):
+        problem_from_data({**data, "stance": {"soles": "left"}}, where="both.toml")

@@ -61,7 +61,7 @@ def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
 
 
 def _contacts(standing: dict[str, NDArray[np.bool_]]) -> dict[str, Any]:
-    """Which soles stand (k, soles), and their names, of a motion with stance phases."""
+    """Mask (k, soles) of the soles that stand, and their names, of a motion with stance phases."""
     if not standing:
         return {}
     return {"sole_contact": np.column_stack(list(standing.values())), "sole_names": np.array(list(standing))}

@@ -159,7 +159,6 @@ class MotionPhase:
     more : which of these are beside the ends and middles of the spline's intervals.
     c, legs, w, T : variables: control points, legs and sole wrenches at the nodes, duration [s].
     unloaded : components of the sole wrenches that are zero, by the number of the node.
-    bearing : index of a sole that bears load at all nodes.
     """
 
     c: Group
@@ -185,7 +184,6 @@ class MotionPhase:
         self._begins, self._ends = begins, ends
         self._at: dict[float, tuple[Affine, Affine, Affine]] = {}
         self.unloaded: dict[int, Index] = {}
-        self.bearing = 0
         self._last = len(self.breaks) + 1
         self._y0 = Affine.constant(b.y0)
         self.lead = _control_points(begins, {REST: 3, FREE: 0})
@@ -251,10 +249,16 @@ class MotionPhase:
             (self.place_at(s), [self.at(s)[0], self.legs[k]]) for k, s in enumerate(self.nodes) if s >= since
         ]
 
+    def _bearing(self, k: int) -> Index:
+        """Components of the first sole that bears load at a node, if any does."""
+        soles = np.arange(self.w.size).reshape(-1, 6)
+        return next((own for own in soles if not np.isin(own, self.unloaded.get(k, ())).any()), np.arange(0))
+
     def determined(self) -> list[Determined]:
         """Variables determined at each node: each leg, and the wrench of a sole that bears load."""
-        own = slice(6 * self.bearing, 6 * self.bearing + 6)
-        found = [[*by_leg(self.legs.index(k)), self.w.index(k)[own]] for k in range(self.w.count)]
+        found = [
+            [*by_leg(self.legs.index(k)), self.w.index(k)[self._bearing(k)]] for k in range(self.w.count)
+        ]
         return [each for parts in found for each in at_node(parts)]
 
     # ------------------------------------------------------------------ constraints

@@ -118,7 +118,6 @@ class Course:
             light = self._soles(one + other - heavy)
             gone = [6 * k + np.arange(6) for k, name in enumerate(names) if name not in light]
             phase.unloaded[node] = np.concatenate(gone)
-            phase.bearing = next(k for k, name in enumerate(names) if name not in self.fading(heavy))
 
     @property
     def stands(self) -> dict[int, MotionPhase]:

@@ -68,9 +68,12 @@ def held(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> Simulation:
 
 
 def test_derivatives_are_those_of_differences(program: Transcription) -> None:
-    rng = np.random.default_rng(1)
-    x = first_iterate(program)
-    check_derivatives(program.program, x + 0.01 * rng.standard_normal(len(x)))
+    # and of a blow on two feet, after a step on the left one and before one on the right one
+    left, right = (dataclasses.replace(BOTH, soles=(name,)) for name in ("left", "right"))
+    steps = (BOTH, left, StancePhase(soles=("left", "right")), right, BOTH)
+    for t in (program, transcribed(stepping(stances=steps))):
+        x = first_iterate(t)
+        check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
 
 
 def test_soles_stand_where_they_stood_in_their_phases_and_are_in_the_air_between(

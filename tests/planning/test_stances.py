@@ -13,12 +13,14 @@ from support.small_robots import arm, biped
 
 from impactopt.errors import InputError
 from impactopt.files.export.motion import motion_at
+from impactopt.files.output import Record
 from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
 from impactopt.files.verify import motion_of_record
 from impactopt.kinematics.stance import FixedBase
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.stances import StancePhase
+from impactopt.report.histories import soles_standing, zmp_margins
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.transcription.initial_guess import carried_over, first_iterate
@@ -280,3 +282,19 @@ def test_a_problem_file_has_the_phases() -> None:
             problem_from_data({**data, "stances": stances}, where="wrong.toml")
     with pytest.raises(InputError, match=r"\[stance\] holds one stance"):
         problem_from_data({**data, "stance": {"soles": "left"}}, where="both.toml")
+
+
+def test_a_page_draws_the_margin_to_what_stands(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> None:
+    arrays = {"polygon": plan.polygon}
+    for leg in plan.problem.stance_coordinates[0].legs:
+        corners = np.column_stack([leg.sole.polygon, np.zeros(4)])
+        arrays[f"sole_{leg.name}"] = (corners @ leg.placement.rotation.T + leg.placement.translation)[:, :2]
+    record = Record(summary={"stances": plan.stances()}, arrays=arrays)
+    away = ways[0].phase != 1
+    time, ground = ways[0].time[away], ways[0].ground[away]
+    standing = soles_standing(record, time)
+    np.testing.assert_array_equal(standing["left"], np.ones(len(time), dtype=bool))
+    np.testing.assert_array_equal(standing["right"], ways[0].stance[away] != 1)
+    drawn, phase = zmp_margins(record, time, ground), ways[0].phase[away]
+    for name, number in (("swing", 0), ("follow", 2)):
+        assert drawn[phase == number].min() == pytest.approx(plan.margins()["zmp_margin_m"][name], abs=1e-9)

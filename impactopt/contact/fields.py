@@ -154,6 +154,9 @@ def power(base: Any, exponent: Any) -> Any:
 
 def numbers_of(instance: Any) -> dict[str, float]:
     """The fields of a dataclass by name."""
+    if not dataclasses.is_dataclass(instance):
+        kind = type(instance).__name__
+        raise InputError(f"{kind} is no dataclass: write @dataclass(frozen=True, kw_only=True) above it")
     return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
 
 

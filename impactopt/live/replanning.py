@@ -72,7 +72,7 @@ class Replanning:
             return Answer(seconds=time.perf_counter() - began, why=str(error))
         if not stale():
             self.last = solution
-        margins = solution.plan.margins(reference, solution.collision)
+        margins = solution.plan.margins(solution.collision, reference)
         seconds = time.perf_counter() - began
         return Answer(solution=solution, track=track, margins=margins, seconds=seconds)
 

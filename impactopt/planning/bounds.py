@@ -18,6 +18,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
+    TERMS,
     Balance,
     ContactWrenchCone,
     GearLoad,
@@ -221,7 +222,8 @@ def _of_gears(t: Transcription, term: GearLoad) -> Iterator[Bound]:
 def _fields(t: Transcription, x: Array, term: Term, chosen: Chosen) -> Iterator[Cause]:
     """The numbers of a term any one of which would do, with their values."""
     first = {TorqueLimit: "torque", VelocityLimit: "speed"}.get(type(term), term.name)
-    section = snake_case(type(term).__name__)
+    kind = type(term).__name__
+    written = f"[terms.{snake_case(kind)}] " if type(term) in TERMS else f"{kind}."
     allowed = {field.name: about for field, about in abouts(type(term))}
     rows = _rows(t, chosen).tolist()
     off = row_violations(t.program, t.program.constraints(x))
@@ -248,7 +250,7 @@ def _fields(t: Transcription, x: Array, term: Term, chosen: Chosen) -> Iterator[
         new = None
         with contextlib.suppress(InputError):
             new = changed(t.problem, terms=_with(t.problem, replace(term, **{field.name: value})))
-        yield Cause(first=first, text=f"{words} ([terms.{section}] {field.name}{where})", problem=new)
+        yield Cause(first=first, text=f"{words} ({written}{field.name}{where})", problem=new)
 
 
 def _where_met(off: Callable[[float], float], old: float) -> float | None:

@@ -133,7 +133,7 @@ class PlannedContact:
     def reference(self) -> Trajectory:
         """The servo's; of a strike, one that coasts."""
         if isinstance(self.planned, Plan):
-            return self.planned.trajectory()
+            return self.planned.reference
         return _coasting(self.problem, self.planned)
 
     @cached_property

@@ -175,17 +175,15 @@ class Solution(Solved):
         )
         return 100 * (self.result.objective + worth) / abs(worth) if worth else np.nan
 
-    @cached_property
+    @property
     def trajectory(self) -> Trajectory:
         """The servo's reference, sampled."""
-        return self.plan.trajectory() if self.contact is None else self.contact.reference
+        return self.plan.reference
 
-    @cached_property
+    @property
     def missed_trajectory(self) -> Trajectory:
         """The servo's reference if nothing is hit; InputError if the plan has no abort motion."""
-        return self.plan.trajectory(
-            missed=True, known=self.trajectory if self.plan.abort is not None else None
-        )
+        return self.plan.missed_reference
 
     @property
     def _missed(self) -> Trajectory | None:
@@ -255,11 +253,11 @@ class Solution(Solved):
 
     def margins(self) -> dict[str, dict[str, float]]:
         """ZMP margin [m] and torque demand over limit by phase, as of `Plan.margins`, in `collision`."""
-        return self.plan.margins(self.trajectory, self.collision, self._missed)
+        return self.plan.margins(self.collision)
 
     def sole_margins(self) -> dict[str, Any]:
         """Margins of each sole by itself, as of `Plan.sole_margins`."""
-        return self.plan.sole_margins(self.trajectory, self.collision, self._missed)
+        return self.plan.sole_margins(self.collision)
 
     def _stances(self) -> dict[str, Any]:
         """Stance phases, and how fast soles touch down, as ``summary.json`` has them."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impactopt.errors import InputError
 from impactopt.transcription.layout import Affine, Array, Index, stack
 
 # of functions that take one instance a call: those in lanes are done before a thread has started
@@ -152,7 +153,7 @@ class Block:
         lifts = [stack(slots) for slots in instances]
         for lift in lifts:
             if lift.size != n_in:
-                raise ValueError(f"block {name} takes {n_in} inputs, was given {lift.size}")
+                raise InputError(f"block {name} takes {n_in} inputs, was given {lift.size}")
         return cls.of_lift(name, functions, stack(lifts), len(lifts), parameters)
 
     @classmethod
@@ -162,7 +163,10 @@ class Block:
         """Makes the block (:meth:`make`) with the z of all instances (count * n_in) as one expression."""
         f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
         n_in, n_out = f.size1_in(0), f.size1_out(0)
-        p = np.broadcast_to(np.asarray(parameters, dtype=float), (count, f.size1_in(1)))
+        p, n_p = np.asarray(parameters, dtype=float), f.size1_in(1)
+        if p.ndim and p.shape[-1] != n_p:
+            raise InputError(f"block {name} takes {n_p} numbers, was given {p.shape[-1]}")
+        p = np.broadcast_to(p, (count, n_p))
         value, jacobian, hessian = (BatchedFunction(function, count, p) for function in (f, j, h))
         return cls(
             name=name,

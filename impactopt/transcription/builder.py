@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription import blocks as symbolic
@@ -74,7 +75,16 @@ class Builder:
         return next(block for block in self.blocks if block.name == name)
 
     def add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
-        """Append a block; the index of its first output."""
+        """Append a block; the index of its first output.
+
+        instances : of each, the slots that make up z, in its order.  parameters : p (n_p,) of all, or
+            (count, n_p).
+        """
+        if name not in self.functions:
+            raise InputError(
+                f"there is no block {name!r}{did_you_mean(name, self.functions)}: return it from `blocks` of "
+                "the term or objective that asks for it"
+            )
         return self.append(Block.make(name, self.functions, instances, parameters))
 
     def append(self, block: Block) -> int:

@@ -93,6 +93,7 @@ def add_balance(
 # the striking point stays this far behind the target [m], and less only at this speed [m/s] towards it
 # or away from it: what hovers at the plane would touch it between the nodes
 CLEARANCE, HASTE = 0.02, 0.04
+PARTING = 0.12  # [m/s] away, of a tool in a soft grip: it swings back, in a replay some mm farther
 TOO_NEAR = millimetres("too near")
 GONE = "target's way after contact"
 
@@ -199,15 +200,16 @@ def _add_clearance(
     surface, coming = Affine.constant(float(p.normal @ point)), float(p.target.speed_before())
     for i, s in enumerate(before):
         plane = surface - swing.T[0] * (coming * (1 - s))
-        spot = first + i, swing.place_at(s), (1 - s) * ahead
+        spot = first + i, swing.place_at(s), HASTE * (1 - s) * ahead
         _add_row(b, "no touch before contact", number, spot, plane)
-    aparts = [(1 - s) * ahead for s in before]
+    aparts = [HASTE * (1 - s) * ahead for s in before]
     b.follow(lambda b: _follow(b, number, start, aparts))
     if gone is None:
         return
     # the striker has left the target where it is then, from where it goes on; a nail that coasts on only
     # makes room
-    first, behind, place = first + len(before), float(np.mean(p.follow.duration)), follow.place_at
+    first, place = first + len(before), follow.place_at
+    behind = _parting(b, striker) * float(np.mean(p.follow.duration))
     name = f"target left by {striker}" if number else "target left"
     there = b.lift(name, np.array([first]), place=place(0.0), measure=TOO_NEAR)[0]
     spots = [(first + i, place(s), s * behind) for i, s in enumerate(after) if i]
@@ -218,7 +220,7 @@ def _add_clearance(
 
 
 def _add_row(b: Builder, term: str, number: int, spot: tuple[int, Place, float], plane: Affine) -> None:
-    """``spot``: output, place and time from contact [s]; plane [m]: the target's, along the normal."""
+    """``spot``: output, place, distance asked near contact [m]; plane [m]: the target's, along the normal."""
     output, place, apart = spot
     b.rows.add(
         term=term,
@@ -226,20 +228,26 @@ def _add_row(b: Builder, term: str, number: int, spot: tuple[int, Place, float],
         components=[b.problem.contacts[number][0]],
         outputs=np.array([output]),
         affine=-plane,
-        upper=-min(_nearest(b, number), HASTE * apart),
+        upper=-min(_nearest(b, number), apart),
         measure=TOO_NEAR,
     )
 
 
 def _follow(b: Builder, number: int, start: int, aparts: list[float], *, planes: bool = True) -> None:
-    """Rows from ``start`` on, of places at these times from contact [s]; planes: that of the target, and not
-    one that is a variable.
+    """Rows from ``start`` on, of places with these distances asked near contact [m]; planes: that of the
+    target, and not one that is a variable.
     """
     nearest, surface = _nearest(b, number), float(b.problem.normal @ b.problem.contacts[number][1])
     for k, apart in enumerate(aparts, start=start):
-        b.rows.bound(k, -np.inf, -min(nearest, HASTE * apart))
+        b.rows.bound(k, -np.inf, -min(nearest, apart))
         if planes:
             b.rows.affine[k] = replace(b.rows.affine[k], const=np.full(1, -surface))
+
+
+def _parting(b: Builder, striker: str) -> float:
+    """Least mean speed [m/s] at which a striker goes away from a target that stays."""
+    soft = any(tool.name == striker and tool.grip is not None for tool in b.problem.robot.tools)
+    return PARTING if soft else HASTE
 
 
 def _nearest(b: Builder, number: int) -> float:

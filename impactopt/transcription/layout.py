@@ -22,6 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
+from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
@@ -355,8 +356,11 @@ class Rows:
         keep = np.flatnonzero(np.isfinite(lo) | np.isfinite(hi))
         if not keep.size:
             return
-        out = np.full(n, -1, dtype=np.intp) if outputs is None else np.asarray(outputs, dtype=np.intp)
+        out = np.full(n, -1) if outputs is None else np.atleast_1d(np.asarray(outputs, dtype=np.intp))
         lin = Affine.zeros(n) if affine is None else affine
+        for what, count in (("outputs", out.size), ("affine", lin.size)):
+            if count != n:
+                raise InputError(f"{term}: {what} are {count}, components {n}; give as many of both")
         if keep.size < n:
             out, lin, lo, hi = out[keep], lin[keep], lo[keep], hi[keep]
         self.outputs.append(out)

@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.contact.targets import Target
-from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 from impactopt.robots.loads import BEARS, cop_margin, fading, least_kept, weight_of
 from impactopt.transcription.contact_guess import mass_at_contact, natural_durations
-from impactopt.transcription.plan import Piece, Plan, complete_reference, gear_share, sampled
+from impactopt.transcription.plan import Piece, Plan, Trajectory, gear_share
 
 Array = NDArray[np.float64]
 STEP = 1e-3  # [s] at which a motion is looked at: as the servo's reference is sampled
@@ -61,17 +60,12 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     friction than it may; where torques give up half of the room to all that the motors have; where a joint of
     a constrained leg is faster than it may be; and where a gear carries 3 % more than it may.
     """
-    blow, q = plan.problem.blow, plan.problem.start_posture
-    at_contact = q
-    found: dict[tuple[int, int], set[float]] = {}
+    blow, found = plan.problem.blow, dict[tuple[int, int], set[float]]()
     for piece in plan.pieces():
-        middles, q = _middles_outside(plan, piece, q)
-        found[piece.phase, piece.number] = set(middles)
-        at_contact = q if (piece.phase, piece.number) == (0, blow) else at_contact
+        found[piece.phase, piece.number] = set(_middles_outside(plan, plan.reference, piece))
     if plan.abort is not None:
-        q = at_contact
         for piece in plan.pieces(missed=True)[len(plan.before) + 1 :]:
-            middles, q = _middles_outside(plan, piece, q)
+            middles = _middles_outside(plan, plan.missed_reference, piece)
             found[piece.phase, piece.number] |= set(middles)
     stands = [
         {*known.of_stand(k), *(found[0 if k < blow else 2, k] if k != blow else ())}
@@ -84,42 +78,41 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     )
 
 
-def _middles_outside(plan: Plan, piece: Piece, q: Array) -> tuple[list[float], Array]:
-    """Middles between nodes between which a piece of a plan is out of its limits, and the configuration at
-    its end; q (nq,) : near that at its start.
-    """
+def _middles_outside(plan: Plan, way: Trajectory, piece: Piece) -> list[float]:
+    """Middles between nodes between which a piece of a reference is out of its limits."""
     p, c = plan.problem, plan.problem.stance_coordinates[piece.number]
-    time = sampled(0.0, piece.spline.duration, STEP)
-    at = complete_reference(p, *piece.sample(piece.start + time), c.split(q)[1], c)
+    own = way.phase == piece.phase
+    if way.stance.size:
+        own &= way.stance == piece.number
+    nodes, duration = piece.nodes, piece.spline.duration
+    at = np.flatnonzero(own & (way.time <= piece.start + duration))
     limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)
-    ratio = np.abs(at.torque / p.robot.torque_limit).max(axis=1, initial=0.0)
+    ratio = np.abs(way.torque[at] / p.robot.torque_limit).max(axis=1, initial=0.0)
     outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
     # the others' rates are bounded by their splines' control points
-    outside |= (np.abs(at.v[:, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
-    outside |= gear_share(p, at.torque, at.a[:, joints]) > 1.0 + GEAR
-    fades = {sole.name for sole, on in zip(p.soles, fading(p.standing)[piece.number], strict=True) if on}
-    outside |= _soles_outside(p, c, at.sole_wrench, fades)
-    nodes = piece.nodes
-    between = np.searchsorted(nodes, time[outside] / piece.spline.duration, side="right")
-    between = between.clip(1, len(nodes) - 1)
-    middles = [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
-    return middles, at.q[-1]
+    outside |= (np.abs(way.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
+    outside |= gear_share(p, way.torque[at], way.a[at, joints]) > 1.0 + GEAR
+    outside |= _soles_outside(p, piece.number, way.sole_wrench[at])
+    time = (way.time[at[outside]] - piece.start) / duration
+    between = np.searchsorted(nodes, time, side="right").clip(1, len(nodes) - 1)
+    return [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
 
 
-def _soles_outside(
-    problem: ImpactProblem, c: StanceCoordinates, wrenches: Array, fades: Collection[str]
-) -> NDArray[np.bool_]:
-    """Instants (k,) at which some sole keeps too little of its limits, from wrenches (k, 6 a sole).
+def _soles_outside(problem: ImpactProblem, number: int, wrenches: Array) -> NDArray[np.bool_]:
+    """Instants (k,) at which some sole that stands in a stance phase keeps too little of its limits.
 
-    fades : names of soles that may bear nothing, and have no friction to speak of then.
+    wrenches (k, 6 a sole) : of all soles. One that may bear nothing has no friction to speak of then.
     """
-    robot, soles, cone = problem.robot, c.soles, problem.term(ContactWrenchCone)
-    own, least = wrenches.reshape(len(wrenches), -1, 6)[:, : len(soles)], least_kept(cone.margin)
-    outside = (cop_margin(robot, [sole.polygon for sole in soles], own) < least).any(axis=1)
-    for k, sole in enumerate(soles):
-        bears = own[:, k, 2] >= (BEARS * weight_of(robot) if sole.name in fades else -np.inf)
-        outside |= bears & (own[:, k, 2] < _SHARE * cone.minimum_force) & (sole.name not in fades)
-        rows = contact_wrench_cone(sole.polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
+    robot, cone = problem.robot, problem.term(ContactWrenchCone)
+    least, standing = least_kept(cone.margin), problem.standing
+    on, fades = np.flatnonzero(standing[number]), fading(standing)[number]
+    soles, own = problem.soles, wrenches.reshape(len(wrenches), -1, 6)
+    outside = (cop_margin(robot, [soles[k].polygon for k in on], own[:, on]) < least).any(axis=1)
+    for k in on:
+        bears = own[:, k, 2] >= (BEARS * weight_of(robot) if fades[k] else -np.inf)
+        if not fades[k]:
+            outside |= own[:, k, 2] < _SHARE * cone.minimum_force
+        rows = contact_wrench_cone(soles[k].polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
         outside |= bears & (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)
     return np.asarray(outside)
 

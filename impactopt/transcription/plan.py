@@ -79,7 +79,10 @@ def complete_reference(
     q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
     torque, corrected = np.zeros((n, robot.n)), np.zeros((n, 6 * len(c.legs)))
     cost = _correction_costs(c, wrench, BEARS * weight_of(robot))
-    for k, leg in enumerate(c.closing.follow(y, legs)):
+    rows = np.hstack([y, yd, ydd, wrench])
+    moves = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))[:n]  # at rest one row is as the one before
+    kept = np.flatnonzero(moves)
+    for k, leg in zip(kept.tolist(), c.closing.follow(y[kept], legs), strict=True):
         q[k], v[k], a[k], jac = c.closing.motion(y[k], yd[k], ydd[k], leg)
         tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
         if c.legs:
@@ -89,6 +92,8 @@ def complete_reference(
             corrected[k] = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / cost[k]
             tau = tau - jac.T @ corrected[k]
         torque[k] = tau[c.base :]
+    last = np.maximum.accumulate(np.where(moves, np.arange(n), 0))
+    q, v, a, torque, corrected = (part[last] for part in (q, v, a, torque, corrected))
     return Completed(q, v, a, torque, total_ground_wrench(c, corrected), corrected)
 
 
@@ -305,6 +310,16 @@ class Plan:
     @property
     def coordinates(self) -> StanceCoordinates:
         return self.problem.coordinates
+
+    @cached_property
+    def reference(self) -> Trajectory:
+        """The servo's reference every millisecond; InputError where legs do not reach."""
+        return self.trajectory()
+
+    @cached_property
+    def missed_reference(self) -> Trajectory:
+        """The servo's reference if nothing is hit; InputError if the plan has no abort motion."""
+        return self.trajectory(missed=True, known=self.reference if self.abort is not None else None)
 
     @property
     def swing_start(self) -> float:
@@ -579,19 +594,18 @@ class Plan:
 
     def margins(
         self,
-        trajectory: Trajectory | None = None,
         collision: PlannedCollision | None = None,
-        missed: Trajectory | None = None,
+        reference: Trajectory | None = None,
     ) -> dict[str, dict[str, float]]:
         """Planned ZMP margin [m] and torque demand over limit, in swing, collision, follow-through, and from
         the planned contact on if nothing is hit.
 
         Of an impact without duration the plan knows neither, so there is no number for the collision.
 
-        trajectory : the reference, if it is known.  collision : the planned one at more instants than the
-        program has, such as `ContactError.finer`.  missed : the reference of a robot that hits nothing.
+        collision : the planned one at more instants than the program has, such as `ContactError.finer`.
+        reference : a coarser one instead, without the missed blow.
         """
-        ref = self.trajectory() if trajectory is None else trajectory
+        ref = self.reference if reference is None else reference
         limit = self.problem.robot.torque_limit
         phase = ref.phase
         hit = self.collision if collision is None else collision
@@ -602,7 +616,8 @@ class Plan:
         ]
         during = hit.torque if len(hit.ground) else hit.torque[:0]
         torques = [ref.torque[phase == 0], during, ref.torque[phase == 2]]
-        if missed is not None:
+        if self.abort is not None and reference is None:
+            missed = self.missed_reference
             inside.append(self._inside(missed, missed.phase > 0))
             torques.append(missed.torque[missed.phase > 0])
         names = ("swing", "collision", "follow", "missed")[: len(torques)]
@@ -626,12 +641,7 @@ class Plan:
             out[own] = margin_of(support_polygon(self.problem.robot, c), way.ground[own])
         return out[chosen]
 
-    def sole_margins(
-        self,
-        trajectory: Trajectory | None = None,
-        collision: PlannedCollision | None = None,
-        missed: Trajectory | None = None,
-    ) -> dict[str, Any]:
+    def sole_margins(self, collision: PlannedCollision | None = None) -> dict[str, Any]:
         """Planned margins of each sole by itself, and what is asked of them, as ``summary.json`` has them.
 
         ``sole_cop_margin_mm`` and ``sole_force_N`` by sole and phase: the least distance of its centre of
@@ -640,12 +650,12 @@ class Plan:
         and after a blow that meets nothing. ``sole_cop_margin_asked_mm`` by phase, ``sole_force_asked_N``.
         Nothing of a robot without soles.
 
-        trajectory, collision : as of :meth:`margins`.  missed : the reference of a missed blow, if known.
+        collision : as of :meth:`margins`.
         """
         p, cone = self.problem, self.problem.term(ContactWrenchCone)
         if not p.soles:
             return {}
-        ref = self.trajectory() if trajectory is None else trajectory
+        ref = self.reference
         hit = self.collision if collision is None else collision
         of_hit = self._wrench_of_all(p.blow, hit.sole_wrench) if p.stances else hit.sole_wrench
         parts = {
@@ -654,7 +664,7 @@ class Plan:
             "follow": (ref.sole_wrench[ref.phase == 2], ref.stance[ref.phase[: len(ref.stance)] == 2]),
         }
         if self.abort is not None:
-            way = self.trajectory(missed=True, known=ref) if missed is None else missed
+            way = self.missed_reference
             parts["missed"] = way.sole_wrench[way.phase > 0], way.stance[way.phase[: len(way.stance)] > 0]
         labels = np.repeat(list(parts), [len(part) for part, _ in parts.values()])
         wrench = np.concatenate([part for part, _ in parts.values()])

@@ -33,6 +33,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from impactopt.codegen.compiler import address, native_library
+from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import solve_in_order
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.program import Determined
@@ -354,6 +355,14 @@ class StructuredProgram:
         self._row_out = np.concatenate([np.zeros(0, dtype=np.intp), *rows.outputs])
         self._nonlinear = np.flatnonzero(self._row_out >= 0)
         self._of_nonlinear = self._row_out[self._nonlinear]
+        taken, times = np.unique(self._of_nonlinear, return_counts=True)
+        if (times > 1).any():
+            twice = self._nonlinear[self._of_nonlinear == taken[times > 1][0]]
+            one, other = (self.origins[i] for i in twice[:2])
+            raise InputError(
+                f"one output of a block is in two constraints, {one!s} and {other!s}: give the block that "
+                "output twice, or lift it"
+            )
         self.m = len(self._row_out)
         self._rows_matrix, self._rows_const = linear_rows.matrix(n), linear_rows.const
         self.g_lower = np.concatenate([np.zeros(0), *rows.lower])

@@ -482,3 +482,26 @@ def test_stances_refuse_what_a_robot_cannot_do():
         BothSoles(base_mass=1e5)
     with pytest.raises(InputError, match="base_inertia"):
         BothSoles(base_mass=1e5, base_inertia=-1.0)
+
+
+# ------------------------------------------------------------ laws of a user's own
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Baked(ContactLaw):
+    """Its own number stays in compiled functions, whatever a collision is asked for."""
+
+    stiffness: float
+
+    def branch(self, penetration, rate, compressing, parameters=None):
+        return self.stiffness * penetration
+
+
+class Undecorated(ContactLaw):
+    def branch(self, penetration, rate, compressing, parameters=None):
+        return penetration
+
+
+def test_a_law_that_does_not_take_its_numbers_as_inputs_is_refused():
+    with pytest.raises(InputError, match=r"Baked\.branch does not take stiffness .* `parameters`"):
+        Baked(stiffness=1e4).formula()
+    with pytest.raises(InputError, match="Undecorated is no dataclass: write @dataclass"):
+        _ = Undecorated().parameters

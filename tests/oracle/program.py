@@ -45,7 +45,8 @@ __all__ = ["Claims", "Program"]
 
 Array = NDArray[np.float64]
 EARLY = 0.12  # [s] before contact: from then on no corner of the striking link is beyond the target's plane
-CLEARANCE, HASTE = 0.02, 0.04  # [m], [m/s] how far the striker keeps off the target's plane
+# [m], [m/s], [m/s] how far the striker keeps off the target's plane; and a tool in a soft grip after contact
+CLEARANCE, HASTE, PARTING = 0.02, 0.04, 0.12
 _KNOWN_TERMS = (
     *map(type, DEFAULT_TERMS),
     FirstTouch,
@@ -330,14 +331,16 @@ class Program:
             def value(v: Variables) -> Array:
                 return np.array([along(at(v)[0]) - plane(v)])
 
-            most = -min(nearest, HASTE * apart)
+            most = -min(nearest, apart)
             self.rows.append(Piece.of(value, [(term, way.place(s), [striker], -np.inf, most)]))
 
         def surface(s: float, v: Variables) -> float:
             """[m] of the target along the normal at a fraction of the swing, which it may come in."""
             return float(p.normal @ point) - float(p.target.speed_before()) * (1 - s) * v.one(swing.T)
 
-        ahead, behind = float(np.mean(p.swing.duration)), float(np.mean(p.follow.duration))
+        soft = any(tool.name == striker and tool.grip is not None for tool in p.robot.tools)
+        ahead = HASTE * float(np.mean(p.swing.duration))
+        behind = (PARTING if soft else HASTE) * float(np.mean(p.follow.duration))
         for s in map(float, swing.nodes[:-1]):
             add("no touch before contact", swing, s, (1 - s) * ahead, partial(surface, s))
         slow = not p.target.stays and p.extra(TargetSpeed) is not None

@@ -191,7 +191,7 @@ def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned)
     """By the wrenches that the legs' torques leave to the soles, as the plan says."""
     plan, t = biped_plan.plan, biped_plan.transcription
     arrays = {f"reference_{f.name}": getattr(biped_plan.trajectory, f.name) for f in fields(Trajectory)}
-    margins = plan.sole_margins(biped_plan.trajectory)["sole_cop_margin_mm"].values()
+    margins = plan.sole_margins()["sole_cop_margin_mm"].values()
     kept = 1e-3 * min(phases[name] for phases in margins for name in ("swing", "follow"))
     for half, short in ((kept + 3e-3, 3e-3), (kept - 1e-3, 0.0)):
         cone = ContactWrenchCone(margin=2 * half, minimum_force=0.0)

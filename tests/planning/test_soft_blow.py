@@ -81,6 +81,18 @@ def test_what_is_planned_happens(soft: Solution, engine: str) -> None:
     assert replay.saturated == 0.0
 
 
+def test_the_hammer_goes_away_from_the_nail(soft: Solution) -> None:
+    """On its spring it swings back: a replay that went a little farther would hit again."""
+    problem, way = soft.problem, soft.plan.trajectory()
+    model, after = problem.robot.model, np.flatnonzero(way.phase == 2)
+    data, hand, along = model.createData(), model.getFrameId("striker:hammer"), []
+    for q in way.q[after]:
+        pin.framesForwardKinematics(model, data, q)
+        along.append(float(problem.normal @ data.oMf[hand].translation))
+    since = way.time[after] - way.time[after[0]]
+    assert (along[0] - np.array(along) >= np.minimum(0.02, 0.12 * since) - 1e-3).all()
+
+
 def test_it_spares_the_gears_and_drives_the_nail_deeper(soft: Solution, hammered: Solution) -> None:
     firm = hammered
     assert soft.loads is not None

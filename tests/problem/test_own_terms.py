@@ -15,6 +15,7 @@ from support.small_plans import changed
 
 from impactopt.errors import InputError
 from impactopt.files.problem_file import write_problem
+from impactopt.planning.bounds import bounds_of
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.objectives import Effort, Impulse, Objective
 from impactopt.problem.terms import Gaze, Term, TorqueLimit
@@ -129,6 +130,9 @@ def test_a_plan_obeys_a_term_of_ones_own(arm_transcription: Transcription) -> No
     result = solve_ipopt(low.program, first_iterate(low))
     assert result.status is Status.INFEASIBLE
     assert "ceiling, " in result.message and " mm too high" in result.message
+    (bound,) = (bound for bound in bounds_of(low) if bound.name == "ceiling")
+    (cause,) = bound.told(result.x)
+    assert "(Ceiling.height; " in cause.text, "no section of a file has it"
 
 
 def test_an_objective_of_ones_own_is_kept_small(arm_transcription: Transcription) -> None:
@@ -267,6 +271,36 @@ def test_what_is_no_block_or_no_quantity_is_refused(arm_transcription: Transcrip
     for kind in (Wide, Number):
         with pytest.raises(InputError, match=rf"{kind.__name__}\.quantity gave .*one affine expression"):
             changed(arm_transcription, objectives=(Impulse(), kind(weight=1.0)))
+
+
+def test_mistakes_in_rows_are_told_where_they_are_made(arm_transcription: Transcription) -> None:
+    """They were a KeyError, shapes of arrays elsewhere, or constraints without a derivative."""
+
+    class Wrong(Ceiling):
+        block: ClassVar[str] = "ceiling"
+        numbers: ClassVar[int] = 0
+        rows: ClassVar[list[Any]] = []
+
+        def add_rows(self, program: Any) -> None:
+            (_, slots), *_ = program.follow_spots()
+            at = program.add_block(self.block, [slots], np.zeros(self.numbers))
+            for components, outputs in self.rows:
+                program.rows.add(term=self.name, components=components, outputs=at + outputs, upper=1.0)
+
+    def program() -> Any:
+        return changed(arm_transcription, terms=(Wrong(height=1.0),)).program
+
+    Wrong.rows = [("a", 0)]
+    assert program().row_name(program().m - 1) == "ceiling, a", "a number is as good as an array of one"
+    for attribute, value, words in (
+        ("rows", [("ab", np.zeros(1, dtype=int))], "ceiling: outputs are 1, components 2"),
+        ("rows", [("a", 0), ("b", 0)], "in two constraints, ceiling, a and ceiling, b: "),
+        ("numbers", 2, "block ceiling takes 0 numbers, was given 2"),
+        ("block", "cieling", r"no block 'cieling' \(did you mean 'ceiling'\?\): return it from `blocks`"),
+    ):
+        setattr(Wrong, attribute, value)
+        with pytest.raises(InputError, match=words):
+            program()
 
 
 def test_a_block_is_known_by_what_it_computes(arm_transcription: Transcription) -> None:

@@ -232,7 +232,7 @@ def test_its_trajectory_has_no_time_of_contact(solved: Planned) -> None:
 
 
 def test_it_says_nothing_of_the_collision_that_it_does_not_know(solved: Planned) -> None:
-    margins = solved.plan.margins(solved.trajectory)
+    margins = solved.plan.margins()
     for numbers in margins.values():
         assert numbers.keys() == {"swing", "follow"}
     assert solved.plan.scenarios == ()

@@ -321,7 +321,7 @@ def test_the_simulated_impulse_is_the_planned_one(solved: Planned) -> None:
 
 def test_the_simulated_demand_is_the_planned_one(solved: Planned) -> None:
     limit = solved.problem.robot.torque_limit
-    planned_ratio = solved.plan.margins(solved.trajectory)["torque_ratio"]
+    planned_ratio = solved.plan.margins()["torque_ratio"]
     ratio = np.abs(solved.simulation.demand / limit).max(axis=1)
     demand = [float(ratio[solved.simulation.phase() == k].max()) for k in range(3)]
     assert demand[0] == pytest.approx(planned_ratio["swing"], abs=5e-3)

@@ -7,6 +7,7 @@ n.
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -15,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import Described, Parameters, check_numbers, choose, numbers_of, text_of
+from impactopt.errors import InputError
 
 __all__ = ["ContactLaw", "rough_at"]
 
@@ -69,7 +71,16 @@ class ContactLaw(Described, ABC):
         """
         names = {name: ca.SX.sym(name) for name in self.parameters}
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
-        compression, restitution = (text_of([self.branch(x, rate, c, names)]) for c in (True, False))
+        forces = [self.branch(x, rate, c, names) for c in (True, False)]
+        used = {symbol.name() for symbol in ca.symvar(ca.SX(ca.vertcat(*forces)))}
+        unused = [name for name in names if name not in used]
+        own_fields = dataclasses.is_dataclass(type(self))  # a CustomLaw's functions are given all numbers
+        if unused and own_fields:
+            raise InputError(
+                f"{type(self).__name__}.branch does not take {', '.join(unused)} from its argument "
+                '`parameters`, so changing it would do nothing: write parameters["..."], not self'
+            )
+        compression, restitution = (text_of([force]) for force in forces)
         return compression, restitution, text_of([self.separation(x, rate, names)])
 
     def force(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:

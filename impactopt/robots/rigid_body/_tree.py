@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -404,6 +405,12 @@ class Coordinates:
         return [[1.0, sr * t, cr * t], [0.0, cr, 0.0 - sr], [0.0, sr / cp, cr / cp]]
 
     # ------------------------------------------------------------ numeric
+    @cached_property
+    def _one_number(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Places in q and in v of the joints that have one number in each: replays look them up often."""
+        joints = [j for j in self.tree.joints[1:] if not j.continuous and j.kind is not Kind.FREE]
+        return np.array([j.q for j in joints], dtype=np.intp), np.array([j.v for j in joints], dtype=np.intp)
+
     def from_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """These coordinates of Pinocchio's q; angles in (-pi, pi] where q does not tell turns apart."""
         q = check_array("q (pinocchio)", q, (self.tree.nq,))
@@ -433,11 +440,11 @@ class Coordinates:
         out = np.empty(self.tree.nq)
         if self.tree.floating:
             out[:7] = pin.SE3ToXYZQUAT(pin.SE3(pin.rpy.rpyToMatrix(q[3:6]), q[:3]))
+        places, columns = self._one_number
+        out[places] = q[columns]
         for joint in self.tree.joints[1:]:
             if joint.continuous:
                 out[joint.q : joint.q + 2] = np.cos(q[joint.v]), np.sin(q[joint.v])
-            elif joint.kind is not Kind.FREE:
-                out[joint.q] = q[joint.v]
         return out
 
 

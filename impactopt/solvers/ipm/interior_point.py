@@ -43,6 +43,7 @@ _WORSE = 0.99  # a correction that leaves more than this part of the violation e
 # where no row is off, or will be, by more than this
 _LONGER, _SHORT, _BENT = 1.2, 0.9, 1.0
 _CRAWL, _PATIENCE = 1e-2, 20  # so many steps shorter than this, one after the other, are no progress either
+_HELD = 0.2  # a step of which who watches lets less than this part be taken is held back
 
 
 class Found(NamedTuple):
@@ -55,13 +56,19 @@ class Found(NamedTuple):
 
 
 class LineSearch:
-    """The filter, and how long steps have been short."""
+    """The filter, and how long steps have been short.
+
+    Attributes
+    ----------
+    held : whether who watches has held the last step back.
+    """
 
     def __init__(self, watch: Watch | None = None) -> None:
         """watch : who says how far a step may go."""
         self._watch = watch
         self._filter: Filter | None = None
         self._crawled = 0  # iterations of short steps
+        self.held = False
 
     def forget(self) -> None:
         """Forget what has been, as the problem is another from here on: its barrier, objective or rows."""
@@ -71,6 +78,7 @@ class LineSearch:
         """The part of a step that is progress; None where there is none, or has hardly been any for long."""
         longest = problem.longest(step)
         most = self._most(problem, step, longest)
+        self.held = most < _HELD * longest
         longest = min(longest, most)
         at = problem.progress(step, residual)
         if self._filter is None:
@@ -400,8 +408,11 @@ class InteriorRun(Run[IPMOptions]):
         return Status.ITERATION_LIMIT
 
     def _lacks(self) -> bool:
-        """True if the program lacks constraints at the iterate."""
-        if self._watch is None or self._problem.elastic is not None:
+        """True if the program lacks constraints at the iterate.
+
+        While rows are elastic only those count that hold steps back.
+        """
+        if self._watch is None or (self._problem.elastic is not None and not self._search.held):
             return False
         if not self._watch.lacks(self.point.x):
             return False

@@ -290,12 +290,10 @@ class StancePhaseSection(Section):
         "of [swing] and [follow]",
         "duration_s",
     )
-    intervals: int = optional("number of the spline's intervals, at least 6")
-    grading: AtLeastOne = optional("longest over shortest interval, the short ones at the contact")
-
-    @classmethod
-    def defaults(cls) -> dict[str, Any]:
-        return {f.name: f.default for f in fields(Phase) if f.default is not MISSING}
+    intervals: int = optional("number of the spline's intervals, at least 6, by default 12")
+    grading: AtLeastOne = optional(
+        "longest over shortest interval, the short ones at the contact, by default 3"
+    )
 
     def build(self) -> StancePhase:
         given = self.given()

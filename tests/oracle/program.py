@@ -463,8 +463,6 @@ def unknown(problem: ImpactProblem) -> list[str]:
     out = []
     if not problem.lasts or problem.frozen is not None:
         out.append(f"the model {problem.collision!r} of the collision")
-    if problem.stances:
-        out.append("stance phases")
     out += [f"the term {type(t).__name__}" for t in problem.terms if type(t) not in _KNOWN_TERMS]
     out += [
         f"the objective {type(o).__name__}" for o in problem.objectives if type(o) not in _KNOWN_OBJECTIVES

@@ -158,14 +158,15 @@ class Solution(solution.Solution):
         rate: float | None = None,
         joints: Sequence[str] | None = None,
         gravity: bool = True,
+        smooth: tuple[float, float] | None = None,
     ) -> list[Path]:
         """Write the plan for other programs: ``solution.export("csv", "results/csv")``; the files.
 
-        to, directory, rate, joints, gravity : as of :func:`impactopt.export`.
+        to, directory, rate, joints, gravity, smooth : as of :func:`impactopt.export`.
         """
         from impactopt.files.export import export
 
-        return export(self, to, directory, rate=rate, joints=joints, gravity=gravity)
+        return export(self, to, directory, rate=rate, joints=joints, gravity=gravity, smooth=smooth)
 
 
 def _or_file(run: Callable[..., R]) -> Callable[..., R]:

@@ -104,8 +104,9 @@ def bare_joints(robot: Robot, shown: Collection[int]) -> set[int]:
     """Joints whose bodies are not known, as all their meshes are nowhere; shown : those of which some are."""
     urdf = Path(robot.urdf) if robot.urdf is not None else None
     root = urdf_root(urdf) if urdf is not None else None
-    lost = lost_meshes(robot.model, root, urdf) if root is not None and urdf is not None else {}
-    return {joint for joint in lost if joint not in shown}
+    if root is None or urdf is None:
+        return set()
+    return set(lost_meshes(robot.model, root, urdf, without=shown))
 
 
 def _from_urdf(robot: Robot) -> Iterator[Piece]:
@@ -113,9 +114,9 @@ def _from_urdf(robot: Robot) -> Iterator[Piece]:
     root = urdf_root(urdf) if urdf is not None else None
     if root is None or urdf is None:
         return
-    found = {kind: list(shapes_of(robot.model, root, urdf, kind)) for kind in ("collision", "visual")}
-    bodied = {shape.link for shape in found["collision"]}
-    for shape in [*found["collision"], *(s for s in found["visual"] if s.link not in bodied)]:
+    solid = list(shapes_of(robot.model, root, urdf, "collision"))
+    seen = shapes_of(robot.model, root, urdf, "visual", without={shape.link for shape in solid})
+    for shape in [*solid, *seen]:
         piece = _hull(shape.link, shape.joint, shape.solid)
         if piece is not None:
             yield piece

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -44,14 +44,17 @@ def urdf_root(urdf: Path) -> ElementTree.Element | None:
         return None
 
 
-def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> Iterator[LinkShape]:
+def shapes_of(
+    model: Any, root: ElementTree.Element, urdf: Path, kind: str, *, without: Collection[str] = ()
+) -> Iterator[LinkShape]:
     """All readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
 
-    What is malformed is left out, and so are meshes that are missing or damaged.
+    without : names of links that are left out. So is what is malformed, and so are meshes that are missing or
+    damaged.
     """
     for link in root.findall("link"):
         name = link.get("name", "")
-        if not model.existFrame(name, pin.FrameType.BODY):
+        if name in without or not model.existFrame(name, pin.FrameType.BODY):
             continue
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
         for element in link.findall(kind):
@@ -64,14 +67,21 @@ def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> I
                 yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
 
 
-def lost_meshes(model: Any, root: ElementTree.Element, urdf: Path) -> dict[int, dict[str, str]]:
-    """Meshes that are missing or unreadable, with the reason, by the joint that moves their link."""
+def lost_meshes(
+    model: Any, root: ElementTree.Element, urdf: Path, *, without: Collection[int] = ()
+) -> dict[int, dict[str, str]]:
+    """Meshes that are missing or unreadable, with the reason, by the joint that moves their link.
+
+    without : joints whose meshes are not looked at.
+    """
     lost: dict[int, dict[str, str]] = {}
     for link in root.findall("link"):
         name = link.get("name", "")
         if not model.existFrame(name, pin.FrameType.BODY):
             continue
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+        if int(frame.parentJoint) in without:
+            continue
         for mesh in link.iterfind("*/geometry/mesh"):
             file = mesh.get("filename", "")
             if lack := lack_of(file, urdf):

@@ -21,6 +21,7 @@ import ctypes
 import functools
 import hashlib
 import io
+import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from impactopt.bodies import separation_numpy
+from impactopt.bodies.convex_hulls import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies
 from impactopt.bodies.separation_numpy import ROUNDING
 from impactopt.bodies.world import WorldBody
@@ -97,7 +99,8 @@ class Shapes:
         of a body of the world.
         """
         corners = [_corners(body.half) for body in world]
-        own = {id(piece): thinned(piece.vertices) for piece in links.pieces}
+        own = {id(piece): _few_of(piece) for piece in links.pieces}
+        ball = {id(piece): _ball(piece.vertices) for piece in links.pieces}
         self.points, self.blocks, places = packed([*own.values(), *corners])
         names: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
         where = dict(zip(names, places, strict=True))
@@ -108,7 +111,7 @@ class Shapes:
                 pairs.append((a, b))
                 number.append(k)
                 hulls.append((*where[id(one)], *where[id(two)]))
-                balls.append((*_ball(one.vertices), *_ball(two.vertices)))
+                balls.append((*ball[id(one)], *ball[id(two)]))
                 radius.append(0.0)
         for j, w in pairs_with_world:
             body = world[w]
@@ -116,7 +119,7 @@ class Shapes:
                 pairs.append((j, -1 - w))
                 number.append(k)
                 hulls.append((*where[id(one)], *where["world", w]))
-                balls.append((*_ball(one.vertices), *body.half, body.radius))
+                balls.append((*ball[id(one)], *body.half, body.radius))
                 radius.append(body.radius)
         self.pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         self.number = np.array(number, dtype=np.int64)
@@ -231,6 +234,16 @@ def packed(hulls: Sequence[Array]) -> tuple[Array, Array, list[tuple[int, int]]]
         size += len(vertices) + more
     points = np.concatenate(parts)
     return points, np.ascontiguousarray(points.reshape(-1, _EIGHT, 3).transpose(0, 2, 1)), where
+
+
+_FEW_OF: weakref.WeakKeyDictionary[Piece, Array] = weakref.WeakKeyDictionary()
+
+
+def _few_of(piece: Piece) -> Array:
+    """`thinned` of a piece's vertices, found once: scenes about one robot share its pieces."""
+    if piece not in _FEW_OF:
+        _FEW_OF[piece] = thinned(piece.vertices)
+    return _FEW_OF[piece]
 
 
 def thinned(vertices: Array) -> Array:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import io
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,6 +15,8 @@ from pathlib import Path
 import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from impactopt.codegen.files import kept
 
 __all__ = [
     "Solid",
@@ -29,6 +33,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+SELF_CONTAINED = (".dae", ".obj", ".stl")  # meshes whose files name no others that hold their numbers
 TO_MEAN = 1e-3  # how much a simplified vertex is drawn to the mean of those that it stands for
 
 
@@ -229,12 +234,33 @@ def _read(path: Path, scale: Array) -> Solid:
         facets = np.frombuffer(data, offset=84, dtype=[("at", "<f4", (4, 3)), ("attribute", "<u2")])
         vertices = facets["at"][:, 1:].reshape(-1, 3).astype(float)
         return Solid(vertices=scale * vertices, triangles=np.arange(3 * count).reshape(-1, 3))
+    digest = hashlib.sha256(data + b"coal").hexdigest()
+    if path.suffix.lower() not in SELF_CONTAINED:  # it names other files that hold its numbers
+        return _scaled(_loaded(path), scale)
+    with np.load(
+        io.BytesIO(kept("mesh", digest, lambda: _saved(_loaded(path)))), allow_pickle=False
+    ) as found:
+        solid = Solid(vertices=found["vertices"], triangles=found["triangles"])
+    return _scaled(solid, scale)
+
+
+def _scaled(solid: Solid, scale: Array) -> Solid:
+    return Solid(vertices=scale * solid.vertices, triangles=solid.triangles)
+
+
+def _saved(solid: Solid) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, vertices=solid.vertices, triangles=solid.triangles)
+    return file.getvalue()
+
+
+def _loaded(path: Path) -> Solid:
+    """A mesh by coal: seconds for a large one."""
     try:
-        mesh = coal.MeshLoader().load(str(path), scale)
+        mesh = coal.MeshLoader().load(str(path), np.ones(3))
     except (ValueError, RuntimeError) as error:  # the reader's own words come after the file's name
         said = str(error).partition(str(path))[2].strip().splitlines()
         raise ValueError(said[0].rstrip(".") if said else "no reader of meshes takes it") from error
     corners = [mesh.tri_indices(k) for k in range(mesh.num_tris)]
-    return Solid(
-        vertices=np.array(mesh.vertices()), triangles=np.array([[t[0], t[1], t[2]] for t in corners])
-    )
+    triangles = np.array([[t[0], t[1], t[2]] for t in corners], dtype=np.intp)
+    return Solid(vertices=np.array(mesh.vertices()), triangles=triangles.reshape(-1, 3))

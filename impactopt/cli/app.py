@@ -120,7 +120,11 @@ def solve(
     verbose: Verbose = False,
     validate: Annotated[bool, typer.Option(help="Replay the plan in full dynamics.")] = True,
     baseline: Annotated[
-        bool, typer.Option("--baseline", help="Also find the hardest minimum-jerk reach in the same limits.")
+        bool,
+        typer.Option(
+            "--baseline",
+            help="Also find the hardest minimum-jerk reach, with the ZMP up to the soles' edges.",
+        ),
     ] = False,
 ) -> None:
     """Plan the motion that a problem asks for, replay it in full dynamics, write numbers and pictures.
@@ -162,7 +166,7 @@ def solve(
             record = _record(solution, read, validate, progress)
             record.summary.update(command=command_line(context), ok=solution.status.usable)
             if baseline and solution.status is not Status.INTERRUPTED:
-                progress.say("looking for the hardest minimum-jerk reach inside the same limits")
+                progress.say("looking for the hardest minimum-jerk reach")
                 record.summary["baseline"] = _baseline(problem, progress)
             written = [*keep_record(record, directory)]
         _show(record, as_json, solution.status.usable)
@@ -313,7 +317,7 @@ def _show(record: Record, as_json: bool, ok: bool) -> None:
     reach = summary.get("baseline", {})
     if "impulse_Ns" in reach:
         console.print(
-            f"hardest minimum-jerk reach inside the same limits: {reach['impulse_Ns']:.2f} N s at "
+            f"hardest minimum-jerk reach: {reach['impulse_Ns']:.2f} N s at "
             f"{reach['hand_speed_m_s']:.2f} m/s (simulated)",
             highlight=False,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -61,6 +62,14 @@ def export(
             help="Whether effort holds the arm against gravity; not, if its controller does.",
         ),
     ] = True,
+    smooth: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,J",
+            help="No jumps: the nearest motion with at most A rad/s^2 and J rad/s^3, for bolted arms whose "
+            "controllers refuse more.",
+        ),
+    ] = None,
     problem: OtherProblem = None,
     as_json: AsJson = False,
 ) -> None:
@@ -81,14 +90,35 @@ def export(
         beside = folder.parent if folder.name.strip(".") else folder.resolve().parent  # not in "."
         directory = out if out is not None else beside / f"{folder.resolve().name}_{to.value}"
         names = None if joints is None else [name.strip() for name in joints.split(",")]
-        written = export_planned(planned, to.value, directory, rate=rate, joints=names, gravity=gravity)
+        most = None if smooth is None else _limits(smooth)
+        written = export_planned(
+            planned, to.value, directory, rate=rate, joints=names, gravity=gravity, smooth=most
+        )
+        cost = json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
         if as_json:
             told = {"to": to.value, "directory": str(directory), "files": [str(path) for path in written]}
-            print_json(told, True)
+            print_json(told | ({} if cost is None else {"smooth": cost}), True)
             return
         for path in written:
             typer.echo(printable(str(path)))
+        if cost is not None:
+            meets = f"; it meets other bodies {cost['touches']} times" if cost["touches"] else ""
+            typer.echo(
+                f"smoothed: {cost['impulse_Ns']:.3g} N s in our replay, of {cost['planned_impulse_Ns']:.3g} "
+                f"planned{meets}"
+            )
         if to is Target.mujoco:
             typer.echo(f"\n{(directory / 'play.py').read_text(encoding='utf-8')}")
         if to.value in NEXT:
             typer.echo(printable(NEXT[to.value].format(directory=directory)))
+
+
+def _limits(given: str) -> tuple[float, float]:
+    """Acceleration and jerk of `--smooth A,J`."""
+    try:
+        acceleration, jerk = (float(word) for word in given.split(","))
+    except ValueError:
+        raise typer.BadParameter(
+            f"{given!r}; give two numbers, such as 15,5000", param_hint="--smooth"
+        ) from None
+    return acceleration, jerk

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +15,12 @@ from impactopt.report.plain_errors import BAD_INPUT, plain_errors
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
     from impactopt.robots.robot import Robot
+
+
+class Motion(str, enum.Enum):
+    punch = "punch"
+    kick = "kick"
+
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
@@ -141,6 +148,10 @@ def new(
     bolted: Annotated[
         bool, typer.Option("--bolted", help="Draft it bolted to the ground, even if it has legs.")
     ] = False,
+    motion: Annotated[
+        Motion | None,
+        typer.Option(help="Draft this motion (default: a kick of a robot without arms, else a punch)."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Print a problem file to start from, with a comment to each key; without a name, list the problems.
@@ -154,6 +165,8 @@ def new(
             raise typer.BadParameter("give one of NAME, --urdf, --mjcf and --reference")
         if bolted and urdf is None and mjcf is None:
             raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint="--bolted")
+        if motion is not None and urdf is None and mjcf is None:
+            raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint="--motion")
         if reference and as_json:
             raise typer.BadParameter("the reference is Markdown; leave --json out", param_hint="--json")
         if reference:
@@ -161,7 +174,7 @@ def new(
 
             _give(page(), out)
         elif urdf is not None or mjcf is not None:
-            _draft(str(mjcf if urdf is None else urdf), urdf is None, bolted, out, as_json)
+            _draft(str(mjcf if urdf is None else urdf), urdf is None, bolted, motion, out, as_json)
         elif name is not None:
             from impactopt.files.problem_file.reference import problem_template
 
@@ -172,14 +185,27 @@ def new(
             problems(as_json)
 
 
-def _draft(given: str, mjcf: bool, bolted: bool, out: Path | None, as_json: bool) -> None:
+def _draft(
+    given: str, mjcf: bool, bolted: bool, motion: Motion | None, out: Path | None, as_json: bool
+) -> None:
+    from rich.console import Console
+
     from impactopt.errors import printable
     from impactopt.files.draft.description import find_description
     from impactopt.files.draft.drafting import draft_problem
+    from impactopt.report.console import SolveConsole
 
     path = Path(given) if mjcf else find_description(given)
     folder = Path() if out is None else out.parent
-    draft = draft_problem(path, folder=folder, mjcf=mjcf, bolted=bolted)
+    with SolveConsole(Console(stderr=True)) as progress:
+        draft = draft_problem(
+            path,
+            folder=folder,
+            mjcf=mjcf,
+            bolted=bolted,
+            motion=None if motion is None else motion.value,
+            report=progress.say,
+        )
     _give(draft.text, out, as_json)
     for line in draft.said:
         typer.echo(printable(line), err=True)

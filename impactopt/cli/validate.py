@@ -18,6 +18,11 @@ class Controller(str, enum.Enum):
     wbc = "wbc"
 
 
+class Contact(str, enum.Enum):
+    point = "point"
+    link = "link"
+
+
 FELL = 1  # exit code
 
 
@@ -47,6 +52,12 @@ def validate(
         Controller,
         typer.Option(help="servo: of the joints; wbc: whole-body controller, set as the problem file says."),
     ] = Controller.servo,
+    contact: Annotated[
+        Contact,
+        typer.Option(
+            help="link: the striking link's hull meets the target's body; point: its striking point."
+        ),
+    ] = Contact.point,
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -125,7 +136,12 @@ def validate(
             planned = load_planned(result, problem_file=problem, settings=changes)
             progress.say(f"{result} is read; replaying it in {engine.value}")
             done = replay(
-                planned, engine=engine.value, perturbation=world, controller=controller.value, **options
+                planned,
+                engine=engine.value,
+                perturbation=world,
+                controller=controller.value,
+                contact=contact.value,
+                **options,
             )
             ok = done.report["standing"] is not False
             if directory is not None:
@@ -144,12 +160,14 @@ def validate(
         if as_json:
             print_json(done.report, ok)
         else:
-            from impactopt.report.console import output, replay_table
+            from impactopt.report.console import output, replay_table, touch_message
 
             console = output()
             console.print(replay_table(done.report, planned.record.summary))
             if beyond := done.record.summary.get("gear_caution"):
                 console.print(printable(str(beyond)), markup=False, highlight=False)
+            if told := touch_message(done.report):
+                console.print(told, highlight=False, markup=False)
             for path in written:
                 console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
         if not ok:

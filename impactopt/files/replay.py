@@ -254,13 +254,15 @@ def replay(
     engine: str = "mujoco",
     perturbation: Perturbation | None = None,
     controller: str = "servo",
+    contact: str = "point",
     **options: Any,
 ) -> Replay:
     """Follow the plan's reference in an engine; "mujoco" lets the robot slip, lift its soles and fall.
 
     perturbation : where the world differs from what was planned ("mujoco"; with "pinocchio" the target may
-        be missing, no more).  controller : "servo", or "wbc" ("mujoco" only).  options : of the engine, such
-        as ``step`` [s].
+        be missing, no more).  controller : "servo", or "wbc" ("mujoco" only).  contact : "point", or "link"
+        ("mujoco" only): the striking link's hull meets the target's body. The report then has impulse and
+        first touch of both.  options : of the engine, such as ``step`` [s].
 
     Raises
     ------
@@ -275,8 +277,14 @@ def replay(
     options["missed"] = planned.missed
     options["controller"] = controller_of(controller, planned.controller)
     problem = planned.problem
-    simulation = simulate(problem, planned.reference, engine=engine, **options)
+    if contact != "point" and engine != "mujoco":
+        raise InputError(f"engine {engine!r} knows striking points only; take engine 'mujoco'")
+    met: dict[str, Any] = {} if contact == "point" else {"contact": contact}
+    simulation = simulate(problem, planned.reference, engine=engine, **options, **met)
     check_steps(simulation, options.get("step"))
+    if met:
+        point = simulate(problem, planned.reference, engine=engine, **options)
+        met |= {**_touch(simulation), "point": _touch(point)}
     report = plain(
         simulation.report(
             torque_limit=world.torque_limit * problem.robot.torque_limit,
@@ -284,6 +292,7 @@ def replay(
             planned_impulse=float(planned.record.summary["impulse_Ns"]),
         )
         | {"controller": controller}
+        | met
     )
     kept = {n: v for n, v in planned.record.arrays.items() if not n.startswith("replayed_")}
     kept |= {name: np.asarray(value) for name, value in replay_arrays(simulation).items()}
@@ -291,3 +300,9 @@ def replay(
     summary = {**planned.record.summary, "replayed": report, **beyond}
     record = dataclasses.replace(planned.record, arrays=kept, summary=summary)
     return Replay(planned=planned, perturbation=world, simulation=simulation, report=report, record=record)
+
+
+def _touch(simulation: Simulation) -> dict[str, float]:
+    """Impulse [N s], and how much earlier than planned contact begins [ms]."""
+    early = simulation.expected - simulation.contact_start
+    return {"impulse_Ns": simulation.impulse, "first_touch_ms": 1e3 * early}

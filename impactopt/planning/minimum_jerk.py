@@ -65,6 +65,7 @@ def minimum_jerk_baseline(
 ) -> Baseline:
     """The hardest minimum-jerk reach; ``tolerance``: of its speed, relative; ``fastest`` [m/s] that is tried.
 
+    It may use the soles up to their edges: with the margins that plans keep it could hardly move.
     All reaches strike in one posture and direction, so that the impulse grows with the speed: they are taken
     by descending speed, and the first whose replay keeps the limits is the hardest.
 
@@ -170,7 +171,7 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
 
 
 def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> bool:
-    """True if sole wrenches inside their cones balance the motion with torques inside the limits (a linear
+    """True if wrenches that soles can transmit balance the motion with torques inside the limits (a linear
     program).
     """
     c, r = problem.coordinates, problem.robot
@@ -191,12 +192,11 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
             rows.append(block)
             bounds.append(np.tile(np.repeat([grip.force, grip.moment], 3), 2))
             continue
-        facets = contact_wrench_cone(leg.sole.polygon, cone.friction, margin=cone.margin)
-        block = np.zeros((len(facets) + 1, n))
-        block[:-1, 6 * k : 6 * k + 6] = -facets
-        block[-1, 6 * k + 2] = -1.0
+        facets = contact_wrench_cone(leg.sole.polygon, cone.friction, margin=0.0)
+        block = np.zeros((len(facets), n))
+        block[:, 6 * k : 6 * k + 6] = -facets
         rows.append(block)
-        bounds.append(np.concatenate([np.zeros(len(facets)), [-cone.minimum_force]]))
+        bounds.append(np.zeros(len(facets)))
     legs = jac[:, c.base :].T
     rows += [-legs, legs]
     bounds += [limit - tau[c.base :], limit + tau[c.base :]]

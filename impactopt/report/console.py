@@ -123,6 +123,17 @@ def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table
     return _table(summary, replay_columns(report, summary))
 
 
+def touch_message(report: Mapping[str, Any]) -> str:
+    """Impulse and first touch of the striking link's hull beside those of its striking point; "" without."""
+    if "point" not in report:
+        return ""
+    one, other = (
+        f"{found['impulse_Ns']:.2f} N s, {found['first_touch_ms']:+.2f} ms early"
+        for found in (report, report["point"])
+    )
+    return f"contact of the link's hull: {one}; of the striking point: {other}"
+
+
 def verdict_table(verdict: Mapping[str, Any]) -> Table:
     """Table of a verification, the worst first; `verdict` as in `impactopt verify --json`."""
     kkt = "not computed" if verdict["kkt"] is None else f"KKT residual {verdict['kkt']:.2g}"

@@ -176,7 +176,7 @@ def g1(**overrides: Any) -> Robot:
         ),
         "strikers": tuple(
             Striker(
-                name=f"{side}_hand", frame=f"{side}_rubber_hand", point=np.array([0.13, sign * 0.03, 0.007])
+                name=f"{side}_hand", frame=f"{side}_rubber_hand", point=np.array([0.1318, sign * 0.03, 0.007])
             )
             for side, sign in (("right", 1.0), ("left", -1.0))
         ),

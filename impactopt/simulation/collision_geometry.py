@@ -28,6 +28,7 @@ class Solid:
     vertices (k, 3) [m] : of a hull, in the joint's frame; None: a box with half sides ``half`` (3,) [m],
     inflated by ``radius`` [m], at ``place`` (3,) with axes ``rotation`` (3, 3).
     of_target : it is there only if the target is.  moves : with it.  before : it is gone after contact.
+    strikable : the link that strikes may touch it.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Solid:
     of_target: bool = False
     moves: bool = False
     before: bool = False
+    strikable: bool = False
 
     @cached_property
     def hull(self) -> Any:

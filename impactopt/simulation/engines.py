@@ -66,6 +66,7 @@ def solids_of(problem: ImpactProblem) -> Solids:
                 of_target=body.of_target,
                 moves=body.moves,
                 before=body.before,
+                strikable=body.strikable,
             )
         )
     for joint, w in bodies.world_pairs:

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, did_you_mean
 from impactopt.robots.loads import BEARS, weight_of
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import Besides
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
+from impactopt.simulation.link_contact import CONTACTS, LinkContact, solids_in_contact
 from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
 from impactopt.simulation.mujoco_world import (
     MujocoOptions,
@@ -48,6 +49,7 @@ FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; o
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
 SETTLES, SETTLES_BOLTED = 2.0, 0.3  # [s] beyond the motion: a robot on its feet may fall late
 TOUCHING = 1e-9  # [m] that the robot starts lower: soles that rounding has above the floor bear nothing
+MOVED = 1e-3  # [m] from one step to the next: a striking link meets the target at another point
 SLID = 0.05  # [m] of a sole along the floor, about half of one's width: it stands where it was not to
 
 
@@ -60,6 +62,7 @@ class _Replay(MujocoRobot):
         perturbation: Perturbation,
         solver: MujocoOptions,
         controller: ControllerSettings | None = None,
+        contact: str = "point",
     ) -> None:
         self.scene, self.perturbation = perturbation.scene(scene), perturbation
         self.wbc: WholeBodyController | None = None
@@ -74,8 +77,14 @@ class _Replay(MujocoRobot):
             )
         solids = self.scene.solids
         near = solids.near(robot.model, reference)
-        world = build_world(robot, self.scene, perturbation, solver, near)
+        meeting = solids_in_contact(robot, self.scene) if contact == "link" else []
+        struck = [k for each in meeting for pair in each for k in pair]
+        world = build_world(robot, self.scene, perturbation, solver, near, struck)
         super().__init__(robot, world, *(site_name(k + 1) for k in range(len(scene.strikers))))
+        self.links = LinkContact(self.mujoco, self.world, meeting) if meeting else None
+        self.depths = np.full(len(scene.strikers), -np.inf)  # [m] of strikers in the target
+        if self.links is not None:
+            self.world.site_sameframe[self.sites] = 0  # they move in their bodies
         self.grips = Welds(self.world, scene.hands)
         self.besides = Besides(self.world, solids)
         self.planned = self.followed = reference
@@ -132,8 +141,32 @@ class _Replay(MujocoRobot):
 
     # ------------------------------------------------------------------ what a step needs
     def hand_speeds(self) -> Array:
-        """Speeds (h,) of the striking points along the normal [m/s]."""
+        """Speeds (h,) of the striking points along the normal [m/s]; sets their depths in the target."""
+        places = self.places()
+        if self.kept is not None:
+            # depths are the contact's: they are followed more exactly there than the arms are
+            gone = self.struck.depths(places, 0.0) - self.kept
+            known = gone[np.isfinite(gone)]
+            self.travel = float(known.mean()) if known.size else self.travel
+        self.kept = None
+        self.depths = self.struck.depths(places, self.travel)
+        if self.links is not None:
+            self._meet(self.links)
         return self.speeds_along(self.scene.normal)
+
+    def _meet(self, links: LinkContact) -> None:
+        """Striking points are where their links are deepest in the target's body."""
+        d = self.data
+        for k, site in enumerate(self.sites):
+            depth, place = links.deepest(d, k)
+            self.depths[k] = depth - (self.travel - self.placed[1])  # its body is where it was placed
+            if place is None:
+                continue
+            if np.linalg.norm(place - d.site_xpos[site]) > MOVED:
+                self.before = None
+            body = self.world.site_bodyid[site]
+            self.world.site_pos[site] = d.xmat[body].reshape(3, 3).T @ (place - d.xpos[body])
+            d.site_xpos[site] = place
 
     def push(self, speeds: Array, step: float) -> Push:
         """The contact in the step that begins now; moves the target.
@@ -141,14 +174,8 @@ class _Replay(MujocoRobot):
         Hands gain speed as in the step before, where soles and servos had the same to say.
         """
         struck, d, none = self.struck, self.data, 0.0 * speeds
-        places = self.places()
-        if self.kept is not None:
-            # depths are the contact's: they are followed more exactly there than the arms are
-            gone = struck.depths(places, 0.0) - self.kept
-            known = gone[np.isfinite(gone)]
-            self.travel = float(known.mean()) if known.size else self.travel
-        depths = none - np.inf if self.perturbation.missing else struck.depths(places, self.travel)
-        self.kept, self.yields = None, None
+        depths = none - np.inf if self.perturbation.missing else self.depths
+        self.yields = None
         if struck.near(depths, speeds, self.target, step):
             self.yields = np.zeros_like(self.along)
             self.mujoco.mj_solveM(self.world, d, self.yields, self.along)
@@ -157,6 +184,8 @@ class _Replay(MujocoRobot):
             gains = gains + (none if self.before is None else yields @ self.before[1])
             push = struck.pushed(depths, speeds, gains, yields, self.target, self.travel, step)
             self.kept = push.depths
+            if self.links is not None:  # as those of points in a plane
+                self.kept = self.kept + struck.depths(self.places(), self.travel) - depths
         else:
             state = struck.moved(self.target, 0.0, step)
             travel = self.travel + step * struck.speed(state)
@@ -288,6 +317,7 @@ def simulate_mujoco(
     perturbation: Perturbation | None = None,
     missed: Any = None,
     controller: ControllerSettings | None = None,
+    contact: str = "point",
     until: float = np.inf,
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
@@ -300,20 +330,27 @@ def simulate_mujoco(
     missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
         :class:`impactopt.simulation.result.FollowedReference`); default: it does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
+    contact : "point": the striking point meets the target's plane; "link": the hull of the striking link
+        meets the target's body, and the law's force acts where it is deepest.
     until [s] : it ends, if that is earlier.
 
     A fall ends the simulation early; the result says so.
 
     Raises
     ------
-    InputError : MuJoCo is not installed, or the simulation diverges (with the time at which it did).
+    InputError : MuJoCo is not installed, there is no such contact, or the simulation diverges (with the time
+    at which it did).
     """
     if not step > 0:
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
+    if contact not in CONTACTS:
+        raise InputError(
+            f"contact {contact!r}{did_you_mean(contact, CONTACTS)}: give one of {', '.join(CONTACTS)}"
+        )
     world = perturbation if perturbation is not None else Perturbation()
     beyond = settle if settle is not None else SETTLES if robot.floating else SETTLES_BOLTED
     solver = MujocoOptions(step, iterations, tolerance)
-    replay = _Replay(robot, reference, scene, world, solver, controller)
+    replay = _Replay(robot, reference, scene, world, solver, controller, contact)
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
     most = servo.limit * (1 + 1e-9)  # demand that does not saturate
     period, wait = world.period, world.delay
@@ -382,10 +419,9 @@ def simulate_mujoco(
             if kept:
                 ground = replay.ground()
                 assert state is not None
-                contact = force, replay.struck.speed(target_before), float(speeds[0])
-                rows.append(
-                    (t, *state, *contact, demand, torque, ground, corners, gears.taken(), stance_at(now, t))
-                )
+                met = force, replay.struck.speed(target_before), float(speeds[0])
+                loads = demand, torque, ground, corners, gears.taken()
+                rows.append((t, *state, *met, *loads, stance_at(now, t)))
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(t)
                 if fall:

@@ -75,6 +75,7 @@ def build_world(
     perturbation: Perturbation,
     solver: MujocoOptions,
     near: Sequence[tuple[int, int]] = (),
+    struck: Sequence[int] = (),
 ) -> Any:
     """The compiled mujoco.MjModel.
 
@@ -82,11 +83,11 @@ def build_world(
     the robot, held by the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing
     else touches anything, but the pairs of solids (`near`), which push each other back: hulls of links, named
     ``solid <number>``, and bodies of the world; those that move with the target are on the mocap body
-    ``target``. The contact law between target and striker is the engine's business. Hands that hold on are
-    welded.
+    ``target``. Other solids (`struck`) are there to be asked for their distance. The contact law between
+    target and striker is the engine's business. Hands that hold on are welded.
     """
     spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver, scene.solids.floor)
-    _solids(mujoco_module(), spec, bodies, scene, near)
+    _solids(mujoco_module(), spec, bodies, scene, near, struck)
     add_welds(spec, bodies, robot, scene.hands, solver.step)
     return spec.compile()
 
@@ -130,11 +131,18 @@ def spec_of(robot: Robot, solver: MujocoOptions) -> Any:
     return spec
 
 
-def _solids(mujoco: Any, spec: Any, bodies: list[Any], scene: Scene, near: Sequence[tuple[int, int]]) -> None:
+def _solids(
+    mujoco: Any,
+    spec: Any,
+    bodies: list[Any],
+    scene: Scene,
+    near: Sequence[tuple[int, int]],
+    struck: Sequence[int],
+) -> None:
     """Geometry of the solids that are in a pair, and the pairs."""
     solids = scene.solids.solids
     target = spec.worldbody.add_body(name="target", mocap=True)
-    for k in sorted({k for pair in near for k in pair if k != FLOOR}):
+    for k in sorted({*struck, *(k for pair in near for k in pair if k != FLOOR)}):
         solid = solids[k]
         body = bodies[solid.joint] if solid.joint else (target if solid.moves else spec.worldbody)
         if solid.vertices is not None:

@@ -1,7 +1,8 @@
 """A fair baseline: what people do today, on the same robot and in the same limits, beside our plans.
 
 Every reference is replayed in MuJoCo with free soles, as planned and under drawn perturbations. All plans
-keep the same limits in the swing and in the follow-through; the rows of the collision are ours only.
+keep the same limits in the swing and in the follow-through, but the minimum-jerk reach, which needs no margin
+to the soles' edges; the rows of the collision are ours only.
 """
 
 from __future__ import annotations

@@ -197,7 +197,7 @@ def test_the_baseline_is_reported_beside_the_plan(
 
     monkeypatch.setattr("impactopt.planning.minimum_jerk.minimum_jerk_baseline", lambda problem: Reach())
     out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
-    assert "minimum-jerk reach inside the same limits: 1.50 N s at 0.40 m/s" in out
+    assert "hardest minimum-jerk reach: 1.50 N s at 0.40 m/s" in out
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["baseline"]["impulse_Ns"] == 1.5
 
     def nothing(problem: ImpactProblem) -> Reach:

@@ -20,6 +20,7 @@ from impactopt.errors import InputError
 from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.draft.robot import draft_robot
+from impactopt.files.draft.strikers import find_striker
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.toml import read_toml
 from impactopt.problem.feasibility import hopeless
@@ -32,12 +33,43 @@ FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
 
 def _drafted(folder: Path, text: str, **options: Any) -> Draft:
     (folder / "robot.urdf").write_text(text)
-    return draft_problem(folder / "robot.urdf", folder=folder, **options)
+    return draft_problem(folder / "robot.urdf", folder=folder, **{"planned": False, **options})
 
 
 def _problem(folder: Path, text: str, **options: Any) -> ImpactProblem:
     (folder / "robot.toml").write_text(_drafted(folder, text, **options).text)
     return load_problem(folder / "robot.toml")
+
+
+@pytest.mark.parametrize("arms", [False, True], ids=["legs", "arms"])
+def test_a_biped_kicks_where_it_has_no_arms_or_is_told_to(tmp_path: Path, arms: bool) -> None:
+    """From one foot, with the weight above it and the other foot in the air, behind the ball."""
+    problem = _problem(tmp_path, urdfs.biped(arms=arms), **({"motion": "kick"} if arms else {}))
+    robot, q = problem.robot, problem.start_posture
+    (sole,) = problem.stance.soles(robot)
+    assert sole.name == "left" and problem.striker == "right_toe" and not hopeless(problem)
+    data = robot.model.createData()
+    centre = pin.centerOfMass(robot.model, data, q)
+    pin.framesForwardKinematics(robot.model, data, q)
+    at = data.oMf[robot.model.getFrameId(sole.frame)]
+    low, high = sole.polygon.min(axis=0), sole.polygon.max(axis=0)
+    assert np.all(centre[:2] > at.translation[:2] + low + 0.01)
+    assert np.all(centre[:2] < at.translation[:2] + high - 0.01)
+    toe = data.oMf[robot.model.getFrameId("striker:right_toe")].translation
+    other = data.oMf[robot.model.getFrameId(robot.sole("right").frame)].translation
+    assert at.translation[2] == pytest.approx(0.0, abs=1e-6) and other[2] > 0.03
+    assert toe[0] < problem.point[0] - 0.05 and toe[1] == pytest.approx(problem.point[1], abs=1e-3)
+
+
+def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
+    for text, motion, why in (
+        (urdfs.arm(), "kick", "does not stand on legs"),
+        (urdfs.biped(arms=False), "punch", "no limb beside the legs"),
+        (urdfs.biped(legs=5, arms=False), None, "would swing on its hinge"),
+        (urdfs.arm(), "slap", "give punch or kick"),
+    ):
+        with pytest.raises(InputError, match=why):
+            _drafted(tmp_path, text, motion=motion)
 
 
 @pytest.mark.parametrize("behind", [False, True], ids=["ahead", "behind"])
@@ -194,6 +226,42 @@ def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
     assert found is not None and found[0] > 0.6
 
 
+def _two_arms() -> str:
+    """Two arms that lie level in the zero posture, which their shoulders cannot bear, and a head."""
+    parts = [urdfs.link("base", 30.0, (0.3, 0.3, 0.8), (0.0, 0.0, 0.4))]
+    for side, y in (("left", 0.35), ("right", -0.35)):
+        parent = "base"
+        for name, axis, at, long in (
+            ("turn", "0 0 1", (0.0, y, 0.9), 0.05),
+            ("lift", "0 1 0", (0.05, 0.0, 0.0), 0.3),
+            ("elbow", "0 1 0", (0.3, 0.0, 0.0), 0.3),
+            ("wrist", "0 1 0", (0.3, 0.0, 0.0), 0.1),
+        ):
+            child = f"{side}_{name}_link"
+            parts += [urdfs.link(child, 6 * long, (long, 0.06, 0.06), (long / 2, 0.0, 0.0))]
+            parts += [urdfs.joint(f"{side}_{name}", parent, child, axis, at, (-2.2, 2.2), effort=12.0)]
+            parent = child
+    parts += [urdfs.link("head", 1.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.1))]
+    parts += [urdfs.joint("head_pan", "base", "head", "0 0 1", (0.0, 0.0, 0.9), (-1.0, 1.0))]
+    return urdfs.robot("two arms", *parts)
+
+
+def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path) -> None:
+    draft = _drafted(tmp_path, _two_arms(), planned=True)
+    assert any("a whole motion leads to" in line for line in draft.said)
+    (tmp_path / "robot.toml").write_text(draft.text)
+    problem = load_problem(tmp_path / "robot.toml")
+    robot, q = problem.robot, problem.start_posture
+    assert "head_pan" not in robot.joint_names and problem.striker == "right_hand"
+    weight, asked = (
+        np.abs(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), posture))
+        for posture in (np.zeros(robot.nq), q)
+    )
+    left = [k for k, name in enumerate(robot.joint_names) if name.startswith("left")]
+    assert (weight > robot.torque_limit)[left].any() and (asked <= 0.6 * robot.torque_limit)[left].all()
+    assert solve(problem).status.usable
+
+
 @pytest.mark.parametrize("still", [("turn", "wrist"), ("wrist",)])
 def test_an_arm_of_few_joints_strikes(tmp_path: Path, still: tuple[str, ...]) -> None:
     """It cannot turn its hand at will: with the hand's face, or else with what comes first."""
@@ -271,6 +339,17 @@ def test_a_tool_frame_wins_over_shapes(tmp_path: Path, name: str, place: str, po
     problem = _problem(tmp_path, _flange(_fixed("flange", name, place)))
     striker = problem.robot.striker(problem.striker)
     assert striker.frame == name and striker.point == pytest.approx(point, abs=1e-6)
+
+
+def test_of_a_tool_at_the_joint_itself_a_long_hand_strikes(tmp_path: Path) -> None:
+    """Where it ends, though the arm comes from another side."""
+    hand = urdfs.link("hand", 0.3, (0.2, 0.05, 0.05), (0.1, 0.0, 0.0))
+    held = _fixed("flange", "hand", 'xyz="0 0 0"').replace('<link name="hand"/>', hand)
+    (tmp_path / "robot.urdf").write_text(_flange(held + _fixed("flange", "tool0", 'xyz="0 0 0"')))
+    drafted = draft_robot(tmp_path / "robot.urdf")
+    striker, axis = find_striker(drafted.robot.model, drafted.arms[0], "hand", drafted.pieces)
+    assert striker.frame == "tool0" and striker.point == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
+    assert axis == pytest.approx([1.0, 0.0, 0.0])
 
 
 def test_a_shape_far_from_its_link_is_told_and_does_not_strike(tmp_path: Path) -> None:
@@ -449,6 +528,10 @@ def test_robots_of_example_robot_data_go_by_name() -> None:
         find_description("pnada")
     with pytest.raises(InputError, match=r"several robots 'alex'.*alex_nub_hands"):
         find_description("alex")
+    with pytest.raises(InputError, match=r"did you mean 'g1_29dof_rev_1_0'"):  # a dot makes it no file
+        find_description("g1_29dof_rev_1.0")
+    with pytest.raises(InputError, match=r"there is no file gone.urdf$"):
+        find_description("gone.urdf")
 
 
 def test_the_command_writes_a_file_once(tmp_path: Path) -> None:

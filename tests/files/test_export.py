@@ -242,6 +242,42 @@ def test_effort_without_gravity_is_for_arms_that_hold_themselves(
         arm.export("mujoco", tmp_path / "scene", gravity=False)
 
 
+def test_a_smoothed_motion_keeps_limits_of_acceleration_and_jerk(
+    arm: Solution, planned: Planned, still: Solution, tmp_path: Path
+) -> None:
+    """By differences of the rows alone; and the blow is nearly the planned one."""
+    robot, limits = arm.problem.robot, (60.0, 5000.0)
+    meta, path = arm.export("csv", tmp_path / "csv", smooth=limits)
+    read = from_csv(path, robot)
+    gap = np.diff(read.time)[:, None]
+    acceleration = np.diff(read.v, axis=0) / gap
+    assert gap.min() > 0.9e-3  # no instant twice
+    assert np.abs(acceleration).max() < limits[0] * (1 + 1e-6)
+    # of constant jerk in each piece: the second difference of velocities is its mean over two rows
+    assert np.abs(np.diff(acceleration, axis=0) / gap[1:]).max() < limits[1] * (1 + 1e-6)
+    np.testing.assert_allclose(
+        np.diff(read.q, axis=0) / gap, (read.v[1:] + read.v[:-1]) / 2, atol=limits[1] * 1e-3**2 / 6
+    )
+    for row in (0, -1):
+        np.testing.assert_allclose(read.v[row], 0.0, atol=1e-9)
+    np.testing.assert_allclose(read.q[[0, -1]], arm.trajectory.q[[0, -1]], atol=1e-6)
+    told = json.loads(meta.read_text())["smooth"]
+    assert told["impulse_Ns"] == pytest.approx(replayed(arm.problem, read).impulse, rel=2 * NEAR)
+    assert told["impulse_Ns"] == pytest.approx(arm.impulse, rel=0.05)
+    with pytest.raises(InputError, match="bolted robots"):
+        still.export("csv", tmp_path / "legs", smooth=limits)
+    meta, _ = arm.export("csv", tmp_path / "slow", smooth=(0.1, 1.0))  # it hardly moves, and says so
+    assert json.loads(meta.read_text())["smooth"]["impulse_Ns"] == 0.0
+    way = np.linspace(0.0, 1.0, len(planned.reference.time))[:, None]
+    farther = dataclasses.replace(planned.reference, q=planned.reference.q + way)
+    with pytest.raises(InputError, match="larger limits"):
+        export_planned(
+            dataclasses.replace(planned, reference=farther), "csv", tmp_path / "far", smooth=(0.1, 1.0)
+        )
+    with pytest.raises(InputError, match="above 0"):
+        arm.export("csv", tmp_path / "none", smooth=(0.0, 1.0))
+
+
 def test_mcap_is_what_ros_reads(arm: Solution, tmp_path: Path) -> None:
     _, path = arm.export("mcap", tmp_path / "bag")
     messages = read_mcap(path)
@@ -338,6 +374,11 @@ def test_a_soft_grip_is_a_spring_in_the_scene_and_the_tables(tmp_path: Path) -> 
     assert moves and all(np.ptp(table[name]) == 0.0 for name in moves)
     joints = json.loads((tmp_path / "csv" / "meta.json").read_text())["joints"]
     assert [joint["name"] for joint in joints if joint.get("passive")] == ["hammer_grip"]
+    less = soft.export("csv", tmp_path / "less", gravity=False)[1]  # no controller bears a spring's weight
+    less = np.genfromtxt(less, delimiter=",", names=True, comments="#")
+    (effort,) = (name for name in moves if name.startswith("effort"))
+    np.testing.assert_array_equal(less[effort], table[effort])
+    assert np.any(less["effort_shoulder_N_m"] != table["effort_shoulder_N_m"])
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from impactopt.cli.validate import validate
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, record_of, save_record
 from impactopt.files.replay import Planned, Replay, load_planned, replay
+from impactopt.report.console import touch_message
 from impactopt.report.pictures.animation import AROUND, FPS, SLOW, _Drawing, save_animation, shown_times
 from impactopt.simulation import Perturbation
 from impactopt.simulation.result import REPORT
@@ -148,6 +149,19 @@ def test_a_result_without_a_motion_has_nothing_to_replay(tmp_path: Path) -> None
     save_record(Record(summary={"note": "stopped early"}), tmp_path)
     with pytest.raises(InputError, match="no motion to replay: stopped early"):
         load_planned(tmp_path)
+
+
+def test_the_links_hull_is_told_beside_the_striking_point(hammered: Solution) -> None:
+    planned = Planned(record=record_of(hammered), problem=hammered.problem, reference=hammered.trajectory)
+    report = replay(planned, contact="link").report
+    assert report["contact"] == "link"
+    assert report["point"]["impulse_Ns"] == pytest.approx(hammered.impulse, rel=0.01)
+    assert report["impulse_Ns"] == pytest.approx(hammered.impulse, rel=0.05)
+    assert abs(report["first_touch_ms"]) < 1.0 and abs(report["point"]["first_touch_ms"]) < 0.3
+    assert touch_message(report).startswith(f"contact of the link's hull: {report['impulse_Ns']:.2f} N s")
+    assert touch_message({}) == ""
+    with pytest.raises(InputError, match="take engine 'mujoco'"):
+        replay(planned, engine="pinocchio", contact="link")
 
 
 # ---- pictures

@@ -14,7 +14,7 @@ from impactopt.errors import InputError
 from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.minimum_jerk import _holds, _profile, _wrenches_exist, minimum_jerk_baseline
 from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.terms import TorqueLimit
+from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
 
@@ -81,3 +81,12 @@ def test_limits_that_do_not_let_it_stand_are_said() -> None:
     problem = reach_of(arm(), "start", "hand", stance=FixedBase(), terms=(TorqueLimit(fraction=1e-3),))
     with pytest.raises(InputError, match=r"minimum-jerk reach that hits at 0\.01 m/s"):
         minimum_jerk_baseline(problem)
+
+
+def test_a_reach_may_use_the_soles_up_to_their_edges() -> None:
+    """A margin that leaves a plan no room leaves a reach as it is."""
+    narrow = ContactWrenchCone(margin=0.045, minimum_force=100.0)
+    plain, wary = (reach_of(biped(), "half_sitting", "fist", terms=t) for t in ((), (narrow,)))
+    found = minimum_jerk_baseline(wary, tolerance=0.1)
+    assert found.speed == minimum_jerk_baseline(plain, tolerance=0.1).speed
+    assert min(found.summary["zmp_margin_m"].values()) >= 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from impactopt.simulation import (
     simulate_mujoco,
     simulate_pinocchio,
 )
+from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.mujoco_engine import _Replay
 from impactopt.simulation.mujoco_world import MujocoOptions
 
@@ -500,3 +501,43 @@ def test_a_replay_far_from_the_plan_does_not_pass_for_one_that_stands(punch: Sol
     sim = punch.validate(engine="mujoco", step=1e-3, perturbation=Perturbation(torque_limit=0.3))
     assert sim.standing is False
     assert sim.saturated > 0.1
+
+
+# ---- the striking link in place of its point
+
+
+CUBE = np.array([[x, y, z] for x in (-0.02, 0.02) for y in (-0.02, 0.02) for z in (-0.02, 0.02)])
+
+
+def hulls(ahead: float, at: Array) -> Solids:
+    """A cube on the slider, whose front is so far ahead [m] of its striking point, and a cube that is hit."""
+    hand = Solid(name="hand", joint=1, vertices=CUBE + np.array([ahead - 0.02, 0.0, 0.0]))
+    place = at + np.array([0.05, 0.0, 0.0])
+    box = Solid(
+        name="box", half=np.full(3, 0.05), place=place, rotation=np.eye(3), of_target=True, moves=True
+    )
+    return Solids(solids=(hand, replace(box, strikable=True)))
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.006])
+def test_a_link_hits_when_its_hull_meets_the_targets_body(ahead: float) -> None:
+    """As early as its front is ahead, and as hard as the point that it stands for."""
+
+    def with_hulls(robot: Robot, way: Any, there: Scene, **options: Any) -> Simulation:
+        there = replace(there, solids=hulls(ahead, there.point))
+        return simulate_mujoco(robot, way, there, contact="link", **options)
+
+    sim, exact = strike(100.0, simulate=with_hulls)
+    assert sim.impulse == pytest.approx(exact["impulse"], rel=1e-3)
+    assert sim.contact_start == pytest.approx(exact["start"] - ahead / exact["speed"], abs=2e-4)
+    assert sim.contact_end - sim.contact_start == pytest.approx(exact["duration"], abs=4e-4)
+
+
+def test_a_link_or_a_target_without_a_body_is_refused() -> None:
+    def bare(robot: Robot, way: Any, there: Scene, **options: Any) -> Simulation:
+        return simulate_mujoco(robot, way, there, contact="link", **options)
+
+    with pytest.raises(InputError, match=r"'link' needs bodies, and the target has none: .*keep_out"):
+        strike(100.0, simulate=bare)
+    with pytest.raises(InputError, match=r"contact 'lnk' .did you mean 'link'"):
+        strike(100.0, simulate=lambda *given, **o: simulate_mujoco(*given, contact="lnk", **o))

@@ -71,12 +71,13 @@ def biped(
     moments: str = "",
     effort: float = 80.0,
     pairs: int = 1,
+    arms: bool = True,
 ) -> str:
     """Two legs of so many joints with box feet, and two arms of three.
 
     without : one of these joints.  waist : one more joint, from the trunk to both legs.
     behind : its root looks along -x.  moments : of the right elbow's link.  effort : of all joints [N m].
-    pairs : of legs, one behind the other.
+    pairs : of legs, one behind the other.  arms : False: none.
     """
     sign = -1.0 if behind else 1.0
     parts = [link("trunk", 15.0, (0.2, 0.3, 0.5), (0.0, 0.0, 0.25))]
@@ -99,7 +100,7 @@ def biped(
                 parts += [link(child, mass, size, at)]
                 parts += [joint(f"{mark}_{name}", parent, child, turn, place, limits, effort=effort)]
                 parent = child
-    for side, out in (("left", sign), ("right", -sign)):
+    for side, out in (("left", sign), ("right", -sign)) if arms else ():
         parent = "trunk"
         for name, axis, (x, y, z), limits, long in _ARM:
             child = f"{side}_{name}_link"

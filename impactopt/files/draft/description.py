@@ -10,6 +10,8 @@ from impactopt.robots.presets import example_robots
 
 __all__ = ["find_description"]
 
+SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
+
 
 def find_description(given: str) -> Path:
     """The URDF of a path, or of a name such as "panda" or "ur5_robot" that example-robot-data knows.
@@ -21,7 +23,7 @@ def find_description(given: str) -> Path:
     path = Path(given).expanduser()
     if is_plain_file(path):
         return path
-    if path.suffix or len(path.parts) != 1:
+    if path.suffix.lower() in SUFFIXES or len(path.parts) != 1:
         raise InputError(f"there is no file {shortened(given, 300)}")
     known = _examples()
     if given in known:

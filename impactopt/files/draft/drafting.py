@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,18 +19,21 @@ from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.draft.default_drives import DOUBT
 from impactopt.files.draft.limbs import renumbered
-from impactopt.files.draft.postures import half_sitting, rested
+from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_striker
-from impactopt.files.draft.strong import Strong, duration, strongest
+from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest
 from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.files.problem_file.writing import sole_data, striker_data
+from impactopt.kinematics.operational_space import striking_point
+from impactopt.planning.solve import solve
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import far_shapes
+from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.attachments import Sole, Striker
 from impactopt.robots.build import default_kd, default_kp
 from impactopt.robots.checks import REPAIRED
@@ -42,6 +47,12 @@ TRIED = 8  # targets
 STIFFNESS, DAMPING = 1e4, 300.0  # [N/m], [N s/m] of a drafted contact
 SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # [s] of fast robots
 START = "ready"
+MOTIONS = ("punch", "kick")
+TOE = 0.02  # [m] of the point of a toe above the sole
+BALL, KICKS = (
+    0.22,
+    (0.3, 0.2, 0.4),
+)  # [m] of a ball; of the hip's height: how far ahead it lies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,61 +63,173 @@ class Draft:
     said: tuple[str, ...]
 
 
-def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, bolted: bool = False) -> Draft:
+def draft_problem(
+    path: Path,
+    *,
+    folder: Path,
+    mjcf: bool = False,
+    bolted: bool = False,
+    motion: str | None = None,
+    planned: bool = True,
+    report: Callable[[str], None] | None = None,
+) -> Draft:
     """The text of a problem file for the robot of a URDF, or an MJCF.
 
-    folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.
+    folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.  motion :
+    "punch" or "kick"; None: a robot on legs kicks where it has no arm to strike with.  planned : the whole
+    motion to a bolted arm's blow is solved, too, and the next blow taken where there is none.
+    report : is told what is done.
 
     Raises
     ------
     InputError : the file cannot be read; the robot is none that can be planned for, with the reason; no
-        posture or no target is found.
+        posture or no target is found; an unknown motion, or a kick of a robot without legs.
     """
+    if motion not in (None, *MOTIONS):
+        raise InputError(f"motion: {motion!r}; give {' or '.join(MOTIONS)}")
+    say = report or (lambda text: None)
+    say("reading the robot and the shapes of its links")
     drafted = draft_robot(path, mjcf=mjcf, bolted=bolted)
     model, forward = drafted.robot.model, np.array(WAYS[0])
     soles: list[Sole] = []
     if drafted.legs:
         soles, forward = find_soles(model, drafted.legs, drafted.pieces)
+    if motion == "kick" and not soles:
+        raise InputError(f"{path}: it does not stand on legs, so it cannot kick")
     arms, strikers = _arms(drafted)
+    if motion == "punch" and not arms:
+        raise InputError(f"{path}: there is no limb beside the legs to punch with; let it kick")
+    if soles and (motion == "kick" or not arms):
+        return _kick(drafted, soles, strikers, forward, folder)
     robot = drafted.made(soles=soles, strikers=strikers)
     legs = tuple(renumbered(leg, model, robot.model) for leg in drafted.legs)
     arms = [replace(arm, limb=renumbered(arm.limb, model, robot.model)) for arm in arms]
-    q = half_sitting(robot, legs, soles, forward) if soles else rested(robot)
-    strong = None if soles else _strong(robot, arms[0], q)
-    edgewise = strong is None and not soles
+    said: list[str] = []
+    strong: list[Strong] = []
+    if soles:
+        say(f"{robot.name}: {robot.n} joints, on two legs; looking for a posture and a target")
+        q = half_sitting(robot, legs, soles, forward)
+    else:
+        say(f"{robot.name}: {robot.n} joints, on a fixed base; trying blows (compiles the first time)")
+        q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
+        strong = _strong(robot, arms[0], q)
+    edgewise = not strong and not soles
     if edgewise:  # an arm of few joints cannot turn the link's face to where it moves
         strong = _strong(robot, arms[0], q, with_face=False)
-    if strong is None:
-        q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
-        data = _data(drafted, robot, soles, strikers, q, folder)
-        data = _aimed(data, robot, arms[0], aims(robot, arms[0], q, way), way, folder)
-    else:
-        data = _data(drafted, robot, soles, strikers, strong.start, folder)
-        way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
-        for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
-            data[phase]["duration_s"] = duration(robot, way, usual)
+    if strong:
+        tries = [_struck(drafted, robot, strikers, arms[0], blow, edgewise, folder) for blow in strong]
+        taken = _planned(tries, folder, say) if planned else 0
+        data = tries[taken or 0]
+        said.append(_strike_message(strong[taken or 0], found=taken is not None, tried=planned))
         if edgewise:
-            data["terms"] = {"first_touch": {"enabled": False}}
-        data = _aimed(data, robot, arms[0], iter([strong.point]), strong.normal, folder)
-    said = [*_said(data, drafted, robot), *([_strike_message(strong)] if strong else [])]
-    if strong and edgewise:
-        said.append(
-            "no strike with the striking link's face to the target is found: [terms.first_touch] is off, so "
-            "another part of the link may touch first"
-        )
-    return Draft(text=_text(data, drafted, robot), said=tuple(said))
+            said.append(
+                "no strike with the striking link's face to the target is found: [terms.first_touch] is off, "
+                "so another part of the link may touch first"
+            )
+    else:
+        try:
+            q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
+        except InputError:
+            if not soles or motion == "punch":
+                raise
+            return _kick(drafted, soles, strikers, forward, folder)
+        data = _data(drafted, robot, soles, strikers, q, folder)
+        data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
+    return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
 
 
-def _strong(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True) -> Strong | None:
-    """The hardest blow that is found for an arm on a fixed base."""
+def _strong(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True) -> list[Strong]:
+    """The hardest blows that are found for an arm on a fixed base."""
     law, target = SpringDamper(stiffness=STIFFNESS, damping=DAMPING), FreeMass(mass=_target_mass(robot))
     return strongest(robot, arm, q, with_face=with_face, law=law, target=target)
 
 
-def _strike_message(strong: Strong) -> str:
+def _struck(
+    drafted: Drafted,
+    robot: Robot,
+    strikers: list[Striker],
+    arm: Arm,
+    strong: Strong,
+    edgewise: bool,
+    folder: Path,
+) -> dict[str, Any]:
+    """The data of a blow of a bolted arm."""
+    data = _data(drafted, robot, [], strikers, strong.start, folder)
+    way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
+    for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
+        data[phase]["duration_s"] = duration(robot, way, usual)
+    if edgewise:
+        data["terms"] = {"first_touch": {"enabled": False}}
+    return _aimed(data, arm.name, iter([strong.point]), strong.normal, folder)
+
+
+def _kick(
+    drafted: Drafted,
+    soles: list[Sole],
+    strikers: list[Striker],
+    forward: Array,
+    folder: Path,
+) -> Draft:
+    """A draft of a kick: from one foot, with the toe of the other one, against a ball on the ground.
+
+    Raises
+    ------
+    InputError : a sole has a hinge; no posture or no target is found.
+    """
+    if any(sole.hinge is not None for sole in soles):
+        raise InputError(
+            f"{drafted.path}: there is nothing to strike with but the feet, and legs of five joints cannot "
+            "kick: a foot in the air would swing on its hinge"
+        )
+    lifted = max(range(len(soles)), key=lambda k: soles[k].name == "right")
+    foot, stands = soles[lifted], soles[1 - lifted]
+    place, corners = foot.placement, foot.polygon
+    point = place.act(np.array([corners[:, 0].max(), corners[:, 1].mean(), TOE]))
+    assert foot.parent is not None  # it is drafted
+    toe = Striker(name=f"{foot.name}_toe", frame=foot.parent, point=np.round(point, 4) + 0.0)
+    strikers = [*strikers, toe]
+    robot = drafted.made(soles=soles, strikers=strikers)
+    legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
+    q = half_sitting(robot, legs, soles, forward, lifted=lifted)
+    at = striking_point(robot, toe.name, q)
+    hip = robot.model.createData()
+    pin.forwardKinematics(robot.model, hip, q)
+    length = float(hip.oMi[legs[1 - lifted].own[0]].translation[2])
+    data = _data(drafted, robot, soles, strikers, q, folder)
+    size = float(f"{min(BALL, 0.3 * length):.2g}")
+    mass = float(f"{np.clip(0.005 * sum(body.mass for body in robot.model.inertias), 0.1, 0.45):.2g}")
+    data["stance"] = {"soles": stands.name}
+    data["target"] = {"mass_kg": mass, "body": {"shape": "ball", "size_m": [size]}}
+    data["contact"] = {"stiffness_N_m": 2 * STIFFNESS, "damping_N_s_m": 20.0}
+    points = (np.round([part * length, at[1], size / 2], 3) + 0.0 for part in KICKS)
+    data = _aimed(data, toe.name, points, np.array(WAYS[0]), folder)
+    return Draft(text=_text(data, drafted, robot), said=tuple(_said(data, drafted, robot)))
+
+
+def _planned(tries: Sequence[dict[str, Any]], folder: Path, say: Callable[[str], None]) -> int | None:
+    """Index of the first data with a plan for the whole motion; None: no plan is found for any of them.
+
+    A strike need not have one: its links may be beyond the target's plane just before.
+    """
+    for k, data in enumerate(tries):
+        say(f"planning the motion to blow {k + 1} of {len(tries)}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the draft is only tried
+            with contextlib.suppress(InputError):
+                problem = _built(data, folder)
+                solution = solve(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
+                if solution.status.usable:
+                    return k
+    return None
+
+
+def _strike_message(strong: Strong, *, tried: bool, found: bool) -> str:
     normal = ", ".join(f"{x:g}" for x in strong.normal)
+    ends = " that a whole motion leads to" if tried and found else ""
+    none = "; no whole motion to it, or to another one, was found" if not found else ""
     return (
-        f"the drafted blow, along [{normal}], is the hardest of the strikes tried: {strong.impulse:.3g} N s"
+        f"the drafted blow, along [{normal}], is the hardest of the strikes tried{ends}: "
+        f"{strong.impulse:.3g} N s{none}"
     )
 
 
@@ -178,7 +301,7 @@ def _data(
 
 
 def _aimed(
-    data: dict[str, Any], robot: Robot, arm: Arm, points: Iterator[Array], way: Array, folder: Path
+    data: dict[str, Any], striker: str, points: Iterator[Array], way: Array, folder: Path
 ) -> dict[str, Any]:
     """The data with a target that check finds no fault with.
 
@@ -190,20 +313,25 @@ def _aimed(
     for k, point in enumerate(points):
         if k == TRIED:
             break
-        problem = {"striker": arm.name, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
+        problem = {"striker": striker, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
         aimed = {**data, "problem": {"name": data["problem"]["name"], **problem, "start": START}}
-        tried = {**aimed, "robot": {**aimed["robot"], "inertias": REPAIRED}}
         try:
-            wrong = hopeless(problem_file_from_data(tried, where=folder / "draft.toml").build())
+            wrong = hopeless(_built(aimed, folder))
         except InputError as error:
             wrong = [str(error)]
         if not wrong:
             return aimed
         first = first or wrong[0]
     raise InputError(
-        f"no target is found that {arm.name!r} can hit from the drafted posture; write the problem file by "
+        f"no target is found that {striker!r} can hit from the drafted posture; write the problem file by "
         f"hand (docs/howto/robot.md){f': {first}' if first else ''}"
     )
+
+
+def _built(data: dict[str, Any], folder: Path) -> ImpactProblem:
+    """The problem of drafted data, its inertias repaired."""
+    tried = {**data, "robot": {**data["robot"], "inertias": REPAIRED}}
+    return problem_file_from_data(tried, where=folder / "draft.toml").build()
 
 
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
@@ -220,6 +348,8 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         if len(place) == 2 and place[0] == "robot" and str(place[1]) in guessed:
             return guessed[str(place[1])]
         if place == ("robot", "postures_rad", START):
+            if "stance" in data:
+                return "on one foot, the other one behind it, knees ahead"
             return "soles level, knees ahead, arms bent" if data["robot"].get("soles") else "bent"
         return comment_at(data, place)
 

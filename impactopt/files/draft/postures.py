@@ -9,16 +9,21 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
 from impactopt.robots.checks import LEG
 from impactopt.robots.robot import Robot, Sole
 
-__all__ = ["arm_length", "bend_arm", "half_sitting", "rested", "shoulder"]
+__all__ = ["arm_length", "bend_arm", "eased", "half_sitting", "rested", "shoulder"]
 
 Array = NDArray[np.float64]
 BENT = 0.06  # of the legs' length: how much lower than straight it sits
+WAITS = (0.1, 0.12)  # of the legs' length: how far back, and how much higher, a foot waits to kick
+INNER = 0.15  # of a sole's width: how far inside its middle the weight is, of a robot on one foot
+LEVEL, INACCURATE = 1e-7, 0.1  # [m], [rad] off its goal: a sole that stands, and one that waits in the air
 STARTS = 10
+HELD = 0.5  # of its torque limit: what gravity may ask of a joint that does not strike
 INSIDE = 0.1  # of a joint's range that is left to its limits
 REST = 0.02  # [m] that the whole range of a joint costs: postures in the middle of their ranges
 LONG = 0.2  # of an arm's length: an upper arm at least
@@ -26,10 +31,13 @@ ACROSS = 0.7  # largest cosine between a shoulder's axis and the arm, for its pl
 EDGE = 0.2  # of a range: zero is a joint's rest unless it is as near to a limit as that
 
 
-def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array) -> Array:
+def half_sitting(
+    robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array, *, lifted: int | None = None
+) -> Array:
     """A configuration (nq,) with the soles level and beside each other, knees ahead, the weight above them.
 
-    robot : with the soles.  forward (3,) : in the root's frame.
+    robot : with the soles.  forward (3,) : in the root's frame.  lifted : the sole of that index waits higher
+    and farther back, to kick, with the weight above the other one.
 
     Raises
     ------
@@ -46,21 +54,29 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
     length = float(np.mean([_path(robot, own[1:]) for own in chains]))
     height = min(float(spot[2]) for spot in straight) + BENT * length
     ahead = float(np.mean([hip @ forward for hip in hips]))
+    bearing = [sole for k, sole in enumerate(soles) if k != lifted]
+    waits = [length * np.array(WAITS if k == lifted else (0.0, 0.0)) for k in range(len(soles))]
+    inwards = 0.0 if lifted is None else float(np.sign(aside[lifted] - aside[1 - lifted]))
     rng, q = np.random.default_rng(0), neutral
-    for _ in range(4):  # feet go where the weight is
-        for own, sole, out in zip(chains, soles, aside, strict=True):
-            spot = ahead * turn[:, 0] + out * turn[:, 1] + height * turn[:, 2]
-            q = _leg(robot, own, sole, pin.SE3(turn, spot), q, forward, rng)
+    for _ in range(8 if lifted is not None else 4):  # feet go where the weight is
+        for own, sole, out, (back, up) in zip(chains, soles, aside, waits, strict=True):
+            spot = (ahead - back) * turn[:, 0] + out * turn[:, 1] + (height + up) * turn[:, 2]
+            within = LEVEL if sole in bearing else INACCURATE
+            q = _leg(robot, own, sole, pin.SE3(turn, spot), q, forward, rng, within)
         centre = np.array(pin.centerOfMass(model, data, q))
         pin.framesForwardKinematics(model, data, q)
         middles = [
-            data.oMf[model.getFrameId(s.frame)].act(np.append(s.polygon.mean(axis=0), 0.0)) for s in soles
+            data.oMf[model.getFrameId(s.frame)].act(np.append(s.polygon.mean(axis=0), 0.0)) for s in bearing
         ]
-        off = float((centre - np.mean(middles, axis=0)) @ forward)
-        if abs(off) < 2e-3:
+        if lifted is not None:  # an ankle need not roll that far
+            middles = [middles[0] + INNER * np.ptp(bearing[0].polygon[:, 1]) * inwards * turn[:, 1]]
+        off = (centre - np.mean(middles, axis=0)) @ turn
+        if lifted is not None:
+            aside = [out + float(off[1]) for out in aside]
+        if np.abs(off[: 1 if lifted is None else 2]).max() < 2e-3:
             break
-        ahead += off
-    return robot.place(q, soles)
+        ahead += float(off[0])
+    return robot.place(q, bearing)
 
 
 def bend_arm(
@@ -131,10 +147,11 @@ def _leg(
     q: Array,
     forward: Array,
     rng: np.random.Generator,
+    within: float,
 ) -> Array:
     """The configuration with a leg's sole at its goal, a pin.SE3, and its knee as far ahead as may be.
 
-    joints : of the leg; its last six move, or as many as there are.
+    joints : of the leg; its last six move, or as many as there are.  within [m], [rad] : of the goal.
     """
     model, data = robot.model, robot.model.createData()
     fid, own = model.getFrameId(sole.frame), _rows(robot, joints[-LEG:])
@@ -154,7 +171,7 @@ def _leg(
         )
         off = float(np.abs(errors(found.x)).max())
         nearest = min(nearest, off)
-        if off > 1e-7:
+        if off > within:
             continue
         knee = max(float(data.oMi[j].translation @ forward) for j in joints)
         if best is None or knee > best[0] + 1e-4:
@@ -186,6 +203,32 @@ def rested(robot: Robot) -> Array:
     q, every = pin.neutral(robot.model), np.arange(robot.n)
     low, high = _limits(robot, every)
     return _set(robot, q, every, np.clip(robot.joint_positions(q), low, high))
+
+
+def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
+    """The configuration (nq,) near q with limbs bent or hanging, so that gravity asks little of them.
+
+    Of several the one in which the fewest links touch.
+    """
+    own = _rows(robot, [joint for limb in limbs for joint in limb.own])
+    model, data = robot.model, robot.model.createData()
+    low, high = _limits(robot, own)
+    rest, rng = robot.joint_positions(q)[own], np.random.default_rng(0)
+
+    def errors(angles: Array) -> Array:
+        weight = pin.computeGeneralizedGravity(model, data, _set(robot, q, own, angles))
+        share = np.abs(np.array(weight)[robot.nv - robot.n + own]) / robot.torque_limit[own]
+        return np.concatenate([np.maximum(share - HELD, 0.0), REST * (angles - rest) / (high - low)])
+
+    if not errors(rest)[: len(own)].any():
+        return q
+    tries = []
+    for _ in range(STARTS):
+        start = np.clip(rest + 0.25 * (high - low) * rng.standard_normal(len(own)), low, high)
+        found = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), max_nfev=60)
+        posture = _set(robot, q, own, found.x)
+        tries.append((len(bodies_of(robot).piece_pairs(posture)[1]), float(found.cost), posture))
+    return min(tries, key=lambda one: one[:2])[2]
 
 
 def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.errors import InputError
 from impactopt.files.draft.default_drives import Drives, guess_drives
-from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock, toes, unshared
+from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints
 from impactopt.robots.checks import LEG, REPAIRED, check_inertias
 from impactopt.robots.description import Description, Tie
@@ -69,7 +69,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     Raises
     ------
     InputError : it cannot be read; it has legs that no plan can hold, with the reason; its root has no mass,
-        and legs bear it; nothing can strike.
+        and legs bear it; it is bolted, and nothing can strike.
     """
     first = _floating(path, mjcf, bolted)
     locked = _locked(first)
@@ -89,9 +89,26 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     elif floats:
         found = _made(path, mjcf, False, locked)
     arms = arms_of(found.robot.model, legs)
-    if not arms:
-        raise InputError(f"{path}: there is no limb beside the legs, so nothing to strike with")
+    if idle := {} if legs else _idle(found.robot.model, arms):
+        found = _made(path, mjcf, False, {**found.locked, **idle})
+        arms = arms_of(found.robot.model, legs)
+    if not arms and not legs:
+        raise InputError(f"{path}: there is no limb, so nothing to strike with")
     return replace(found, legs=legs, arms=arms)
+
+
+def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:
+    """Joints of a bolted robot's limbs that cannot strike, as of heads and sensors, and why they are locked.
+
+    On legs such joints help to balance.
+    """
+    striking = {arm.tip for arm in arms}
+    return {
+        str(model.names[joint]): "moves a head or a sensor"
+        for limb in limbs_of(model)
+        if limb.tip not in striking
+        for joint in limb.own
+    }
 
 
 def _floating(path: Path, mjcf: bool, bolted: bool) -> Description:

@@ -28,6 +28,7 @@ _TOOLS = tuple(
 )
 APART = 0.01  # [m] two places are apart, and a shape's middle is ahead of its joint
 SHORT = 0.06  # [m] a link so short at most, as a flange is, never folds back over the link before it
+LONG = 0.12  # [m] a hand sticks out so far from a tool's frame at least
 ROLLS = np.cos(np.radians(25))  # least cosine between a joint's axis and what turns about it
 STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
 
@@ -38,8 +39,8 @@ def find_striker(
     """The end of a limb, and the direction (3,) in which its last link points there, in that joint's frame.
 
     A frame that is named as tools are is on the axis of the striking point; else the middle of the last
-    link's shapes is. The point is where these end, away from the arm. In place of shapes that are far from
-    their link there is the box of its inertia.
+    link's shapes is. The point is where these end, away from the arm; of a tool's frame at the joint itself
+    where a long hand ends. In place of shapes that are far from their link there is the box of its inertia.
     """
     own = pieces.get(limb.tip, ())
     points = [p.vertices for p in own if not is_far(model, p, own)]
@@ -49,10 +50,13 @@ def find_striker(
     if tool is not None:
         place = tool.placement
         axes = np.column_stack([place.rotation, -place.rotation])
-        beyond = place.translation + away * APART  # a frame at the joint itself: on as the arm goes
-        axis = axes[:, int(np.argmax(axes.T @ (beyond if np.linalg.norm(beyond) > 3 * APART else away)))]
-        ahead = max([float(((p - place.translation) @ axis).max()) for p in points], default=0.0)
-        local = place.rotation.T @ (axis * max(ahead, 0.0))
+        reach = np.max([np.zeros(6), *(((p - place.translation) @ axes).max(axis=0) for p in points)], axis=0)
+        way = place.translation + away * APART
+        if np.linalg.norm(way) <= 3 * APART:  # at the joint itself: to where a hand is, else as the arm goes
+            way = axes[:, int(np.argmax(reach))] if reach.max() > LONG else away
+        k = int(np.argmax(axes.T @ way))
+        axis, ahead = axes[:, k], float(reach[k])
+        local = place.rotation.T @ (axis * ahead)
         return Striker(name=name, frame=str(tool.name), point=np.round(local, 4) + 0.0), axis
     parent, above = first_link(model, limb.tip)
     frames = [f.placement.translation for f in model.frames if f.parentJoint == limb.tip]

@@ -23,7 +23,7 @@ from impactopt.problem.strength import Blow, Strength, drawn_blows
 from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 
-__all__ = ["Strong", "duration", "strongest"]
+__all__ = ["ITERATIONS", "SECONDS", "Strong", "duration", "strongest"]
 
 Array = NDArray[np.float64]
 STRIKES, LOOKED_AT = 4, 60  # blows that are solved as strikes; estimated ones that are looked at for them
@@ -34,7 +34,7 @@ RUN, BACK = 0.7, (0.35, 0.9)
 SHORTER = (1.0, 0.75, 0.55, 0.4)  # of that way, where joints or bodies leave no more
 BEHIND = 0.06, 0.15  # [m], and of the reach: of the start behind the target's plane, the smaller at least
 PARTS = (0.8, 3.0)  # of the time that joints need for their way: shortest and longest duration
-SECONDS = 10.0  # [s] of a strike
+ITERATIONS, SECONDS = 150, 30.0  # of a strike, or a plan, that is tried: most are there in a third of it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,30 +50,31 @@ class Strong:
     impulse: float
 
 
-def strongest(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True, **given: Any) -> Strong | None:
-    """The best strike of the blows that are estimated best; None: check finds a fault with all of them, or
-    none of the strikes is solved.
+def strongest(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True, **given: Any) -> list[Strong]:
+    """Strikes of the blows that are estimated best, the hardest first; none: check finds a fault with all of
+    them, or none of the strikes is solved.
 
     q (nq,) : what does not strike stays as in it.  with_face : the link's face meets the target; else any
     part of it may touch first.  given : law and target, as of `ImpactProblem`.
     """
     given["terms"] = () if with_face else (FirstTouch(enabled=False),)
     strength = Strength(robot=robot, striker=arm.name, law=given["law"], target=given["target"])
-    best: Strong | None = None
+    found = []
     for problem, blow in _sound(robot, arm, drawn_blows(strength, q, with_face=with_face), given):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
-            solved = optimize_strike(problem, time_limit=SECONDS)
-        if not solved.status.usable or (best is not None and solved.impulse <= best.impulse):
-            continue
-        best = Strong(
-            start=problem.start_posture,
-            contact=blow.q,
-            point=problem.point,
-            normal=problem.normal,
-            impulse=solved.impulse,
-        )
-    return best
+            solved = optimize_strike(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
+        if solved.status.usable:
+            found.append(
+                Strong(
+                    start=problem.start_posture,
+                    contact=blow.q,
+                    point=problem.point,
+                    normal=problem.normal,
+                    impulse=solved.impulse,
+                )
+            )
+    return sorted(found, key=lambda strong: -strong.impulse)
 
 
 def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:

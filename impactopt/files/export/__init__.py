@@ -46,6 +46,7 @@ def export(
     rate: float | None = None,
     joints: Sequence[str] | None = None,
     gravity: bool = True,
+    smooth: tuple[float, float] | None = None,
 ) -> list[Path]:
     """Write a plan for other programs; the files.
 
@@ -55,12 +56,15 @@ def export(
     joints : their order in all columns, each of the robot's once; the robot's own if left out.
     gravity : False: effort is without the torque that holds the posture against gravity, for arms whose
         controller adds that itself.
+    smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints, for bolted arms whose
+        controllers refuse jumps: the nearest motion within these. ``meta.json`` says what it costs.
 
     Raises
     ------
     InputError : an unknown format, a plan that is not finished, joints that are no order of the robot's, a
         directory with something else in it, a package that is missing; a robot on soles, or a format that
-        needs the whole effort, without gravity. Nothing is written then.
+        needs the whole effort, without gravity; a robot on soles, or limits that no motion is within,
+        smoothed. Nothing is written then.
     """
     usual = _format(to).rate
     # before the record's numbers are computed
@@ -70,7 +74,7 @@ def export(
         raise InputError(f"there is no motion to export: {record.summary['note']}")
     missed = solution.missed_trajectory if solution.plan.abort is not None else None
     planned = Planned(record=record, problem=solution.problem, reference=solution.trajectory, missed=missed)
-    return export_planned(planned, to, directory, rate=rate, joints=joints, gravity=gravity)
+    return export_planned(planned, to, directory, rate=rate, joints=joints, gravity=gravity, smooth=smooth)
 
 
 def export_planned(
@@ -81,13 +85,14 @@ def export_planned(
     rate: float | None = None,
     joints: Sequence[str] | None = None,
     gravity: bool = True,
+    smooth: tuple[float, float] | None = None,
 ) -> list[Path]:
     """The same of a plan that was read from a disk."""
     chosen = _format(to)
     if chosen.whole and not gravity:
         raise InputError(f"gravity: {to} needs the whole effort; leave gravity at its default")
     rate = chosen.rate if rate is None else rate
-    content = export_of(planned, rate=rate, joints=joints, gravity=gravity)
+    content = export_of(planned, rate=rate, joints=joints, gravity=gravity, smooth=smooth)
     writer = importlib.import_module(f"impactopt.files.export.{chosen.module}")
     return write_directory(Path(directory), to, content.meta, lambda new: writer.write(content, new))
 

@@ -25,10 +25,12 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_number, did_you_mean
 from impactopt.files.export.motion import JUMP, Motion, motion_at, springs_at_rest
+from impactopt.files.export.smooth import Smoothness, smoothed
 from impactopt.files.output import plain
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
+from impactopt.simulation import simulate
 from impactopt.simulation.result import parts_from
 from impactopt.solvers.program import Status
 from impactopt.transcription.plan import Trajectory
@@ -125,8 +127,10 @@ class Export:
 
     planned : the plan, its problem and its references.  joints : names, in the order of all columns.
     order (n,) : where these are in the robot's own arrays.  rate [Hz].  gravity : effort bears it.
-    motion : as planned.  missed : if nothing is hit, on the same time axis: both coast from contact on, one
-    until its contact ends, the other until the abort motion begins.  None where the plan has none.
+    smooth : the limits that the motion is smoothed within, if it is, and what the replay of it brings.
+    motion : as planned, or smoothed.  missed : if nothing is hit, on the same time axis: both coast from
+    contact on, one until its contact ends, the other until the abort motion begins.  None where the plan has
+    none.
     """
 
     planned: Planned
@@ -134,6 +138,7 @@ class Export:
     order: NDArray[np.intp]
     rate: float
     gravity: bool
+    smooth: Mapping[str, float] | None
     motion: Motion
     missed: Motion | None
 
@@ -180,6 +185,7 @@ class Export:
                 "rate_Hz": self.rate,
                 "jump_s": JUMP,
                 "effort_holds_gravity": self.gravity,
+                "smooth": self.smooth,
                 "phases": list(PHASES),
                 **({"stances": s["stances"]} if "stances" in s else {}),
                 "joints": self._joints(),
@@ -234,19 +240,28 @@ class Export:
 
 
 def export_of(
-    planned: Planned, *, rate: float, joints: Sequence[str] | None = None, gravity: bool = True
+    planned: Planned,
+    *,
+    rate: float,
+    joints: Sequence[str] | None = None,
+    gravity: bool = True,
+    smooth: tuple[float, float] | None = None,
 ) -> Export:
     """A plan at a rate [Hz].
 
     joints : their order in all columns; the robot's own if left out.  gravity : whether effort bears it.
+    smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints, if there are to be no jumps.
 
     Raises
     ------
     InputError : the plan is not finished; joints that are no order of the robot's; a rate out of its range;
-        a robot on soles without gravity.
+        a robot on soles without gravity, or smoothed; limits that no motion is within.
     """
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
+    told: dict[str, float] | None = None
+    if smooth is not None:
+        planned, told = _smoothed(planned, smooth)
     reference, missed = planned.reference, planned.missed
     if not gravity:
         reference = _without_gravity(reference, robot)
@@ -257,13 +272,31 @@ def export_of(
         order=order,
         rate=rate,
         gravity=gravity,
-        motion=motion_at(reference, robot, rate, order, planned.record.arrays),
+        smooth=told,
+        motion=motion_at(reference, robot, rate, order, planned.record.arrays, jumps=smooth is None),
         missed=None if missed is None else motion_at(missed, robot, rate, order, {}),
     )
 
 
+def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float]]:
+    """The plan with a smoothed reference and without an abort motion, which would begin by a jump; and what
+    the blow comes to in our replay.
+    """
+    within = Smoothness(acceleration=limits[0], jerk=limits[1])
+    reference = smoothed(planned.reference, planned.problem, within)
+    replayed = simulate(planned.problem, reference)
+    told = {
+        "acceleration_rad_s2": within.acceleration,
+        "jerk_rad_s3": within.jerk,
+        "impulse_Ns": replayed.impulse,
+        "planned_impulse_Ns": float(planned.record.summary["impulse_Ns"]),
+        "touches": len(replayed.touched),
+    }
+    return dataclasses.replace(planned, reference=reference, missed=None), told
+
+
 def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
-    """The reference with less feed-forward: without g(q) of each of its postures."""
+    """The reference with less feed-forward: without g(q) of each of its postures, where a motor bears it."""
     if robot.floating:
         raise InputError(
             "gravity: the legs of a robot on soles bear it, so no torque is gravity's alone; leave it at its "
@@ -271,7 +304,7 @@ def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
         )
     model, data = robot.model, robot.model.createData()
     held = np.array([pin.computeGeneralizedGravity(model, data, q) for q in reference.q])
-    return dataclasses.replace(reference, torque=reference.torque - held)
+    return dataclasses.replace(reference, torque=reference.torque - np.where(robot.passive, 0.0, held))
 
 
 def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] | None) -> NDArray[np.intp]:

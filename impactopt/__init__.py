@@ -40,6 +40,7 @@ _EXPORTS = {
     "Sole": "robots.robot",
     "Solution": "api",
     "PerturbationRanges": "simulation.robustness",
+    "StancePhase": "problem.stances",
     "Status": "solvers.program",
     "StrikeSolution": "planning.strike",
     "SoftGrip": "robots.attachments",

@@ -200,7 +200,8 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
         "armature": robot.armature,
         "polygon": support_polygon(robot, c),
     }
-    for leg in c.legs:
+    legs = {leg.frame: leg for c in problem.stance_coordinates for leg in c.legs}
+    for leg in legs.values():
         if leg.sole is None:
             continue
         corners = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])

@@ -23,7 +23,7 @@ _REFERENCE = {
     **_MOTION,
     **dict.fromkeys(("v", "a"), "k nv"),
     **{"phase": "k", "torque": "k n", "ground": "k 6", "contact_start": "", "contact_end": "", "end": ""},
-    "sole_wrench": "? k w",
+    **{"sole_wrench": "? k w", "stance": "? k"},
 }
 _HISTORIES = {
     **dict.fromkeys(("force", "target_speed", "hand_speed"), "k"),
@@ -98,6 +98,7 @@ _SOLES: dict[str, _Kinds] = {
     **dict.fromkeys(("sole_cop_margin_mm?", "sole_force_N?"), ({"*": _PHASES}, type(None))),
     "sole_cop_margin_asked_mm?": _PHASES,
     "sole_force_asked_N?": _NUMBER,
+    "landing_speed_m_s?": (*_NUMBERS, type(None)),
 }
 _ANY_REPLAY: dict[str, _Kinds] = {
     **_BLOW,
@@ -172,6 +173,7 @@ _OTHERS: Mapping[str, _Kinds] = {
         _NUMBER,
     ),
     **dict.fromkeys(("freezes?", "price_scale?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),
+    "stances?": ([({"soles": ([_TEXT],), "from_s": (int, float), "to_s": (int, float)},)],),
     "ground_force_share?": ([(int, float)], type(None)),
     "collision_elements?": ([(int,)], type(None)),
     "scenarios?": ([(_SCENARIO,)],),

@@ -70,7 +70,8 @@ def program_of_record(record: Record, problem: ImpactProblem) -> Transcription |
         return None
     told: dict[str, Any] = json.loads(str(record.arrays["program_statement"]))
     elements: Elements = tuple(tuple(e) for e in told["elements"]) if told["guarded"] else ()
-    nodes = MoreNodes(*(tuple(places) for places in told["more"]))
+    swing, follow, *stands = (tuple(places) for places in told["more"])
+    nodes = MoreNodes(swing, follow, tuple(stands))
     t = program_on(problem, nodes, elements, tuple(told.get("shares", ())))
     return t.with_apart(_apart(told["apart"])) if told["apart"] else t
 

@@ -251,8 +251,13 @@ def motion_of_record(
     names = ("time", "phase", "q", "v", "a", "torque")
     time, phase, q, v, a, torque = (np.asarray(arrays[f"{prefix}_{name}"]) for name in names)
     wrench = np.asarray(arrays.get(f"{prefix}_sole_wrench", np.zeros((0, 0))))
-    robot, c = problem.robot, problem.coordinates
+    robot, held = problem.robot, [c.legs for c in problem.stance_coordinates]
     model, data = robot.model, robot.model.createData()
+    # where the wrench of each frame begins, and which stance it is
+    frames = [sole.frame for sole in problem.soles] if problem.stances else problem.coordinates.frames
+    columns = {frame: 6 * k for k, frame in enumerate(frames)}
+    stance = np.asarray(arrays.get(f"{prefix}_stance", ()), dtype=int)
+    stance = stance if stance.size else np.zeros(len(time), dtype=int)
     steps = np.flatnonzero((np.diff(time) > 0) & (np.diff(phase) == 0))
     for k in map(int, steps):
         # from one instant to the next, by the trapezoidal rule with its first correction
@@ -262,7 +267,6 @@ def motion_of_record(
         # what is beyond the rule: a tenth of what the correction is
         beyond = 0.1 * h**2 * float(np.abs(a[k + 1] - a[k]).max()) + h**3 * float(np.abs(v[k]).max() ** 2)
         yield f"{prefix}: rates", off - beyond, f"{time[k]:.4g} s"
-    legs = [(leg, model.getFrameId(leg.frame)) for leg in c.legs]
     limit, still = robot.torque_limit, np.zeros(robot.nv - robot.n)
     scale = np.concatenate([np.full(len(still), max(1.0, weight_of(robot))), limit])
     for i, instant in enumerate(time):
@@ -270,13 +274,14 @@ def motion_of_record(
         tau = np.array(pin.rnea(model, data, q[i], v[i], a[i]))
         pin.computeJointJacobians(model, data, q[i])
         pin.updateFramePlacements(model, data)
-        for n, (leg, frame) in enumerate(legs):
+        for leg in held[stance[i]]:
+            frame, at = model.getFrameId(leg.frame), columns[leg.frame]
             off = np.abs(pin.log6(leg.placement.actInv(data.oMf[frame])).vector).max()
             yield f"{prefix}: held soles", float(off), where
             if wrench.size:
                 jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL)
-                tau -= jacobian.T @ wrench[i, 6 * n : 6 * n + 6]
-        if phase[i] != 1 and (wrench.size or not legs):  # in contact the hand bears force, too
+                tau -= jacobian.T @ wrench[i, at : at + 6]
+        if phase[i] != 1 and (wrench.size or not columns):  # in contact the hand bears force, too
             needed = np.concatenate([still, torque[i]])
             yield f"{prefix}: equation of motion", float(np.abs((tau - needed) / scale).max()), where
         yield f"{prefix}: torque limit", float(np.abs(torque[i] / limit).max() - 1), where

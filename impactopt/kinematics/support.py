@@ -109,9 +109,11 @@ def support_polygon(robot: Any, coordinates: Any) -> Array:
         if leg.sole is not None
         for x, y in leg.sole.polygon
     ]
-    if not corners:
-        return np.zeros((0, 2))
-    points = np.array(corners)
+    return convex_polygon(np.array(corners)) if corners else np.zeros((0, 2))
+
+
+def convex_polygon(points: Array) -> Array:
+    """Convex hull (k, 2) [m] of points (n, 2), counter-clockwise; none of its corners is inside an edge."""
     hull = list(points[ConvexHull(points).vertices])
     k = 0
     while k < len(hull):  # rounding decides whether a corner in the middle of an edge belongs to the hull

@@ -151,7 +151,7 @@ class Watch:
         self._t, self._margins, self._shapes = t, margins, margins.bodies.shapes
         spots = spots_of(t, x)
         self._names, self._travel, self._phase = spots.names, spots.at.travel, spots.at.phase
-        slots = {place.name: parts for place, parts in [*t.swing_spots(), *t.follow_spots()]}
+        slots = {place.name: parts for place, parts in t.body_spots()}
         lift = stack([part for name in self._names for part in slots[name]])
         self._lift, self._const = lift.matrix(t.layout.n), lift.const
         shape = len(self._names), len(self._shapes)
@@ -419,10 +419,11 @@ class _Nodes:
 
     def __init__(self, t: Transcription, plan: Plan) -> None:
         self._plan, self._places = plan, {0: set(t.nodes.swing), AFTER: set(t.nodes.follow)}
+        self._stands = t.nodes.stands
 
     @property
     def all(self) -> MoreNodes:
-        return MoreNodes(tuple(sorted(self._places[0])), tuple(sorted(self._places[AFTER])))
+        return MoreNodes(tuple(sorted(self._places[0])), tuple(sorted(self._places[AFTER])), self._stands)
 
     def add(self, found: _Between, jumps: bool) -> bool:
         """One at that instant, or as near to it as others are not; two beside it, where bodies jump from one

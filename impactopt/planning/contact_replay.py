@@ -215,6 +215,7 @@ def _coasting(problem: ImpactProblem, strike: PlannedStrike) -> Trajectory:
         contact_start=0.0,
         contact_end=longest,
         end=longest,
+        stance=np.full(len(times) + 1 if problem.stances else 0, problem.blow),
     )
 
 

@@ -71,8 +71,10 @@ def minimum_jerk_baseline(
 
     Raises
     ------
-    InputError : not even a touch at 1 cm/s keeps the limits.
+    InputError : not even a touch at 1 cm/s keeps the limits; a problem with stance phases.
     """
+    if problem.stances:
+        raise InputError("a minimum-jerk reach keeps one stance: there is none for stance phases")
     # (-speed, bound, duration): the fastest reach without contact, or where `bound` is 1 no more than a bound
     reaches = [(-fastest, 1, duration) for duration in DURATIONS]
     heapq.heapify(reaches)

@@ -259,6 +259,12 @@ class Solution(Solved):
         """Margins of each sole by itself, as of `Plan.sole_margins`."""
         return self.plan.sole_margins(self.collision)
 
+    def _stances(self) -> dict[str, Any]:
+        """Stance phases, and how fast soles touch down, as ``summary.json`` has them."""
+        if not self.problem.stances:
+            return {}
+        return {"stances": self.plan.stances(), "landing_speed_m_s": self.plan.landing_speeds()}
+
     @cached_property
     def loads(self) -> DriveLoads:
         """Peak loads of gears and motors, as planned with the expected target."""
@@ -274,6 +280,7 @@ class Solution(Solved):
             "objectives": dict(self.objectives),
             "motion_price_pct": self.motion_price_pct,
             "duration_s": plan.duration,
+            **self._stances(),
             "nodes_added": self.nodes.total,
             "collision_elements": self.contact_elements,
             "collision_error_pct": self.contact_error_pct,

@@ -28,6 +28,8 @@ def problem_hash(problem: Any) -> str:
     """
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name not in _UNSHAPED}
     second = shape.pop("second")
+    if not shape["stances"]:
+        shape.pop("stances")
     shape.pop("ground")
     if not problem.robot.floating:
         shape["ground"] = problem.ground_height

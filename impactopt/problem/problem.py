@@ -8,6 +8,7 @@ from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Bodies
@@ -34,6 +35,7 @@ from impactopt.errors import (
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import BothSoles, Stance
+from impactopt.kinematics.support import support_polygon
 from impactopt.problem.checks import (
     COLLISIONS,
     INSTANT,
@@ -53,6 +55,7 @@ from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
+from impactopt.problem.stances import StancePhase, check_stances, names_of
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -66,6 +69,7 @@ from impactopt.problem.terms import (
     check_known,
     kind_of,
 )
+from impactopt.robots.attachments import Sole
 from impactopt.robots.gains import GainFactor
 from impactopt.robots.robot import Robot
 
@@ -90,6 +94,8 @@ class ImpactProblem:
     law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
         once and stands again before the striker leaves it.
     stance : which soles are held, and which hands hold on: to where they are in the start posture.
+    stances : the motion as a sequence of phases, each with the soles that stand in it; (): `stance` from the
+        first to the last instant. With phases `stance` is that of the one with the blow.
     start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
         configuration (nq,).
     swing, follow : wind-up and strike; follow-through to rest.
@@ -138,6 +144,7 @@ class ImpactProblem:
     target: Target
     second: SecondStriker | None = None
     stance: Stance = field(default_factory=BothSoles)
+    stances: tuple[StancePhase, ...] = ()
     start: str | Array = "half_sitting"
     swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
     follow: Phase = field(default_factory=lambda: Phase(duration=(1.0, 1.0)))
@@ -170,14 +177,16 @@ class ImpactProblem:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but its coordinates, whose symbols CasADi does not pickle: they are made anew when needed."""
-        return {name: value for name, value in vars(self).items() if name != "coordinates"}
+        left_out = ("coordinates", "stance_coordinates")
+        return {name: value for name, value in vars(self).items() if name not in left_out}
 
     def __post_init__(self) -> None:
         found = Mistakes()
         found.attempt(lambda: check_name("the problem", self.name, empty=True))
         hits = found.attempt(lambda: self.robot.striker(self.striker))
         aimed = found.attempt(self._check_aim)
-        stands = found.attempt(partial(check_stance, self)) and found.attempt(self._check_start)
+        stands = found.attempt(partial(check_stances, self)) and found.attempt(partial(check_stance, self))
+        stands = stands and found.attempt(self._check_start)
         for check in (check_elements, check_prices, check_collision):
             found.attempt(partial(check, self))
         if found.attempt(self._check_scenarios):
@@ -237,8 +246,9 @@ class ImpactProblem:
     def _check_start(self) -> None:
         posture = self.start_posture
         self.robot.check_limits(posture, name="the start posture")
-        self.robot.check_stance(posture, self.stance.sole_names(self.robot))
-        check_at_rest(self.robot, self.coordinates, self.stance.sole_names(self.robot), posture)
+        self.robot.check_stance(posture, [sole.name for sole in self.soles])
+        first = self.stance_coordinates[0]
+        check_at_rest(self.robot, first, [sole.name for sole in first.soles], posture)
 
     @property
     def style_prices(self) -> MotionPrices:
@@ -249,7 +259,8 @@ class ImpactProblem:
     def idle_joints(self) -> NDArray[np.bool_]:
         """Mask (n,) of the joints that move no striker, no sole on the ground and no hand that holds on."""
         strikers = [self.robot.striker(name).model_frame for name in self.strikers]
-        return idle_joints(self.robot, [*strikers, *(leg.frame for leg in self.coordinates.legs)])
+        held = [*(leg.frame for leg in self.coordinates.legs), *(sole.frame for sole in self.soles)]
+        return idle_joints(self.robot, [*strikers, *held])
 
     @property
     def lasts(self) -> bool:
@@ -314,6 +325,58 @@ class ImpactProblem:
         return StanceCoordinates(robot, stance.soles(robot), self.start_posture, stance.held_hands(robot))
 
     @cached_property
+    def stance_coordinates(self) -> tuple[StanceCoordinates, ...]:
+        """Independent coordinates of each of its stance phases; of its one stance if it has none."""
+        known = {tuple(sole.name for sole in self.coordinates.soles): self.coordinates}
+        out = []
+        for stance in self.stances:
+            soles = tuple(sole for sole in self.robot.soles if sole.name in stance.soles)
+            names = tuple(sole.name for sole in soles)
+            if names not in known:
+                known[names] = StanceCoordinates(self.robot, soles, self.start_posture)
+            out.append(known[names])
+        return tuple(out) or (self.coordinates,)
+
+    @property
+    def blow(self) -> int:
+        """Index of the stance phase with the blow."""
+        return next((k for k, stance in enumerate(self.stances) if stance.phase is None), 0)
+
+    def change_posture(self, k: int) -> Array:
+        """Some posture (nq,) between stance phases k and k + 1: that of the start, with the centre of mass
+        above the soles that stand in both. That of the start before the first and after the last one.
+        """
+        q = self.start_posture
+        if not 0 <= k < len(self.stances) - 1:
+            return q
+        one, other = self.stance_coordinates[k : k + 2]
+        heavy, light = (one, other) if len(one.legs) > len(other.legs) else (other, one)
+        middle = support_polygon(self.robot, light).mean(axis=0)
+        (y, legs), data = heavy.split(q), self.robot.model.createData()
+        for _ in range(20):
+            y[:2] += middle - np.array(pin.centerOfMass(self.robot.model, data, heavy.join(y, legs)))[:2]
+            try:
+                legs = heavy.solve_legs(y, legs)
+            except InputError:
+                return q
+        return heavy.join(y, legs)
+
+    @property
+    def standing(self) -> NDArray[np.bool_]:
+        """Mask (phases, soles) of its `soles` that stand in each stance phase."""
+        names = [sole.name for sole in self.soles]
+        found = [[name in stance.soles for name in names] for stance in self.stances]
+        return np.array(found or [[True] * len(names)], dtype=bool)
+
+    @property
+    def soles(self) -> tuple[Sole, ...]:
+        """The soles that stand at some time, in the robot's order."""
+        if not self.stances:
+            return self.stance.soles(self.robot)
+        names = {name for stance in self.stances for name in stance.soles}
+        return tuple(sole for sole in self.robot.soles if sole.name in names)
+
+    @cached_property
     def contact_posture(self) -> Array:
         """Some posture (nq,) with the striking point at ``point`` and the soles in place.
 
@@ -321,7 +384,7 @@ class ImpactProblem:
 
         Raises InputError if none is found: the point is out of reach.
         """
-        given = self.coordinates, self.striker, self.point, self.start_posture
+        given = self.coordinates, self.striker, self.point, self.change_posture(self.blow - 1)
         also = self.contacts[1:]
         if (hand := self.extra(HandOrientation)) is not None:
             direction = self.normal if hand.direction is None else np.array(hand.direction)
@@ -406,7 +469,7 @@ class ImpactProblem:
         """
         robot, model = self.robot, self.robot.model
         hits = [robot.striker(name).model_frame for name in self.strikers]
-        frames = [*hits, *(s.frame for s in self.stance.soles(robot))]
+        frames = [*hits, *(s.frame for s in self.soles)]
         joints = [int(model.frames[model.getFrameId(name)].parentJoint) for name in frames]
         return Bodies(
             self.robot,
@@ -439,6 +502,8 @@ class ImpactProblem:
             out["collision"] = self.collision + more.get(self.collision, "")
         if self.second is not None:
             out["second"] = {"striker": self.second.striker, "point_m": self.second.point.tolist()}
+        if self.stances:
+            out["stances"] = names_of(self.stances)
         if hands := self.stance.held_hands(self.robot):
             out["holds_on_with"] = [hand.name for hand in hands]
         if self.robot.source and self.robot.source.repairs:

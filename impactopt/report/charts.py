@@ -8,9 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.files.output import Record
-from impactopt.kinematics.support import margin
 from impactopt.problem.problem import ImpactProblem
-from impactopt.report.histories import BUCKETS, at_contact, ground_wrenches, planned_torque, thinned
+from impactopt.report.histories import (
+    BUCKETS,
+    at_contact,
+    ground_wrenches,
+    planned_torque,
+    soles_standing,
+    thinned,
+    zmp_margins,
+)
 from impactopt.report.result_rows import replay_name
 from impactopt.report.tracks import planned_hand_speed
 from impactopt.simulation.result import centre_of_pressure
@@ -41,6 +48,7 @@ def charts_of(record: Record, problem: ImpactProblem | None = None) -> tuple[lis
             _force(record, arrays, present),
             _speed(record, arrays, present, problem),
             _zmp_margin(record, arrays, present),
+            _stances(record, arrays),
             _zmp_path(record, arrays, present),
             _torque_ratio(record, arrays),
             _joint(record, arrays, "torque", "torque", "torque [N m]"),
@@ -112,7 +120,7 @@ def _zmp_margin(record: Record, arrays: Arrays, present: list[Any]) -> dict[str,
     series = []
     for label, prefix, style in present:
         time, wrench = ground_wrenches(record, prefix)
-        inside = 1e3 * margin(record.arrays["polygon"], centre_of_pressure(wrench))
+        inside = 1e3 * zmp_margins(record, time, wrench)
         series.append(_series(record, arrays, f"margin_{style}", label, style, time, inside))
     note = "Distance of the zero-moment point from the support polygon's nearest edge; below 0 it is outside."
     limits = [{"y": 0.0, "text": "edge"}]
@@ -126,6 +134,20 @@ def _zmp_margin(record: Record, arrays: Arrays, present: list[Any]) -> dict[str,
         note=note,
         height=300,
     )
+
+
+def _stances(record: Record, arrays: Arrays) -> dict[str, Any] | None:
+    """A strip that shows which soles the plan has on the ground; None where it has one stance."""
+    time = record.arrays["reference_time"]
+    standing, series = soles_standing(record, time), []
+    for k, (name, on) in enumerate(standing.items()):
+        at = np.where(on, float(k), np.nan)
+        style = OTHERS[k % len(OTHERS)]
+        series.append(_series(record, arrays, f"stands_{k}", name, style, time, at))
+    if not series:
+        return None
+    around = [-1.0, float(len(series))]
+    return _chart("Soles on the ground", "", series, bands=_bands(record), include=around, height=120)
 
 
 def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any] | None:
@@ -220,12 +242,15 @@ def _soles(record: Record, arrays: Arrays) -> list[dict[str, Any]]:
     if f"{prefix}_sole_ground" not in a or not len(names):
         return []
     how, out = "on free soles" if record.replayed else "on held soles", []
+    time = a[f"{prefix}_time"]
+    standing, always = soles_standing(record, time), np.ones(len(time), dtype=bool)
+    away = np.column_stack([~standing.get(str(name), always) for name in names])
     for what, unit, title, values in (
         (
             "pressed",
             "margin [mm]",
             "Margin of each sole's centre of pressure",
-            1e3 * a[f"{prefix}_cop_margin"],
+            np.where(away, np.nan, 1e3 * a[f"{prefix}_cop_margin"]),
         ),
         ("load", "force [N]", "Normal force on each sole", a[f"{prefix}_sole_ground"][:, :, 2]),
     ):

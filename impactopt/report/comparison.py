@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.files.output import Record, plain
 from impactopt.files.problem_file.toml import TOMLError, read_toml
-from impactopt.kinematics.support import margin
-from impactopt.report.histories import at_contact, ground_wrenches, planned_torque, thinned
+from impactopt.report.histories import at_contact, ground_wrenches, planned_torque, thinned, zmp_margins
 from impactopt.report.page import html_page
 from impactopt.report.report import Report
 from impactopt.report.result_rows import (
@@ -26,7 +25,6 @@ from impactopt.report.result_rows import (
     standing,
     word_row,
 )
-from impactopt.simulation.result import centre_of_pressure
 
 __all__ = ["MOST", "Comparison", "Difference", "compare", "histories_of"]
 
@@ -184,7 +182,7 @@ def histories_of(record: Record) -> dict[str, tuple[Array, Array]]:
         found["force"] = time - start, force
     if len(a["polygon"]):
         time, wrench = ground_wrenches(record, "reference")
-        found["margin"] = time - start, 1e3 * margin(a["polygon"], centre_of_pressure(wrench))
+        found["margin"] = time - start, 1e3 * zmp_margins(record, time, wrench)
     time, torque = planned_torque(record)
     found["ratio"] = time - start, np.abs(torque / a["torque_limit"]).max(axis=1)
     return found

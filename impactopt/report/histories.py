@@ -9,8 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.files.output import Record
+from impactopt.kinematics.support import convex_polygon, margin
+from impactopt.simulation.result import centre_of_pressure
 
-__all__ = ["BUCKETS", "at_contact", "ground_wrenches", "planned_torque", "thinned"]
+__all__ = [
+    "BUCKETS",
+    "at_contact",
+    "ground_wrenches",
+    "planned_torque",
+    "soles_standing",
+    "thinned",
+    "zmp_margins",
+]
 
 Array = NDArray[np.float64]
 BUCKETS = 400  # of a history; of each its ends, and its least and largest value are kept
@@ -61,6 +71,41 @@ def ground_wrenches(record: Record, prefix: str) -> tuple[Array, Array]:
     return np.concatenate([time[keep], inside])[order], np.concatenate([a["reference_ground"][keep], ground])[
         order
     ]
+
+
+def soles_standing(record: Record, time: Array) -> dict[str, NDArray[np.bool_]]:
+    """Mask (k,) of the times [s] at which the plan has each sole on the ground, by its name; none where it
+    has one stance.
+    """
+    phases = record.summary.get("stances") or []
+    names = [name.removeprefix("sole_") for name in record.arrays if name.startswith("sole_")]
+    last = len(phases) - 1
+    return {
+        name: np.any(
+            [
+                (time >= phase["from_s"]) & ((time < phase["to_s"]) | (k == last))
+                for k, phase in enumerate(phases)
+                if name in phase["soles"]
+            ],
+            axis=0,
+        )
+        for name in (names if phases else ())
+    }
+
+
+def zmp_margins(record: Record, time: Array, wrench: Array) -> Array:
+    """Distance (k,) [m] of the ZMP of ground wrenches (k, 6) from the edges of what stands then."""
+    place = centre_of_pressure(wrench)
+    standing = soles_standing(record, time)
+    if not standing:
+        return margin(record.arrays["polygon"], place)
+    on, out = np.column_stack(list(standing.values())), np.full(len(time), np.nan)
+    for mask in np.unique(on, axis=0):
+        corners = [record.arrays[f"sole_{n}"] for n, stands in zip(standing, mask, strict=True) if stands]
+        if corners:
+            here = (on == mask).all(axis=1)
+            out[here] = margin(convex_polygon(np.vstack(corners)), place[here])
+    return out
 
 
 def planned_torque(record: Record) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ __all__ = [
     "SHARE",
     "DriveLoads",
     "cop_margin",
+    "fading",
     "gear_torque",
     "least_kept",
     "least_margins",
@@ -167,22 +168,37 @@ def least_kept(asked: float) -> float:
     return asked - max(SHARE * asked, FREE)
 
 
+def fading(standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (phases, soles) of soles that stand, but not in the phase before or after; of what stands."""
+    away = ~np.pad(standing, ((1, 1), (0, 0)), mode="edge")
+    return np.asarray(standing & (away[:-2] | away[2:]))
+
+
 def least_margins(
-    names: Sequence[str], cop: Array, force: Array, phases: Mapping[str, NDArray[np.bool_]]
+    names: Sequence[str],
+    cop: Array,
+    force: Array,
+    phases: Mapping[str, NDArray[np.bool_]],
+    standing: NDArray[np.bool_] | None = None,
+    stance: NDArray[np.intp] | None = None,
 ) -> dict[str, dict[str, dict[str, float]]]:
     """Least margin [mm] and least normal force [N] of each sole in each phase, as in ``summary.json``.
 
     cop (k, soles) [m] : of :func:`cop_margin`.  force (k, soles) [N].  phases : by name, which instants (k,)
-    are in it; one without any is left out.
+    are in it; one without any is left out.  standing (stances, soles), stance (k,) : which soles stand, and
+    when; None: all of them, always. Forces are of soles that are not about to lift, or just down.
     """
+    on = bears = np.ones(force.shape, dtype=bool)
+    if standing is not None and stance is not None:
+        on, bears = standing[stance], (standing & ~fading(standing))[stance]
 
-    def least(values: Array) -> dict[str, dict[str, float]]:
+    def least(values: Array, chosen: NDArray[np.bool_]) -> dict[str, dict[str, float]]:
         return {
-            name: {phase: float(column[at].min()) for phase, at in phases.items() if at.any()}
-            for name, column in zip(names, values.T, strict=True)
+            name: {phase: float(column[at & own].min()) for phase, at in phases.items() if (at & own).any()}
+            for name, column, own in zip(names, values.T, chosen.T, strict=True)
         }
 
-    return {"sole_cop_margin_mm": least(1e3 * cop), "sole_force_N": least(force)}
+    return {"sole_cop_margin_mm": least(1e3 * cop, on), "sole_force_N": least(force, bears)}
 
 
 def shortfalls(numbers: Mapping[str, Any]) -> list[str]:

@@ -32,11 +32,13 @@ def scene_of(problem: ImpactProblem) -> Scene:
         law=p.law,
         target=p.target,
         striker=p.robot.striker(p.striker).model_frame,
-        soles=p.stance.sole_frames(p.robot),
+        soles=tuple(sole.frame for sole in p.soles),
         hands=p.stance.hand_frames(p.robot),
         second=None if p.second is None else (p.robot.striker(p.second.striker).model_frame, p.second.point),
-        corners=tuple(sole.polygon for sole in p.stance.soles(p.robot)),
+        corners=tuple(sole.polygon for sole in p.soles),
         polygon=support_polygon(p.robot, p.coordinates),
+        standing=p.standing if p.stances else np.zeros((0, 0), dtype=bool),
+        polygons=tuple(support_polygon(p.robot, c) for c in p.stance_coordinates) if p.stances else (),
     )
 
 

@@ -38,6 +38,7 @@ from impactopt.simulation.result import (
     check_not_diverged,
     posture_error,
     simulation_of,
+    stance_at,
 )
 from impactopt.simulation.target_dynamics import Push, Struck
 
@@ -65,6 +66,10 @@ class _Replay(MujocoRobot):
     ) -> None:
         self.scene, self.perturbation = perturbation.scene(scene), perturbation
         self.wbc: WholeBodyController | None = None
+        if controller is not None and scene.standing.size:
+            raise InputError(
+                "the whole-body controller keeps one stance: follow stance phases with the servo"
+            )
         if controller is not None:
             world = perturbation
             self.wbc = WholeBodyController(
@@ -415,7 +420,8 @@ def simulate_mujoco(
                 ground = replay.ground()
                 assert state is not None
                 met = force, replay.struck.speed(target_before), float(speeds[0])
-                rows.append((t, *state, *met, demand, torque, ground, corners, gears.taken()))
+                loads = demand, torque, ground, corners, gears.taken()
+                rows.append((t, *state, *met, *loads, stance_at(now, t)))
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(t)
                 if fall:

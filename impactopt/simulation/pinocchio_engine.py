@@ -25,6 +25,7 @@ from impactopt.simulation.result import (
     check_not_diverged,
     posture_error,
     simulation_of,
+    stance_at,
 )
 from impactopt.simulation.target_dynamics import Push, Struck
 
@@ -60,15 +61,41 @@ class _World:
     def __init__(self, robot: Robot, scene: Scene, reference: Any, *, missing: bool = False) -> None:
         self.robot, self.scene, self.missing, self.followed = robot, scene, missing, reference
         self.model, self.base = robot.model, robot.model.nv - robot.n
-        self.body = PinocchioBody(
-            robot, (*scene.soles, *scene.hands), np.zeros(6), scene.strikers, scene.normal
-        )
+        self._soles = [robot.model.getFrameId(frame) for frame in scene.soles]
+        self._bodies: dict[int, tuple[NDArray[np.intp], PinocchioBody]] = {}
+        self._stance = stance_at(reference, 0.0)
+        self.held, self.body = self._held(self._stance)
         self.servo, self.struck = Servo(robot, reference), Struck(scene)
         self.motors, self.delay = Motors(robot), Delay(robot)
 
     def follow(self, reference: Any) -> None:
         """Sets the reference that the servo follows from now on."""
         self.servo, self.followed = Servo(self.robot, reference), reference
+
+    def _held(self, stance: int) -> tuple[NDArray[np.intp], PinocchioBody]:
+        """Indices of the soles and hands that are held in a stance phase, and the robot so held."""
+        if stance not in self._bodies:
+            scene = self.scene
+            frames = (*scene.soles, *scene.hands)
+            held = np.arange(len(frames))
+            if scene.standing.size:
+                held = np.flatnonzero(scene.standing[stance])
+            chosen = tuple(frames[k] for k in held)
+            body = PinocchioBody(self.robot, chosen, np.zeros(6), scene.strikers, scene.normal)
+            self._bodies[stance] = held, body
+        return self._bodies[stance]
+
+    def stand(self, t: float, s: _State) -> _State:
+        """The state with the soles held that stand from a time [s] on; those that touch down stop at once."""
+        if (stance := stance_at(self.followed, t)) == self._stance:
+            return s
+        before = self.held
+        self._stance = stance
+        self.held, self.body = self._held(stance)
+        if np.isin(self.held, before).all():
+            return s
+        self.body.look(s.q, s.v)
+        return replace(s, v=self.body.stopped(s.v))
 
     def at_start(self, reference: Any) -> _State:
         """State at the motion's start: at rest, with motors that give the demanded torque."""
@@ -78,6 +105,8 @@ class _World:
     def at_contact(self, reference: Any) -> _State:
         """State at the planned beginning of contact, where the swing's reference ends."""
         k = int(np.flatnonzero(reference.phase == 0)[-1])
+        self._stance = stance_at(reference, float(reference.contact_start))
+        self.held, self.body = self._held(self._stance)
         return self._begin(float(reference.contact_start), np.array(reference.q[k]), reference.v[k], 0.0)
 
     def _begin(self, t: float, q: Array, v: Array, travel: float) -> _State:
@@ -129,15 +158,18 @@ class _World:
         """(soles and hands, 6) wrench of the world on what it holds, about its origin, of the last call of
         ``rates``.
         """
-        out = self.body.wrenches()
-        out[:, 3:] += np.cross(self.body.places(), out[:, :3])
+        found = self.body.wrenches()
+        found[:, 3:] += np.cross(self.body.places(), found[:, :3])
+        out = np.zeros((len(self.scene.soles) + len(self.scene.hands), 6))
+        out[self.held] = found
         return out
 
     def corners(self) -> Array:
-        """World places (k, 3) of all fixed soles' corners."""
+        """World places (k, 3) of all soles' corners."""
+        at = [pin.updateFramePlacement(self.model, self.body.data, frame) for frame in self._soles]
         places = [
             np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
-            for m, c in zip(self.body.placements(), self.scene.corners, strict=False)  # then hands
+            for m, c in zip(at, self.scene.corners, strict=True)
         ]
         return np.concatenate([np.zeros((0, 3)), *places])
 
@@ -280,6 +312,7 @@ def simulate_pinocchio(
         t = k * step
         if (now := followed.at(t, bool(touches.intervals))) is not world.followed:
             world.follow(now)
+        state = world.stand(t, state)
         first = world.rates(t, state, step=step)
         world.delay.keep(t, first.asked)
         cuts.look(t, first.wanted, first.cut, step)
@@ -294,7 +327,16 @@ def simulate_pinocchio(
         if touches.touching or k % record == 0:
             motion = (state.q, state.v, float(first.forces.sum()), first.vt, first.hand_speed)
             rows.append(
-                (t, *motion, first.demand, first.torque, world.ground(), world.corners(), gears.taken())
+                (
+                    t,
+                    *motion,
+                    first.demand,
+                    first.torque,
+                    world.ground(),
+                    world.corners(),
+                    gears.taken(),
+                    stance_at(now, t),
+                )
             )
         if push is not None:  # the force of a contact that begins within the step jumps there
             gears.look(first.torque, world.body.accelerate(first.torque, push.peaks))

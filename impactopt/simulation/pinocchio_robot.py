@@ -196,6 +196,16 @@ class PinocchioBody(Body):
         )
         return np.array(a)
 
+    def stopped(self, v: Array) -> Array:
+        """Velocity (nv) after constrained frames that still move have stopped at once, where it has been
+        last.
+        """
+        jac = np.vstack([self._jacobian(frame) for frame in self.frames])
+        inertia = np.array(pin.crba(self.model, self._dynamics, self._at[0]))
+        inertia = np.triu(inertia) + np.triu(inertia, 1).T
+        yields = np.linalg.solve(inertia, jac.T)
+        return np.asarray(v - yields @ np.linalg.solve(jac @ yields, jac @ v))
+
     def wrenches(self) -> Array:
         out = np.empty((len(self.frames), 6))
         for k, placement in enumerate(self.placements()):

@@ -54,6 +54,7 @@ REPORT = (
     "hand_speed_m_s",
     "sole_cop_margin_mm",
     "sole_force_N",
+    "landing_speed_m_s",
     "target",
     "grip_force_N",
     "clearance_mm",
@@ -78,6 +79,8 @@ class Scene:
     counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what
     else can touch. hands: frames of the model that hold on to where the reference has them at first.
     second: of another striker that hits the same target, its frame of the model and its point (3,) [m].
+    standing (stances, soles): which soles stand in each stance phase, and polygons of each; (0, 0), (): there
+    is one stance, on all of them.
     """
 
     point: Array
@@ -91,6 +94,8 @@ class Scene:
     solids: Solids = field(default_factory=Solids)
     hands: tuple[str, ...] = ()
     second: tuple[str, Array] | None = None
+    standing: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    polygons: tuple[Array, ...] = ()
 
     @property
     def strikers(self) -> tuple[str, ...]:
@@ -124,6 +129,9 @@ class Simulation:
     before.  loads: what gears and motors carry at most.  cuts: joints whose demand the line of their motor
     has cut, the longest first; None where no motor's line is known.
     grip_force (k, hands) [N]: on each hand that holds on.  impulses (strikers,) [N s]: of each.
+    stance (k,): number of the stance phase that the reference is in, stands (stances, soles) and polygons:
+    the scene's; (0,): there is one. slip and lift are those since a sole has come to stand; landing_speed
+    (soles,) [m/s]: of the corner that is fastest as a sole touches down, nan of one that does not.
     """
 
     engine: str
@@ -160,6 +168,10 @@ class Simulation:
     cuts: tuple[MotorCut, ...] | None = None
     grip_force: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     impulses: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    stance: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
+    stands: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool), repr=False)
+    polygons: tuple[Array, ...] = field(default=(), repr=False)
+    landing_speed: Array = field(default_factory=lambda: np.zeros(0), repr=False)
 
     @property
     def ground(self) -> Array:
@@ -234,7 +246,7 @@ class Simulation:
             n: float(ratio[phase == k].max()) for k, n in enumerate(names) if (phase == k).any()
         }
         if len(polygon):
-            inside = distance_inside(polygon, self.zmp())
+            inside = self._inside(polygon)
             out["zmp_margin_m"] = {
                 n: float(np.nanmin(inside[phase == k]))
                 for k, n in enumerate(names)
@@ -245,7 +257,11 @@ class Simulation:
                 self.cop_margin,
                 self.sole_normal,
                 {n: phase == k for k, n in enumerate(names)},
+                *((self.stands, self.stance) if self.stance.size else ()),
             )
+            if self.stance.size:
+                speeds = zip(self.soles, self.landing_speed, strict=True)
+                out["landing_speed_m_s"] = {name: float(v) for name, v in speeds if np.isfinite(v)}
             if self.grip_force.size:
                 out["grip_force_N"] = float(self.grip_force.max())
             out["sole_slip_mm"] = 1e3 * float(self.slip.max())
@@ -253,6 +269,20 @@ class Simulation:
             collision = self.lift[phase == 1]
             out["sole_lift_collision_mm"] = 1e3 * float(collision.max()) if collision.size else 0.0
         return out
+
+    def _inside(self, polygon: Array) -> Array:
+        """Distance (k,) [m] of the ZMP from the edges of what stands, or presses on the ground all the same;
+        polygon : of one stance.
+        """
+        zmp = self.zmp()
+        if not self.stance.size:
+            return distance_inside(polygon, zmp)
+        found = np.array([distance_inside(own, zmp) for own in self.polygons])
+        on = self.stands[self.stance] | (self.sole_normal > 0)
+        # the smallest stance that has all of these soles
+        lacks = (on[:, None] & ~self.stands).any(axis=2)
+        size = np.where(lacks, self.stands.shape[1] + 1, self.stands.sum(axis=1))
+        return np.asarray(found[size.argmin(axis=1), np.arange(len(zmp))])
 
     def _cut_numbers(self) -> dict[str, Any]:
         """Summary of the joint that was cut longest; None if no motor's line is known, 0 if none was cut."""
@@ -302,6 +332,14 @@ def parts_from(reference: Any, missed: Any) -> float:
     other goes on coasting, until the robot notices at its own ``contact_end``, and is the abort motion then.
     """
     return min(float(reference.contact_end), float(missed.contact_end))
+
+
+def stance_at(reference: Any, t: float) -> int:
+    """Number of the stance phase of a reference at a time [s]; 0 where there is one stance."""
+    stance = getattr(reference, "stance", ())
+    if not len(stance):
+        return 0
+    return int(stance[max(int(np.searchsorted(reference.time, t, side="right")) - 1, 0)])
 
 
 class FollowedReference:
@@ -376,18 +414,51 @@ def cop_margins(robot: Robot, scene: Scene, q: Array, sole_ground: Array) -> Arr
     return cop_margin(robot, scene.corners, wrenches)
 
 
-def slip_and_lift(scene: Scene, corners: Array) -> tuple[Array, Array]:
+def slip_and_lift(scene: Scene, corners: Array, stance: NDArray[np.intp]) -> tuple[Array, Array]:
     """(k, soles) [m] of each sole, of the corner that moved most since the first instant, from the places
-    (k, corners, 3) of all soles' corners, in the scene's order.
+    (k, corners, 3) of all soles' corners, in the scene's order; since it stands, by the stance phases (k,).
     """
-    moves = corners - corners[0]
-    level, up = np.linalg.norm(moves[..., :2], axis=2), np.maximum(moves[..., 2], 0.0)
-    first = np.cumsum([0, *(len(c) for c in scene.corners)])
-    soles = [slice(a, b) for a, b in itertools.pairwise(first)]
-    slip, lift = np.zeros((2, len(corners), len(soles)))
-    for i, its in enumerate(soles):
-        slip[:, i], lift[:, i] = level[:, its].max(axis=1), up[:, its].max(axis=1)
+    slip, lift = np.zeros((2, len(corners), len(scene.corners)))
+    for i, its in enumerate(_corners_of(scene)):
+        for begin, end in _spells(scene, stance, i, len(corners)):
+            moves = corners[begin:end, its] - corners[begin, its]
+            slip[begin:end, i] = np.linalg.norm(moves[..., :2], axis=2).max(axis=1)
+            lift[begin:end, i] = np.maximum(moves[..., 2], 0.0).max(axis=1)
     return slip, lift
+
+
+def _corners_of(scene: Scene) -> list[slice]:
+    """Slices of each sole's corners among all."""
+    return [slice(a, b) for a, b in itertools.pairwise(np.cumsum([0, *(len(c) for c in scene.corners)]))]
+
+
+def _spells(scene: Scene, stance: NDArray[np.intp], sole: int, count: int) -> list[tuple[int, int]]:
+    """First instant and the one after the last, of each time that a sole stands, of so many instants."""
+    if not stance.size:
+        return [(0, count)]
+    on = np.pad(scene.standing[stance, sole].astype(int), 1)
+    return list(zip(np.flatnonzero(np.diff(on) > 0), np.flatnonzero(np.diff(on) < 0), strict=True))
+
+
+def landing_speeds(
+    scene: Scene, time: Array, corners: Array, sole_ground: Array, stance: NDArray[np.intp]
+) -> Array:
+    """(soles,) [m/s] Largest speed of a sole's corners as it touches the ground again; nan: it does not.
+
+    That is when the ground first presses on it, in the later half of its time in the air or after that.
+    """
+    out = np.full(len(scene.corners), np.nan)
+    for i, its in enumerate(_corners_of(scene)):
+        spells = _spells(scene, stance, i, len(time))
+        for (_, left), (back, end) in itertools.pairwise(spells):
+            since = int(np.searchsorted(time, (time[left] + time[back]) / 2))
+            pressed = np.flatnonzero(sole_ground[since:end, i, 2] > 0)
+            if not pressed.size:
+                continue
+            k = since + int(pressed[0])
+            gone = np.linalg.norm(corners[k, its] - corners[k - 1, its], axis=1).max()
+            out[i] = np.nanmax([out[i], gone / (time[k] - time[k - 1])])
+    return out
 
 
 def check_not_diverged(rates: Array, t: float, step: float) -> None:
@@ -411,13 +482,15 @@ def simulation_of(
 ) -> Simulation:
     """Histories of recorded instants: rows of time, q, v, force, target speed, hand speed, demand, torque,
     wrench of each sole and each hand that holds on, places of the soles' corners, torque through the gears
-    since the row before; ``rest``: the other fields.
+    since the row before, number of the stance phase; ``rest``: the other fields.
     """
     if not rows:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
     columns = [np.array(c) for c in zip(*rows, strict=True)]
-    time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, corners, gear = columns
-    slip, lift = slip_and_lift(scene, corners)
+    time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, corners, gear, stance = columns
+    stance = stance if scene.standing.size else stance[:0]
+    slip, lift = slip_and_lift(scene, corners, stance)
+    landings = landing_speeds(scene, time, corners, sole_ground, stance) if stance.size else np.zeros(0)
     contact_start, contact_end = touches.blow()
     joints, soles = v[:, -robot.n :], len(scene.soles)
     sole_ground, grips = sole_ground[:, :soles], sole_ground[:, soles:]
@@ -447,6 +520,10 @@ def simulation_of(
         contact_start=contact_start,
         contact_end=contact_end,
         touches=tuple((start, end, impulse) for start, end, impulse in touches.intervals),
+        stance=stance,
+        stands=scene.standing,
+        polygons=scene.polygons,
+        landing_speed=landings,
         **rest,
     )
 

@@ -51,6 +51,7 @@ __all__ = [
     "make_block",
     "own_blocks",
     "sizes",
+    "stance_blocks",
 ]
 
 
@@ -90,6 +91,7 @@ def sizes(
         "first": {"base": base, "joints": n, "law": 1, "rotors": n},
         "join": {"travel": 1},
         "link": {"contact": 1, "position": 1, "rate": 1},
+        "pace": {"rate": 1},
     }[block]
 
 
@@ -160,6 +162,23 @@ def link() -> BlockExpression:
     yf, yf1, Tf, y, y1, Ts, T1, T2, d1, d2, u0, u = z = [ca.SX.sym(s) for s in names]
     out = {"contact": y1 / Ts - u0, "position": yf - y - T1 * d1 - T2 * d2, "rate": yf1 / Tf - u}
     return make_block(list(z), [], out)
+
+
+def pace() -> BlockExpression:
+    """One coordinate's rate.  z = y', T;  out = ydot."""
+    y1, T = ca.SX.sym("y1"), ca.SX.sym("T")
+    return make_block([y1, T], [], {"rate": y1 / T})
+
+
+def corner_heights(c: StanceCoordinates, frame: str, corners: int) -> BlockExpression:
+    """A sole that is not held.  z = y;  p = its corners in its frame [m] (2 each);  out = their heights
+    [m].
+    """
+    y, zero, p = ca.SX.sym("y", c.ny), ca.SX.zeros(c.ny), ca.SX.sym("corners", 2 * corners)
+    q, _, _ = c.upper_motion(y, zero, zero)
+    rotation, point = c.rb_frame(frame, q)
+    heights = ca.mtimes(ca.reshape(p, 2, corners).T, rotation[2, :2].T) + point[2]
+    return make_block([y], [p], {"height": heights})
 
 
 def spring(c: StanceCoordinates, chosen: Joints = ()) -> BlockExpression:
@@ -250,6 +269,22 @@ def builders(
         **({"balance": lambda: balance(c, edges)} if c.legs else {}),
         **({"spring": lambda: spring(c, chosen)} if c.robot.sprung.any() else {}),
     }
+
+
+def stance_blocks(
+    problem: ImpactProblem,
+) -> dict[str, tuple[StanceCoordinates, Callable[[], BlockExpression]]]:
+    """Blocks of a problem's stance phases: their coordinates, and what builds them."""
+    out: dict[str, tuple[StanceCoordinates, Callable[[], BlockExpression]]] = {}
+    for k, c in enumerate(problem.stance_coordinates if problem.stances else ()):
+        out["pace"] = problem.coordinates, pace
+        if c is not problem.coordinates:
+            out[f"stance{k}_node"] = c, partial(node, c)
+        for i, sole in enumerate(problem.soles):
+            if sole not in c.soles:
+                heights = partial(corner_heights, c, sole.frame, len(sole.polygon))
+                out[f"stance{k}_heights{i}"] = c, heights
+    return out
 
 
 @dataclass(frozen=True)

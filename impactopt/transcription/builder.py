@@ -49,6 +49,17 @@ class Builder:
         other.blocks, other.rows = [block.copy() for block in self.blocks], self.rows.copy()
         return other
 
+    def standing(self, coordinates: StanceCoordinates, node: str) -> Builder:
+        """The same program, to which a phase on other soles can be added; ``node``: its block's name."""
+        other = copy.copy(self)
+        other.coordinates, other.limits = coordinates, Limits(self.problem, coordinates)
+        other.ny, other.nl, other.nw = coordinates.ny, coordinates.nl, 6 * len(coordinates.legs)
+        other.y0, other.legs0 = coordinates.split(self.problem.start_posture)
+        other.functions = dict(self.functions)
+        for of in ("", "_jac", "_hess"):
+            other.functions[f"node{of}"] = self.functions[f"{node}{of}"]
+        return other
+
     def follow(self, take: Callable[[Builder], None]) -> None:
         """Have numbers follow the problem: ``take`` writes them to the blocks, constraints or bounds of a
         builder, this one or a copy, that has another problem.

@@ -219,7 +219,7 @@ class ContactProgram(ABC):
         """All of it, for a solver."""
         objective, quadratic, linear = self._worth
         if self.apart_rows:  # all that such constraints may couple: solvers' structures serve any of them
-            quadratic = coupled(quadratic, self._body_spots())
+            quadratic = coupled(quadratic, self.body_spots())
         return StructuredProgram(
             self.layout,
             self.blocks,
@@ -237,11 +237,11 @@ class ContactProgram(ABC):
         other = copy.copy(self)
         other.__dict__.pop("program", None)
         other.builder = self._bare.copy()
-        order = add_apart_rows(other.builder, self._body_spots(), rows)
+        order = add_apart_rows(other.builder, self.body_spots(), rows)
         other.apart_rows = {name: rows[name] for name in order}
         return other
 
-    def _body_spots(self) -> list[tuple[Place, list[Affine]]]:
+    def body_spots(self) -> list[tuple[Place, list[Affine]]]:
         """Places with coordinates and legs, where bodies are kept apart."""
         return [*self.swing_spots(), *self.follow_spots()]
 
@@ -307,7 +307,7 @@ class ContactProgram(ABC):
 
     @abstractmethod
     def body_states(self, x: Array) -> list[BodyState]:
-        """Configurations at all nodes of `swing_spots` and `follow_spots`, for solver variables (n,)."""
+        """Configurations at all places of `body_spots`, for solver variables (n,)."""
 
     @abstractmethod
     def travel(self, x: Array, time: Array) -> Array:

@@ -14,13 +14,16 @@ from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import TargetSpeed
+from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import carry_contact, same_places
 from impactopt.transcription.layout import Array, Group, Row
 from impactopt.transcription.mesh import with_middles
+from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 
@@ -95,9 +98,12 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     """Solver variables (n,) of a plain reach; speed, noise, seed: as of :func:`reached`."""
     hit = reached(t, speed=speed, noise=noise, seed=seed)
     zero, (swing_T, follow_T) = np.zeros(len(t.y0)), _durations(t)
-    swing = quintic(t.y0, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
+    (start, end) = (
+        t.coordinates.split(t.problem.change_posture(k))[0] for k in (t.problem.blow - 1, t.problem.blow)
+    )
+    swing = quintic(start, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
     # half of the rates is left after contact, as where two like masses meet
-    back = quintic(hit.y, 0.5 * hit.rates, t.y0, zero, follow_T, t.follow.breaks)
+    back = quintic(hit.y, 0.5 * hit.rates, end, zero, follow_T, t.follow.breaks)
     x = _motion(
         t,
         CubicSpline.fit(swing, t.swing.breaks, zero, hit.rates, swing_T),
@@ -138,10 +144,13 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
     y, u = strike.y.read(x)[0], strike.u0.read(x)[0]
     after, rates = (e.evaluate(x) for e in strike.expected.state_after[:2])
     swing_T, follow_T = _durations(t)
+    (start, end) = (
+        t.coordinates.split(t.problem.change_posture(k))[0] for k in (t.problem.blow - 1, t.problem.blow)
+    )
     out = _motion(
         t,
-        _least_accelerations(t, t.swing.breaks, swing_T, t.y0, y, end_rates=u),
-        _least_accelerations(t, t.follow.breaks, follow_T, after, t.y0, rates=rates),
+        _least_accelerations(t, t.swing.breaks, swing_T, start, y, end_rates=u),
+        _least_accelerations(t, t.follow.breaks, follow_T, after, end, rates=rates),
     )
     for name, group in strike.layout.groups.items():
         mine = t.layout.groups.get(name)
@@ -162,6 +171,8 @@ def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: 
     if isinstance(t, Transcription) and isinstance(old, Transcription):
         places = {"swing": (old.swing_nodes, t.swing_nodes)}
         places |= dict.fromkeys(("follow", "abort"), (old.follow_nodes, t.follow_nodes))
+        for mine, its in zip((t.before, *t.after), (old.before, *old.after), strict=True):
+            places |= {one.kind: (its.stands[k].nodes, one.nodes) for k, one in mine.stands.items()}
     new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
     for name, group in t.layout.groups.items():
         known = old.layout.groups.get(name)
@@ -250,28 +261,42 @@ def _durations(t: Transcription) -> tuple[float, float]:
 
 def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
     """A swing and a follow-through, with legs and sole wrenches as at rest."""
-    c, x = t.coordinates, np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
-    limits = t.builder.limits
-    t.swing.c.write(x, curve.control[3:-1])
-    for follow in t.follows:
-        follow.guess(x, back, t.y0)
-    for group, wrench, spline, nodes in (
-        (t.swing.legs, t.swing.w, curve, t.swing.nodes),
-        *((follow.legs, follow.w, back, follow.nodes) for follow in t.follows),
-    ):
-        legs, all_legs, all_w = t.legs0, [], []
-        for y in spline.sample(nodes * spline.duration)[0]:
-            with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
-                legs = c.solve_legs(y, legs)
-            all_legs.append(np.clip(legs, limits.legs_lower, limits.legs_upper))
-            all_w.append(static_wrenches(c, y, legs))
-        if c.legs:
-            group.write(x, np.array(all_legs))
-            wrench.write(x, np.array(all_w))
-    if t.abort is not None and c.legs:
+    x = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
+    for phase, spline in ((t.swing, curve), *((follow, back) for follow in t.follows)):
+        _write(t.builder, x, phase, spline)
+    for course in (t.before, *t.after):
+        for k, phase in course.stands.items():
+            b, T, still = (
+                course.builders[k],
+                float(np.mean(phase.phase.duration)),
+                np.zeros(course.builders[k].ny),
+            )
+            start, end = (b.coordinates.split(t.problem.change_posture(j))[0] for j in (k - 1, k))
+            way = quintic(start, still, end, still, T, phase.breaks)
+            _write(b, x, phase, CubicSpline.fit(way, phase.breaks, still, still, T))
+    if t.abort is not None and t.coordinates.legs:
         t.abort.coast_w.write(x, t.swing.w.read(x)[-1:])
-    t.swing.T.write(x, curve.duration)
     return x
+
+
+def _ends(problem: ImpactProblem, c: StanceCoordinates, k: int) -> list[Array]:
+    """Coordinates (ny,) at the ends of stance phase k."""
+    return [c.split(problem.change_posture(j))[0] for j in (k - 1, k)]
+
+
+def _write(b: Builder, x: Array, phase: MotionPhase, spline: CubicSpline) -> None:
+    """A phase's spline, with legs and sole wrenches as at rest."""
+    c, limits, legs = b.coordinates, b.limits, b.legs0
+    phase.guess(x, spline)
+    all_legs, all_w = [], []
+    for y in spline.sample(phase.nodes * spline.duration)[0]:
+        with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
+            legs = c.solve_legs(y, legs)
+        all_legs.append(np.clip(legs, limits.legs_lower, limits.legs_upper))
+        all_w.append(static_wrenches(c, y, legs))
+    if c.legs:
+        phase.legs.write(x, np.array(all_legs))
+        phase.w.write(x, np.array(all_w))
 
 
 def _least_accelerations(

@@ -19,9 +19,9 @@ from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
-from impactopt.robots.loads import cop_margin, least_kept, weight_of
+from impactopt.robots.loads import BEARS, cop_margin, fading, least_kept, weight_of
 from impactopt.transcription.contact_guess import mass_at_contact, natural_durations
-from impactopt.transcription.plan import Plan, Trajectory, gear_share
+from impactopt.transcription.plan import Piece, Plan, Trajectory, gear_share
 
 Array = NDArray[np.float64]
 STEP = 1e-3  # [s] at which a motion is looked at: as the servo's reference is sampled
@@ -32,15 +32,21 @@ GEAR = 0.03  # of what a gear may bear: what it may carry more between nodes, or
 
 
 class MoreNodes(NamedTuple):
-    """Places on [0, 1] of nodes beside the ends and middles of a spline's intervals: of the swing, and of all
-    ways to rest."""
+    """Places on [0, 1] of nodes beside the ends and middles of a spline's intervals: of the swing, of all
+    ways to rest, and of each stance phase beside the one with the blow.
+    """
 
     swing: tuple[float, ...] = ()
     follow: tuple[float, ...] = ()
+    stands: tuple[tuple[float, ...], ...] = ()
 
     @property
     def total(self) -> int:
-        return len(self.swing) + len(self.follow)
+        return len(self.swing) + len(self.follow) + sum(map(len, self.stands))
+
+    def of_stand(self, number: int) -> tuple[float, ...]:
+        """Places of a stance phase beside the one with the blow."""
+        return self.stands[number] if number < len(self.stands) else ()
 
 
 NO_MORE = MoreNodes()
@@ -54,42 +60,60 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     friction than it may; where torques give up half of the room to all that the motors have; where a joint of
     a constrained leg is faster than it may be; and where a gear carries 3 % more than it may.
     """
-    swing = _middles_outside(plan, plan.reference, 0)
-    follow = _middles_outside(plan, plan.reference, 2)
+    blow, found = plan.problem.blow, dict[tuple[int, int], set[float]]()
+    for piece in plan.pieces():
+        found[piece.phase, piece.number] = set(_middles_outside(plan, plan.reference, piece))
     if plan.abort is not None:
-        follow += _middles_outside(plan, plan.missed_reference, 2, missed=True)
+        for piece in plan.pieces(missed=True)[len(plan.before) + 1 :]:
+            middles = _middles_outside(plan, plan.missed_reference, piece)
+            found[piece.phase, piece.number] |= set(middles)
+    stands = [
+        {*known.of_stand(k), *(found[0 if k < blow else 2, k] if k != blow else ())}
+        for k in range(len(plan.problem.stances))
+    ]
     return MoreNodes(
-        tuple(sorted({*known.swing, *swing})),
-        tuple(sorted({*known.follow, *follow})),
+        tuple(sorted({*known.swing, *found[0, blow]})),
+        tuple(sorted({*known.follow, *found[2, blow]})),
+        tuple(tuple(sorted(places)) for places in stands),
     )
 
 
-def _middles_outside(plan: Plan, way: Trajectory, phase: int, *, missed: bool = False) -> list[float]:
-    """Middles between nodes between which a reference is out of its limits."""
-    p, c = plan.problem, plan.coordinates
-    curve, begin, nodes, _ = plan.segment(phase, missed=missed)
-    at = np.flatnonzero((way.phase == phase) & (way.time <= begin + curve.duration))
+def _middles_outside(plan: Plan, way: Trajectory, piece: Piece) -> list[float]:
+    """Middles between nodes between which a piece of a reference is out of its limits."""
+    p, c = plan.problem, plan.problem.stance_coordinates[piece.number]
+    own = way.phase == piece.phase
+    if way.stance.size:
+        own &= way.stance == piece.number
+    nodes, duration = piece.nodes, piece.spline.duration
+    at = np.flatnonzero(own & (way.time <= piece.start + duration))
     limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)
     ratio = np.abs(way.torque[at] / p.robot.torque_limit).max(axis=1, initial=0.0)
     outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
     # the others' rates are bounded by their splines' control points
     outside |= (np.abs(way.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
     outside |= gear_share(p, way.torque[at], way.a[at, joints]) > 1.0 + GEAR
-    outside |= _soles_outside(plan, way.sole_wrench[at])
-    time = (way.time[at[outside]] - begin) / curve.duration
+    outside |= _soles_outside(p, piece.number, way.sole_wrench[at])
+    time = (way.time[at[outside]] - piece.start) / duration
     between = np.searchsorted(nodes, time, side="right").clip(1, len(nodes) - 1)
     return [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
 
 
-def _soles_outside(plan: Plan, wrenches: Array) -> NDArray[np.bool_]:
-    """Instants (k,) at which some sole keeps too little of its limits, from wrenches (k, 6 a sole)."""
-    robot, soles, cone = plan.problem.robot, plan.coordinates.soles, plan.problem.term(ContactWrenchCone)
-    own, least = wrenches.reshape(len(wrenches), -1, 6)[:, : len(soles)], least_kept(cone.margin)
-    outside = (cop_margin(robot, [sole.polygon for sole in soles], own) < least).any(axis=1)
-    outside |= (own[:, :, 2] < _SHARE * cone.minimum_force).any(axis=1)
-    for k, sole in enumerate(soles):
-        rows = contact_wrench_cone(sole.polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
-        outside |= (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)
+def _soles_outside(problem: ImpactProblem, number: int, wrenches: Array) -> NDArray[np.bool_]:
+    """Instants (k,) at which some sole that stands in a stance phase keeps too little of its limits.
+
+    wrenches (k, 6 a sole) : of all soles. One that may bear nothing has no friction to speak of then.
+    """
+    robot, cone = problem.robot, problem.term(ContactWrenchCone)
+    least, standing = least_kept(cone.margin), problem.standing
+    on, fades = np.flatnonzero(standing[number]), fading(standing)[number]
+    soles, own = problem.soles, wrenches.reshape(len(wrenches), -1, 6)
+    outside = (cop_margin(robot, [soles[k].polygon for k in on], own[:, on]) < least).any(axis=1)
+    for k in on:
+        bears = own[:, k, 2] >= (BEARS * weight_of(robot) if fades[k] else -np.inf)
+        if not fades[k]:
+            outside |= own[:, k, 2] < _SHARE * cone.minimum_force
+        rows = contact_wrench_cone(soles[k].polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
+        outside |= bears & (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)
     return np.asarray(outside)
 
 

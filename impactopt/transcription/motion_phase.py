@@ -1,12 +1,12 @@
 """Motion phases: swing, follow-through and abort motion, cubic splines in y with legs and wrenches at nodes.
 
-There is one after the expected blow and, where a problem asks for it, one for a blow that met nothing.
+There is one after the expected blow and, where a problem asks for it, one for a blow that met nothing. Where
+soles lift off or touch down, there are more (`impactopt.transcription.stance_change`).
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,17 +37,20 @@ from impactopt.transcription.mesh import percentage, with_middles
 
 
 def add_nodes(
-    b: Builder, instances: list[list[Affine]], places: Sequence[Place | str], *, closed: int = 0
+    b: Builder,
+    instances: list[list[Affine]],
+    places: Sequence[Place | str],
+    *,
+    closed: int = 0,
+    fading: Collection[str] = (),
 ) -> list[Index]:
     """Nodes of the block ``node`` with their constraints, but for those of torque; the torques' outputs.
 
     instances : y, y', y'', legs, sole wrench, T of each.  closed : so many of the last have the posture
-    of another, whose constraints close their legs.
+    of another, whose constraints close their legs.  fading : names of soles that may bear nothing.
     """
     c, part = b.coordinates, b.parts("node")
-    limits, rates = b.robot.torque_limit, b.robot.velocity_limit[c.dependent]
-    numbers = np.concatenate([limits, rates, b.limits.units, c.start_determinants])
-    first, torques = b.add_block("node", instances, numbers), []
+    first, torques = b.add_block("node", instances, node_numbers(b)), []
     closure = [f"{leg.end} {d}" for leg in c.legs for d in DIRECTIONS]
     fast = percent("over its limit", of=b.limits.velocity.fraction)
     for i, (place, slots) in enumerate(zip(places, instances, strict=True)):
@@ -76,19 +79,34 @@ def add_nodes(
             lower=b.limits.extension.minimum,
             measure=percent("too near to straight", of=b.limits.extension.minimum),
         )
-        add_cone_rows(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force)
+        add_cone_rows(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force, fading)
         torques.append(at + part["torque"])
     return torques
 
 
+def node_numbers(b: Builder) -> Array:
+    """Parameters of the block ``node``."""
+    limits, rates = b.robot.torque_limit, b.robot.velocity_limit[b.coordinates.dependent]
+    return np.concatenate([limits, rates, b.limits.units, b.coordinates.start_determinants])
+
+
 def add_cone_rows(
-    b: Builder, wrench: Affine, place: Place | str, margin: float, minimum_force: float
+    b: Builder,
+    wrench: Affine,
+    place: Place | str,
+    margin: float,
+    minimum_force: float,
+    fading: Collection[str] = (),
 ) -> None:
-    """Rows: each sole's wrench (6 a sole) is in its cone, its normal force [N] no less than the least."""
+    """Rows: each sole's wrench (6 a sole) is in its cone, its normal force [N] no less than the least, or
+    than none if it is ``fading``; a wrench that is zero has no rows.
+    """
     for k, leg in enumerate(b.coordinates.legs):
         if leg.sole is None:  # a hand: see `Grip`
             continue
         w = wrench[6 * k : 6 * k + 6]
+        if leg.name in fading and not w.cols.size:
+            continue
         rows = contact_wrench_cone(leg.sole.polygon, b.limits.cone.friction, margin=margin) / b.limits.weight
         normal, sole = w[2:3] * (1 / b.limits.weight), leg.end
         b.rows.add(
@@ -100,6 +118,8 @@ def add_cone_rows(
             measure=[_outside_cone(row * b.limits.weight, normal, b.limits.cone.friction) for row in rows],
             whole=sole,
         )
+        if leg.name in fading:
+            continue
         b.rows.add(
             term="normal force",
             place=place,
@@ -120,15 +140,25 @@ def _outside_cone(facet: Array, normal: Affine, friction: float) -> Measure:
     return Measure("%", 100 / max(facet[2], 1e-3), "beyond its friction and torsion", normal, 0.05)
 
 
-class MotionPhase(ABC):
+REST, FREE, COASTING = "rest", "free", "coasting"  # how a spline may begin or end
+
+
+def _control_points(end: str | Affine, known: dict[str, int]) -> int:
+    """Number of control points at an end that are no variables of their own."""
+    return known[end] if isinstance(end, str) else 1
+
+
+class MotionPhase:
     """Takes a builder; hands back places, slots of blocks, and what constraints determine.
 
     Attributes
     ----------
-    name : what constraints and messages call it.  phase : what the problem asks of it.
+    kind : first word of its variables' names.  name : what constraints and messages call it.
+    phase : what the problem asks of it.
     breaks : of the spline, from 0 to 1.  nodes (k,) : where legs and sole wrenches are, and constraints hold.
     more : which of these are beside the ends and middles of the spline's intervals.
     c, legs, w, T : variables: control points, legs and sole wrenches at the nodes, duration [s].
+    unloaded : components of the sole wrenches that are zero, by the number of the node.
     """
 
     c: Group
@@ -136,22 +166,53 @@ class MotionPhase(ABC):
     w: Group
     T: Group
 
-    def __init__(self, name: str, phase: Phase, breaks: Array, nodes: Array, more: tuple[float, ...]) -> None:
-        self.name, self.phase = name, phase
-        self.breaks, self.nodes, self.more = breaks, nodes, more
+    def __init__(
+        self,
+        b: Builder,
+        names: tuple[str, str],
+        phase: Phase,
+        mesh: tuple[Array, Array, tuple[float, ...]],
+        begins: str | Affine,
+        ends: str | Affine,
+    ) -> None:
+        """names : first word of its variables' names, and `name`.  mesh : `breaks`, `nodes`, `more`.
+
+        begins : `REST`, `FREE` or the coordinates (ny) that it begins at.  ends : likewise, or `COASTING`.
+        """
+        self.kind, self.name = names
+        self.phase, (self.breaks, self.nodes, self.more) = phase, mesh
+        self._begins, self._ends = begins, ends
         self._at: dict[float, tuple[Affine, Affine, Affine]] = {}
-
-    def _add_variables(self, b: Builder, kind: str, points: int) -> None:
-        """``points`` control points, and all else; ``kind``: their names' first word."""
+        self.unloaded: dict[int, Index] = {}
+        self._last = len(self.breaks) + 1
+        self._y0 = Affine.constant(b.y0)
+        self.lead = _control_points(begins, {REST: 3, FREE: 0})
+        points = self._last + 1 - self.lead - _control_points(ends, {REST: 2, FREE: 0, COASTING: 1})
         nodes, limits = len(self.nodes), b.limits
-        self.c = b.layout.add(f"{kind} control point", points, b.ny, **limits.of_y)
-        self.legs = b.layout.add(f"{kind} legs", nodes, b.nl, **limits.of_legs)
-        self.w = b.layout.add(f"{kind} sole wrench", nodes, b.nw, **limits.of_wrenches)
-        self.T = b.duration(f"{kind} duration", self.phase.duration, 0.1)
+        self.c = b.layout.add(f"{self.kind} control point", points, b.ny, **limits.of_y)
+        self.legs = b.layout.add(f"{self.kind} legs", nodes, b.nl, **limits.of_legs)
+        self.w = b.layout.add(f"{self.kind} sole wrench", nodes, b.nw, **limits.of_wrenches)
+        self.T = b.duration(f"{self.kind} duration", self.phase.duration, 0.1)
 
-    @abstractmethod
     def control(self, j: int) -> Affine:
-        """Control point j = 0 .. N+2 of the spline."""
+        """Control point j = 0 .. N+2 of the spline.
+
+        Three that are the same make a start or an end at rest. A last one on the line of those before it
+        makes an end without acceleration: the reference coasts from contact on, so the torque that the swing
+        ends with is the feed-forward of the collision: it does not jump, and a target that comes late meets
+        the same motion.
+        """
+        if j < self.lead:
+            return self._y0 if isinstance(self._begins, str) else self._begins
+        if j < self.lead + self.c.count:
+            return self.c[j - self.lead]
+        if self._ends == REST:
+            return self.c[-1]
+        if isinstance(self._ends, Affine):
+            return self._ends
+        factors = rate_weights(self.breaks)
+        step = self.control(j - 1) - self.control(j - 2)
+        return self.control(j - 1) + step * float(factors[-2] / factors[-1])
 
     def at(self, s: float) -> tuple[Affine, Affine, Affine]:
         """y, y', y'' at s."""
@@ -164,12 +225,18 @@ class MotionPhase(ABC):
         return self._at[s]
 
     # ------------------------------------------------------------------ nodes
+    def wrench(self, k: int) -> Affine:
+        """Sole wrenches (6 a sole) at a node."""
+        w = self.w[k]
+        on = ~np.isin(w.rows, self.unloaded.get(k, ()))
+        return w if on.all() else Affine(w.size, w.rows[on], w.cols[on], w.vals[on], w.const)
+
     def place_at(self, s: float) -> Place:
         return Place(f"{self.name}, {percentage(s, self.more)}", f"{self.name} at {{s}}", self.T[0] * s)
 
     def instances(self) -> tuple[list[list[Affine]], list[Place]]:
         """Slots of the block ``node``, and the places of its instances."""
-        slots = [[*self.at(s), self.legs[k], self.w[k], self.T[0]] for k, s in enumerate(self.nodes)]
+        slots = [[*self.at(s), self.legs[k], self.wrench(k), self.T[0]] for k, s in enumerate(self.nodes)]
         return slots, [self.place_at(s) for s in self.nodes]
 
     def motion(self) -> list[tuple[Place, list[Affine]]]:
@@ -182,14 +249,24 @@ class MotionPhase(ABC):
             (self.place_at(s), [self.at(s)[0], self.legs[k]]) for k, s in enumerate(self.nodes) if s >= since
         ]
 
+    def _bearing(self, k: int) -> Index:
+        """Components of the first sole that bears load at a node, if any does."""
+        soles = np.arange(self.w.size).reshape(-1, 6)
+        return next((own for own in soles if not np.isin(own, self.unloaded.get(k, ())).any()), np.arange(0))
+
     def determined(self) -> list[Determined]:
-        """Variables determined at each node: each leg, and the first sole's wrench."""
-        found = [[*by_leg(self.legs.index(k)), self.w.index(k)[:6]] for k in range(self.w.count)]
+        """Variables determined at each node: each leg, and the wrench of a sole that bears load."""
+        found = [
+            [*by_leg(self.legs.index(k)), self.w.index(k)[self._bearing(k)]] for k in range(self.w.count)
+        ]
         return [each for parts in found for each in at_node(parts)]
 
     # ------------------------------------------------------------------ constraints
-    def _add_rate_rows(self, b: Builder, js: range) -> None:
-        """Velocity control points within the limit; multiplied by T they are linear."""
+    def add_rate_rows(self, b: Builder) -> None:
+        """Velocity control points within the limit; multiplied by T they are linear. Those that are zero by
+        construction, at rest, have no rows.
+        """
+        js = range(max(self.lead - 1, 0), self._last - 2 * (self._ends == REST))
         c, velocity = b.coordinates, b.limits.velocity
         joints = np.arange(c.base, c.ny)
         limit = b.limits.rate_limit[c.independent]
@@ -228,6 +305,21 @@ class MotionPhase(ABC):
                 )
 
     # ------------------------------------------------------------------ numbers
+    def guess(self, x: Array, curve: CubicSpline) -> None:
+        """Write a spline and its duration, as far as its control points are variables."""
+        points = curve.control[self.lead : self.lead + self.c.count].copy()
+        if self._ends == REST:
+            points[-1] = curve.control[-1]
+        self.c.write(x, points)
+        self.T.write(x, curve.duration)
+
+    def wrenches(self, x: Array) -> Array:
+        """Sole wrenches (k, 6 a sole) at the nodes."""
+        found = self.w.read(x)
+        for k, zero in self.unloaded.items():
+            found[k, zero] = 0.0
+        return found
+
     def spline(self, x: Array) -> CubicSpline:
         """The spline that solver variables (n,) stand for."""
         points = np.array([self.control(j).evaluate(x) for j in range(len(self.breaks) + 2)])
@@ -242,46 +334,27 @@ def at_node(parts: list[Index]) -> list[Determined]:
 class Swing(MotionPhase):
     """A cubic spline from rest that ends without acceleration; it hands back the state at contact.
 
-    more : nodes beside the ends and middles of its intervals.
+    more : nodes beside the ends and middles of its intervals.  begins : as of `MotionPhase`.
     """
 
-    def __init__(self, b: Builder, more: tuple[float, ...] = ()) -> None:
+    def __init__(self, b: Builder, more: tuple[float, ...] = (), begins: str | Affine = REST) -> None:
         phase = b.problem.swing
         breaks = graded_breaks(phase.intervals, phase.grading, fine_end=True)
-        nodes = np.union1d(with_middles(breaks)[1:], more)  # the start is given
-        super().__init__("swing", phase, breaks, nodes, more)
-        self._start = Affine.constant(b.y0)
-        self._add_variables(b, "swing", phase.intervals - 1)
-
-    def control(self, j: int) -> Affine:
-        """Control point j = 0 .. N+2.
-
-        The first three make a start at rest, the last one an end without acceleration.
-        The reference coasts from contact on, so the torque that the swing ends with is the feed-forward of
-        the collision: it does not jump, and a target that comes late meets the same motion.
-        """
-        if j <= 2:
-            return self._start
-        if j < self.phase.intervals + 2:
-            return self.c[j - 3]
-        factors = rate_weights(self.breaks)
-        step = self.control(j - 1) - self.control(j - 2)
-        return self.control(j - 1) + step * float(factors[-2] / factors[-1])
+        places = with_middles(breaks)
+        places = places[1:] if begins == REST else places  # the start is given
+        mesh = breaks, np.union1d(places, more), more
+        super().__init__(b, ("swing", "swing"), phase, mesh, begins, COASTING)
 
     @property
     def end(self) -> ContactState:
         """The state at contact."""
         return ContactState(*self.at(1.0), T=self.T[0], legs=self.legs[-1], w=self.w[-1])
 
-    def add_rate_rows(self, b: Builder) -> None:
-        """Velocities within their limit; the first two control points of them are zero by construction."""
-        self._add_rate_rows(b, range(2, self.phase.intervals + 2))
-
 
 class FollowThrough(MotionPhase):
     """A clamped cubic spline to rest; it hands back where it starts.
 
-    more : nodes beside the ends and middles of its intervals.
+    more : nodes beside the ends and middles of its intervals.  ends : as of `MotionPhase`.
     kind : first word of its variables' names; name : what constraints and messages call it.
     """
 
@@ -292,15 +365,12 @@ class FollowThrough(MotionPhase):
         *,
         kind: str = "follow",
         name: str = "follow-through",
+        ends: str | Affine = REST,
     ) -> None:
         phase = b.problem.follow
         breaks = graded_breaks(phase.intervals, phase.grading, fine_end=False)
-        super().__init__(name, phase, breaks, np.union1d(with_middles(breaks), more), more)
-        self._add_variables(b, kind, phase.intervals + 1)
-
-    def control(self, j: int) -> Affine:
-        """Control point j = 0 .. N+2; the last three coincide: it ends at rest."""
-        return self.c[min(j, self.c.count - 1)]
+        mesh = breaks, np.union1d(with_middles(breaks), more), more
+        super().__init__(b, (kind, name), phase, mesh, FREE, ends)
 
     @property
     def start(self) -> tuple[Affine, Affine, Affine]:
@@ -313,23 +383,16 @@ class FollowThrough(MotionPhase):
         first = np.concatenate([self.c.index(0), self.c.index(1)])
         return [*super().determined(), determined(Turn.AFTER, first)]
 
-    def add_rate_rows(self, b: Builder) -> None:
-        """Velocities within their limit; the last two control points of them are zero by construction."""
-        self._add_rate_rows(b, range(self.phase.intervals))
-
-    def guess(self, x: Array, curve: CubicSpline, end: Array) -> None:
-        """Write a spline that ends at ``end`` (ny,), and its duration."""
-        self.c.write(x, np.vstack([curve.control[: self.c.count - 1], end]))
-        self.T.write(x, curve.duration)
-
 
 class AbortMotion(FollowThrough):
     """Motion to rest of a robot that has hit nothing, and coasts for ``after`` [s] from contact on until it
     detects that. It has one more node, at the end of coasting, with a sole wrench of its own.
     """
 
-    def __init__(self, b: Builder, more: tuple[float, ...] = (), *, after: float) -> None:
-        super().__init__(b, more, kind="abort", name="abort")
+    def __init__(
+        self, b: Builder, more: tuple[float, ...] = (), *, after: float, ends: str | Affine = REST
+    ) -> None:
+        super().__init__(b, more, kind="abort", name="abort", ends=ends)
         self.after = after
         self.coast_w = b.layout.add("coasting sole wrench", 1, b.nw, **b.limits.of_wrenches)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,16 +58,22 @@ class Completed(NamedTuple):
 
 
 def complete_reference(
-    problem: ImpactProblem, y: Array, yd: Array, ydd: Array, wrench: Array, legs: Array
+    problem: ImpactProblem,
+    y: Array,
+    yd: Array,
+    ydd: Array,
+    wrench: Array,
+    legs: Array,
+    coordinates: StanceCoordinates | None = None,
 ) -> Completed:
     """Full motion, torques and wrenches of a motion in independent coordinates.
 
     y, yd, ydd (k, ny) are independent coordinates, rates and second rates. wrench (k, 6 a sole) is corrected
     to balance the base and hinges of soles, by as little as it takes: each sole takes its part of what is
     lacking by the load that it bears, so that one that bears little keeps its centre of pressure. legs (nl,)
-    starts their inverse kinematics.
+    starts their inverse kinematics. coordinates: if not those of the stance with the blow.
     """
-    c, robot = problem.coordinates, problem.robot
+    c, robot = coordinates or problem.coordinates, problem.robot
     model, data = robot.model, robot.model.createData()
     n = len(y)
     q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
@@ -116,6 +123,11 @@ def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Arra
     return total
 
 
+def margin_of(polygon: Array, ground: Array) -> Array:
+    """Distance (k,) [m] of the ZMP of ground wrenches (k, 6) from a polygon's edges; (0,) without one."""
+    return margin(polygon, zmp(ground)) if len(polygon) and len(ground) else np.zeros(0)
+
+
 def sampled(start: float, end: float, step: float) -> Array:
     """Instants (k,) [s] about every ``step`` [s], both ends included."""
     return np.linspace(start, end, max(2, round((end - start) / step) + 1))
@@ -130,7 +142,7 @@ class Trajectory:
     feed-forward [N m]; ground (k, 6) total ground wrench about the world's origin that the feed-forward
     assumes [N, N m], sole_wrench (k, 6 a sole, 6 a hand that holds on) its parts, in own frames; (0, 0): not
     known. contact_start, contact_end, end [s]: when the plan expects contact to begin and to end,
-    and the motion to be over.
+    and the motion to be over. stance (k,): number of the stance phase; (0,): there is one stance.
     """
 
     time: Array = field(repr=False)
@@ -144,6 +156,44 @@ class Trajectory:
     contact_start: float
     contact_end: float
     end: float
+    stance: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedStand:
+    """Stance phase beside the one with the blow.
+
+    number : of the phase.  spline : in the coordinates of its stance.  nodes (k,) : places of the program's
+    nodes, fractions of it; wrench (k, 6 a sole) there, in each sole's frame [N, N m].
+    """
+
+    number: int
+    spline: CubicSpline
+    nodes: Array
+    wrench: Array
+
+
+class Piece(NamedTuple):
+    """Spline of a plan: phase (0 before, 2 after contact), number of its stance phase, its start [s], nodes
+    and sole wrenches there.
+    """
+
+    phase: int
+    number: int
+    spline: CubicSpline
+    start: float
+    nodes: Array
+    wrench: Array
+
+    def sample(self, time: Array) -> tuple[Array, Array, Array, Array]:
+        """y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) at times (k,) [s] since the motion's start;
+        before and after the piece those of its ends.
+        """
+        ts, nw = np.asarray(time, dtype=float), self.wrench.shape[1]
+        local = np.clip(ts - self.start, 0.0, self.spline.duration)
+        at = self.nodes * self.spline.duration
+        w = [np.interp(local, at, k) for k in self.wrench.T]
+        return *self.spline.sample(local), np.stack(w, axis=1) if nw else np.zeros((len(ts), 0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,6 +277,8 @@ class Plan:
     scenarios : what is predicted of other targets, in the problem's order, without those that are missing.
     coast_wrench : (6 a sole) where a robot that has hit nothing ceases to coast; None as of `abort`.
     abort, abort_wrench : the abort motion, as `follow` and `follow_wrench`; None if the problem has none.
+    before, after, after_abort : stance phases before the swing, after the follow-through and after the abort
+        motion.
     """
 
     problem: ImpactProblem
@@ -245,6 +297,9 @@ class Plan:
     abort: CubicSpline | None = None
     abort_wrench: Array | None = None
     coast_wrench: Array | None = None
+    before: tuple[PlannedStand, ...] = ()
+    after: tuple[PlannedStand, ...] = ()
+    after_abort: tuple[PlannedStand, ...] = ()
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
@@ -267,17 +322,41 @@ class Plan:
         return self.trajectory(missed=True, known=self.reference if self.abort is not None else None)
 
     @property
+    def swing_start(self) -> float:
+        """End of the stance phases before the one with the blow [s]."""
+        return float(sum(stand.spline.duration for stand in self.before))
+
+    @property
     def contact_start(self) -> float:
-        return self.swing.duration
+        return self.swing_start + self.swing.duration
 
     @property
     def contact_end(self) -> float:
-        return self.swing.duration + self.compression + self.restitution
+        return self.contact_start + self.compression + self.restitution
 
     @property
     def duration(self) -> float:
         """Start to rest [s]."""
-        return self.contact_end + self.follow.duration
+        return self.end()
+
+    def end(self, *, missed: bool = False) -> float:
+        """End of the motion [s]; ``missed``: of that of a robot that hits nothing."""
+        last = self.pieces(missed=missed)[-1]
+        return last.start + last.spline.duration
+
+    def pieces(self, *, missed: bool = False) -> list[Piece]:
+        """All splines in the order of time; ``missed``: those of a robot that hits nothing."""
+        out, start = [], 0.0
+        for stand in self.before:
+            out.append(Piece(0, stand.number, stand.spline, start, stand.nodes, stand.wrench))
+            start += stand.spline.duration
+        for phase in (0, 2):
+            out.append(Piece(phase, self.problem.blow, *self.segment(phase, missed=missed)))
+        start = out[-1].start + out[-1].spline.duration
+        for stand in self.after_abort if missed else self.after:
+            out.append(Piece(2, stand.number, stand.spline, start, stand.nodes, stand.wrench))
+            start += stand.spline.duration
+        return out
 
     @cached_property
     def polygon(self) -> Array:
@@ -293,28 +372,23 @@ class Plan:
         phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through,
         then rest; ``missed``: coasting as long as it takes to notice, and the abort motion, instead.
         """
-        ts, nw = np.asarray(time, dtype=float), self.swing_wrench.shape[1]
         if phase == 1:
-            end, rate, _ = self.swing.sample(self.contact_start)
+            ts = np.asarray(time, dtype=float)
+            end, rate, _ = self.swing.sample(self.swing.duration)
             y = end + rate * (ts[:, None] - self.contact_start)
             wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
             if missed and self.coast_wrench is not None:
                 way = (ts - self.contact_start) / (self.segment(2, missed=True)[1] - self.contact_start)
                 wrenches += way[:, None] * (self.coast_wrench - self.swing_wrench[-1])
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
-        curve, start, nodes, wrench = self.segment(phase, missed=missed)
-        local = np.clip(ts - start, 0.0, curve.duration)
-        y, yd, ydd = curve.sample(local)
-        at = nodes * curve.duration
-        w = np.stack([np.interp(local, at, k) for k in wrench.T], axis=1) if nw else np.zeros((len(ts), 0))
-        return y, yd, ydd, w
+        return Piece(phase, self.problem.blow, *self.segment(phase, missed=missed)).sample(time)
 
     def segment(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float, Array, Array]:
         """Spline, start [s], nodes and sole wrenches there of the swing (phase 0) or the follow-through (2);
         ``missed``: of the abort motion.
         """
         if phase == 0:
-            return self.swing, 0.0, self.swing_nodes, self.swing_wrench
+            return self.swing, self.swing_start, self.swing_nodes, self.swing_wrench
         if not missed:
             return self.follow, self.contact_end, self.follow_nodes, self.follow_wrench
         after = self.problem.abort_after
@@ -343,20 +417,34 @@ class Plan:
         The instants of contact and of its end are there twice: the reference jumps from the coasting one to
         the predicted state.
         """
-        last, t1, _, _ = self.segment(2, missed=missed)
-        t0, rest = self.contact_start, t1 + last.duration
-        end = rest + hold
-        legs = self.coordinates.split(self.problem.start_posture)[1]
+        problem, pieces = self.problem, self.pieces(missed=missed)
+        t0, t1, rest = self.contact_start, self.segment(2, missed=missed)[1], self.end(missed=missed)
+        q = problem.start_posture
         parts: list[tuple[Any, ...]] = []
-        for phase, (a, b) in enumerate(((0.0, t0), (t0, t1), (t1, end))):
-            times = sampled(a, b, step)
-            if phase == 0 and known is not None:
-                own = known.phase == 0
-                rows = Completed(*(getattr(known, name)[own] for name in Completed._fields))
-            else:
-                rows = complete_reference(self.problem, *self.independent(phase, times, missed=missed), legs)
-            parts.append((phase, times, *rows))
-            legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
+        stance = np.zeros(0, dtype=np.intp)
+        for piece in pieces[: len(self.before) + 1] if known is None else ():
+            times = sampled(piece.start, piece.start + piece.spline.duration, step)
+            times = times if piece.number == problem.blow else times[:-1]  # the last one is the next one's
+            parts.append((0, times, *self._completed(piece, times, q)))
+            stance = np.append(stance, np.full(len(times), piece.number))
+            q = parts[-1][2][-1]
+        if known is not None:
+            own = known.phase == 0
+            parts.append((0, *(getattr(known, name)[own] for name in ("time", *Completed._fields))))
+            stance = known.stance[own] if known.stance.size else np.zeros(own.sum(), dtype=np.intp)
+            q = parts[-1][2][-1]
+        contact = sampled(t0, t1, step)
+        legs = self.coordinates.split(q)[1]
+        rows = complete_reference(problem, *self.independent(1, contact, missed=missed), legs)
+        parts.append((1, contact, *self._of_all_soles(problem.blow, rows)))
+        stance = np.append(stance, np.full(len(contact), problem.blow))
+        for piece in pieces[len(self.before) + 1 :]:
+            end = piece.start + piece.spline.duration + (hold if piece is pieces[-1] else 0.0)
+            times = sampled(piece.start, end, step)
+            times = times if piece is pieces[-1] else times[:-1]
+            parts.append((2, times, *self._completed(piece, times, q)))
+            stance = np.append(stance, np.full(len(times), piece.number))
+            q = parts[-1][2][-1] if self.after else q
         phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
         time, q, v, a_, torque, ground, wrench = (np.concatenate([p[k] for p in parts]) for k in range(1, 8))
         # held while in contact: the collision model counts on what makes the robot coast at contact. Beyond
@@ -374,7 +462,28 @@ class Plan:
             contact_start=t0,
             contact_end=t1,
             end=rest,
+            stance=stance if problem.stances else stance[:0],
         )
+
+    def _completed(self, piece: Piece, times: Array, near: Array) -> Completed:
+        """Full motion of a piece at times (k,) [s], with legs near those of a configuration (nq,)."""
+        c = self.problem.stance_coordinates[piece.number]
+        rows = complete_reference(self.problem, *piece.sample(times), c.split(near)[1], c)
+        return self._of_all_soles(piece.number, rows)
+
+    def _of_all_soles(self, number: int, rows: Completed) -> Completed:
+        """Rows with the wrenches of all soles that stand at some time; those of the others are zero."""
+        if not self.problem.stances:
+            return rows
+        return rows._replace(sole_wrench=self._wrench_of_all(number, rows.sole_wrench))
+
+    def _wrench_of_all(self, number: int, wrench: Array) -> Array:
+        own = [sole.name for sole in self.problem.stance_coordinates[number].soles]
+        out = np.zeros((len(wrench), len(self.problem.soles), 6))
+        for k, sole in enumerate(self.problem.soles):
+            if sole.name in own:
+                out[:, k] = wrench.reshape(len(wrench), -1, 6)[:, own.index(sole.name)]
+        return out.reshape(len(wrench), -1)
 
     def motion(
         self, step: float = 1e-3, *, missed: bool = False, reference: Trajectory | None = None
@@ -391,8 +500,7 @@ class Plan:
         ------
         InputError : the legs do not reach.
         """
-        last, t1, _, _ = self.segment(2, missed=missed)
-        t0, end = self.contact_start, t1 + last.duration
+        t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
         within = sampled(t0, t1, step)
         during = self.closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
         if reference is not None:
@@ -400,12 +508,16 @@ class Plan:
                 (reference.time[k], reference.q[k]) for k in (reference.phase == 0, reference.phase == 2)
             ]
         else:
-            spans = [sampled(a, b, step) for a, b in ((0.0, t0), (t1, end))]
-            parts = [
-                (times, self.closed(self.independent(phase, times, missed=missed)[0]))
-                for phase, times in zip((0, 2), spans, strict=True)
-                if phase or not missed
-            ]
+            parts = []
+            for phase in (2,) if missed else (0, 2):
+                pieces = [piece for piece in self.pieces(missed=missed) if piece.phase == phase]
+                times = [sampled(p.start, p.start + p.spline.duration, step) for p in pieces]
+                times = [*(at[:-1] for at in times[:-1]), times[-1]]
+                rows = [
+                    self.closed(piece.sample(at)[0], self.problem.stance_coordinates[piece.number])
+                    for piece, at in zip(pieces, times, strict=True)
+                ]
+                parts.append((np.concatenate(times), np.concatenate(rows)))
         if missed:
             parts = [(np.zeros(0), np.zeros((0, self.problem.robot.nq))), parts[-1]]
         (before, q_before), (after, q_after) = parts
@@ -442,9 +554,40 @@ class Plan:
         within = np.interp(since, hit.time, gone, left=0.0)
         return before + within + last * np.maximum(since - hit.time[-1], 0.0)
 
-    def closed(self, y: Array) -> Array:
-        """Configurations (k, nq) of independent coordinates (k, ny), one near the next."""
-        c = self.coordinates
+    def stances(self) -> list[dict[str, Any]]:
+        """Stance phases with the soles that stand in each, from when till when [s]; nothing where the problem
+        has none.
+        """
+        out = []
+        for k, stance in enumerate(self.problem.stances):
+            own = [piece for piece in self.pieces() if piece.number == k]
+            end = own[-1].start + own[-1].spline.duration
+            out.append({"soles": list(stance.soles), "from_s": own[0].start, "to_s": end})
+        return out
+
+    def landing_speeds(self) -> dict[str, float]:
+        """Planned speed [m/s] of the corner that is fastest of each sole that touches down, by name."""
+        p, out = self.problem, dict[str, float]()
+        robot, data = p.robot, p.robot.model.createData()
+        for one, other in pairwise(self.pieces()):
+            landed = p.standing[other.number] & ~p.standing[one.number]
+            for sole in (sole for sole, down in zip(p.soles, landed, strict=True) if down):
+                c, end = p.stance_coordinates[one.number], one.start + one.spline.duration
+                (y,), (yd,), (ydd,), _ = one.sample(np.array([end]))
+                q, v, _ = c.complete_motion(y, yd, ydd, c.solve_legs(y, c.split(p.start_posture)[1]))
+                pin.forwardKinematics(robot.model, data, q, v)
+                frame = robot.model.getFrameId(sole.frame)
+                twist = pin.getFrameVelocity(robot.model, data, frame, pin.LOCAL)
+                corners = np.column_stack([sole.polygon, np.zeros(len(sole.polygon))])
+                speeds = twist.linear + np.cross(twist.angular, corners)
+                out[sole.name] = max(out.get(sole.name, 0.0), float(np.linalg.norm(speeds, axis=1).max()))
+        return out
+
+    def closed(self, y: Array, coordinates: StanceCoordinates | None = None) -> Array:
+        """Configurations (k, nq) of independent coordinates (k, ny), one near the next; coordinates : if not
+        those of the stance with the blow.
+        """
+        c = coordinates or self.coordinates
         legs = c.closing.follow(y, c.split(self.problem.start_posture)[1])
         q = [c.join(row, leg) for row, leg in zip(y, legs, strict=True)]
         return np.array(q).reshape(len(y), self.problem.robot.nq)
@@ -466,23 +609,37 @@ class Plan:
         limit = self.problem.robot.torque_limit
         phase = ref.phase
         hit = self.collision if collision is None else collision
-        grounds = [ref.ground[phase == 0], hit.ground, ref.ground[phase == 2]]
+        inside = [
+            self._inside(ref, phase == 0),
+            margin_of(self.polygon, hit.ground),
+            self._inside(ref, phase == 2),
+        ]
         during = hit.torque if len(hit.ground) else hit.torque[:0]
         torques = [ref.torque[phase == 0], during, ref.torque[phase == 2]]
         if self.abort is not None and reference is None:
             missed = self.missed_reference
-            grounds.append(missed.ground[missed.phase > 0])
+            inside.append(self._inside(missed, missed.phase > 0))
             torques.append(missed.torque[missed.phase > 0])
         names = ("swing", "collision", "follow", "missed")[: len(torques)]
         ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True) if len(t)}
         out = {"torque_ratio": ratio}
         if len(self.polygon):
             out["zmp_margin_m"] = {
-                n: float(margin(self.polygon, zmp(g)).min())
-                for n, g in zip(names, grounds, strict=True)
-                if len(g)
+                n: float(found.min()) for n, found in zip(names, inside, strict=True) if len(found)
             }
         return out
+
+    def _inside(self, way: Trajectory, chosen: NDArray[np.bool_]) -> Array:
+        """Distance (k,) [m] of the ZMP from the edges of what stands, at the chosen instants of a
+        reference.
+        """
+        if not way.stance.size:
+            return margin_of(self.polygon, way.ground[chosen])
+        out = np.zeros(len(way.time))
+        for k, c in enumerate(self.problem.stance_coordinates):
+            own = way.stance == k
+            out[own] = margin_of(support_polygon(self.problem.robot, c), way.ground[own])
+        return out[chosen]
 
     def sole_margins(self, collision: PlannedCollision | None = None) -> dict[str, Any]:
         """Planned margins of each sole by itself, and what is asked of them, as ``summary.json`` has them.
@@ -495,29 +652,33 @@ class Plan:
 
         collision : as of :meth:`margins`.
         """
-        c, cone = self.coordinates, self.problem.term(ContactWrenchCone)
-        if not c.soles:
+        p, cone = self.problem, self.problem.term(ContactWrenchCone)
+        if not p.soles:
             return {}
         ref = self.reference
         hit = self.collision if collision is None else collision
+        of_hit = self._wrench_of_all(p.blow, hit.sole_wrench) if p.stances else hit.sole_wrench
         parts = {
-            "swing": ref.sole_wrench[ref.phase == 0],
-            "collision": hit.sole_wrench,
-            "follow": ref.sole_wrench[ref.phase == 2],
+            "swing": (ref.sole_wrench[ref.phase == 0], ref.stance[ref.phase[: len(ref.stance)] == 0]),
+            "collision": (of_hit, np.full(len(of_hit), p.blow)),
+            "follow": (ref.sole_wrench[ref.phase == 2], ref.stance[ref.phase[: len(ref.stance)] == 2]),
         }
         if self.abort is not None:
             way = self.missed_reference
-            parts["missed"] = way.sole_wrench[way.phase > 0]
-        labels = np.repeat(list(parts), [len(part) for part in parts.values()])
-        wrench = np.concatenate(list(parts.values())).reshape(len(labels), -1, 6)[:, : len(c.soles)]
-        margins = cop_margin(self.problem.robot, [sole.polygon for sole in c.soles], wrench)
+            parts["missed"] = way.sole_wrench[way.phase > 0], way.stance[way.phase[: len(way.stance)] > 0]
+        labels = np.repeat(list(parts), [len(part) for part, _ in parts.values()])
+        wrench = np.concatenate([part for part, _ in parts.values()])
+        wrench = wrench.reshape(len(labels), -1, 6)[:, : len(p.soles)]
+        stance = np.concatenate([numbers for _, numbers in parts.values()])
+        margins = cop_margin(p.robot, [sole.polygon for sole in p.soles], wrench)
         asked = {name: cone.collision_margin if name == "collision" else cone.margin for name in parts}
         return {
             **least_margins(
-                [sole.name for sole in c.soles],
+                [sole.name for sole in p.soles],
                 margins,
                 wrench[:, :, 2],
                 {name: labels == name for name in parts},
+                *((p.standing, stance) if p.stances else ()),
             ),
             "sole_cop_margin_asked_mm": {n: 1e3 * m for n, m in asked.items() if m is not None},
             "sole_force_asked_N": cone.minimum_force,

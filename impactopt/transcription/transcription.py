@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from itertools import groupby
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -19,9 +19,10 @@ from impactopt.codegen.cache import FunctionGroup, cached_groups, model_hash
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.support import support_polygon
+from impactopt.problem.block import BlockExpression
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
-from impactopt.transcription.blocks import ExtraBlock, extra_blocks, own_blocks
+from impactopt.transcription.blocks import ExtraBlock, extra_blocks, own_blocks, stance_blocks
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import SeparationBlock
 from impactopt.transcription.collision import Collision
@@ -46,7 +47,7 @@ from impactopt.transcription.layout import (
 from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares
 from impactopt.transcription.motion_phase import AbortMotion, FollowThrough, Swing, add_nodes
 from impactopt.transcription.objective import Prices, motion_prices, style_prices
-from impactopt.transcription.plan import Plan
+from impactopt.transcription.plan import Piece, Plan
 from impactopt.transcription.simd import in_lanes
 from impactopt.transcription.springs import (
     SpringPoint,
@@ -55,6 +56,7 @@ from impactopt.transcription.springs import (
     swing_springs,
     torque_courses,
 )
+from impactopt.transcription.stance_change import Course
 from impactopt.transcription.structured import derivative_functions
 
 __all__ = ["Transcription", "block_functions", "statement_of"]
@@ -74,16 +76,7 @@ def block_functions(
     """
     robot = problem.robot
     edges = len(support_polygon(robot, coordinates))
-    recipe = (
-        model_hash(robot.model),
-        tuple(
-            (leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12))) for leg in coordinates.legs
-        ),
-        tuple(np.round(coordinates.start, 12)) if any(leg.before.size for leg in coordinates.legs) else (),
-        tuple(tuple(o.tolist()) for leg in coordinates.legs for o in leg.order),
-        problem.striker,
-        edges,
-    )
+    recipe = (*_coordinates_recipe(coordinates), problem.striker, edges)
     target = problem.target
     frozen = () if problem.frozen is None else (problem.frozen,)
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
@@ -107,7 +100,25 @@ def block_functions(
         groups.append(
             FunctionGroup(name=f"{robot.name}-{name}", recipe=(name, *recipe, *block.key), build=functions)
         )
+    for name, (c, build) in stance_blocks(problem).items():
+
+        def of_stance(name: str = name, build: Callable[[], BlockExpression] = build) -> list[Any]:
+            b = build()
+            return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
+
+        key = name, *_coordinates_recipe(c), *((sole.frame, len(sole.polygon)) for sole in problem.soles)
+        groups.append(FunctionGroup(name=f"{robot.name}-{name}", recipe=key, build=of_stance))
     return cached_groups(groups, report=report)
+
+
+def _coordinates_recipe(c: StanceCoordinates) -> tuple[Any, ...]:
+    """Recipe of a block beside its formula: the model, and what its legs hold how."""
+    return (
+        model_hash(c.robot.model),
+        tuple((leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12))) for leg in c.legs),
+        tuple(np.round(c.start, 12)) if any(leg.before.size for leg in c.legs) else (),
+        tuple(tuple(o.tolist()) for leg in c.legs for o in leg.order),
+    )
 
 
 class Transcription(ContactProgram):
@@ -120,6 +131,7 @@ class Transcription(ContactProgram):
     ----------
     swing, follow, abort : the motions; the last one for a blow that meets nothing, if a scenario asks for it.
     follows : those after contact.
+    before, after : the stance phases up to contact, and those after it, of each of `follows`.
     torques : over limit, at each node of swing and follows, if something asks for torques as variables; else
         at contact alone.
     """
@@ -134,12 +146,24 @@ class Transcription(ContactProgram):
         shares: Shares = (),
     ) -> None:
         b, self.nodes = Builder(problem, coordinates, functions), nodes
-        self.swing = Swing(b, nodes.swing)
+        before, after = range(problem.blow + 1), range(problem.blow, max(1, len(problem.stances)))
+        self.before = Course(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
+        self.swing = cast(Swing, self.before.phases[problem.blow])
         contact = Contact(self.swing.end, *add_coasting(b))
         super().__init__(b, Hit(b, contact, elements, shares, after=False))
-        self.follow = FollowThrough(b, nodes.follow)
-        after = problem.abort_after
-        self.abort = None if after is None else AbortMotion(b, nodes.follow, after=after)
+        self.after = [Course(b, after, lambda _, ends: FollowThrough(b, nodes.follow, ends=ends), nodes)]
+        self.follow = cast(FollowThrough, self.after[0].phases[problem.blow])
+        self.abort: AbortMotion | None = None
+        if (late := problem.abort_after) is not None:
+            aborted = Course(
+                b,
+                after,
+                lambda _, ends: AbortMotion(b, nodes.follow, after=late, ends=ends),
+                nodes,
+                missed=True,
+            )
+            self.abort = cast(AbortMotion, aborted.phases[problem.blow])
+            self.after.append(aborted)
         self.follows = [self.follow] if self.abort is None else [self.follow, self.abort]
         self.torques: list[Affine] = []
         self._add_motions()
@@ -200,7 +224,13 @@ class Transcription(ContactProgram):
             coasting, name = self.abort.coasting_node()
             instances.append(coasting)
             places.append(name)
-        outputs = add_nodes(b, instances, places, closed=int(self.abort is not None))
+        outputs = add_nodes(
+            b,
+            instances,
+            places,
+            closed=int(self.abort is not None),
+            fading=self.before.fading(self.problem.blow),
+        )
         self._slots = instances, places
         self._add_torque_rows(places, outputs)
         joints = np.arange(self.coordinates.base, b.ny)
@@ -216,6 +246,9 @@ class Transcription(ContactProgram):
         self.swing.add_rate_rows(b)
         for follow in self.follows:
             follow.add_rate_rows(b)
+        for course in (self.before, *self.after):
+            course.add_stands()
+            course.add_changes()
 
     @property
     def torques_lifted(self) -> bool:
@@ -303,14 +336,23 @@ class Transcription(ContactProgram):
     def _prices(self) -> Prices:
         coasting = [] if self.abort is None else [self.abort.coast_w]
         wrenches = [part.w for part in (self.swing, *self.follows, *self.hit.collisions)]
-        motions = [self.swing, *self.follows]
-        self._style = style_prices(self.builder, motions, self.follows)
-        return motion_prices(self.builder, motions, self.follows, [*wrenches, *coasting]) + self._style
+        motions, b = [self.swing, *self.follows], self.builder
+        to_rest = self.follows if len(self.after[0].numbers) == 1 else []
+        self._style = style_prices(b, motions, to_rest)
+        prices = motion_prices(b, motions, to_rest, [*wrenches, *coasting])
+        for course in (self.before, *self.after):
+            for k, phase in course.stands.items():
+                last = [phase] if k == len(self.problem.stances) - 1 else []
+                prices = prices + motion_prices(course.builders[k], [phase], last, [phase.w])
+                self._style = self._style + style_prices(course.builders[k], [phase], last)
+        return prices + self._style
 
     def _determined(self) -> list[Determined]:
         found = [*self.swing.determined(), *self.hit.determined()]
         for follow in self.follows:
             found += follow.determined()
+        for course in (self.before, *self.after):
+            found += [each for phase in course.stands.values() for each in phase.determined()]
         return [*found, determined(Turn.RATE, self.u0.index(0))]
 
     # ------------------------------------------------------------------ solution
@@ -329,8 +371,9 @@ class Transcription(ContactProgram):
 
     def body_states(self, x: Array) -> list[BodyState]:
         plan, found = self.decode(x), self.swing_spots()
+        begin, swing = plan.segment(0)[1], plan.swing.duration
         out = [
-            BodyState(0, place.name, s * plan.swing.duration, self.posture(x, slots))
+            BodyState(0, place.name, begin + s * swing, self.posture(x, slots))
             for s, (place, slots) in zip(self.swing.nodes, found, strict=True)
         ]
         for missed, follow in enumerate(self.follows):
@@ -339,26 +382,51 @@ class Transcription(ContactProgram):
                 BodyState(2 + missed, place.name, begin + s * curve.duration, self.posture(x, slots))
                 for s, (place, slots) in zip(nodes, follow.spots(), strict=True)
             ]
-        return out
+        for missed, course in enumerate((*self.after[:1], *self.after[1:])):
+            out += self._stand_states(x, course, plan.pieces(missed=bool(missed)), 2 + missed)
+        return out + self._stand_states(x, self.before, plan.pieces(), 0)
+
+    def _stand_states(self, x: Array, course: Course, pieces: list[Piece], phase: int) -> list[BodyState]:
+        found = iter(course.spots())
+        of_number = {piece.number: piece for piece in pieces}
+        return [
+            BodyState(
+                phase,
+                place.name,
+                of_number[k].start + s * of_number[k].spline.duration,
+                self.posture(x, slots),
+            )
+            for k, stand in course.stands.items()
+            for s, (place, slots) in zip(stand.nodes, found, strict=False)
+        ]
+
+    def body_spots(self) -> list[tuple[Place, list[Affine]]]:
+        stands = [spot for course in (self.before, *self.after) for spot in course.spots()]
+        return [*super().body_spots(), *stands]
 
     def travel(self, x: Array, time: Array) -> Array:
         return self.decode(x).travel(time)
 
     def decode(self, x: Array) -> Plan:
         """The plan that solver variables (n,) stand for."""
-        start_w = static_wrenches(self.coordinates, self.y0, self.legs0)
-        abort = self.abort
+        abort, nodes, wrench = self.abort, self.swing.nodes, self.swing.wrenches(x)
+        if nodes[0]:
+            nodes = np.append(0.0, nodes)
+            wrench = np.vstack([static_wrenches(self.coordinates, self.y0, self.legs0), wrench])
         return Plan(
             problem=self.problem,
             swing=self.swing.spline(x),
             follow=self.follow.spline(x),
-            swing_nodes=np.concatenate([[0.0], self.swing.nodes]),
-            swing_wrench=np.vstack([start_w, self.swing.w.read(x)]),
+            swing_nodes=nodes,
+            swing_wrench=wrench,
             follow_nodes=self.follow.nodes,
-            follow_wrench=self.follow.w.read(x),
+            follow_wrench=self.follow.wrenches(x),
             abort=None if abort is None else abort.spline(x),
-            abort_wrench=None if abort is None else abort.w.read(x),
+            abort_wrench=None if abort is None else abort.wrenches(x),
             coast_wrench=None if abort is None else abort.coast_w.read(x)[0],
+            before=self.before.decode(x),
+            after=self.after[0].decode(x),
+            after_abort=self.after[-1].decode(x) if abort is not None else (),
             **self.hit.decode(x, self.program.outputs(x)),
         )
 
@@ -367,8 +435,8 @@ def statement_of(t: Transcription) -> str:
     """JSON summary of a program, for a reader that knows nothing of this package.
 
     `groups`: name, count and size of the variables, in their order. `rows`: term, place and the number of a
-    list of `components`. `more`: nodes beside those of the mesh. `elements`, `guarded`, `shares`,
-    `shortest`: of the contact, its least durations [s] by collision. `apart`: rows between bodies.
+    list of `components`. `more`: nodes beside those of the mesh, as of `MoreNodes`. `elements`, `guarded`,
+    `shares`, `shortest`: of the contact, its least durations [s] by collision. `apart`: rows between bodies.
     """
     lists: dict[tuple[str, ...], int] = {}
     rows = []
@@ -387,7 +455,7 @@ def statement_of(t: Transcription) -> str:
             "groups": [[g.name, g.count, g.size] for g in t.layout.groups.values()],
             "rows": rows,
             "components": list(lists),
-            "more": [list(t.nodes.swing), list(t.nodes.follow)],
+            "more": [list(t.nodes.swing), list(t.nodes.follow), *map(list, t.nodes.stands)],
             "elements": t.hit.elements if collisions else [],
             "guarded": t.hit.guarded,
             "shares": list(t.hit.shares),

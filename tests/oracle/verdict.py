@@ -94,6 +94,9 @@ def verify_record(
     ------
     InputError : it does not say what its variables are.
     """
+    if problem.stances:
+        unknown = "not known to verify: stance phases"
+        return Verdict(ok=False, max_violation=np.inf, kkt=None, objective=None, rows={}, reason=unknown)
     claims = claims_of(arrays)
     program = Program(problem, claims)
     x = np.asarray(arrays["solver_x"], dtype=float)

@@ -23,7 +23,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.blocks import BlockExpression, builders, extra_blocks, own_blocks
+from impactopt.transcription.blocks import BlockExpression, builders, extra_blocks, own_blocks, stance_blocks
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.strike import StrikeTranscription
@@ -83,6 +83,7 @@ def transcribed(problem: ImpactProblem) -> Transcription:
         )
     for instant in (False, True):
         found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant, first=True)
+    found |= {name: build for name, (_, build) in stance_blocks(problem).items()}
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))
 
 

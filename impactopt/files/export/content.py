@@ -142,6 +142,13 @@ class Export:
     motion: Motion
     missed: Motion | None
 
+    def standing(self, motion: Motion) -> dict[str, NDArray[np.bool_]]:
+        """Mask (k,) of the instants at which each sole stands, by its name; none without stance phases."""
+        p = self.problem
+        if motion.stance is None:
+            return {}
+        return dict(zip((sole.name for sole in p.soles), p.standing[motion.stance].T, strict=True))
+
     @property
     def problem(self) -> ImpactProblem:
         return self.planned.problem
@@ -180,6 +187,7 @@ class Export:
                 "effort_holds_gravity": self.gravity,
                 "smooth": self.smooth,
                 "phases": list(PHASES),
+                **({"stances": s["stances"]} if "stances" in s else {}),
                 "joints": self._joints(),
                 "base": None
                 if self.motion.base is None

@@ -32,6 +32,7 @@ def _columns(export: Export, motion: Motion) -> dict[str, Array]:
     inside = (motion.phase == 1).astype(float)
     phase = motion.phase.astype(float)
     out: dict[str, Array] = {"time [s]": motion.time, "phase": phase, "contact": inside}
+    out |= {f"{name} stands": on.astype(float) for name, on in export.standing(motion).items()}
     kinds = [joint["kind"] == "prismatic" for joint in export.meta["joints"]]
     for what, values, turning, sliding in (
         ("position", motion.position, "rad", "m"),

@@ -62,7 +62,8 @@ _TYPES: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 def write(export: Export, directory: Path) -> None:
-    """`motion.mcap`: topics /motion, /missed, /phase, /expected_force, /zmp, /base_pose and /base_twist.
+    """`motion.mcap`: topics /motion, /missed, /phase, /expected_force, /zmp, /base_pose, /base_twist, and of
+    a plan with stance phases /stance.
 
     meta.json is in it too, as an attachment.
 
@@ -116,6 +117,8 @@ def _messages(export: Export, motion: Motion, k: int) -> Iterator[tuple[str, str
     """Topic, type and message of what is reported at each instant."""
     header = _header(motion.time[k])
     yield "/phase", "std_msgs/msg/UInt8", {"data": int(motion.phase[k])}
+    if motion.stance is not None:
+        yield "/stance", "std_msgs/msg/UInt8", {"data": int(motion.stance[k])}
     push = _vector(motion.force[k] * export.problem.normal)
     wrench = {"force": push, "torque": _vector(np.zeros(3))}
     yield "/expected_force", "geometry_msgs/msg/WrenchStamped", {"header": header, "wrench": wrench}

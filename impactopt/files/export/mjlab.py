@@ -56,7 +56,15 @@ def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
         "body_ang_vel_w": angular,
         "joint_names": np.array(export.joints),
         "body_names": np.array([body_name(robot, j) for j in joints]),
+        **_contacts(export.standing(motion)),
     }
+
+
+def _contacts(standing: dict[str, NDArray[np.bool_]]) -> dict[str, Any]:
+    """Mask (k, soles) of the soles that stand, and their names, of a motion with stance phases."""
+    if not standing:
+        return {}
+    return {"sole_contact": np.column_stack(list(standing.values())), "sole_names": np.array(list(standing))}
 
 
 def _state(export: Export, motion: Motion, k: int) -> tuple[Array, Array]:

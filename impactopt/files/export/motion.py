@@ -45,7 +45,7 @@ class Motion:
     base : None of a robot on a fixed base.
     force (k,) [N] on the target, along its normal; zero outside of contact.  zmp (k, 2) [m], or None
     without soles; nan where nothing is known of it.
-    contact_start, contact_end, end [s].
+    contact_start, contact_end, end [s].  stance (k,) : number of the stance phase; None: there is one stance.
     """
 
     time: Array
@@ -60,6 +60,7 @@ class Motion:
     contact_start: float
     contact_end: float
     end: float
+    stance: NDArray[np.intp] | None = None
 
 
 def _frames(end: float, rate: float) -> Array:
@@ -123,7 +124,16 @@ def motion_at(
         contact_start=edges[0],
         contact_end=edges[1],
         end=reference.end,
+        stance=_stances(reference, told),
     )
+
+
+def _stances(reference: Trajectory, time: Array) -> NDArray[np.intp] | None:
+    """Number of the stance phase at each instant (k,) [s]."""
+    if not reference.stance.size:
+        return None
+    rows = np.searchsorted(reference.time, time, side="right") - 1
+    return reference.stance[rows.clip(0)]
 
 
 def springs_at_rest(motion: Motion, springs: NDArray[np.bool_]) -> Motion:

@@ -225,6 +225,7 @@ def _index(value: Any, part: str, key: str, where: str) -> int:
 _T = TypeVar("_T")
 # each entry is checked by itself, and most are part of the program: of thousands a file could say too much
 _LISTS = (
+    ("stances",),
     ("scenarios",),
     ("obstacles",),
     ("robot", "soles"),

@@ -52,6 +52,7 @@ from impactopt.kinematics.stance import BothSoles, FixedBase, Free, OneSole, Sta
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario, SecondStriker
+from impactopt.problem.stances import StancePhase
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS, TERMS
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
@@ -280,6 +281,31 @@ class StanceSection(Section):
     )
 
 
+class StancePhaseSection(Section):
+    """A phase of the motion in which the same soles stand; between two, soles lift off or touch down."""
+
+    soles: list[str] = required("names of the soles that stand")
+    duration: Duration = optional(
+        "one number, or [shortest, longest] [s]; left out of the phase with the blow, whose times are those "
+        "of [swing] and [follow]",
+        "duration_s",
+    )
+    intervals: int = optional("number of the spline's intervals, at least 6, by default 12")
+    grading: AtLeastOne = optional(
+        "longest over shortest interval, the short ones at the contact, by default 3"
+    )
+
+    def build(self) -> StancePhase:
+        given = self.given()
+        soles = tuple(given.pop("soles"))
+        if "duration" not in given and given:
+            raise InputError(
+                f"[[stances]]: the phase on {' and '.join(soles)} has no duration_s: give it one, or leave "
+                f"{' and '.join(given)} out, as the blow falls in it"
+            )
+        return StancePhase(soles=soles, phase=Phase(**given) if given else None)
+
+
 class PhaseSection(Section):
     """A phase of the motion: its duration and its spline."""
 
@@ -361,6 +387,7 @@ class File(Section):
     contact: Contact
     second: SecondSection = optional("")
     stance: StanceSection = optional("")
+    stances: list[StancePhaseSection] = optional("")
     swing: SwingSection = optional("")
     follow: FollowSection = optional("")
     collision: CollisionSection = optional("")
@@ -399,6 +426,8 @@ class File(Section):
 
     def make_stance(self, robot: Robot) -> Stance:
         """Stance of a robot that [stance] describes; InputError for what it cannot stand on."""
+        if self.stance and self.stances:
+            raise InputError("[stance] holds one stance for all of the motion: leave it or [[stances]] out")
         soles = self.stance.soles if self.stance else "both"
         hands = tuple(self.stance.hands) if self.stance else ()
         stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
@@ -452,6 +481,8 @@ class File(Section):
             out["obstacles"] = tuple(obstacle.build() for obstacle in self.obstacles)
         if self.ground is not None:
             out["ground"] = self.ground.build()
+        if self.stances is not None:
+            out["stances"] = tuple(stance.build() for stance in self.stances)
         if self.scenarios is not None:
             out["scenarios"] = tuple(scenario.build() for scenario in self.scenarios)
         for name, section in (("terms", self.terms), ("objectives", self.objectives)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from impactopt.files.problem_file.sections import (
     ScenarioSection,
     SecondSection,
     SolverSettings,
+    StancePhaseSection,
     SwingSection,
     TermSections,
     comment_at,
@@ -269,7 +270,12 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     }
     stance = problem.stance
     hands = {"hands": [hand.name for hand in held]} if (held := stance.held_hands(problem.robot)) else {}
-    if isinstance(stance, OneSole) or hands:
+    data["stances"] = [
+        {"soles": list(each.soles)}
+        | ({} if each.phase is None else _section(StancePhaseSection, each.phase, ("soles",)))
+        for each in problem.stances
+    ]
+    if (isinstance(stance, OneSole) and not problem.stances) or hands:
         data["stance"] = ({"soles": stance.name} if isinstance(stance, OneSole) else {}) | hands
     if problem.second is not None:
         data["second"] = _section(SecondSection, problem.second)
@@ -322,9 +328,10 @@ def _of_kind(what: str, thing: Any, kinds: Mapping[str, type[Section]], key: str
     return {**({} if name == next(iter(kinds)) else {key: name}), **_section(kinds[name], thing)}
 
 
-def _section(section: type[Section], thing: Any) -> dict[str, Any]:
-    """A thing that a section describes, without what is a default."""
-    names = [name for name in section.model_fields if name not in (section.choice, *section.apart)]
+def _section(section: type[Section], thing: Any, without: Sequence[str] = ()) -> dict[str, Any]:
+    """A thing that a section describes, without what is a default; `without`: keys that it has not."""
+    left_out = (section.choice, *section.apart, *without)
+    names = [name for name in section.model_fields if name not in left_out]
     return _different(section, {name: getattr(thing, name) for name in names})
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from impactopt.contact.fields import about
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import Measure
+from impactopt.robots.loads import fading
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,10 @@ class GroundForce(Term):
         soles = [k for k, leg in enumerate(legs) if leg.sole is not None]
         if not soles:
             return
-        sets = [("all soles", soles), *((legs[k].end, [k]) for k in soles if len(soles) > 1)]
+        p = program.problem
+        fades = {s.name for s, on in zip(p.soles, fading(p.standing)[p.blow], strict=True) if on}
+        each = [k for k in soles if len(soles) > 1 and legs[k].name not in fades]
+        sets = [("all soles", soles), *((legs[k].end, [k]) for k in each)]
         normal = np.zeros((len(sets), 6 * len(legs)))
         for row, (_, chosen) in zip(normal, sets, strict=True):
             row[6 * np.array(chosen) + 2] = 1 / weight

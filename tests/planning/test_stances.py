@@ -1,0 +1,300 @@
+"""A motion whose soles lift off and touch down, against Pinocchio, momentum balance and differences."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support.derivative_checks import check_derivatives
+from support.small_plans import BODILESS, biped_problem, transcribed
+from support.small_robots import arm, biped
+
+from impactopt.errors import InputError
+from impactopt.files.export.motion import motion_at
+from impactopt.files.output import Record
+from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
+from impactopt.files.verify import motion_of_record
+from impactopt.kinematics.stance import FixedBase
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.stances import StancePhase
+from impactopt.report.histories import soles_standing, zmp_margins
+from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
+from impactopt.solvers.ipm import solve_ipm
+from impactopt.transcription.initial_guess import carried_over, first_iterate
+from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.transcription.plan import Plan, Trajectory
+from impactopt.transcription.transcription import Transcription
+
+BOTH = StancePhase(soles=("left", "right"), phase=Phase(duration=(0.4, 0.9), intervals=6, grading=1.0))
+STEPS = (BOTH, StancePhase(soles=("left",)), BOTH)
+
+
+def changed_nodes(program: Transcription, nodes: MoreNodes) -> Transcription:
+    return Transcription(program.problem, program.coordinates, program.functions, nodes)
+
+
+def no_multipliers(program: Transcription) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(program.program.m), np.zeros(program.program.n)
+
+
+def stepping(**changes: object) -> ImpactProblem:
+    missing = Scenario(name="gone", missing=True, abort_after=0.02)
+    usual: dict[str, object] = {"stances": STEPS, "terms": BODILESS, "scenarios": (missing,)}
+    return dataclasses.replace(biped_problem(), **{**usual, **changes})
+
+
+@pytest.fixture(scope="module")
+def program() -> Transcription:
+    return transcribed(stepping())
+
+
+@pytest.fixture(scope="module")
+def plan(program: Transcription) -> Plan:
+    result = solve_ipm(program.program, first_iterate(program))
+    assert result.status.usable, result.message
+    return program.decode(result.x)
+
+
+@pytest.fixture(scope="module")
+def ways(plan: Plan) -> tuple[Trajectory, Trajectory]:
+    hit = plan.trajectory()
+    return hit, plan.trajectory(missed=True, known=hit)
+
+
+@pytest.fixture(scope="module")
+def held(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> Simulation:
+    return simulate_pinocchio(plan.problem.robot, ways[0], scene_of(plan.problem), settle=0.1)
+
+
+def test_derivatives_are_those_of_differences(program: Transcription) -> None:
+    # and of a blow on two feet, after a step on the left one and before one on the right one
+    left, right = (dataclasses.replace(BOTH, soles=(name,)) for name in ("left", "right"))
+    steps = (BOTH, left, StancePhase(soles=("left", "right")), right, BOTH)
+    for t in (program, transcribed(stepping(stances=steps))):
+        x = first_iterate(t)
+        check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
+
+
+def test_soles_stand_where_they_stood_in_their_phases_and_are_in_the_air_between(
+    plan: Plan, ways: tuple[Trajectory, Trajectory]
+) -> None:
+    robot, data = plan.problem.robot, plan.problem.robot.model.createData()
+    frames = [robot.model.getFrameId(sole.frame) for sole in plan.problem.soles]
+    pin.framesForwardKinematics(robot.model, data, plan.problem.start_posture)
+    start = [data.oMf[frame].copy() for frame in frames]
+    for way in ways:
+        heights = np.zeros(len(way.time))
+        for i, q in enumerate(way.q):
+            pin.framesForwardKinematics(robot.model, data, q)
+            on = plan.problem.standing[way.stance[i]]
+            for k in np.flatnonzero(on):
+                assert np.abs(pin.log6(start[k].actInv(data.oMf[frames[k]])).vector).max() < 1e-6
+            heights[i] = data.oMf[frames[1]].translation[2]
+        stands = way.stance != 1
+        change = np.flatnonzero(np.diff(way.stance))
+        assert way.stance[0] == 0 and way.stance[-1] == 2 and len(change) == 2
+        late = ~stands & (way.time > way.time[change[0]] + 0.2) & (way.time < way.time[change[1]] - 0.2)
+        assert heights[late].min() > 0.009  # a node's least height is 10 mm
+        assert heights[~stands].min() > -1e-4
+
+
+def test_posture_rates_and_torques_go_on_where_soles_change(ways: tuple[Trajectory, Trajectory]) -> None:
+    for way in ways:
+        for k in np.flatnonzero(np.diff(way.stance)):
+            h = way.time[k + 1] - way.time[k]
+            rates = (way.v[k + 1] - way.v[k]) / h
+            # as everywhere: what they change by is what accelerations say
+            assert np.abs(rates - (way.a[k] + way.a[k + 1]) / 2).max() < 0.5
+            assert np.abs(way.a[k + 1] - way.a[k]).max() < 3.0
+            assert np.abs(way.torque[k + 1] - way.torque[k]).max() < 3.0
+
+
+def test_the_sole_that_changes_bears_nothing_there_and_stays_in_its_cone(
+    plan: Plan, ways: tuple[Trajectory, Trajectory]
+) -> None:
+    cone = plan.problem.robot.sole("right").polygon
+    for way in ways:
+        wrench = way.sole_wrench.reshape(len(way.time), 2, 6)[:, 1]
+        assert not wrench[way.stance == 1].any()
+        lifted, landed = np.flatnonzero(np.diff(way.stance))
+        assert np.abs(wrench[[lifted, landed + 1]]).max() < 10.0
+        assert wrench[:, 2].min() > -1e-6
+        loaded = wrench[wrench[:, 2] > 20.0]
+        cop = np.stack([-loaded[:, 4], loaded[:, 3]], axis=1) / loaded[:, 2:3]
+        assert (cop > cone.min(axis=0)).all() and (cop < cone.max(axis=0)).all()
+        assert wrench[0, 2] > 50.0 and wrench[-1, 2] > 50.0
+
+
+def test_momentum_is_that_of_gravity_and_the_soles_in_every_phase(
+    plan: Plan, ways: tuple[Trajectory, Trajectory]
+) -> None:
+    robot, data = plan.problem.robot, plan.problem.robot.model.createData()
+    mass = sum(inertia.mass for inertia in robot.model.inertias)
+    for way in ways:
+        for i in np.flatnonzero(way.phase != 1)[::7]:
+            pin.computeCentroidalMomentumTimeVariation(robot.model, data, way.q[i], way.v[i], way.a[i])
+            pin.framesForwardKinematics(robot.model, data, way.q[i])
+            force = pin.Force(mass * np.array([0.0, 0.0, -9.81]), np.zeros(3))
+            about = pin.SE3(np.eye(3), data.com[0])
+            for k, sole in enumerate(plan.problem.soles):
+                place = data.oMf[robot.model.getFrameId(sole.frame)]
+                own = pin.Force(way.sole_wrench[i, 6 * k : 6 * k + 6])
+                force += about.actInv(place.act(own))
+            np.testing.assert_allclose(data.dhg.vector, force.vector, atol=1e-9 * mass * 9.81 * 10)
+
+
+def test_a_replay_that_holds_the_soles_by_the_schedule_does_what_is_planned(
+    plan: Plan, ways: tuple[Trajectory, Trajectory], held: Simulation
+) -> None:
+    assert held.impulse == pytest.approx(plan.impulse, rel=0.01)
+    assert max(plan.landing_speeds().values()) < 1e-6
+    assert held.landing_speed[1] < 0.01 and np.isnan(held.landing_speed[0])
+    assert held.posture_error < 2e-3 and held.slip.max() < 1e-4 and held.lift.max() < 1e-4
+    assert not held.sole_ground[held.stance == 1, 1].any()
+    numbers = held.summary(
+        torque_limit=plan.problem.robot.torque_limit, polygon=plan.polygon, planned_impulse=plan.impulse
+    )
+    assert numbers["landing_speed_m_s"].keys() == {"right"}
+    planned, found = plan.margins()["zmp_margin_m"], numbers["zmp_margin_m"]
+    assert found["swing"] == pytest.approx(planned["swing"], abs=1e-3)
+    assert found["follow"] > planned["follow"] - 1e-3
+
+
+def test_nodes_are_added_in_phases_beside_the_one_with_the_blow(plan: Plan, program: Transcription) -> None:
+    more = nodes_to_add(plan, NO_MORE)  # of six intervals, some margin is gone between two nodes
+    assert len(more.stands) == 3 and not more.stands[1] and any(more.stands)
+    finer = changed_nodes(program, more)
+    names = set(finer.layout.groups)
+    assert finer.program.n > program.program.n and names == set(program.layout.groups)
+    x = carried_over(finer, program, first_iterate(program), *no_multipliers(program))[0]
+    assert np.abs(finer.decode(x).before[0].spline.control).max() > 0.1
+
+
+def test_what_is_said_of_each_phase(plan: Plan) -> None:
+    stances = plan.stances()
+    assert [each["soles"] for each in stances] == [["left", "right"], ["left"], ["left", "right"]]
+    assert stances[0]["from_s"] == 0.0 and stances[-1]["to_s"] == pytest.approx(plan.duration)
+    assert stances[0]["to_s"] == stances[1]["from_s"] < plan.contact_start < stances[1]["to_s"]
+    margins = plan.sole_margins()
+    # next to no force on a sole that is about to lift is no shortfall
+    assert margins["sole_force_N"]["right"] == {}
+    assert margins["sole_cop_margin_mm"]["left"].keys() == {"swing", "collision", "follow", "missed"}
+
+
+@pytest.mark.parametrize(
+    ("stances", "message"),
+    [
+        ((BOTH, StancePhase(soles=("left",), phase=Phase(duration=0.5))), "the blow falls in one phase"),
+        ((BOTH, StancePhase(soles=("left",)), StancePhase(soles=("left", "right"))), "and 2 of"),
+        ((StancePhase(soles=("left",)),), "no schedule"),
+        ((BOTH, StancePhase(soles=("left", "right"))), "lift off or to touch down"),
+        (
+            (StancePhase(soles=("left",), phase=Phase(duration=0.5)), StancePhase(soles=("right",))),
+            "not both",
+        ),
+        ((BOTH, StancePhase(soles=("middle",))), "no sole 'middle'"),
+        ((BOTH, "left"), "tuple of StancePhase"),
+    ],
+)
+def test_what_is_no_schedule_is_refused(stances: tuple[StancePhase, ...], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        stepping(stances=stances)
+
+
+def test_what_is_no_phase_is_refused() -> None:
+    with pytest.raises(InputError, match="has no soles"):
+        StancePhase(soles=())
+    with pytest.raises(InputError, match="each once"):
+        StancePhase(soles=("left", "left"))
+    with pytest.raises(InputError, match="must be a Phase"):
+        StancePhase(soles=("left",), phase=0.5)  # type: ignore[arg-type]
+
+
+def test_a_robot_without_soles_to_lift_is_refused() -> None:
+    with pytest.raises(InputError, match="leave `stances` out"):
+        ImpactProblem(
+            robot=arm(),
+            striker="hand",
+            start="start",
+            stance=FixedBase(),
+            stances=STEPS,
+            point=np.zeros(3),
+            normal=[0.0, 1.0, 0.0],
+            law=biped_problem().law,
+            target=biped_problem().target,
+        )
+
+
+def test_the_first_phase_has_to_carry_the_start_posture() -> None:
+    one = StancePhase(soles=("right",), phase=Phase(duration=0.5))
+    with pytest.raises(InputError, match="support polygon of right"):
+        stepping(stances=(one, StancePhase(soles=("left", "right"))))
+
+
+def test_the_stance_of_a_problem_is_that_of_the_blow() -> None:
+    problem = stepping()
+    assert problem.stance.sole_names(problem.robot) == ("left",)
+    assert [sole.name for sole in problem.soles] == ["left", "right"]
+    assert problem.hash != stepping(stances=STEPS[:2]).hash
+    assert biped_problem(biped()).hash == dataclasses.replace(biped_problem(biped()), stances=()).hash
+
+
+# ---- what is made of such a plan
+
+
+def test_a_verdict_holds_the_soles_of_each_phase_to_their_places(
+    plan: Plan, ways: tuple[Trajectory, Trajectory]
+) -> None:
+    arrays = {f"reference_{f.name}": getattr(ways[0], f.name) for f in dataclasses.fields(ways[0])}
+    found = list(motion_of_record(plan.problem, arrays))
+    worst = max(found, key=lambda off: off[1])
+    assert worst[1] < 2e-2, worst  # [1] of its size: what a program's tolerance leaves
+    assert max(off for name, off, _ in found if name.endswith("held soles")) < 1e-6
+    moved = {**arrays, "reference_stance": np.zeros_like(ways[0].stance)}
+    assert max(off for name, off, _ in motion_of_record(plan.problem, moved) if "held soles" in name) > 0.01
+
+
+def test_an_export_says_which_sole_stands(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> None:
+    robot = plan.problem.robot
+    for jumps in (True, False):
+        motion = motion_at(ways[0], robot, 500.0, np.arange(robot.n), {}, jumps=jumps)
+        assert motion.stance is not None
+        changes = motion.time[np.flatnonzero(np.diff(motion.stance)) + 1]
+        planned = [each["from_s"] for each in plan.stances()[1:]]
+        np.testing.assert_allclose(changes, planned, atol=2e-3)
+
+
+def test_a_problem_file_has_the_phases() -> None:
+    problem = load_problem("kick_two_feet")
+    again = problem_from_data(problem_data(problem), where="again.toml")
+    assert again.hash == problem.hash and again.stances == problem.stances
+    data = problem_data(problem)
+    for stances, message in (
+        ([{"soles": ["left"], "duration_s": 1.0}], "the blow falls in one phase"),
+        ([{"soles": []}, *data["stances"]], "no soles"),
+        ([{"soles": ["left"], "intervals": 8}, *data["stances"]], "no duration_s"),
+        ([*data["stances"], {"soles": ["up"], "duration_s": 1.0}], "no sole 'up'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            problem_from_data({**data, "stances": stances}, where="wrong.toml")
+    with pytest.raises(InputError, match=r"\[stance\] holds one stance"):
+        problem_from_data({**data, "stance": {"soles": "left"}}, where="both.toml")
+
+
+def test_a_page_draws_the_margin_to_what_stands(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> None:
+    arrays = {"polygon": plan.polygon}
+    for leg in plan.problem.stance_coordinates[0].legs:
+        corners = np.column_stack([leg.sole.polygon, np.zeros(4)])
+        arrays[f"sole_{leg.name}"] = (corners @ leg.placement.rotation.T + leg.placement.translation)[:, :2]
+    record = Record(summary={"stances": plan.stances()}, arrays=arrays)
+    away = ways[0].phase != 1
+    time, ground = ways[0].time[away], ways[0].ground[away]
+    standing = soles_standing(record, time)
+    np.testing.assert_array_equal(standing["left"], np.ones(len(time), dtype=bool))
+    np.testing.assert_array_equal(standing["right"], ways[0].stance[away] != 1)
+    drawn, phase = zmp_margins(record, time, ground), ways[0].phase[away]
+    for name, number in (("swing", 0), ("follow", 2)):
+        assert drawn[phase == number].min() == pytest.approx(plan.margins()["zmp_margin_m"][name], abs=1e-9)

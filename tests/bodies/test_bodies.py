@@ -96,7 +96,7 @@ def test_hulls_are_about_what_pinocchio_reads(make: Callable[[], Robot]) -> None
             for b in theirs[two]
         )
         if hulls > 0:
-            assert exact >= hulls - EXACT, (one, two)
+            assert exact >= hulls - 2 * EXACT, (one, two)  # both are coal's
         looked += 1
 
 

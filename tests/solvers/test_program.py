@@ -76,7 +76,7 @@ def test_complementarity_looks_at_the_bound_of_the_multipliers_sign():
     x, g, z = np.array([0.25]), np.array([0.25]), np.zeros(1)
     assert complementarity(program, x, g, np.array([2.0]), z) == pytest.approx(1.5)
     assert complementarity(program, x, g, np.array([-2.0]), z) == pytest.approx(0.5)
-    assert complementarity(program, x, g, np.array([0.0]), np.array([1.0])) == np.inf
+    assert complementarity(program, x, g, np.array([0.0]), np.array([3.0])) == 3.0
 
 
 def test_stationary_violations_are_told_from_others():

@@ -273,15 +273,13 @@ def scaled_residual(residual: Vector, multipliers: Vector, bound_multipliers: Ve
 def complementarity(
     program: NonlinearProgram, x: Vector, g: Vector, multipliers: Vector, bound_multipliers: Vector
 ) -> float:
-    """Largest |multiplier| x distance to the bound it belongs to; |multiplier| where there is no such bound."""
+    """Largest |multiplier| x distance to the bound it belongs to; |multiplier| where there is none."""
     value = np.concatenate([g, x])
     lower = np.concatenate([program.g_lower, program.x_lower])
     upper = np.concatenate([program.g_upper, program.x_upper])
     y = np.concatenate([multipliers, bound_multipliers])
     gap = np.where(y > 0, np.abs(upper - value), np.abs(value - lower))
-    gap[np.isinf(gap)] = (
-        1.0  # its sign is wrong by its size: a rounding of 1e-8 is no reason to refuse a plan
-    )
+    gap[np.isinf(gap)] = 1.0  # its sign is wrong by its size: one of 1e-8 is rounding
     return float(np.max(np.abs(y[y != 0]) * gap[y != 0], initial=0.0))
 
 

@@ -133,7 +133,7 @@ def test_a_kick_meets_the_middle_of_a_ball_with_the_front_of_the_foot(name: str)
     toe = place.actInv(data.oMf[model.getFrameId("striker:right_toe")].translation)
     assert sole.polygon[:, 0].max() <= toe[0] < sole.polygon[:, 0].max() + 0.03
     assert 0.0 < toe[2] < BALL and sole.polygon[:, 1].min() < toe[1] < sole.polygon[:, 1].max()
-    # at rest the right foot is flat beside the left one, in the air unless it stands, and the ball is ahead of it
+    # at rest the right foot is flat beside the left one, in the air unless it stands, behind the ball
     np.testing.assert_allclose(place.rotation[:, 2], [0, 0, 1], atol=2e-3)
     stands = "right" in [sole.name for sole in problem.soles]
     assert abs(place.translation[2]) < 1e-9 if stands else place.translation[2] > 0.05

@@ -234,12 +234,11 @@ def _read(path: Path, scale: Array) -> Solid:
         facets = np.frombuffer(data, offset=84, dtype=[("at", "<f4", (4, 3)), ("attribute", "<u2")])
         vertices = facets["at"][:, 1:].reshape(-1, 3).astype(float)
         return Solid(vertices=scale * vertices, triangles=np.arange(3 * count).reshape(-1, 3))
-    digest = hashlib.sha256(data + b"coal").hexdigest()
     if path.suffix.lower() not in SELF_CONTAINED:  # it names other files that hold its numbers
         return _scaled(_loaded(path), scale)
-    with np.load(
-        io.BytesIO(kept("mesh", digest, lambda: _saved(_loaded(path)))), allow_pickle=False
-    ) as found:
+    digest = hashlib.sha256(data + b"coal").hexdigest()
+    archive = io.BytesIO(kept("mesh", digest, lambda: _saved(_loaded(path))))
+    with np.load(archive, allow_pickle=False) as found:
         solid = Solid(vertices=found["vertices"], triangles=found["triangles"])
     return _scaled(solid, scale)
 

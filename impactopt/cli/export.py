@@ -94,7 +94,7 @@ def export(
         written = export_planned(
             planned, to.value, directory, rate=rate, joints=names, gravity=gravity, smooth=most
         )
-        cost = json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
+        cost = None if most is None else json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
         if as_json:
             told = {"to": to.value, "directory": str(directory), "files": [str(path) for path in written]}
             print_json(told | ({} if cost is None else {"smooth": cost}), True)

@@ -28,7 +28,7 @@ from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, Torq
 from impactopt.robots.tools import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.transcription.initial_guess import strike_rates
-from impactopt.transcription.plan import Trajectory, complete_reference
+from impactopt.transcription.plan import Completed, Trajectory, complete_reference
 
 Array = NDArray[np.float64]
 
@@ -228,17 +228,12 @@ def _reference(problem: ImpactProblem, there: float, speed: float) -> Trajectory
         legs = c.split(parts[-1][2][-1])[1]
         start += duration
     columns = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-    time, phases, q, v, a, torque, ground, wrench = columns
+    time, phases, *rows = columns
     hit = float(parts[0][0][-1])
     return Trajectory(
         time=time,
         phase=phases,
-        q=q,
-        v=v,
-        a=a,
-        torque=torque,
-        ground=ground,
-        sole_wrench=wrench,
+        **Completed(*rows)._asdict(),
         contact_start=hit,
         contact_end=hit,
         end=start,

@@ -98,9 +98,7 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     """Solver variables (n,) of a plain reach; speed, noise, seed: as of :func:`reached`."""
     hit = reached(t, speed=speed, noise=noise, seed=seed)
     zero, (swing_T, follow_T) = np.zeros(len(t.y0)), _durations(t)
-    (start, end) = (
-        t.coordinates.split(t.problem.change_posture(k))[0] for k in (t.problem.blow - 1, t.problem.blow)
-    )
+    start, end = _ends(t.problem, t.coordinates, t.problem.blow)
     swing = quintic(start, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
     # half of the rates is left after contact, as where two like masses meet
     back = quintic(hit.y, 0.5 * hit.rates, end, zero, follow_T, t.follow.breaks)
@@ -144,9 +142,7 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
     y, u = strike.y.read(x)[0], strike.u0.read(x)[0]
     after, rates = (e.evaluate(x) for e in strike.expected.state_after[:2])
     swing_T, follow_T = _durations(t)
-    (start, end) = (
-        t.coordinates.split(t.problem.change_posture(k))[0] for k in (t.problem.blow - 1, t.problem.blow)
-    )
+    start, end = _ends(t.problem, t.coordinates, t.problem.blow)
     out = _motion(
         t,
         _least_accelerations(t, t.swing.breaks, swing_T, start, y, end_rates=u),
@@ -266,12 +262,8 @@ def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
         _write(t.builder, x, phase, spline)
     for course in (t.before, *t.after):
         for k, phase in course.stands.items():
-            b, T, still = (
-                course.builders[k],
-                float(np.mean(phase.phase.duration)),
-                np.zeros(course.builders[k].ny),
-            )
-            start, end = (b.coordinates.split(t.problem.change_posture(j))[0] for j in (k - 1, k))
+            b, T = course.builders[k], float(np.mean(phase.phase.duration))
+            (start, end), still = _ends(t.problem, b.coordinates, k), np.zeros(b.ny)
             way = quintic(start, still, end, still, T, phase.breaks)
             _write(b, x, phase, CubicSpline.fit(way, phase.breaks, still, still, T))
     if t.abort is not None and t.coordinates.legs:

@@ -382,7 +382,7 @@ class Transcription(ContactProgram):
                 BodyState(2 + missed, place.name, begin + s * curve.duration, self.posture(x, slots))
                 for s, (place, slots) in zip(nodes, follow.spots(), strict=True)
             ]
-        for missed, course in enumerate((*self.after[:1], *self.after[1:])):
+        for missed, course in enumerate(self.after):
             out += self._stand_states(x, course, plan.pieces(missed=bool(missed)), 2 + missed)
         return out + self._stand_states(x, self.before, plan.pieces(), 0)
 

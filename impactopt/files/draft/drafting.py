@@ -49,10 +49,8 @@ SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # [s] of fast robots
 START = "ready"
 MOTIONS = ("punch", "kick")
 TOE = 0.02  # [m] of the point of a toe above the sole
-BALL, KICKS = (
-    0.22,
-    (0.3, 0.2, 0.4),
-)  # [m] of a ball; of the hip's height: how far ahead it lies
+BALL = 0.22  # [m]
+KICKS = (0.3, 0.2, 0.4)  # of the hip's height: how far ahead the ball lies
 
 
 @dataclass(frozen=True, kw_only=True)

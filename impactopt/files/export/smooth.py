@@ -84,18 +84,11 @@ def smoothed(reference: Trajectory, problem: ImpactProblem, limits: Smoothness) 
     )
     time = np.concatenate([before, hit, after])
     y, yd, ydd = np.stack([_at(time, nodes, *part) for part in parts], axis=-1)
-    q, v, a, torque, ground, wrench = complete_reference(
-        problem, y, yd, ydd, np.zeros((len(time), 0)), np.zeros(0)
-    )
+    rows = complete_reference(problem, y, yd, ydd, np.zeros((len(time), 0)), np.zeros(0))
     return Trajectory(
         time=time,
         phase=np.repeat(np.arange(3), [len(before), len(hit), len(after)]),
-        q=q,
-        v=v,
-        a=a,
-        torque=torque,
-        ground=ground,
-        sole_wrench=wrench,
+        **rows._asdict(),
         contact_start=reference.contact_start,
         contact_end=reference.contact_end,
         end=float(nodes[-1]),

@@ -236,9 +236,10 @@ def _allowed(info: FieldInfo) -> str:
     length = next((m.min_length for m in info.metadata if hasattr(m, "min_length")), None)
     if length:
         return f"{length} numbers"
-    kind, *_ = get_args(get_args(info.annotation)[0]) or (float,)  # of what it is a list
+    entry = get_args(info.annotation)[0]
+    kind, *_ = get_args(entry) or (entry,)  # of what it is a list
     pairs = "pairs of " if get_origin(kind) is list else ""
-    return f"list of {pairs}{'names' if get_args(kind) == (str,) else 'numbers'}"
+    return f"list of {pairs}{'names' if kind is str or get_args(kind) == (str,) else 'numbers'}"
 
 
 def _sentence(text: str) -> str:

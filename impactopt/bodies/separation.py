@@ -227,13 +227,31 @@ def packed(hulls: Sequence[Array]) -> tuple[Array, Array, list[tuple[int, int]]]
     by eight, with coordinates of a kind side by side (k / 8, 3, 8); first vertex and number of each hull.
     """
     parts, where, size = [np.zeros((0, 3))], list[tuple[int, int]](), 0
-    for vertices in hulls:
+    for hull in hulls:
+        vertices = hull[_neighbours(hull)]
         where.append((size, len(vertices)))
         more = -len(vertices) % _EIGHT
         parts += [vertices, np.repeat(vertices[-1:], more, axis=0)]
         size += len(vertices) + more
     points = np.concatenate(parts)
     return points, np.ascontiguousarray(points.reshape(-1, _EIGHT, 3).transpose(0, 2, 1)), where
+
+
+def _neighbours(vertices: Array) -> Index:
+    """Order (k,) of vertices (k, 3) in which eight by eight are close together: most of these are far below
+    the highest one in any direction, and cost no exponentials.
+    """
+    order, parts = np.arange(len(vertices)), [slice(0, len(vertices))]
+    while parts:
+        own = parts.pop()
+        blocks = -(-(own.stop - own.start) // _EIGHT)
+        if blocks < 2:
+            continue
+        points, middle = vertices[order[own]], own.start + blocks // 2 * _EIGHT
+        longest = int(np.ptp(points, axis=0).argmax())
+        order[own] = order[own][np.argsort(points[:, longest], kind="stable")]
+        parts += [slice(own.start, middle), slice(middle, own.stop)]
+    return order
 
 
 _FEW_OF: weakref.WeakKeyDictionary[Piece, Array] = weakref.WeakKeyDictionary()

@@ -15,7 +15,7 @@ typedef struct { double h, mean[3], cov[6]; } Support;
 #define BLOCK (3 * EIGHT)
 #define COORDINATE(p, i, k) (p)[BLOCK * ((i) / EIGHT) + EIGHT * (k) + (i) % EIGHT]
 
-/* The largest of n vertices' heights in direction u; all of them in far. */
+/* The largest of n vertices' heights in direction u; all of them in far. Copies count for nothing there. */
 static inline double heights(int64_t n, const double *restrict p, const double *u, double *restrict far) {
     double most[EIGHT], top;
     const double x = u[0], y = u[1], z = u[2];
@@ -31,27 +31,47 @@ static inline double heights(int64_t n, const double *restrict p, const double *
     return top;
 }
 
+/* exp(x) of x <= 0 to an ulp or two, without branches, so that loops over it are vectorized: x = n log 2 + r, a polynomial
+ * in r, and n into the exponent's bits by way of a sum whose last bit is 1. */
+static inline double decay(double x) {
+    const double whole = 0x1.8p52, c = x < -700.0 ? -700.0 : x, shifted = c * 0x1.71547652b82fep0 + whole, n = shifted - whole;
+    const double r = (c - n * 0x1.62e42fefa39efp-1) - n * 0x1.abc9e3b39803fp-56;
+    double e = 0x1.ae64567f544e4p-26; /* 1 / 11! */
+    e = e * r + 0x1.27e4fb7789f5cp-22; e = e * r + 0x1.71de3a556c734p-19; e = e * r + 0x1.a01a01a01a01ap-16;
+    e = e * r + 0x1.a01a01a01a01ap-13; e = e * r + 0x1.6c16c16c16c17p-10; e = e * r + 0x1.1111111111111p-7;
+    e = e * r + 0x1.5555555555555p-5; e = e * r + 0x1.5555555555555p-3; e = e * r + 0.5; e = e * r + 1.0; e = e * r + 1.0;
+    union { double d; uint64_t i; } in = {shifted}, out;
+    out.i = (in.i + 1023) << 52;
+    return e * out.d;
+}
+
 /* of n vertices in direction u; sharp: 1 / rounding */
 static void support(int64_t n, const double *restrict p, const double *u, double sharp, double *restrict far,
                     Support *out) {
     const double most = heights(n, p, u, far), least = most - FAR_DOWN / sharp;
-    double sum = 0.0, m0 = 0, m1 = 0, m2 = 0, c[6] = {0};
+    double s[10][EIGHT] = {{0}}, t[10] = {0};
     int64_t top = 0;
-    while (top < n - 1 && far[top] != most) ++top;
+    while (far[top] != most) ++top;
     const double ox = COORDINATE(p, top, 0), oy = COORDINATE(p, top, 1), oz = COORDINATE(p, top, 2);
-    for (int64_t i = 0; i < n; ++i) {
-        if (far[i] < least) continue;
-        double e = exp(sharp * (far[i] - most));
-        double x = COORDINATE(p, i, 0) - ox, y = COORDINATE(p, i, 1) - oy, z = COORDINATE(p, i, 2) - oz;
-        sum += e; m0 += e * x; m1 += e * y; m2 += e * z;
-        c[0] += e * x * x; c[1] += e * x * y; c[2] += e * x * z;
-        c[3] += e * y * y; c[4] += e * y * z; c[5] += e * z * z;
+    for (int64_t i = n; i % EIGHT; ++i) far[i] = -1e300; /* copies */
+    for (int64_t i = 0; i < n; i += EIGHT, p += BLOCK, far += EIGHT) {
+        double near = far[0];
+        for (int j = 1; j < EIGHT; ++j) near = far[j] > near ? far[j] : near;
+        if (near < least) continue;
+        for (int j = 0; j < EIGHT; ++j) {
+            const double e = decay(sharp * (far[j] - most));
+            const double x = p[j] - ox, y = p[EIGHT + j] - oy, z = p[2 * EIGHT + j] - oz, ex = e * x, ey = e * y, ez = e * z;
+            s[0][j] += e; s[1][j] += ex; s[2][j] += ey; s[3][j] += ez;
+            s[4][j] += ex * x; s[5][j] += ex * y; s[6][j] += ex * z;
+            s[7][j] += ey * y; s[8][j] += ey * z; s[9][j] += ez * z;
+        }
     }
-    m0 /= sum; m1 /= sum; m2 /= sum;
-    out->h = most + log(sum) / sharp;
+    for (int k = 0; k < 10; ++k) for (int j = 0; j < EIGHT; ++j) t[k] += s[k][j];
+    const double one = 1.0 / t[0], m0 = t[1] * one, m1 = t[2] * one, m2 = t[3] * one;
+    out->h = most + log(t[0]) / sharp;
     out->mean[0] = ox + m0; out->mean[1] = oy + m1; out->mean[2] = oz + m2;
-    out->cov[0] = c[0] / sum - m0 * m0; out->cov[1] = c[1] / sum - m0 * m1; out->cov[2] = c[2] / sum - m0 * m2;
-    out->cov[3] = c[3] / sum - m1 * m1; out->cov[4] = c[4] / sum - m1 * m2; out->cov[5] = c[5] / sum - m2 * m2;
+    out->cov[0] = t[4] * one - m0 * m0; out->cov[1] = t[5] * one - m0 * m1; out->cov[2] = t[6] * one - m0 * m2;
+    out->cov[3] = t[7] * one - m1 * m1; out->cov[4] = t[8] * one - m1 * m2; out->cov[5] = t[9] * one - m2 * m2;
 }
 
 static inline double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }

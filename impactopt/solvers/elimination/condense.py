@@ -10,6 +10,7 @@ treated together. What is left is a Newton system in the free variables (Nocedal
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -144,14 +145,50 @@ def numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
 _lower = functools.cache(np.tril_indices)
 
 
-def products(pairs: Places, groups: Sequence[Alike]) -> list[Products]:
-    """Places of the products of each row's numbers; pairs : places of the entries of W, as of `numbered`."""
-    out = []
-    for columns, counts, rows, values in groups:
+class Pairs:
+    """Places of the entries of W's lower triangle (i, j), counted from 1.
+
+    They take a search in half a million entries. Programs that grow by a few rows ask for the same ones
+    again, so those of each pattern of a row are kept.
+    """
+
+    def __init__(self, i: Index, j: Index, n: int) -> None:
+        """i, j : ascending, row by row."""
+        self._n, self._keys = n, i * n + j
+        self._of_row: dict[bytes, Places] = {}
+        self._of_matrix: tuple[Index, Index, Places] | None = None
+
+    def at(self, i: Index, j: Index) -> Places:
+        """Places (k,) of entries (k,); 0: there is none."""
+        wanted = i.astype(np.int64) * self._n + j
+        found = np.searchsorted(self._keys, wanted).clip(max=self._keys.size - 1)
+        return np.where(self._keys[found] == wanted, found + 1, 0).astype(np.int32)
+
+    def of_rows(self, columns: Index) -> Places:
+        """Places (k, p (p + 1) / 2) of the products of the numbers of rows with columns (k, p)."""
         i, j = _lower(columns.shape[1])
-        to = pairs[columns[:, i], columns[:, j]]
-        out.append(Products(counts=counts, rows=rows.astype(np.int32), values=values, to=to))
-    return out
+        keys, ends = columns.tobytes(), range(0, columns.nbytes + 1, max(columns[:1].nbytes, 1))
+        names = [keys[one:two] for one, two in itertools.pairwise(ends)]
+        new = [k for k, name in enumerate(names) if name not in self._of_row]
+        found = self.at(columns[new][:, i].ravel(), columns[new][:, j].ravel())
+        self._of_row.update(zip((names[k] for k in new), found.reshape(len(new), i.size), strict=True))
+        return np.array([self._of_row[name] for name in names])
+
+    def of_matrix(self, lower: Index, matrix: Matrix) -> Places:
+        """Places of a csc's entries, of which ``lower`` are in the lower triangle."""
+        known, pattern = self._of_matrix, (matrix.indices, matrix.indptr)
+        if known is None or not all(map(np.array_equal, known[:2], pattern)):
+            found = self.at(matrix.indices[lower], _columns(matrix)[lower])
+            known = self._of_matrix = matrix.indices.copy(), matrix.indptr.copy(), found
+        return known[2]
+
+
+def products(pairs: Pairs, groups: Sequence[Alike]) -> list[Products]:
+    """Places of the products of each row's numbers."""
+    return [
+        Products(counts=counts, rows=rows.astype(np.int32), values=values, to=pairs.of_rows(columns))
+        for columns, counts, rows, values in groups
+    ]
 
 
 def shapes(systems: list[Touched]) -> list[list[Touched]]:
@@ -281,13 +318,14 @@ class Condenser:
 
         rows, count = numbered(*entries(touches), touches.shape)
         i, j = entries(couples)
-        i, j = self._entries = i[i >= j], j[i >= j]
+        i, j = i[i >= j], j[i >= j]
         pairs, coupled = numbered(i, j, couples.shape)
+        self._pairs = Pairs(i, j, n)
         self.J, self.W = np.zeros(count + 1), np.zeros(coupled + 1)
         self._to = rows[own_rows, own_columns]
         self._diagonal = np.diagonal(pairs).copy()
         self._products: list[Products] = []
-        self._take(jacobian, hessian, equal, pairs, groups)
+        self._take(jacobian, hessian, equal, groups)
         pairs[j, i] = pairs[i, j]
         self._stages = [stage(same, rows, pairs) for found in systems for same in shapes(found)]
         self.pattern = couples[np.ix_(self.free, self.free)]
@@ -309,17 +347,13 @@ class Condenser:
         """Be that of matrices with other patterns but the same equalities; False: these rows or this Hessian
         couple variables that nothing has coupled yet, and all stays as it was.
         """
-        pairs, _ = numbered(*self._entries, (self.n, self.n))
-        return self._take(jacobian, hessian, equal, pairs, by_pattern(jacobian, np.flatnonzero(~equal)))
+        return self._take(jacobian, hessian, equal, by_pattern(jacobian, np.flatnonzero(~equal)))
 
-    def _take(
-        self, jacobian: Matrix, hessian: Matrix, equal: Mask, pairs: Places, groups: Sequence[Alike]
-    ) -> bool:
-        """pairs : places of the entries of W's lower triangle, as of `numbered`."""
-        found = products(pairs, groups)
+    def _take(self, jacobian: Matrix, hessian: Matrix, equal: Mask, groups: Sequence[Alike]) -> bool:
+        found = products(self._pairs, groups)
         row, column = hessian.indices, _columns(hessian)
         lower = np.flatnonzero(row >= column)
-        to = pairs[row[lower], column[lower]]
+        to = self._pairs.of_matrix(lower, hessian)
         if not (to.all() and all(p.to.all() for p in found)):
             return False
         self._kernels.forget(self._products)

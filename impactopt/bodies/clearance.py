@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import coal
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece
@@ -70,12 +69,7 @@ class Places:
     @classmethod
     def of(cls, robot: Robot, q: Array, travel: Array, phase: Index) -> Places:
         """Placements for configurations q (k, nq)."""
-        model, data = robot.model, robot.model.createData()
-        placements = np.zeros((len(q), model.njoints, 4, 4))
-        for k, posture in enumerate(q):
-            pin.forwardKinematics(model, data, posture)
-            placements[k] = [joint.homogeneous for joint in data.oMi]
-        rotation, translation = placements[..., :3, :3].copy(), placements[..., :3, 3].copy()
+        rotation, translation = robot.forward_kinematics(q)
         return cls(rotation=rotation, translation=translation, travel=travel, phase=phase)
 
     def __len__(self) -> int:

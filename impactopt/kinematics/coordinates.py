@@ -525,10 +525,10 @@ class StanceCoordinates:
         return np.concatenate([q[: self.base], joints[self.independent]]), joints[self.dependent]
 
     def join(self, y: Array, legs: Array) -> Array:
-        """pin configuration (nq,) of (y, legs)."""
-        joints = np.zeros(self.robot.n)
-        joints[self.independent], joints[self.dependent] = y[self.base :], legs
-        return self.rb.to_pin(np.concatenate([y[: self.base], joints]))
+        """pin configuration (nq,) of (y, legs), or (k, nq) of rows of them."""
+        joints = np.zeros((*y.shape[:-1], self.robot.n))
+        joints[..., self.independent], joints[..., self.dependent] = y[..., self.base :], legs
+        return self.rb.to_pin(np.concatenate([y[..., : self.base], joints], axis=-1))
 
     def solve_legs(self, y: Array, guess: Array) -> Array:
         """Leg joints (nl,) that put every fixed sole in its place; Newton from ``guess``.

@@ -226,7 +226,7 @@ class Watch:
     def _placed(self, x: Array) -> Placed:
         c, ny = self._t.coordinates, self._t.builder.ny
         z = (self._lift @ x + self._const).reshape(len(self._names), -1)
-        q = np.array([c.join(part[:ny], part[ny:]) for part in z])
+        q = c.join(z[:, :ny], z[:, ny:])
         return self._margins.bodies.placed(Places.of(self._t.robot, q, self._travel, self._phase))
 
     def _shapes_at(self, at: Placed, ways: Array, within: float = ENTERS) -> tuple[Placed, Looked]:

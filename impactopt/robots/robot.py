@@ -20,6 +20,7 @@ from impactopt.robots import urdf as _urdf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
 from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, read_only
 from impactopt.robots.checks import GIVEN, REPAIRED, check_inertias, tell_apart
+from impactopt.robots.forward_kinematics import ForwardKinematics
 from impactopt.robots.tools import check_sole, with_hinges
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
@@ -270,6 +271,11 @@ class Robot:
     @cached_property
     def nv(self) -> int:
         return int(self.model.nv)
+
+    @cached_property
+    def forward_kinematics(self) -> ForwardKinematics:
+        """Placements of its joints at many configurations at once."""
+        return ForwardKinematics(self.model)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:

@@ -588,9 +588,8 @@ class Plan:
         those of the stance with the blow.
         """
         c = coordinates or self.coordinates
-        legs = c.closing.follow(y, c.split(self.problem.start_posture)[1])
-        q = [c.join(row, leg) for row, leg in zip(y, legs, strict=True)]
-        return np.array(q).reshape(len(y), self.problem.robot.nq)
+        legs = list(c.closing.follow(y, c.split(self.problem.start_posture)[1]))
+        return c.join(y, np.array(legs).reshape(len(y), -1))
 
     def margins(
         self,

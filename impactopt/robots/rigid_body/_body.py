@@ -176,7 +176,7 @@ class RigidBody:
         return self._coordinates.from_pin(q)
 
     def to_pin(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Pinocchio's q, (model.nq), of these coordinates, (nq)."""
+        """Pinocchio's q, (model.nq) or (k, model.nq), of these coordinates, (nq) or (k, nq)."""
         return self._coordinates.to_pin(q)
 
     # ------------------------------------------------------------ shared parts

@@ -433,19 +433,27 @@ class Coordinates:
         return out
 
     def to_pin(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Pinocchio's q of these coordinates."""
-        q = check_array("q", q, (self.nq,))
+        """Pinocchio's q of these coordinates, of one configuration or of a row of them."""
+        q = check_array("q", q, (self.nq,) if np.ndim(q) < 2 else (None, self.nq))
         if self.base == "quaternion":
             return q
-        out = np.empty(self.tree.nq)
+        out = np.empty((*q.shape[:-1], self.tree.nq))
         if self.tree.floating:
-            out[:7] = pin.SE3ToXYZQUAT(pin.SE3(pin.rpy.rpyToMatrix(q[3:6]), q[:3]))
+            out[..., :3], out[..., 3:7] = q[..., :3], _quaternion(*np.moveaxis(q[..., 3:6] / 2, -1, 0))
         places, columns = self._one_number
-        out[places] = q[columns]
+        out[..., places] = q[..., columns]
         for joint in self.tree.joints[1:]:
             if joint.continuous:
-                out[joint.q : joint.q + 2] = np.cos(q[joint.v]), np.sin(q[joint.v])
+                out[..., joint.q], out[..., joint.q + 1] = np.cos(q[..., joint.v]), np.sin(q[..., joint.v])
         return out
+
+
+def _quaternion(roll: Any, pitch: Any, yaw: Any) -> NDArray[np.float64]:
+    """Quaternion (..., 4), the scalar last and not negative, of half of these angles [rad]."""
+    (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, (roll, pitch, yaw))) for f in (np.cos, np.sin))
+    parts = (sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy)
+    out = np.stack([*parts, cr * cp * cy + sr * sp * sy], axis=-1)
+    return np.where(out[..., 3:] < 0.0, -out, out)
 
 
 def _quaternion_matrix(x: Scalar, y: Scalar, z: Scalar, w: Scalar) -> Matrix:

@@ -1,0 +1,82 @@
+"""Placements of all joints at many configurations at once: forward kinematics in whole arrays.
+
+Pinocchio's takes 5 us a configuration, but handing its placements over joint by joint takes 60.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+__all__ = ["ForwardKinematics"]
+
+Array = NDArray[np.float64]
+
+
+class ForwardKinematics:
+    """Forward kinematics of a model of joints that turn or slide about an axis, with a free-flyer or none."""
+
+    def __init__(self, model: pin.Model) -> None:
+        joints = range(1, model.njoints)
+        fixed = [model.jointPlacements[j] for j in joints]
+        self._rotation = np.array([place.rotation for place in fixed]).reshape(-1, 3, 3)
+        self._translation = np.array([place.translation for place in fixed]).reshape(-1, 3)
+        self._free = [j for j in joints if model.joints[j].nv == 6]
+        self._q = np.array([model.joints[j].idx_q for j in joints], dtype=np.intp)
+        self._unbounded = np.array([model.joints[j].nq == 2 for j in joints], dtype=bool)
+        turn, slide = np.zeros((len(joints), 3)), np.zeros((len(joints), 3))
+        for k, j in enumerate(joints):
+            if j not in self._free:
+                slide[k], turn[k] = np.split(_subspace(model, j), 2)
+        self._slide = np.einsum("jab,jb->ja", self._rotation, slide)
+        # Rodrigues: R (1 - c) a a' + c 1 + s [a]x, whose three parts are the model's
+        along, turned = np.einsum("ja,jb->jab", turn, turn), np.array([pin.skew(a) for a in turn])
+        self._parts = [self._rotation @ part for part in (along, np.eye(3) - along, turned)]
+        self._turns = turn.any(axis=1)
+        parents = np.array(list(model.parents))
+        depth = np.zeros(model.njoints, dtype=np.intp)
+        for j in joints:
+            depth[j] = depth[parents[j]] + 1
+        levels = (np.flatnonzero(depth == level) for level in range(1, depth.max(initial=0) + 1))
+        self._levels = [(own, parents[own]) for own in levels]
+
+    def __call__(self, q: Array) -> tuple[Array, Array]:
+        """Rotations (k, joints, 3, 3) and translations (k, joints, 3) [m] at configurations q (k, nq)."""
+        angle = np.where(self._turns, q[:, self._q], 0.0)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        cosine[:, self._unbounded] = q[:, self._q[self._unbounded]]
+        sine[:, self._unbounded] = q[:, self._q[self._unbounded] + 1]
+        along, across, turned = self._parts
+        local = along + cosine[:, :, None, None] * across + sine[:, :, None, None] * turned
+        shift = self._translation + self._slide * q[:, self._q, None]
+        for j in self._free:
+            at = int(self._q[j - 1])
+            local[:, j - 1] = self._rotation[j - 1] @ _of_quaternions(q[:, at + 3 : at + 7])
+            shift[:, j - 1] = self._translation[j - 1] + q[:, at : at + 3] @ self._rotation[j - 1].T
+        rotation = np.zeros((len(q), len(self._q) + 1, 3, 3))
+        translation = np.zeros((len(q), len(self._q) + 1, 3))
+        rotation[:, 0] = np.eye(3)
+        for own, parents in self._levels:
+            above = rotation[:, parents]
+            rotation[:, own] = above @ local[:, own - 1]
+            translation[:, own] = translation[:, parents] + (above @ shift[:, own - 1, :, None])[..., 0]
+        return rotation, translation
+
+
+def _subspace(model: pin.Model, joint: int) -> Array:
+    """Motion subspace (6,) of a joint with one degree of freedom, in its own frame."""
+    data = model.joints[joint].createData()
+    model.joints[joint].calc(data, pin.neutral(model))
+    return np.asarray(data.S, dtype=float).reshape(6)
+
+
+def _of_quaternions(q: Array) -> Array:
+    """Rotations (k, 3, 3) of unit quaternions (k, 4), the scalar last."""
+    x, y, z, w = q.T
+    entries = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    ]
+    return np.stack(entries, axis=1).reshape(-1, 3, 3)

@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ __all__ = [
     "longest_body",
     "name_of",
     "native_library",
+    "quick_to_compile",
     "why_no_compiler",
 ]
 
@@ -62,7 +63,8 @@ class Compiler:
     @property
     def key(self) -> str:
         """Text that differs whenever a library made here could differ or not run."""
-        return "\0".join([ca.__version__, *self.command, self.version, *_FLAGS, platform.machine(), _cpu()])
+        text = [ca.__version__, *self.command, self.version, *_FLAGS, platform.machine(), _cpu()]
+        return "\0".join([*text, "quick"] if quick_to_compile() else text)
 
     def run(self, source: Path, library: Path, level: str, *more: Path) -> None:
         """Compile `source`, and `more`, into the shared `library` at an optimization level such as "-O1", or
@@ -106,6 +108,14 @@ def why_no_compiler() -> str:
 
 def _forbidden() -> bool:
     return os.environ.get("IMPACTOPT_NO_COMPILER", "") not in ("", "0") or os.name != "posix"
+
+
+def quick_to_compile() -> bool:
+    """Whether IMPACTOPT_COMPILE is "quick": collisions compile three times sooner, and run slower.
+
+    Tests of mathematics set it: there a collision runs a few times only.
+    """
+    return os.environ.get("IMPACTOPT_COMPILE", "") == "quick"
 
 
 def _candidates() -> list[tuple[str, ...]]:
@@ -186,7 +196,12 @@ def _cpu() -> str:
 # Beyond this many, -O0: compiled ten times sooner, two to three times slower, but 5 times faster than the VM.
 MAX_OPTIMIZED = 60_000
 # Loops over vectors gain from all that keeps the order of sums; -ffast-math would not keep it, nor NaN.
-_NATIVE_LEVEL = "-O3 -fvisibility=hidden -ffp-contract=fast -fno-math-errno -fno-trapping-math"
+_NATIVE_FLAGS = "-fvisibility=hidden -ffp-contract=fast -fno-math-errno -fno-trapping-math"
+_NATIVE_LEVEL = f"-O3 {_NATIVE_FLAGS}"
+
+
+def _level() -> str:
+    return f"-O1 {_NATIVE_FLAGS}" if quick_to_compile() else _NATIVE_LEVEL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +219,7 @@ class NativeCode:
     name: str
     code: str
     graph: Callable[[], ca.Function]
-    level: str = _NATIVE_LEVEL
+    level: str = field(default_factory=_level)
 
 
 Buildable = Any  # ca.Function or NativeCode

@@ -30,7 +30,10 @@ from impactopt.contact import (
 )
 from impactopt.errors import InputError
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+pytestmark = [
+    pytest.mark.usefixtures("as_shipped"),
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
+]
 
 X = np.array([1.0, 0.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=2.0)

@@ -130,6 +130,7 @@ def test_a_stand_in_in_random_directions():
 
 
 # ------------------------------------------------------------ against exact collisions
+@pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("case", [case for case in CASES if "biped" in case])
 def test_columns_are_those_of_exact_collisions(case):
     model = implicit("biped", **SHORT | CASES[case][1])

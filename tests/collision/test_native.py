@@ -41,6 +41,7 @@ from impactopt.contact import (
 from impactopt.kinematics.stance import BothSoles, OneSole
 
 pytestmark = [
+    pytest.mark.usefixtures("as_shipped"),
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
     pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning"),
 ]

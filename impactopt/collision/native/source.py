@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.codegen.compiler import NativeCode
+from impactopt.codegen.compiler import NativeCode, quick_to_compile
 from impactopt.collision.checks import LEAST_PIVOT
 from impactopt.collision.graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
 from impactopt.collision.native.sizes import (
@@ -37,14 +37,9 @@ __all__ = ["least_size", "native_collision", "native_differences", "native_gradi
 _IMPLICIT = ("implicit", *(f"implicit_{part}" for part in ("factor", "step", "bend", "events", "run")))
 _STEPS = {"rk4": ("rk4.h", "steps.h"), "implicit": tuple(f"{name}.h" for name in _IMPLICIT)}
 _BACK = {"rk4": ("rk4_back.h", "steps_back.h"), "implicit": ("implicit_back.h",)}
-# the tree's code is long and straight: this makes it a sixth faster than -Og, for half a second more of the
+# The tree's code is long and straight: this makes it a sixth faster than -Og, for half a second more of the
 # compiler; -O2 takes as much again and gains no more. Its angles' sines and cosines are our own
-_TREE = (
-    "#pragma GCC push_options\n"
-    '#pragma GCC optimize ("O1", "expensive-optimizations", "reciprocal-math", "schedule-insns2")\n'
-    + files(__package__).joinpath("angles.h").read_text(encoding="utf-8"),
-    "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
-)
+_TREE, _QUICK_TREE = '"O1", "expensive-optimizations", "reciprocal-math", "schedule-insns2"', '"O0"'
 _OF_DIFFERENCES = 1e-12
 # length of differences by method, of an input's size: what implicit steps leave out changes between two;
 # Runge-Kutta's do not, but end in whole numbers
@@ -195,9 +190,11 @@ def _code(
 
     parts = [
         "#define CASADI_SYMBOL_EXPORT static\n",
-        _TREE[0],
+        "#pragma GCC push_options",
+        f"#pragma GCC optimize ({_QUICK_TREE if quick_to_compile() else _TREE})",
+        *text("angles.h"),
         c_code("tree", of_tree),
-        _TREE[1],
+        "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
         c_code("scalars", scalars),
         f"#define GRADIENT {int((gradient and not collision.n_freezes) or jacobian)}",
         f"#define NAME {name}\n#define OF_NAME(part) {name}_##part",

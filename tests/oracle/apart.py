@@ -56,14 +56,14 @@ class _Hulls:
 
     def support(self, u: Array) -> tuple[Array, Array, Array]:
         """Rounded supports (m,), their gradients (m, 3) and second derivatives (m, 3, 3) in directions."""
-        height = np.einsum("mki,mi->mk", self.vertices, u) / ROUND
+        height = (self.vertices @ u[:, :, None])[:, :, 0] / ROUND
         height[self.missing] = -np.inf
         most = height.max(axis=1, keepdims=True)
         weight = np.exp(height - most)
         total = weight.sum(axis=1, keepdims=True)
         weight /= total
-        mean = np.einsum("mk,mki->mi", weight, self.vertices)
-        square = np.einsum("mk,mki,mkj->mij", weight, self.vertices, self.vertices)
+        mean = (weight[:, None] @ self.vertices)[:, 0]
+        square = (weight[:, :, None] * self.vertices).transpose(0, 2, 1) @ self.vertices  # not einsum: slow
         second = (square - mean[:, :, None] * mean[:, None]) / ROUND
         return ROUND * (most + np.log(total))[:, 0], mean, second
 

@@ -111,7 +111,7 @@ def _forbidden() -> bool:
 
 
 def quick_to_compile() -> bool:
-    """Whether IMPACTOPT_COMPILE is "quick": collisions compile three times sooner, and run slower.
+    """True if IMPACTOPT_COMPILE is "quick": collisions compile three times sooner, and run slower.
 
     Tests of mathematics set it: there a collision runs a few times only.
     """

@@ -85,7 +85,7 @@ class Record:
     summary : the content of `summary.json`.
     problem : text of the problem file, "" if there was none.
     arrays : by name. `joints`, `torque_limit`, `velocity_limit`, `armature` (n,); `polygon` and `sole_<name>`
-        (k, 2) [m], corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over
+        (k, 2) [m], corners on the ground as it stands at first; `reference_angle`, `simulated_angle` (k, n), joint angles over
         time; and, field by field, `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan
         with an abort motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines),
         `collision_*` (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*`
@@ -200,7 +200,8 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
         "armature": robot.armature,
         "polygon": support_polygon(robot, c),
     }
-    legs = {leg.frame: leg for c in problem.stance_coordinates for leg in c.legs}
+    # of a sole that steps where it stands first
+    legs = {leg.frame: leg for c in reversed(problem.stance_coordinates) for leg in c.legs}
     for leg in legs.values():
         if leg.sole is None:
             continue

@@ -173,7 +173,18 @@ _OTHERS: Mapping[str, _Kinds] = {
         _NUMBER,
     ),
     **dict.fromkeys(("freezes?", "price_scale?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),
-    "stances?": ([({"soles": ([_TEXT],), "from_s": (int, float), "to_s": (int, float)},)],),
+    "stances?": (
+        [
+            (
+                {
+                    "soles": ([_TEXT],),
+                    "from_s": (int, float),
+                    "to_s": (int, float),
+                    "moved_m?": ({"*": ([(int, float)],)},),
+                },
+            )
+        ],
+    ),
     "ground_force_share?": ([(int, float)], type(None)),
     "collision_elements?": ([(int,)], type(None)),
     "scenarios?": ([(_SCENARIO,)],),

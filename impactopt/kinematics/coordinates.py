@@ -266,7 +266,7 @@ class StanceCoordinates:
     independent : (ny - 6 or ny,) indices of the independent joints among the robot's joints.
     undriven : indices in v of what no motor moves but the soles' wrenches: the base, and soles' hinges.
     labels : names of the independent coordinates.
-    start : (ny,) those of the posture.
+    posture : (nq,) that it was made with.  start, start_legs : (ny,), (nl,) its coordinates and legs.
     """
 
     def __init__(
@@ -275,7 +275,7 @@ class StanceCoordinates:
         """``posture`` (nq,): pin configuration with the soles in place; it fixes where soles and hands are
         held.
         """
-        self.robot, self.soles = robot, soles
+        self.robot, self.soles, self.posture = robot, soles, posture
         self.model, self.data = robot.model, robot.model.createData()
         self.base = 6 if robot.floating else 0
         if robot.floating and not soles:
@@ -315,9 +315,11 @@ class StanceCoordinates:
         self.rb = RigidBody(self.model, base="rpy")
         self._build_symbolic_pieces()
         legs = ca.SX.sym("legs", self.nl)
-        self.start, start = self.split(posture)
+        self.start, self.start_legs = self.split(posture)
         self.start_determinants = np.array(
-            ca.Function("det", [legs], [self.leg_determinants(legs)])(start) if self.legs else np.zeros(0)
+            ca.Function("det", [legs], [self.leg_determinants(legs)])(self.start_legs)
+            if self.legs
+            else np.zeros(0)
         ).ravel()
 
     def _leg_samples(self, frame: str, chain: Index, posture: Array) -> list[Array]:

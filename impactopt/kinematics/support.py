@@ -126,6 +126,12 @@ def convex_polygon(points: Array) -> Array:
     return np.array(hull)
 
 
+def overlap(one: Array, other: Array) -> bool:
+    """True if two convex polygons (k, 2) [m], counter-clockwise, have points in common: no edge parts them."""
+    pairs = ((one, other), (other, one))
+    return not any((b @ n < least).all() for a, b in pairs for n, least in zip(*inward_edges(a), strict=True))
+
+
 def margin(polygon: Array, points: Array) -> Array:
     """Distance (n,) [m] of points (n, 2) from the polygon's nearest edge line, positive inside."""
     inward, offset = inward_edges(polygon)

@@ -125,7 +125,7 @@ def _phases(
 ) -> list[tuple[float, tuple[Array, Array, Array, Array]]]:
     """(duration, (start, start rate, end, end rate)) of the way there and of the way back."""
     c = problem.coordinates
-    y0, _ = c.split(problem.start_posture)
+    y0 = c.start
     hit, legs = c.split(problem.contact_posture)
     rates = strike_rates(c, problem.strikers, hit, legs, speed * problem.normal, base=0.02)  # by the arm
     zero = np.zeros(c.ny)
@@ -152,7 +152,7 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
     """True if the reach without contact keeps the limits at ``nodes`` instants of each of its two motions."""
     c, r = problem.coordinates, problem.robot
     lower, upper = inside(r, problem.term(PositionLimit).margin)
-    legs0 = c.split(problem.start_posture)[1]
+    legs0 = c.start_legs
     for duration, ends in _phases(problem, there, speed):
         y, yd, ydd = _profile(duration, ends, np.linspace(0, duration, nodes)[1:])
         wrench = np.tile(static_wrenches(c, ends[0], legs0), (len(y), 1))
@@ -215,7 +215,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
 def _reference(problem: ImpactProblem, there: float, speed: float) -> Trajectory:
     """The servo's reference: there and back, as if there were no target."""
     c = problem.coordinates
-    legs = c.split(problem.start_posture)[1]
+    legs = c.start_legs
     parts, start = [], 0.0
     for phase, (duration, ends) in zip((0, 2), _phases(problem, there, speed), strict=True):
         length = duration + (0.5 if phase else 0.0)

@@ -55,7 +55,13 @@ from impactopt.problem.hashing import problem_hash
 from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.scenario import Phase, Scenario, SecondStriker, check_second
-from impactopt.problem.stances import StancePhase, check_stances, names_of
+from impactopt.problem.stances import (
+    StancePhase,
+    check_stances,
+    names_of,
+    places_of_soles,
+    stepped_posture,
+)
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -320,22 +326,30 @@ class ImpactProblem:
 
     @cached_property
     def coordinates(self) -> StanceCoordinates:
-        """Independent coordinates of the stance at the start posture, in which hands hold on, too."""
-        stance, robot = self.stance, self.robot
-        return StanceCoordinates(robot, stance.soles(robot), self.start_posture, stance.held_hands(robot))
+        """Independent coordinates of the stance with the blow, in which hands hold on, too."""
+        return self.stance_coordinates[self.blow]
 
     @cached_property
     def stance_coordinates(self) -> tuple[StanceCoordinates, ...]:
         """Independent coordinates of each of its stance phases; of its one stance if it has none."""
-        known = {tuple(sole.name for sole in self.coordinates.soles): self.coordinates}
+        robot, start = self.robot, self.start_posture
+        if not self.stances:
+            hands = self.stance.held_hands(robot)
+            return (StanceCoordinates(robot, self.stance.soles(robot), start, hands),)
+        known: dict[Any, StanceCoordinates] = {}
         out = []
-        for stance in self.stances:
-            soles = tuple(sole for sole in self.robot.soles if sole.name in stance.soles)
-            names = tuple(sole.name for sole in soles)
+        for places in places_of_soles(self.stances, [sole.name for sole in robot.soles]):
+            soles = tuple(robot.sole(name) for name in places)
+            names, key = tuple(places), tuple((name, *at) for name, at in places.items())
             if names not in known:
-                known[names] = StanceCoordinates(self.robot, soles, self.start_posture)
-            out.append(known[names])
-        return tuple(out) or (self.coordinates,)
+                known[names] = StanceCoordinates(robot, soles, start)
+            if key not in known:
+                c = known[names]
+                if any(at.any() for at in places.values()):
+                    c = StanceCoordinates(robot, soles, stepped_posture(c, places))
+                known[key] = c
+            out.append(known[key])
+        return tuple(out)
 
     @property
     def blow(self) -> int:
@@ -343,22 +357,21 @@ class ImpactProblem:
         return next((k for k, stance in enumerate(self.stances) if stance.phase is None), 0)
 
     def change_posture(self, k: int) -> Array:
-        """Some posture (nq,) between stance phases k and k + 1: that of the start, with the centre of mass
-        above the soles that stand in both. That of the start before the first and after the last one.
+        """Some posture (nq,) between stance phases k and k + 1: that of the heavier one, with the centre of
+        mass above the soles that stand in both. That of the stance before the first and after the last one.
         """
-        q = self.start_posture
         if not 0 <= k < len(self.stances) - 1:
-            return q
+            return self.stance_coordinates[min(max(k, 0), len(self.stances) - 1)].posture
         one, other = self.stance_coordinates[k : k + 2]
         heavy, light = (one, other) if len(one.legs) > len(other.legs) else (other, one)
         middle = support_polygon(self.robot, light).mean(axis=0)
-        (y, legs), data = heavy.split(q), self.robot.model.createData()
+        y, legs, data = heavy.start.copy(), heavy.start_legs, self.robot.model.createData()
         for _ in range(20):
             y[:2] += middle - np.array(pin.centerOfMass(self.robot.model, data, heavy.join(y, legs)))[:2]
             try:
                 legs = heavy.solve_legs(y, legs)
             except InputError:
-                return q
+                y[2] -= 0.02  # the legs do not reach: lower
         return heavy.join(y, legs)
 
     @property

@@ -2,32 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, pairwise
 from typing import Any
 
-from impactopt.errors import InputError, shortened
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError, check_array, shortened
+from impactopt.kinematics.coordinates import Closing, Limb, StanceCoordinates
 from impactopt.kinematics.stance import BothSoles, OneSole, Stance
+from impactopt.kinematics.support import overlap
 from impactopt.problem.scenario import Phase
 from impactopt.robots.robot import Robot
 
-__all__ = ["StancePhase", "check_stances", "names_of"]
+__all__ = ["StancePhase", "check_stances", "names_of", "places_of_soles", "stepped_posture"]
+
+_LOWER = np.arange(0.0, 0.21, 0.02)  # [m] that the base goes down for legs that do not reach
+_LONGEST = 2.0  # [m] of a step: what is farther is a mistake of units
 
 
 @dataclass(frozen=True, kw_only=True)
 class StancePhase:
     """A phase of the motion in which the same soles stand.
 
-    Between two phases soles lift off, or touch down where they stood at the start.
+    Between two phases soles lift off, or touch down: where they stood before, or a step from there.
 
     soles : names of those that stand.
     phase : its duration and its spline. None: the blow falls in it, and its times are those of the problem's
         swing and follow-through.
+    steps : by name of a sole that touches down as the phase begins: forward and to the left [m], world axes,
+        from where it stood before.
     """
 
     soles: tuple[str, ...]
     phase: Phase | None = None
+    steps: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if (
@@ -43,6 +55,13 @@ class StancePhase:
             raise InputError("a stance phase has no soles: name those that stand; plans do not jump")
         if self.phase is not None and not isinstance(self.phase, Phase):
             raise InputError(f"a stance phase's phase must be a Phase, not {self.phase!r}")
+        if not isinstance(self.steps, Mapping):
+            raise InputError(f"a stance phase's steps are a table by sole's name, not {self.steps!r}")
+        steps = {
+            name: check_array(f"the step of sole {name!r} [m]", step, (2,), most=_LONGEST)
+            for name, step in self.steps.items()
+        }
+        object.__setattr__(self, "steps", {name: tuple(step.tolist()) for name, step in steps.items()})
 
 
 def names_of(stances: Sequence[StancePhase]) -> str:
@@ -80,11 +99,73 @@ def check_stances(problem: Any) -> None:
                 f"stances: between {' and '.join(one.soles)} and {' and '.join(other.soles)} soles have to "
                 "lift off or to touch down, not both: put a phase between in which all of these stand"
             )
+    _check_steps(stances)
     if problem.stance.hand_frames(robot):
         raise InputError("stances: a hand that holds on goes with one stance: leave one of them out")
     if robot.sprung.any():
         raise InputError(f"stances: robot {robot.name!r} has springs, which go with one stance")
     object.__setattr__(problem, "stance", _stance(robot, of_blow[0].soles))
+
+
+def _check_steps(stances: Sequence[StancePhase]) -> None:
+    """InputError for a step of a sole that does not touch down."""
+    for k, stance in enumerate(stances):
+        landing = set(stance.soles) - set(stances[k - 1].soles if k else stance.soles)
+        for name in stance.steps:
+            if name not in landing:
+                there = " or ".join(sorted(landing)) or "no sole"
+                raise InputError(
+                    f"stances: sole {name!r} has a step in phase {k + 1}, on {' and '.join(stance.soles)}, "
+                    f"where {there} touches down: give the step to the phase in which it lands"
+                )
+
+
+def places_of_soles(
+    stances: Sequence[StancePhase], names: Sequence[str]
+) -> Iterator[dict[str, NDArray[np.float64]]]:
+    """Displacements (2,) [m] of each phase's soles from where they stood at the start, by name.
+
+    names : of the robot's soles, in its order, which is kept.
+    """
+    moved: dict[str, NDArray[np.float64]] = {}
+    for stance in stances:
+        moved |= {name: moved.get(name, np.zeros(2)) + step for name, step in stance.steps.items()}
+        yield {name: moved.get(name, np.zeros(2)) for name in names if name in stance.soles}
+
+
+def stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Posture (nq,) of a stance with its soles displaced by ``moved`` (2,) [m].
+
+    That of the stance, with the base above the soles as there, and lower where the legs do not reach.
+
+    Raises
+    ------
+    InputError : the legs do not reach, or beyond their joints' limits only; soles overlap.
+    """
+    limbs, corners = [], {}
+    for leg in c.legs:
+        step = np.append(moved.get(leg.name, np.zeros(2)), 0.0)
+        placement = pin.SE3(leg.placement.rotation, leg.placement.translation + step)
+        limbs.append(Limb(leg.frame, placement, c.base + leg.joints))
+        if leg.sole is not None:
+            flat = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])
+            corners[leg.name] = (flat @ placement.rotation.T + placement.translation)[:, :2]
+    steps = ", ".join(f"{name} by {np.round(step, 3).tolist()} m" for name, step in moved.items())
+    for (one, a), (other, b) in combinations(corners.items(), 2):
+        if overlap(a, b):
+            raise InputError(f"stances: soles {one} and {other} overlap after steps of {steps}")
+    closing = Closing(c.model, c.data, limbs, base=c.base, independent=c.base + c.independent, join=c.join)
+    mean = np.mean([moved.get(leg.name, np.zeros(2)) for leg in c.legs], axis=0)
+    lower, upper = c.robot.lower[c.dependent], c.robot.upper[c.dependent]
+    for down in _LOWER:
+        y = c.start + np.concatenate([mean, [-down], np.zeros(c.ny - 3)])
+        try:
+            legs = closing.legs(y, c.start_legs)
+        except InputError:
+            continue
+        if ((lower <= legs) & (legs <= upper)).all():
+            return c.join(y, legs)
+    raise InputError(f"stances: the legs do not reach soles displaced by steps ({steps}): make them shorter")
 
 
 def _stance(robot: Robot, soles: tuple[str, ...]) -> Stance:

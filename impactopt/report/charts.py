@@ -12,6 +12,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import (
     BUCKETS,
     at_contact,
+    footprints,
     ground_wrenches,
     planned_torque,
     soles_standing,
@@ -163,8 +164,9 @@ def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, A
         # its number is the margin that the chart beside it draws
         beside = {"x": f"margin_{style}_x", "y": f"margin_{style}_y"}
         series.append({"label": label, "style": style, "xy": name, "time": f"{name}_time", **beside})
-    soles = [name for name in record.arrays if name.startswith("sole_")]
-    arrays |= {f"ground_{name}": record.arrays[name] for name in ("polygon", *soles)}
+    soles = footprints(record)
+    arrays |= {f"ground_{name}": corners for name, corners in soles.items()}
+    arrays["ground_polygon"] = polygon
     return {
         "kind": "ground",
         "title": "ZMP in the support polygon",

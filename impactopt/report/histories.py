@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,17 +96,33 @@ def soles_standing(record: Record, time: Array) -> dict[str, NDArray[np.bool_]]:
 
 def zmp_margins(record: Record, time: Array, wrench: Array) -> Array:
     """Distance (k,) [m] of the ZMP of ground wrenches (k, 6) from the edges of what stands then."""
-    place = centre_of_pressure(wrench)
-    standing = soles_standing(record, time)
-    if not standing:
+    place, phases = centre_of_pressure(wrench), record.summary.get("stances") or []
+    if not phases:
         return margin(record.arrays["polygon"], place)
-    on, out = np.column_stack(list(standing.values())), np.full(len(time), np.nan)
-    for mask in np.unique(on, axis=0):
-        corners = [record.arrays[f"sole_{n}"] for n, stands in zip(standing, mask, strict=True) if stands]
-        if corners:
-            here = (on == mask).all(axis=1)
-            out[here] = margin(convex_polygon(np.vstack(corners)), place[here])
+    out = np.full(len(time), np.nan)
+    for phase in phases:
+        here = (time >= phase["from_s"]) & ((time < phase["to_s"]) | (phase is phases[-1]))
+        polygon = convex_polygon(np.vstack([_footprint(record, phase, name) for name in phase["soles"]]))
+        out[here] = margin(polygon, place[here])
     return out
+
+
+def footprints(record: Record) -> dict[str, Array]:
+    """Corners (k, 2) [m] of each sole on the ground by ``sole_<name>``; and where it stands after a step."""
+    out = {name: corners for name, corners in record.arrays.items() if name.startswith("sole_")}
+    for k, phase in enumerate(record.summary.get("stances") or []):
+        for name in phase.get("moved_m", {}):
+            there = _footprint(record, phase, name)
+            if not any(np.array_equal(there, known) for known in out.values()):
+                out[f"sole_{name}, phase {k + 1}"] = there
+    return out
+
+
+def _footprint(record: Record, phase: Mapping[str, Any], name: str) -> Array:
+    """Corners (k, 2) [m] of a sole on the ground in a stance phase."""
+    return np.asarray(
+        record.arrays[f"sole_{name}"] + np.array(phase.get("moved_m", {}).get(name, (0.0, 0.0)))
+    )
 
 
 def planned_torque(record: Record) -> tuple[Array, Array]:

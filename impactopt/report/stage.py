@@ -12,6 +12,7 @@ from impactopt.bodies.visuals import Visual, surroundings_of, visuals_of
 from impactopt.bodies.world import WorldBody
 from impactopt.files.output import Record
 from impactopt.problem.problem import ImpactProblem
+from impactopt.report.histories import footprints
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.robots.robot import Robot
 
@@ -31,9 +32,7 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
     bodies = pack_robot(problem.robot, arrays)
     world = pack_world(problem.world, arrays)
     tracks = [pack_track(f"track{k}", track, arrays) for k, track in enumerate(tracks_of(record, problem))]
-    soles = {n: a for n, a in record.arrays.items() if n.startswith("sole_")} | {
-        "polygon": record.arrays["polygon"]
-    }
+    soles = footprints(record) | {"polygon": record.arrays["polygon"]}
     arrays |= {f"ground_{name}": corners for name, corners in soles.items()}
     header = {
         "bodies": bodies,

@@ -25,7 +25,7 @@ class Builder:
     problem, coordinates, robot, limits : what is asked for.
     functions : the compiled blocks by name.
     ny, nl, nw : number of coordinates, of legs' joints, of sole wrenches' components.
-    y0 (ny,), legs0 (nl,) : the start posture.
+    y0 (ny,), legs0 (nl,) : the stance's posture, which is the start's where no sole has stepped.
     layout, rows, blocks : variables, constraints and functions so far.
     lifted : variables of :meth:`lift`, with the numbers of the outputs that they equal.
     followers : what :meth:`follow` was given.
@@ -37,7 +37,7 @@ class Builder:
         self.problem, self.coordinates, self.robot = problem, coordinates, problem.robot
         self.functions, self.limits = functions, Limits(problem, coordinates)
         self.ny, self.nl, self.nw = coordinates.ny, coordinates.nl, 6 * len(coordinates.legs)
-        self.y0, self.legs0 = coordinates.split(problem.start_posture)
+        self.y0, self.legs0 = coordinates.start, coordinates.start_legs
         self.layout, self.rows = Layout(), Rows()
         self.blocks: list[Block] = []
         self.lifted: list[tuple[Group, Index]] = []
@@ -54,7 +54,7 @@ class Builder:
         other = copy.copy(self)
         other.coordinates, other.limits = coordinates, Limits(self.problem, coordinates)
         other.ny, other.nl, other.nw = coordinates.ny, coordinates.nl, 6 * len(coordinates.legs)
-        other.y0, other.legs0 = coordinates.split(self.problem.start_posture)
+        other.y0, other.legs0 = coordinates.start, coordinates.start_legs
         other.functions = dict(self.functions)
         for of in ("", "_jac", "_hess"):
             other.functions[f"node{of}"] = self.functions[f"{node}{of}"]

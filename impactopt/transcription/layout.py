@@ -400,7 +400,7 @@ class Limits:
         self.extension = p.term(LegExtension)
         self.weight = GRAVITY * float(sum(i.mass for i in r.model.inertias))
         lower, upper = inside(r, self.position.margin)
-        box, y0 = BASE_BOX[: c.base], c.split(p.start_posture)[0]
+        box, y0 = BASE_BOX[: c.base], c.start
         self.y_lower = np.concatenate([y0[: c.base] - box, lower[c.independent]])
         self.y_upper = np.concatenate([y0[: c.base] + box, upper[c.independent]])
         self.legs_lower, self.legs_upper = lower[c.dependent], upper[c.dependent]

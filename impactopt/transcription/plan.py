@@ -20,6 +20,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.stances import places_of_soles
 from impactopt.problem.terms import ContactWrenchCone, GearLoad
 from impactopt.robots.loads import BEARS, DriveLoads, cop_margin, gear_torque, least_margins, weight_of
 from impactopt.robots.robot import Robot
@@ -555,14 +556,17 @@ class Plan:
         return before + within + last * np.maximum(since - hit.time[-1], 0.0)
 
     def stances(self) -> list[dict[str, Any]]:
-        """Stance phases with the soles that stand in each, from when till when [s]; nothing where the problem
-        has none.
+        """Stance phases with the soles that stand in each, from when till when [s], and how far [m] those
+        that have stepped are from where they stood at the start; nothing where the problem has none.
         """
         out = []
-        for k, stance in enumerate(self.problem.stances):
+        displacements = places_of_soles(self.problem.stances, [sole.name for sole in self.problem.soles])
+        for k, (stance, places) in enumerate(zip(self.problem.stances, displacements, strict=True)):
             own = [piece for piece in self.pieces() if piece.number == k]
             end = own[-1].start + own[-1].spline.duration
-            out.append({"soles": list(stance.soles), "from_s": own[0].start, "to_s": end})
+            moved = {name: at.tolist() for name, at in places.items() if at.any()}
+            phase = {"soles": list(stance.soles), "from_s": own[0].start, "to_s": end}
+            out.append(phase | ({"moved_m": moved} if moved else {}))
         return out
 
     def landing_speeds(self) -> dict[str, float]:
@@ -574,7 +578,7 @@ class Plan:
             for sole in (sole for sole, down in zip(p.soles, landed, strict=True) if down):
                 c, end = p.stance_coordinates[one.number], one.start + one.spline.duration
                 (y,), (yd,), (ydd,), _ = one.sample(np.array([end]))
-                q, v, _ = c.complete_motion(y, yd, ydd, c.solve_legs(y, c.split(p.start_posture)[1]))
+                q, v, _ = c.complete_motion(y, yd, ydd, c.solve_legs(y, c.start_legs))
                 pin.forwardKinematics(robot.model, data, q, v)
                 frame = robot.model.getFrameId(sole.frame)
                 twist = pin.getFrameVelocity(robot.model, data, frame, pin.LOCAL)
@@ -588,7 +592,7 @@ class Plan:
         those of the stance with the blow.
         """
         c = coordinates or self.coordinates
-        legs = list(c.closing.follow(y, c.split(self.problem.start_posture)[1]))
+        legs = list(c.closing.follow(y, c.start_legs))
         return c.join(y, np.array(legs).reshape(len(y), -1))
 
     def margins(

@@ -294,16 +294,21 @@ class StancePhaseSection(Section):
     grading: AtLeastOne = optional(
         "longest over shortest interval, the short ones at the contact, by default 3"
     )
+    steps: dict[str, list[float]] = optional(
+        "by sole that touches down as the phase begins: forward and to the left [m] from where it stood "
+        "before, such as { left = [0.3, 0.0] }; without one it comes down where it was",
+        "steps_m",
+    )
 
     def build(self) -> StancePhase:
         given = self.given()
-        soles = tuple(given.pop("soles"))
+        soles, steps = tuple(given.pop("soles")), given.pop("steps", {})
         if "duration" not in given and given:
             raise InputError(
                 f"[[stances]]: the phase on {' and '.join(soles)} has no duration_s: give it one, or leave "
                 f"{' and '.join(given)} out, as the blow falls in it"
             )
-        return StancePhase(soles=soles, phase=Phase(**given) if given else None)
+        return StancePhase(soles=soles, phase=Phase(**given) if given else None, steps=steps)
 
 
 class PhaseSection(Section):

@@ -272,7 +272,8 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     hands = {"hands": [hand.name for hand in held]} if (held := stance.held_hands(problem.robot)) else {}
     data["stances"] = [
         {"soles": list(each.soles)}
-        | ({} if each.phase is None else _section(StancePhaseSection, each.phase, ("soles",)))
+        | ({} if each.phase is None else _section(StancePhaseSection, each.phase, ("soles", "steps")))
+        | ({"steps_m": {name: list(step) for name, step in each.steps.items()}} if each.steps else {})
         for each in problem.stances
     ]
     if (isinstance(stance, OneSole) and not problem.stances) or hands:

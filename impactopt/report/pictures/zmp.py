@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.files.output import Record
 from impactopt.kinematics.support import zmp
+from impactopt.report.histories import footprints
 from impactopt.report.pictures.style import (
     BLACK,
     OVER,
@@ -47,7 +48,7 @@ def draw_zmp(figure: FigureBase, record: Record, phases: Sequence[int] = (0, 1, 
     paths = _zmp_paths(record)
     panels: Any = figure.subplots(1, len(phases), sharex=True, sharey=True, squeeze=False)[0]
     for axes, k in zip(panels, phases, strict=True):
-        _ground(axes, a)
+        _ground(axes, footprints(record), a["polygon"])
         norm = None
         for kind in ("simulated", "planned"):
             if (kind, k) not in paths:
@@ -119,24 +120,23 @@ def _stations(time: Array, count: int) -> NDArray[np.intp]:
     return np.searchsorted(time, np.linspace(time[0], time[-1], count)).clip(0, len(time) - 1)
 
 
-def _ground(axes: Any, arrays: Mapping[str, Array]) -> None:
+def _ground(axes: Any, soles: Mapping[str, Array], polygon: Array) -> None:
     """Soles and support polygon from above: forward is up, left is left."""
-    for name, corners in arrays.items():
-        if name.startswith("sole_"):
-            axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
-            middle = corners.mean(axis=0)
-            axes.annotate(
-                name.removeprefix("sole_"),
-                (-middle[1], corners[:, 0].min()),
-                (0, 3),
-                textcoords="offset points",
-                ha="center",
-                va="bottom",
-                color="#666666",
-                fontsize=6.5,
-            )
-    polygon = np.vstack([arrays["polygon"], arrays["polygon"][:1]])
-    axes.plot(-polygon[:, 1], polygon[:, 0], "--", color=BLACK, linewidth=1.0)
+    for name, corners in soles.items():
+        axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
+        middle = corners.mean(axis=0)
+        axes.annotate(
+            name.removeprefix("sole_"),
+            (-middle[1], corners[:, 0].min()),
+            (0, 3),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            color="#666666",
+            fontsize=6.5,
+        )
+    closed = np.vstack([polygon, polygon[:1]])
+    axes.plot(-closed[:, 1], closed[:, 0], "--", color=BLACK, linewidth=1.0)
     axes.set_aspect("equal")
     axes.set_xlabel(RIGHT)
     axes.grid(False)

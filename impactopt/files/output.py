@@ -85,10 +85,10 @@ class Record:
     summary : the content of `summary.json`.
     problem : text of the problem file, "" if there was none.
     arrays : by name. `joints`, `torque_limit`, `velocity_limit`, `armature` (n,); `polygon` and `sole_<name>`
-        (k, 2) [m], corners on the ground as it stands at first; `reference_angle`, `simulated_angle` (k, n), joint angles over
-        time; and, field by field, `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan
-        with an abort motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines),
-        `collision_*` (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*`
+        (k, 2) [m], corners on the ground, of a sole that steps as it stands at first; `reference_angle`,
+        `simulated_angle` (k, n), joint angles over time; and, field by field, `reference_*`
+        (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort motion, `missed_*`,
+        `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*`
         (`Simulation` on free soles, without velocities and torques), `solver_*` (`SolverResult`),
         `history_*` (its iterations); `program_statement`, names of the program's variables and constraints,
         as JSON. Histories of many channels are rounded (`rounded`).

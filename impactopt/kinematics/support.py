@@ -127,9 +127,12 @@ def convex_polygon(points: Array) -> Array:
 
 
 def overlap(one: Array, other: Array) -> bool:
-    """True if two convex polygons (k, 2) [m], counter-clockwise, have points in common: no edge parts them."""
-    pairs = ((one, other), (other, one))
-    return not any((b @ n < least).all() for a, b in pairs for n, least in zip(*inward_edges(a), strict=True))
+    """True if two convex polygons (k, 2) [m], counter-clockwise, overlap: no edge parts them."""
+    for a, b in ((one, other), (other, one)):
+        inward, offset = inward_edges(a)
+        if (b @ inward.T < offset).all(axis=0).any():
+            return False
+    return True
 
 
 def margin(polygon: Array, points: Array) -> Array:

@@ -29,7 +29,8 @@ from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.transcription import Transcription
 
 BOTH = StancePhase(soles=("left", "right"), phase=Phase(duration=(0.4, 0.9), intervals=6, grading=1.0))
-STEPS = (BOTH, StancePhase(soles=("left",)), BOTH)
+AHEAD = {"right": (0.06, -0.02)}  # [m]
+STEPS = (BOTH, StancePhase(soles=("left",)), dataclasses.replace(BOTH, steps=AHEAD))
 
 
 def changed_nodes(program: Transcription, nodes: MoreNodes) -> Transcription:
@@ -72,26 +73,28 @@ def held(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> Simulation:
 def test_derivatives_are_those_of_differences(program: Transcription) -> None:
     # and of a blow on two feet, after a step on the left one and before one on the right one
     left, right = (dataclasses.replace(BOTH, soles=(name,)) for name in ("left", "right"))
-    steps = (BOTH, left, StancePhase(soles=("left", "right")), right, BOTH)
+    steps = (BOTH, left, StancePhase(soles=("left", "right"), steps=AHEAD), right, BOTH)
     for t in (program, transcribed(stepping(stances=steps))):
         x = first_iterate(t)
         check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
 
 
-def test_soles_stand_where_they_stood_in_their_phases_and_are_in_the_air_between(
+def test_soles_stand_in_their_places_in_their_phases_and_are_in_the_air_between(
     plan: Plan, ways: tuple[Trajectory, Trajectory]
 ) -> None:
     robot, data = plan.problem.robot, plan.problem.robot.model.createData()
     frames = [robot.model.getFrameId(sole.frame) for sole in plan.problem.soles]
     pin.framesForwardKinematics(robot.model, data, plan.problem.start_posture)
     start = [data.oMf[frame].copy() for frame in frames]
+    ahead = pin.SE3(start[1].rotation, start[1].translation + np.append(AHEAD["right"], 0.0))
     for way in ways:
         heights = np.zeros(len(way.time))
         for i, q in enumerate(way.q):
             pin.framesForwardKinematics(robot.model, data, q)
             on = plan.problem.standing[way.stance[i]]
+            places = [start[0], ahead if way.stance[i] == 2 else start[1]]
             for k in np.flatnonzero(on):
-                assert np.abs(pin.log6(start[k].actInv(data.oMf[frames[k]])).vector).max() < 1e-6
+                assert np.abs(pin.log6(places[k].actInv(data.oMf[frames[k]])).vector).max() < 1e-6
             heights[i] = data.oMf[frames[1]].translation[2]
         stands = way.stance != 1
         change = np.flatnonzero(np.diff(way.stance))
@@ -197,6 +200,10 @@ def test_what_is_said_of_each_phase(plan: Plan) -> None:
         ),
         ((BOTH, StancePhase(soles=("middle",))), "no sole 'middle'"),
         ((BOTH, "left"), "tuple of StancePhase"),
+        ((*STEPS[:2], dataclasses.replace(BOTH, steps={"left": (0.1, 0.0)})), "right touches down"),
+        ((dataclasses.replace(BOTH, steps=AHEAD), *STEPS[1:]), "no sole touches down"),
+        ((*STEPS[:2], dataclasses.replace(BOTH, steps={"right": (1.5, 0.0)})), "do not reach"),
+        ((*STEPS[:2], dataclasses.replace(BOTH, steps={"right": (0.0, 0.19)})), "left and right overlap"),
     ],
 )
 def test_what_is_no_schedule_is_refused(stances: tuple[StancePhase, ...], message: str) -> None:
@@ -211,6 +218,24 @@ def test_what_is_no_phase_is_refused() -> None:
         StancePhase(soles=("left", "left"))
     with pytest.raises(InputError, match="must be a Phase"):
         StancePhase(soles=("left",), phase=0.5)  # type: ignore[arg-type]
+    for step, message in (((0.1,), "shape"), ((np.nan, 0.0), "nan"), ((300.0, 0.0), "at most 2")):
+        with pytest.raises(InputError, match=rf"the step of sole 'left'.*{message}"):
+            StancePhase(soles=("left",), steps={"left": step})
+    with pytest.raises(InputError, match="a table by sole's name"):
+        StancePhase(soles=("left",), steps=(0.1, 0.0))  # type: ignore[arg-type]
+
+
+def test_steps_add_up() -> None:
+    # right, left, right: each from where it stood before
+    right, left = (dataclasses.replace(BOTH, soles=(name,)) for name in ("right", "left"))
+    steps = (BOTH, left, dataclasses.replace(BOTH, steps=AHEAD), right, StancePhase(soles=("left", "right")))
+    steps = (*steps, left, dataclasses.replace(BOTH, steps=AHEAD))
+    c = stepping(stances=steps).stance_coordinates
+    at = np.array([[leg.placement.translation for leg in c[k].legs] for k in (0, 2, 4, 6)])
+    moved = np.array([0.0, 1.0, 1.0, 2.0])[:, None] * [*AHEAD["right"], 0.0]
+    np.testing.assert_allclose(at[:, 1] - at[0, 1], moved, atol=1e-12)
+    np.testing.assert_allclose(at[:, 0], at[[0] * 4, 0], atol=1e-12)
+    np.testing.assert_allclose(c[3].legs[0].placement.translation - at[0, 1], moved[1], atol=1e-12)
 
 
 def test_a_robot_without_soles_to_lift_is_refused() -> None:
@@ -268,9 +293,10 @@ def test_an_export_says_which_sole_stands(plan: Plan, ways: tuple[Trajectory, Tr
 
 
 def test_a_problem_file_has_the_phases() -> None:
-    problem = load_problem("kick_two_feet")
-    again = problem_from_data(problem_data(problem), where="again.toml")
-    assert again.hash == problem.hash and again.stances == problem.stances
+    for name in ("punch_step", "kick_two_feet"):
+        problem = load_problem(name)
+        again = problem_from_data(problem_data(problem), where="again.toml")
+        assert again.hash == problem.hash and again.stances == problem.stances
     data = problem_data(problem)
     for stances, message in (
         ([{"soles": ["left"], "duration_s": 1.0}], "the blow falls in one phase"),

@@ -88,10 +88,11 @@ class Record:
         (k, 2) [m], corners on the ground, of a sole that steps as it stands at first; `reference_angle`,
         `simulated_angle` (k, n), joint angles over time; and, field by field, `reference_*`
         (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort motion, `missed_*`,
-        `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*`
-        (`Simulation` on free soles, without velocities and torques), `solver_*` (`SolverResult`),
-        `history_*` (its iterations); `program_statement`, names of the program's variables and constraints,
-        as JSON. Histories of many channels are rounded (`rounded`).
+        `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`),
+        `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on free soles, without
+        velocities and torques), `solver_*` (`SolverResult`), `history_*` (its iterations);
+        `program_statement`, names of the program's variables and constraints, as JSON. Histories of many
+        channels are rounded (`rounded`).
     problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 

@@ -279,10 +279,13 @@ class Simulation:
             return distance_inside(polygon, zmp)
         found = np.array([distance_inside(own, zmp) for own in self.polygons])
         on = self.stands[self.stance] | (self.sole_normal > 0)
-        # the smallest stance that has all of these soles; of several, which steps part, the nearest phase's
+        # the smallest stance that has all of these soles; of several, which a step parts, the nearest in time
         lacks = (on[:, None] & ~self.stands).any(axis=2)
         size = np.where(lacks, self.stands.shape[1] + 1.0, self.stands.sum(axis=1))
-        size += np.abs(self.stance[:, None] - np.arange(len(found))) / (len(found) + 1)
+        number = np.arange(len(found))
+        begins = self.time[np.searchsorted(self.stance, number).clip(max=len(self.time) - 1)]
+        at = np.interp(self.time, [*begins, self.time[-1]], [*number, len(number)]) - 0.5
+        size += np.abs(at[:, None] - number) / (len(number) + 1)
         return np.asarray(found[size.argmin(axis=1), np.arange(len(zmp))])
 
     def _cut_numbers(self) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 
 from impactopt.files.output import Record
 from impactopt.kinematics.support import zmp
+from impactopt.report.histories import footprints
 from impactopt.report.pictures.style import (
     BLACK,
     BLUE,
@@ -45,7 +46,7 @@ def draw_replay(figure: FigureBase, record: Record) -> None:
     """The same into a figure, or a part of one."""
     a = record.arrays
     places: Any = figure.subplot_mosaic([["cop", "force"], ["cop", "move"]], width_ratios=[2, 3])
-    _centres(figure, places["cop"], a)
+    _centres(figure, places["cop"], record)
     time, start = a["replayed_time"], float(a["replayed_contact_start"])
     names = [str(name).replace("_", " ") for name in a["replayed_soles"]]
     for k, (name, colour) in enumerate(zip(names, SOLE_COLOURS, strict=False)):
@@ -73,16 +74,15 @@ def _verdict(record: Record) -> str:
     return "stands at the end" if stands else str(reason).split(":")[0] if stands is None else str(reason)
 
 
-def _centres(figure: FigureBase, axes: Any, a: Any) -> None:
+def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
     """Paths of the centres of pressure by phase, from above: forward is up, left is left."""
+    a = record.arrays
     time, start, end = a["replayed_time"], a["replayed_contact_start"], a["replayed_contact_end"]
     phase = (time >= start).astype(int) + (time >= end).astype(int)  # nan compares false
-    for k, name in enumerate(a["replayed_soles"]):
-        corners = a[f"sole_{name}"]
+    for name, corners in footprints(record).items():
         axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
-        label = str(name).replace("_", " ")
         axes.annotate(
-            label,
+            name.removeprefix("sole_").partition(",")[0].replace("_", " "),
             (-corners[:, 1].mean(), corners[:, 0].max()),
             (0, 2),
             textcoords="offset points",
@@ -90,7 +90,8 @@ def _centres(figure: FigureBase, axes: Any, a: Any) -> None:
             ha="center",
             fontsize=6.5,
         )
-        normal = a["replayed_sole_ground"][:, :, 2]
+    normal = a["replayed_sole_ground"][:, :, 2]
+    for k in range(normal.shape[1]):
         loaded = normal[:, k] >= BEARS * np.median(normal.sum(axis=1))  # for most of it at rest
         for which, colour in enumerate(PHASE_COLOURS):
             keep = loaded & (phase == which)

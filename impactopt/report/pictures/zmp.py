@@ -126,7 +126,7 @@ def _ground(axes: Any, soles: Mapping[str, Array], polygon: Array) -> None:
         axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
         middle = corners.mean(axis=0)
         axes.annotate(
-            name.removeprefix("sole_"),
+            name.removeprefix("sole_").partition(",")[0],
             (-middle[1], corners[:, 0].min()),
             (0, 3),
             textcoords="offset points",

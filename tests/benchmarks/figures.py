@@ -32,6 +32,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "replay": ("plot", "punch"),
     "sheet_punch": ("sheet", "punch"),
     "sheet_kick_talos": ("sheet", "kick_talos"),
+    "sheet_punch_step": ("sheet", "punch_step"),
     "sheet_nailing": ("sheet", "nailing"),
     "fig3": ("reproduce", "fig3"),
     "fig4": ("reproduce", "fig4"),

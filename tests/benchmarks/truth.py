@@ -52,6 +52,7 @@ HELD = (
     ("steps", "iterations", 0),
     ("s", "solve_seconds", 1),
     ("N s", "impulse_planned_Ns", 2),
+    ("stances", "stances", 0),
     ("error %", "impulse_error_pct", 2),
     ("ZMP mm", "zmp_margin_mm", 1),
     ("CoP planned", "cop_planned", 2),
@@ -171,6 +172,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         summary = solution.outcome()
         out |= {key: summary[key] for key in ("status", "iterations", "solve_seconds")}
         out["impulse_planned_Ns"] = solution.impulse
+        out["stances"] = max(1, len(solution.problem.stances))
         replay = solution.validate()
         told = solution.summary(replay)
         held = _with_missed(told["simulated"], _miss(solution, missing=True))

@@ -66,10 +66,6 @@ class _Replay(MujocoRobot):
     ) -> None:
         self.scene, self.perturbation = perturbation.scene(scene), perturbation
         self.wbc: WholeBodyController | None = None
-        if controller is not None and scene.standing.size:
-            raise InputError(
-                "the whole-body controller keeps one stance: follow stance phases with the servo"
-            )
         if controller is not None:
             world = perturbation
             self.wbc = WholeBodyController(

@@ -5,7 +5,7 @@ gyroscope with 0.01 deg/s/sqrt(Hz) and a bias of 10 deg/h. Encoders behind the g
 are their differences over a sample; the hand's force has 2 N: both are assumptions.
 
 The base's orientation is the inertial unit's. Its place is where the legs put it if the soles are where they
-stood in the beginning, and its velocity if they rest there: the mean over the soles, by their loads.
+stood as they began to, and its velocity if they rest there: the mean over the soles, by their loads.
 """
 
 from __future__ import annotations
@@ -78,9 +78,16 @@ class StateEstimate:
         joints = list(robot.model.joints)[-robot.n :]
         self._place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
-        self._soles = [self.model.getFrameId(name) for name in soles]
-        pin.framesForwardKinematics(self.model, self.data, q0)
-        self._stood = [self.data.oMf[i].copy() for i in self._soles]
+        self._stood = dict[int, Any]()
+        self.stand(soles, q0)
+
+    def stand(self, soles: tuple[str, ...], q: Array) -> None:
+        """Soles that stand from now on: those that did before where they did, others where q (nq,) has
+        them.
+        """
+        pin.framesForwardKinematics(self.model, self.data, q)
+        frames = [self.model.getFrameId(name) for name in soles]
+        self._stood = {i: self._stood.get(i, self.data.oMf[i].copy()) for i in frames}
 
     def of(self, measured: Measured, loads: Array, points: Array) -> tuple[Array, Array]:
         """q (nq,), v (nv,).  loads (soles,) : weights;  points (soles, 3) [m] : of each sole, in its frame,
@@ -100,7 +107,7 @@ class StateEstimate:
         pin.forwardKinematics(model, data, q, v)
         share = loads / loads.sum()
         place, speed = np.zeros(3), np.zeros(3)
-        for i, stood, point, part in zip(self._soles, self._stood, points, share, strict=True):
+        for (i, stood), point, part in zip(self._stood.items(), points, share, strict=True):
             at = pin.updateFramePlacement(model, data, i)
             place += part * (stood.act(point) - at.act(point))
             moves = pin.getFrameVelocity(model, data, i, pin.LOCAL)

@@ -61,7 +61,8 @@ class Recovery:
         last = np.asarray(reference.q[-1])
         shift = np.zeros(robot.nv)
         if not scene.hands:  # they would be torn off
-            q = _moved(robot, last, np.asarray(reference.q[0]), scene, settings.recovery_margin)
+            hit = int(np.searchsorted(reference.time, reference.contact_start))
+            q = _moved(robot, last, np.asarray(reference.q[hit]), scene, settings.recovery_margin)
             shift = np.array(pin.difference(self.model, last, q))
         self.shift = shift * _clear_part(self.model, reference, scene, shift)
         q = pin.integrate(self.model, last, self.shift)

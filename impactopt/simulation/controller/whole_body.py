@@ -27,9 +27,9 @@ from impactopt.simulation.controller.sensors import Sensors, StateEstimate
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.controller.tracking_reference import Aim, Recovery, Target
 from impactopt.simulation.motors import Servo
-from impactopt.simulation.result import Scene
+from impactopt.simulation.result import Scene, stance_at
 
-__all__ = ["Cones", "HeldDynamics", "Tasks", "TorqueQP", "WholeBodyController", "cone_of"]
+__all__ = ["Cones", "Footing", "HeldDynamics", "Tasks", "TorqueQP", "WholeBodyController", "cone_of"]
 
 Array = NDArray[np.float64]
 RHO = 1.0  # of OSQP's ADMM, where P is the identity
@@ -248,12 +248,42 @@ FILTER = 3e-3  # [s] of the hand's force
 TOUCH = 20.0  # [N] that the hand feels as a touch
 LEVER = 0.1  # [m] by which moments of a sole are compared with its forces
 EFFORT = 1e-3  # weight of torques over their limits in the recovery, which has no feed-forward
+FEET = 40.0  # [rad/s] of the feedback of soles in the air
 FAST = 10.0  # [m/s^2] by which clearance constraints are scaled
 PRICE, SQUARE = 1e3, 1e3  # of leaving the cones, over the robot's weight, and those: linear, and of squares
 
 
+class Footing:
+    """Parts of the controller that depend on the soles that stand.
+
+    frames : of these soles.  air : of the others, numbers in the model.  held : the robot on them.
+    cones, tasks, qp : of its wrenches.
+    share, lift : of wrenches, over the weight; and to what they make, the momentum's rate over the mass.
+    loads (soles,), points (soles, 3) [m] : where they are pressed.
+    """
+
+    def __init__(
+        self, robot: Robot, scene: Scene, on: NDArray[np.intp], settings: ControllerSettings, q0: Array
+    ) -> None:
+        """on : indices of the scene's soles that stand.  q0 (nq,) : a configuration with them in place."""
+        self.frames = tuple(scene.soles[k] for k in on)
+        self.air = [robot.model.getFrameId(name) for name in scene.soles if name not in self.frames]
+        self.held = HeldDynamics(robot, self.frames, scene.strikers, scene.normal, q0, holding=scene.hands)
+        mass, n, held = float(pin.computeTotalMass(robot.model)), robot.n, len(on) + len(scene.hands)
+        weight = 9.81 * max(mass, 1e-9)
+        self.cones = Cones(tuple(scene.corners[k] for k in on), settings, n, weight)
+        balances = robot.floating and len(on) > 0
+        self.tasks = Tasks(n, robot.nv + 3 * len(scene.strikers) + 6 * (balances + held + len(self.air)))
+        # torques over their limits, and two slacks: of the cones, and of clearance constraints
+        self.qp = TorqueQP(n + 2, self.cones.m + MOST, iterations=settings.iterations)
+        # of a wrench's parts over the weight
+        self.share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), held) / weight
+        self.lift = np.tile(np.eye(6), held) / max(mass, 1e-9)
+        self.loads, self.points = np.ones(len(on)), np.zeros((len(on), 3))
+
+
 class WholeBodyController:
-    """Torques of a robot on a scene's soles that follows a reference.
+    """Torques of a robot on a scene's soles that follows a reference, and its schedule of stance phases.
 
     reference : as of :class:`impactopt.transcription.plan.Trajectory`.
     kp, kd : factors of the feedback's stiffness and damping.  limit : of the torque limits, which it knows.
@@ -274,33 +304,23 @@ class WholeBodyController:
         self.robot, self.scene, self.settings, self.kp, self.kd = robot, scene, settings, kp, kd
         self.limit = limit * robot.torque_limit
         self.sensors = Sensors(robot, noise=settings.noise, rate=settings.rate, seed=settings.seed)
-        q0 = np.asarray(reference.q[0])
-        self.held = HeldDynamics(robot, scene.soles, scene.strikers, scene.normal, q0, holding=scene.hands)
         self.data: Any = robot.model.createData()
         self.mass = float(pin.computeTotalMass(robot.model))
-        self.weight = 9.81 * max(self.mass, 1e-9)
-        n, soles, held = robot.n, len(scene.soles), len(scene.soles) + len(scene.hands)
-        self.n, self.gravity = n, np.array(robot.model.gravity.linear)
-        self.balances = robot.floating and soles > 0
-        self.cones = Cones(scene.corners, settings, n, self.weight)
-        self.tasks = Tasks(n, robot.nv + 3 * len(scene.strikers) + 6 * self.balances + 6 * held)
+        self.n, self.gravity = robot.n, np.array(robot.model.gravity.linear)
+        self.balances = robot.floating and bool(scene.soles)
         self.clearance = Clearance(robot.model, scene.solids, period=settings.period)
-        # torques over their limits, and two slacks: of the cones, and of clearance constraints
-        self.qp = TorqueQP(n + 2, self.cones.m + MOST, iterations=settings.iterations)
-        self.low, self.high = -np.ones(n + 2), np.ones(n + 2)
-        self.low[n:], self.high[n:] = 0.0, 1e3
-        # of a wrench's parts over the weight, and of rates of momentum
-        self.share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), held) / self.weight
-        self.moves = np.repeat([settings.com, settings.angular_momentum], 3)
-        # from wrenches to what they make: the momentum's rate over the mass
-        self.lift = np.tile(np.eye(6), held) / max(self.mass, 1e-9)
+        self.low, self.high = -np.ones(self.n + 2), np.ones(self.n + 2)
+        self.low[self.n :], self.high[self.n :] = 0.0, 1e3
+        self.moves = np.repeat([settings.com, settings.angular_momentum], 3)  # of rates of momentum
         self.seconds: list[float] = []
-        stands = robot.floating and bool(scene.soles) and settings.follow == "recover"
+        steps_on = stance_at(reference, reference.contact_end) != stance_at(reference, np.inf)
+        stands = self.balances and settings.follow == "recover" and not steps_on
         recovery = Recovery(robot, reference, scene, settings) if stands else None
         self.target = Target(robot, reference, scene.strikers, spread=settings.spreads, recovery=recovery)
-        self.of_blow = self.target
-        self.estimate = StateEstimate(robot, scene.soles, q0)
-        self.loads, self.points = np.ones(soles), np.zeros((soles, 3))
+        self.of_blow, self.planned, self.followed = self.target, reference, reference
+        q0 = np.asarray(reference.q[0])
+        self.stance, self.footing = 0, self._footing(0)
+        self.estimate = StateEstimate(robot, self.footing.frames, q0)
         self.acceleration = np.zeros(robot.nv)
         self.felt = np.zeros(len(scene.strikers))  # [N] at the hands, filtered
         self.springs = Servo(robot, reference).springs
@@ -311,35 +331,49 @@ class WholeBodyController:
 
     def follow(self, missed: Any | None) -> None:
         """Track from now on the plan's blow (None), or the reference of a robot that hits nothing."""
-        self.target = self.of_blow
+        self.target, self.followed = self.of_blow, self.planned
         if missed is not None:
-            self.target = Target(self.robot, missed, self.scene.strikers, spread=False)
+            self.target, self.followed = Target(self.robot, missed, self.scene.strikers, spread=False), missed
+
+    def _footing(self, stance: int) -> Footing:
+        """Parts on the soles of a stance phase, which stand where the reference has them as it begins."""
+        scene, stances = self.scene, np.asarray(getattr(self.followed, "stance", ()))
+        on = np.flatnonzero(scene.standing[stance]) if stances.size else np.arange(len(scene.soles))
+        begins = int(np.argmax(stances == stance)) if stances.size else 0
+        q0 = np.asarray(self.followed.q[begins])
+        return Footing(self.robot, scene, on, self.settings, q0)
 
     def torque(self, t: float, angles: Array, v: Array, rotation: Array, forces: Array) -> Array:
         """Torque demand (n,) [N m] at a time [s], from what the sensors make of the true state."""
         s = self.settings
         measured = self.sensors.read(angles, v, rotation, forces)
-        q, rates = self.estimate.of(measured, self.loads, self.points)
+        q, rates = self.estimate.of(measured, self.footing.loads, self.footing.points)
+        stance = stance_at(self.followed, self.target.clock(t)[0])
+        if stance != self.stance:  # soles lift off, or are taken to stand where they are
+            self.stance, self.footing = stance, self._footing(stance)
+            self.estimate.stand(self.footing.frames, q)
         ahead = s.delay
         q = pin.integrate(self.robot.model, q, ahead * rates)
         rates = rates + ahead * self.acceleration
         self.felt += (1 - math.exp(-s.period / FILTER)) * (measured.forces - self.felt)
         self.target.feel(t, bool((measured.forces > TOUCH).any()))
         aim = self.target.at(t + ahead)
-        self.held.look(q, rates, self.felt, s.sole_bandwidth)
+        held = self.footing.held
+        held.look(q, rates, self.felt, s.sole_bandwidth)
         if self.undriven:
             angles = self.robot.joint_positions(q)
-            self.held.pulled(self.passive, self.springs(angles, rates[-self.n :]))
+            held.pulled(self.passive, self.springs(angles, rates[-self.n :]))
         x = self._solve(t, q, rates, aim)[: self.n]
         torque = self.limit * x
         # what is expected until the next sample: accelerations, and where the soles are pressed
-        self.acceleration = self.held.A @ torque + self.held.a0
+        self.acceleration = held.A @ torque + held.a0
         if self.balances:
-            self.loads, self.points = self.cones.pressed(x)
+            self.footing.loads, self.footing.points = self.footing.cones.pressed(x)
         return torque
 
     def _solve(self, t: float, q: Array, v: Array, aim: Aim) -> Array:
-        held, s, n, tasks = self.held, self.settings, self.n, self.tasks
+        on, s, n = self.footing, self.settings, self.n
+        held, tasks = on.held, on.tasks
         recovers = self.target.recovers(t + s.delay)
         struck = s.impact == "planned" and self.target.struck and not recovers
         off = pin.difference(self.robot.model, q, aim.q)
@@ -354,42 +388,43 @@ class WholeBodyController:
             w = s.recovery_bandwidth if recovers else s.posture_bandwidth
             wanted = aim.a + self.kp * w**2 * off + self.kd * 2 * w * lag
             tasks.add(s.posture * self.steered, A, held.a0 - wanted)
+            self._feet(aim, v, A)
         self._hands(off, lag, aim, A, recovers)
-        rate, lift = np.zeros(6), self.lift
+        rate, lift = np.zeros(6), on.lift
         if self.balances:
             rate = self._momentum(q, v, lag, aim, B, recovers)
         feed = aim.torque
         if struck:  # what the plan counts on in contact
             feed = feed + self.kp * self.robot.kp * off[-n:] + self.kd * self.robot.kd * rate_error
         feed = feed / self.limit
-        if self.share.size:
+        if on.share.size:
             now, goal = held.back, B @ feed
             if recovers:  # what makes the momentum's rate with the least wrenches
-                spread = lift / self.share**2
+                spread = lift / on.share**2
                 now, goal = held.b0, spread.T @ dgesv(spread @ lift.T, rate)[2]
-            tasks.add(s.wrench, self.share[:, None] * B, self.share * (now - goal))
+            tasks.add(s.wrench, on.share[:, None] * B, on.share * (now - goal))
         P, g = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
         P[:n, :n], g[:n] = tasks.sums()
         effort = s.blow if struck else (EFFORT if recovers else s.torque)
         P.flat[: n * (n + 2) : n + 3] += effort
         g[:n] -= effort * feed
         P.flat[n * (n + 3) :: n + 3], g[n:] = SQUARE, PRICE
-        m = self.cones.m
+        m = on.cones.m
         C, c = np.zeros((m + MOST, n + 2)), np.full(m + MOST, -1.0)  # what there is no pair for holds
-        C[:m, : n + 1], c[:m] = self.cones.look(held.places, B, held.b0)
+        C[:m, : n + 1], c[:m] = on.cones.look(held.places, B, held.b0)
         if recovers or self.target.bounced:  # up to the blow the plan keeps bodies apart, at speed
             rows, least = self.clearance.constraints(held.data)
             its = slice(m, m + len(least))
             C[its, :n], C[its, n + 1] = rows @ A / FAST, 1.0
             c[its] = (least - rows @ held.a0) / FAST
         begun = time.process_time()
-        x = self.qp.solve(P, g, C, c, self.low, self.high)
+        x = on.qp.solve(P, g, C, c, self.low, self.high)
         self.seconds.append(time.process_time() - begun)
         return x
 
     def _hands(self, off: Array, lag: Array, aim: Aim, A: Array, recovers: bool) -> None:
         """Rows of the striking points."""
-        held, s, w = self.held, self.settings, self.settings.hand_bandwidth
+        held, s, w = self.footing.held, self.settings, self.settings.hand_bandwidth
         back = self.sprung and self.target.bounced and not recovers
         if not (self.target.before or back):
             return
@@ -403,14 +438,34 @@ class WholeBodyController:
             if back:  # a tool swings on in a soft grip, and would touch again
                 away = away - s.draw_back * self.scene.normal
             wanted = gain + self.kp * w**2 * away + self.kd * 2 * w * (hand @ lag)
-            self.tasks.add(s.hand, hand @ A, hand @ held.a0 + drift - wanted)
+            self.footing.tasks.add(s.hand, hand @ A, hand @ held.a0 + drift - wanted)
+
+    def _feet(self, aim: Aim, v: Array, A: Array) -> None:
+        """Rows of the soles in the air: posture alone would have them land at speed."""
+        model, of_aim, w = self.robot.model, self.data, FEET
+        held, air = self.footing.held, self.footing.air
+        if air:
+            pin.forwardKinematics(model, of_aim, aim.q, aim.v, aim.a)
+        for i in air:
+            goal, place = (
+                pin.updateFramePlacement(model, of_aim, i),
+                pin.updateFramePlacement(model, held.data, i),
+            )
+            rows = np.array(pin.getFrameJacobian(model, held.data, i, _AXES))
+            drift = pin.getFrameClassicalAcceleration(model, held.data, i, _AXES).vector
+            lag = pin.getFrameVelocity(model, of_aim, i, _AXES).vector - rows @ v
+            off = np.append(goal.translation - place.translation, pin.log3(goal.rotation @ place.rotation.T))
+            wanted = pin.getFrameClassicalAcceleration(model, of_aim, i, _AXES).vector
+            wanted = wanted + self.kp * w**2 * off + self.kd * 2 * w * lag
+            self.footing.tasks.add(self.settings.hand, rows @ A, rows @ held.a0 + drift - wanted)
 
     def _momentum(self, q: Array, v: Array, lag: Array, aim: Aim, B: Array, recovers: bool) -> Array:
         """Rows of the centre of mass and of the angular momentum, whose rates are the soles' wrenches.
 
         What all wrenches are to make (6,), over the mass.
         """
-        held, s, data, mass, lift = self.held, self.settings, self.data, self.mass, self.lift
+        held, lift = self.footing.held, self.footing.lift
+        s, data, mass = self.settings, self.data, self.mass
         Ag = pin.ccrba(self.robot.model, data, q, v)
         com = np.array(data.com[0])
         for k, place in enumerate(held.places):
@@ -428,7 +483,7 @@ class WholeBodyController:
             - self.gravity
         )
         wanted[3:] = (aim.momentum[1] + s.momentum_gain * error[3:]) / mass
-        self.tasks.add(self.moves, lift @ B, lift @ held.b0 - wanted)
+        self.footing.tasks.add(self.moves, lift @ B, lift @ held.b0 - wanted)
         return wanted
 
 

@@ -32,6 +32,7 @@ _EXPORTS = {
     "Phase": "problem.problem",
     "Plan": "transcription.plan",
     "RigidBody": "robots.rigid_body",
+    "RigidImpact": "collision",
     "Robot": "robots.robot",
     "Robustness": "simulation.robustness",
     "SDC": "collision",

@@ -29,6 +29,7 @@ class Model(str, enum.Enum):
     sdc = "sdc"
     paper = "sdc-paper"
     virtual_mass = "virtual-mass"
+    rigid = "rigid"
     full = "full"
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, ValidationError
 
 from impactopt.collide.contact_states import ContactStates, States
 from impactopt.collision import Collision, CollisionModel
+from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.sdc import frozen_model
-from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import Record, load_record, plain
@@ -39,6 +39,7 @@ __all__ = [
     "collide_once",
     "collision_model",
     "full_names",
+    "one_collision",
     "planned_numbers",
     "problem_of_result",
 ]
@@ -66,7 +67,7 @@ class AtContact(Section):
     kp_scale: Positive = 1.0
     kd_scale: Positive = 1.0
     torque_limit_scale: Positive = 1.0
-    model: Literal["virtual-mass", "sdc-paper", "sdc", "full"] = "sdc"
+    model: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full"] = "sdc"
     freezes: int = Field(default=0, ge=0)
     horizon: Positive = Field(default=0.2, alias="horizon_s")
 
@@ -113,6 +114,9 @@ def collision_model(
     }
     if section.model == "full":
         return FullDynamics(**options, step=_STEP)
+    if section.model == "rigid":
+        e = content.collision.given().get("coefficient_of_restitution", 0.0) if content.collision else 0.0
+        return RigidImpact(**options, coefficient_of_restitution=e)
     return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)
 
 
@@ -250,6 +254,8 @@ _OWN_ERRORS = {
     "sdc-paper": "it has no servo stiffness, no feed-forward torque, no bias and no dJ/dt v: of ZMP, "
     "forces on soles and torques believe the plan and its replays",
     "virtual-mass": "a point mass, which no servo pushes on: believe the plan and its replays",
+    "rigid": "an impact in no time, which neither servo nor contact law has a part in: believe the plan and "
+    "its replays",
     "full": "nothing is frozen; it differs from the replay on held soles by their steps, and from "
     "the plan by what that has between its collocation points",
 }
@@ -406,7 +412,13 @@ def _collide(model: CollisionModel, rows: States, section: AtContact) -> Collisi
     known = getattr(model, "settings", settings)
     given = {name: x for name, x in settings.items() if name in known}
     q, v, torque = rows.q[0], rows.v[0], rows.torque[0]
-    if isinstance(model, SymbolicModel):
-        return model.collide(q, v, torque, require_separation=False, **given)
-    full: Any = model
-    return full.converged(q, v, torque, tolerance=_TOLERANCE, require_separation=False, **given)[0]
+    return one_collision(model, q, v, torque, **given)
+
+
+def one_collision(
+    model: CollisionModel, q: Array, v: Array, torque: Array, **settings: ArrayLike
+) -> Collision:
+    """A collision of any model, that of full dynamics with steps so short that they change nothing."""
+    if isinstance(model, FullDynamics):
+        return model.converged(q, v, torque, tolerance=_TOLERANCE, require_separation=False, **settings)[0]
+    return model.collide(q, v, torque, require_separation=False, **settings)

@@ -3,6 +3,7 @@
 from impactopt.collision.frozen import effective_mass
 from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.collision.outputs import OUTPUTS
+from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.sdc import SDC, VirtualMass
 from impactopt.collision.settings import Effects, JointFriction
 
@@ -13,6 +14,7 @@ __all__ = [
     "CollisionModel",
     "Effects",
     "JointFriction",
+    "RigidImpact",
     "VirtualMass",
     "effective_mass",
 ]

@@ -28,7 +28,7 @@ class Collision:
     Attributes
     ----------
     impulse : [N s] delivered to the target.
-    peak_force : [N] largest contact force; of 'rk4' at the steps.
+    peak_force : [N] largest contact force; of 'rk4' at the steps; infinite of a rigid impact.
     duration : [s] from contact to separation.
     energy : [J] given to the target.
     separated : whether the contact ended within the horizon.
@@ -41,7 +41,7 @@ class Collision:
     hand_speed, target_speed : (k) [m/s] along the normal.
     joint_velocity : (k, n) [rad/s].
     torque, demand : (k, n) [N m] of the servo, and what it would be without saturation. These, the joint
-        velocities and all wrenches are None of a point mass, which knows nothing of them.
+        velocities and all wrenches are None of a point mass and a rigid impact, which know nothing of them.
     sole_wrench : (k, soles, 6) [N, N m] of the ground on each fixed sole, world axes, at the sole's frame;
         in the stance's order of soles. None on a fixed base.
     hand_wrench : (k, hands, 6) [N, N m] of the world on each supporting hand, world axes, at its striking

@@ -26,6 +26,7 @@ from impactopt.collide.single_collision import (
     chosen,
     collision_model,
     full_names,
+    one_collision,
 )
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import FREEZE_ERROR, too_large
@@ -124,7 +125,6 @@ Rows = NDArray[np.intp]
 Numbers = Mapping[Place, Array]  # columns of numbers, by their keys' places
 
 _ROWS, _WITH_HISTORIES = 8192, 512  # rows at a time: histories are large
-_TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
 NO_NUMBER = (
     "the collision has no finite numbers: its steps are unstable here, or what holds the robot cannot be "
     "told apart"
@@ -288,21 +288,14 @@ def batch(
 def one_by_one(
     model: Any, outputs: tuple[str, ...], states: States, settings: Mapping[str, Array]
 ) -> tuple[dict[str, Array], NDArray[np.object_]]:
-    """Likewise, of the full dynamics, which have no batch."""
+    """Likewise, of models that have no batch."""
     count = len(states.q)
     rows: list[Collision | None] = []
     reason = np.full(count, "", dtype=object)
     for i in range(count):
         own = {name: x[0 if len(x) == 1 else i] for name, x in settings.items()}
         try:
-            result, _ = model.converged(
-                states.q[i],
-                states.v[i],
-                states.torque[i],
-                tolerance=_TOLERANCE,
-                require_separation=False,
-                **own,
-            )
+            result = one_collision(model, states.q[i], states.v[i], states.torque[i], **own)
         except InputError as error:
             rows.append(None)
             reason[i] = str(error)

@@ -1,0 +1,118 @@
+"""Rigid impact with a coefficient of restitution: the robot as it is held, in no time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.collision.interface import Collision, CollisionModel
+from impactopt.contact import FreeMass, RigidWall
+from impactopt.errors import InputError, check_array, check_number, did_you_mean
+from impactopt.kinematics.operational_space import Held
+
+__all__ = ["RigidImpact"]
+
+Array = NDArray[np.float64]
+_DEPENDENT = 1e-12  # of the largest: a robot of few joints has constraints that depend on each other
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigidImpact(CollisionModel):
+    """Newton's restitution along the normal between robot and target, whose postures do not change meanwhile.
+
+    With P the inverse inertia of the robot as held, v_c the speed of approach and m_t the target's mass,
+
+        I = (1 + e) v_c / (n' J P J' n + 1 / m_t),      v+ = v - P J' n I.
+
+    Finite forces do nothing in no time: servo, gravity and the contact law are not in it, and neither are
+    torques, sole wrenches and ZMP (None in its results). The peak force is infinite.
+
+    Attributes
+    ----------
+    coefficient_of_restitution : e, of the speed of approach: 0, plastic, to 1, elastic.
+
+    Others, and errors, as of `CollisionModel`; also
+
+    Raises
+    ------
+    InputError : a coefficient outside [0, 1]; a target that is neither a free mass nor a wall.
+    """
+
+    coefficient_of_restitution: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        e = check_number("coefficient_of_restitution", self.coefficient_of_restitution)
+        if not 0 <= e <= 1:
+            raise InputError(f"coefficient_of_restitution must be between 0 and 1, not {e:g}")
+        if not isinstance(self.target, (FreeMass, RigidWall)):
+            raise InputError(
+                f"a rigid impact knows the targets FreeMass and RigidWall only, not "
+                f"{type(self.target).__name__}: take another model"
+            )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Numbers that `collide` may be given instead: those of the target, ``target_mass``."""
+        return {f"target_{name}": value for name, value in self.target.parameters.items()}
+
+    def _by_unit_impulse(self, q: Array) -> tuple[Array, Array]:
+        """n' J (nv,), and P J' n (nv,): the velocities that a unit impulse takes."""
+        frames = self.held_by.constraint_frames(self.robot)
+        body = Held.at(self.robot.model, q, frames, self.robot.striker(self.striker).model_frame)
+        hand = np.asarray(self.normal) @ body.hand
+        moves = np.linalg.solve(body.inertia, np.vstack([body.held, hand]).T)
+        held, free = moves[:, :-1], moves[:, -1]
+        inner = body.held @ held + np.diag(np.tile(self.held_by.compliance, len(frames)))
+        return hand, free - held @ np.linalg.lstsq(inner, body.held @ free, rcond=_DEPENDENT)[0]
+
+    def collide(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        torque: ArrayLike | None = None,
+        *,
+        require_separation: bool = True,
+        **overrides: ArrayLike,
+    ) -> Collision:
+        q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
+        for name in overrides:
+            if name not in self.settings:
+                raise InputError(f"there is no setting {name!r}{did_you_mean(name, self.settings)}")
+        known = self.settings | {n: float(check_array(n, x, ())) for n, x in overrides.items()}
+        numbers = {name: known[f"target_{name}"] for name in self.target.parameters}
+        state = np.zeros(self.target.n_states)
+        before = float(self.target.velocity(state, numbers))
+        hand, change = self._by_unit_impulse(q)
+        speed, yields = float(hand @ v), float(hand @ change)
+        gain = np.array(self.target.derivative(state, 1.0, numbers), dtype=float)  # of the target's state
+        lightness = float(self.target.velocity(gain, numbers)) - before
+        impulse = max((1 + self.coefficient_of_restitution) * (speed - before) / (yields + lightness), 0.0)
+        after, state = v - change * impulse, gain * impulse
+        values = self.target.result(state, numbers)
+        at = np.zeros(1)
+        return Collision(
+            impulse=impulse,
+            peak_force=np.inf if impulse else 0.0,
+            duration=0.0,
+            energy=float(self.target.energy(state, numbers)),
+            separated=True,
+            velocity=after,
+            configuration=q,
+            target_result=dict(zip(self.target.results, map(float, values), strict=True)),
+            time=at,
+            force=at,
+            penetration=at,
+            hand_speed=np.array([speed - yields * impulse]),
+            target_speed=np.array([float(self.target.velocity(state, numbers))]),
+            joint_velocity=None,
+            torque=None,
+            demand=None,
+            sole_wrench=None,
+            hand_wrench=None,
+            ground_wrench=None,
+            zmp=None,
+        )

@@ -44,13 +44,15 @@ class TorqueCourse(NamedTuple):
 def torque_courses(
     b: Builder, swing: MotionPhase, follows: Sequence[MotionPhase], torques: Sequence[Affine]
 ) -> list[TorqueCourse]:
-    """Torque profiles of the swing, whose initial torque is given, and of each motion to rest.
+    """Torque profiles of the swing, whose initial torque is given where it starts at rest, and of each motion
+    to rest.
 
     torques : over limit, at the nodes of all of these, one motion after the other.
     """
-    start, first = Affine.constant(start_torque(b)), len(swing.nodes)
-    nodes = np.append(0.0, swing.nodes)
-    out = [TorqueCourse(nodes, [start, *torques[:first]], swing.T[0], swing.place_at)]
+    first, nodes, own = len(swing.nodes), swing.nodes, list(torques[: len(swing.nodes)])
+    if nodes[0]:  # at rest before it
+        nodes, own = np.append(0.0, nodes), [Affine.constant(start_torque(b)), *own]
+    out = [TorqueCourse(nodes, own, swing.T[0], swing.place_at)]
     for motion in follows:
         last = first + len(motion.nodes)
         out.append(TorqueCourse(motion.nodes, list(torques[first:last]), motion.T[0], motion.place_at))

@@ -46,6 +46,7 @@ Array = NDArray[np.float64]
 TRIED = 8  # targets
 STIFFNESS, DAMPING = 1e4, 300.0  # [N/m], [N s/m] of a drafted contact
 SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # [s] of fast robots
+SHIFT = (0.6, 1.2)  # [s] from two feet to one, and back
 START = "ready"
 MOTIONS = ("punch", "kick")
 TOE = 0.02  # [m] of the point of a toe above the sole
@@ -168,7 +169,7 @@ def _kick(
     forward: Array,
     folder: Path,
 ) -> Draft:
-    """A draft of a kick: from one foot, with the toe of the other one, against a ball on the ground.
+    """A draft of a kick from two feet and back to them, with the toe, against a ball on the ground.
 
     Raises
     ------
@@ -188,7 +189,7 @@ def _kick(
     strikers = [*strikers, toe]
     robot = drafted.made(soles=soles, strikers=strikers)
     legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
-    q = half_sitting(robot, legs, soles, forward, lifted=lifted)
+    q = half_sitting(robot, legs, soles, forward)
     at = striking_point(robot, toe.name, q)
     hip = robot.model.createData()
     pin.forwardKinematics(robot.model, hip, q)
@@ -196,7 +197,8 @@ def _kick(
     data = _data(drafted, robot, soles, strikers, q, folder)
     size = float(f"{min(BALL, 0.3 * length):.2g}")
     mass = float(f"{np.clip(0.005 * sum(body.mass for body in robot.model.inertias), 0.1, 0.45):.2g}")
-    data["stance"] = {"soles": stands.name}
+    both = {"soles": [sole.name for sole in soles], "duration_s": list(SHIFT), "intervals": 8, "grading": 1.0}
+    data["stances"] = [both, {"soles": [stands.name]}, both]
     data["target"] = {"mass_kg": mass, "body": {"shape": "ball", "size_m": [size]}}
     data["contact"] = {"stiffness_N_m": 2 * STIFFNESS, "damping_N_s_m": 20.0}
     points = (np.round([part * length, at[1], size / 2], 3) + 0.0 for part in KICKS)
@@ -346,8 +348,6 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         if len(place) == 2 and place[0] == "robot" and str(place[1]) in guessed:
             return guessed[str(place[1])]
         if place == ("robot", "postures_rad", START):
-            if "stance" in data:
-                return "on one foot, the other one behind it, knees ahead"
             return "soles level, knees ahead, arms bent" if data["robot"].get("soles") else "bent"
         return comment_at(data, place)
 

@@ -19,9 +19,7 @@ __all__ = ["arm_length", "bend_arm", "eased", "half_sitting", "rested", "shoulde
 
 Array = NDArray[np.float64]
 BENT = 0.06  # of the legs' length: how much lower than straight it sits
-WAITS = (0.1, 0.12)  # of the legs' length: how far back, and how much higher, a foot waits to kick
-INNER = 0.15  # of a sole's width: how far inside its middle the weight is, of a robot on one foot
-LEVEL, INACCURATE = 1e-7, 0.1  # [m], [rad] off its goal: a sole that stands, and one that waits in the air
+LEVEL = 1e-7  # [m], [rad] off its goal: a sole that stands
 STARTS = 10
 HELD = 0.5  # of its torque limit: what gravity may ask of a joint that does not strike
 INSIDE = 0.1  # of a joint's range that is left to its limits
@@ -31,13 +29,10 @@ ACROSS = 0.7  # largest cosine between a shoulder's axis and the arm, for its pl
 EDGE = 0.2  # of a range: zero is a joint's rest unless it is as near to a limit as that
 
 
-def half_sitting(
-    robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array, *, lifted: int | None = None
-) -> Array:
+def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array) -> Array:
     """A configuration (nq,) with the soles level and beside each other, knees ahead, the weight above them.
 
-    robot : with the soles.  forward (3,) : in the root's frame.  lifted : the sole of that index waits higher
-    and farther back, to kick, with the weight above the other one.
+    robot : with the soles.  forward (3,) : in the root's frame.
 
     Raises
     ------
@@ -54,29 +49,21 @@ def half_sitting(
     length = float(np.mean([_path(robot, own[1:]) for own in chains]))
     height = min(float(spot[2]) for spot in straight) + BENT * length
     ahead = float(np.mean([hip @ forward for hip in hips]))
-    bearing = [sole for k, sole in enumerate(soles) if k != lifted]
-    waits = [length * np.array(WAITS if k == lifted else (0.0, 0.0)) for k in range(len(soles))]
-    inwards = 0.0 if lifted is None else float(np.sign(aside[lifted] - aside[1 - lifted]))
     rng, q = np.random.default_rng(0), neutral
-    for _ in range(8 if lifted is not None else 4):  # feet go where the weight is
-        for own, sole, out, (back, up) in zip(chains, soles, aside, waits, strict=True):
-            spot = (ahead - back) * turn[:, 0] + out * turn[:, 1] + (height + up) * turn[:, 2]
-            within = LEVEL if sole in bearing else INACCURATE
-            q = _leg(robot, own, sole, pin.SE3(turn, spot), q, forward, rng, within)
+    for _ in range(4):  # feet go where the weight is
+        for own, sole, out in zip(chains, soles, aside, strict=True):
+            spot = ahead * turn[:, 0] + out * turn[:, 1] + height * turn[:, 2]
+            q = _leg(robot, own, sole, pin.SE3(turn, spot), q, forward, rng)
         centre = np.array(pin.centerOfMass(model, data, q))
         pin.framesForwardKinematics(model, data, q)
         middles = [
-            data.oMf[model.getFrameId(s.frame)].act(np.append(s.polygon.mean(axis=0), 0.0)) for s in bearing
+            data.oMf[model.getFrameId(s.frame)].act(np.append(s.polygon.mean(axis=0), 0.0)) for s in soles
         ]
-        if lifted is not None:  # an ankle need not roll that far
-            middles = [middles[0] + INNER * np.ptp(bearing[0].polygon[:, 1]) * inwards * turn[:, 1]]
-        off = (centre - np.mean(middles, axis=0)) @ turn
-        if lifted is not None:
-            aside = [out + float(off[1]) for out in aside]
-        if np.abs(off[: 1 if lifted is None else 2]).max() < 2e-3:
+        off = float((centre - np.mean(middles, axis=0)) @ turn[:, 0])
+        if abs(off) < 2e-3:
             break
-        ahead += float(off[0])
-    return robot.place(q, bearing)
+        ahead += off
+    return robot.place(q, soles)
 
 
 def bend_arm(
@@ -147,11 +134,10 @@ def _leg(
     q: Array,
     forward: Array,
     rng: np.random.Generator,
-    within: float,
 ) -> Array:
     """The configuration with a leg's sole at its goal, a pin.SE3, and its knee as far ahead as may be.
 
-    joints : of the leg; its last six move, or as many as there are.  within [m], [rad] : of the goal.
+    joints : of the leg; its last six move, or as many as there are.
     """
     model, data = robot.model, robot.model.createData()
     fid, own = model.getFrameId(sole.frame), _rows(robot, joints[-LEG:])
@@ -171,7 +157,7 @@ def _leg(
         )
         off = float(np.abs(errors(found.x)).max())
         nearest = min(nearest, off)
-        if off > within:
+        if off > LEVEL:
             continue
         knee = max(float(data.oMi[j].translation @ forward) for j in joints)
         if best is None or knee > best[0] + 1e-4:

@@ -15,6 +15,7 @@ _EXPORTS = {
     "Actuator": "robots.actuators",
     "BothSoles": "kinematics.stance",
     "CacheWarning": "errors",
+    "ContactFriction": "contact",
     "Perturbation": "simulation.perturbation",
     "FixedBase": "kinematics.stance",
     "Free": "kinematics.stance",

@@ -5,9 +5,10 @@ One class a file, in `laws/` and `targets/`; `targets/base.py` has numbers that 
 
 from impactopt.contact import laws, targets
 from impactopt.contact.fields import power
+from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import *  # noqa: F403
 from impactopt.contact.targets import *  # noqa: F403
 
-__all__ = ["power"]
+__all__ = ["ContactFriction", "power"]
 __all__ += laws.__all__
 __all__ += targets.__all__

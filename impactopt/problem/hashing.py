@@ -28,8 +28,9 @@ def problem_hash(problem: Any) -> str:
     """
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name not in _UNSHAPED}
     second = shape.pop("second")
-    if not shape["stances"]:
-        shape.pop("stances")
+    for name in ("stances", "friction"):
+        if not shape[name]:
+            shape.pop(name)
     shape.pop("ground")
     if not problem.robot.floating:
         shape["ground"] = problem.ground_height

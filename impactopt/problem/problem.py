@@ -23,6 +23,7 @@ from impactopt.bodies.world import (
     target_bodies,
 )
 from impactopt.collision.settings import Effects
+from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import (
@@ -96,6 +97,7 @@ class ImpactProblem:
         with z = 0 at the ground on which the soles stand, and the soles of the start posture centred on the
         origin.
     normal (3,) : unit vector in the world frame, along which the target is pushed.
+    friction : of the striking points on the target, which does not move sideways; None: there is none.
     second : another striker that hits the same target at the same time, at a point of its own.
     law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
         once and stands again before the striker leaves it.
@@ -148,6 +150,7 @@ class ImpactProblem:
     normal: Array
     law: ContactLaw
     target: Target
+    friction: ContactFriction | None = None
     second: SecondStriker | None = None
     stance: Stance = field(default_factory=BothSoles)
     stances: tuple[StancePhase, ...] = ()

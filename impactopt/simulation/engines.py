@@ -31,6 +31,7 @@ def scene_of(problem: ImpactProblem) -> Scene:
         normal=p.normal,
         law=p.law,
         target=p.target,
+        friction=p.friction,
         striker=p.robot.striker(p.striker).model_frame,
         soles=tuple(sole.frame for sole in p.soles),
         hands=p.stance.hand_frames(p.robot),

@@ -76,7 +76,8 @@ class _Replay(MujocoRobot):
         meeting = solids_in_contact(robot, self.scene) if contact == "link" else []
         struck = [k for each in meeting for pair in each for k in pair]
         world = build_world(robot, self.scene, perturbation, solver, near, struck)
-        super().__init__(robot, world, *(site_name(k + 1) for k in range(len(scene.strikers))))
+        sites = (site_name(k + 1) for k in range(len(scene.strikers)))
+        super().__init__(robot, world, *sites, friction=scene.friction)
         self.links = LinkContact(self.mujoco, self.world, meeting) if meeting else None
         self.depths = np.full(len(scene.strikers), -np.inf)  # [m] of strikers in the target
         if self.links is not None:
@@ -174,7 +175,7 @@ class _Replay(MujocoRobot):
         self.yields = None
         if struck.near(depths, speeds, self.target, step):
             self.yields = np.zeros_like(self.along)
-            self.mujoco.mj_solveM(self.world, d, self.yields, self.along)
+            self.mujoco.mj_solveM(self.world, d, self.yields, self.pushes)
             yields = self.along @ self.yields.T
             gains = none if self.before is None else (speeds - self.before[0]) / step
             gains = gains + (none if self.before is None else yields @ self.before[1])

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.contact.friction import ContactFriction
 from impactopt.errors import missing_package
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR
@@ -291,10 +292,12 @@ class MujocoRobot:
 
     world, data : MuJoCo's model and its data.  dof, place : where the joints' rates and angles are in qvel
     and qpos.  sites : of the striking points, and along (h, nv): their Jacobians along the normal, where they
-    have been last.
+    have been last; pushes (h, nv): the forces of a unit of normal force, which are these without friction.
     """
 
-    def __init__(self, robot: Robot, world: Any, *strikers: str) -> None:
+    def __init__(
+        self, robot: Robot, world: Any, *strikers: str, friction: ContactFriction | None = None
+    ) -> None:
         self.mujoco, self.robot, self.world = mujoco_module(), robot, world
         self.data = self.mujoco.MjData(world)
         self.floating = robot.floating
@@ -308,6 +311,8 @@ class MujocoRobot:
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._rows, self.along = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
+        self.friction = friction
+        self.pushes = self.along if friction is None else np.zeros_like(self.along)
 
     def put(self, q: Array, v: Array | None = None) -> None:
         """Go to q (nq), v (nv; None: the rates stay); what depends on them is not computed yet."""
@@ -346,16 +351,20 @@ class MujocoRobot:
         return np.asarray(self.data.site_xpos[self.sites])
 
     def speeds_along(self, normal: Array) -> Array:
-        """Speeds (h,) [m/s] of the striking points along a normal (3,); leaves their rows in `along`."""
+        """Speeds (h,) [m/s] of the striking points along a normal (3,); leaves their rows in `along`, and
+        what a unit of the contacts' normal forces does in `pushes`.
+        """
         for k, site in enumerate(self.sites):
             self.mujoco.mj_jacSite(self.world, self.data, self._rows, None, site)
             self.along[k] = normal @ self._rows
+            if self.friction is not None:
+                self.pushes[k] = self.friction.way(normal, self._rows @ self.data.qvel) @ self._rows
         return np.asarray(self.along @ self.data.qvel)
 
     def apply(self, torque: Array, forces: Array | float) -> None:
         """Torque (n) [N m] at the joints, and the contacts' forces (h,) [N], against the normal."""
         applied = self.data.qfrc_applied
-        applied[:] = -np.atleast_1d(forces) @ self.along
+        applied[:] = -np.atleast_1d(forces) @ self.pushes
         applied[self.dof] += torque
 
 

@@ -81,7 +81,9 @@ class _World:
             if scene.standing.size:
                 held = np.flatnonzero(scene.standing[stance])
             chosen = tuple(frames[k] for k in held)
-            body = PinocchioBody(self.robot, chosen, np.zeros(6), scene.strikers, scene.normal)
+            body = PinocchioBody(
+                self.robot, chosen, np.zeros(6), scene.strikers, scene.normal, scene.friction
+            )
             self._bodies[stance] = held, body
         return self._bodies[stance]
 

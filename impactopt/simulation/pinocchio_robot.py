@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 
@@ -32,6 +33,7 @@ class Body(ABC):
     compliance : (6,) of each constrained frame, as `Stance.compliance`.
     striker : the striking frame, or several.
     normal : (3,) of the blow.
+    friction : of the striking points on the target.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class Body(ABC):
         compliance: Array,
         striker: str | tuple[str, ...],
         normal: Array,
+        friction: ContactFriction | None = None,
     ) -> None:
         self.model, self.n, self.nv = robot.model, robot.n, robot.nv
         self.data: Any = robot.model.createData()
@@ -48,7 +51,8 @@ class Body(ABC):
         self.compliance, self.normal = np.tile(compliance, len(frames)), normal
         strikers = (striker,) if isinstance(striker, str) else striker
         self.hands = [self.model.getFrameId(name) for name in strikers]
-        self.rows = np.zeros((len(strikers), self.nv))
+        self.friction = friction
+        self.rows = self.pushes = np.zeros((len(strikers), self.nv))
 
     @abstractmethod
     def look(self, q: Array, v: Array) -> float:
@@ -86,12 +90,17 @@ class Body(ABC):
         J = pin.getFrameJacobian(self.model, self.data, frame, _AXES)
         return np.reshape(J, (6, self.nv))  # a single column comes without its second dimension
 
-    def _rows(self) -> Array:
-        """(hands, nv) of the striking points' speeds along the normal, once all Jacobians are known."""
-        return np.array([self.normal @ self._jacobian(hand)[:3] for hand in self.hands])
+    def _meet(self, v: Array) -> None:
+        """Sets rows and pushes (hands, nv), once all Jacobians are known: the striking points' speeds along
+        the normal, and what a unit of the contact's normal force does, friction included.
+        """
+        jacobians = [self._jacobian(hand)[:3] for hand in self.hands]
+        self.rows = self.pushes = np.array([self.normal @ J for J in jacobians])
+        if self.friction is not None:
+            self.pushes = np.array([self.friction.way(self.normal, J @ v) @ J for J in jacobians])
 
     def _push(self, torque: Array, force: float | Array) -> Array:
-        push = -np.atleast_1d(force) @ self.rows
+        push = -np.atleast_1d(force) @ self.pushes
         push[-self.n :] += torque
         return push
 
@@ -121,7 +130,7 @@ class DenseBody(Body):
             self._matrix[rows, :nv] = J
             self._matrix[:nv, rows] = -J.T
             self._right[rows] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
-        self.rows = self._rows()
+        self._meet(v)
         self._matrix[:nv, :nv] = pin.crba(model, data, q)
         self._bias = pin.nonLinearEffects(model, data, q, v)
         return float(self.rows[0] @ v)
@@ -184,7 +193,7 @@ class PinocchioBody(Body):
         self._at = q, v
         pin.forwardKinematics(self.model, self.data, q, v)
         pin.computeJointJacobians(self.model, self.data)
-        self.rows = self._rows()
+        self._meet(v)
         return float(self.rows[0] @ v)
 
     def accelerate(self, torque: Array, force: float | Array) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
@@ -78,6 +79,7 @@ class Scene:
     of the model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
     counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what
     else can touch. hands: frames of the model that hold on to where the reference has them at first.
+    friction: of the striking points on the target.
     second: of another striker that hits the same target, its frame of the model and its point (3,) [m].
     standing (stances, soles): which soles stand in each stance phase, and polygons of each; (0, 0), (): there
     is one stance, on all of them.
@@ -93,6 +95,7 @@ class Scene:
     polygon: Array
     solids: Solids = field(default_factory=Solids)
     hands: tuple[str, ...] = ()
+    friction: ContactFriction | None = None
     second: tuple[str, Array] | None = None
     standing: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     polygons: tuple[Array, ...] = ()

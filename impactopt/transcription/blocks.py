@@ -233,16 +233,17 @@ def builders(
     first: bool = False,
     second: str = "",
     chosen: Joints = (),
+    rubs: bool = False,
 ) -> dict[str, Callable[[], BlockExpression]]:
     """Block's name -> a function that builds its expression; ``instant``: for an impact without duration;
     ``frozen``: the terms of a model with frozen dynamics, and its freezes on the way; ``first``: whether the
     first instant of contact is looked at; ``second``: another striker; ``chosen``: joints whose gains have a
-    factor each.
+    factor each; ``rubs``: whether striking points have friction.
 
     That is slow: it is only called when the compiled library is not in the cache.
     """
     hit: dict[str, Callable[[], BlockExpression]] = {
-        "collision": lambda: collision(c, striker, frozen, second, chosen),
+        "collision": lambda: collision(c, striker, frozen, second, chosen, rubs),
         "force": lambda: force(c, striker, law, target, frozen, second),
     }
     if c.legs:
@@ -259,7 +260,7 @@ def builders(
         hit["second_contact"] = lambda: contact(c, second)
         hit["second_approach"] = lambda: approach(c, second)
     if first:
-        hit["first"] = lambda: first_instant(c, striker, law)
+        hit["first"] = lambda: first_instant(c, striker, law, rubs)
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),
@@ -311,6 +312,7 @@ def own_blocks(
         first=problem.first_instant,
         second="" if problem.second is None else problem.second.striker,
         chosen=problem.gain_joints,
+        rubs=problem.friction is not None,
     )
 
 

@@ -78,7 +78,7 @@ class FirstInstant:
         law, robot = np.array([*self.law.values()]), b.robot
         before = np.array([float(b.problem.target.speed_before())])
         numbers = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
-        return slots, np.concatenate(numbers)
+        return slots, np.concatenate([*numbers, friction_numbers(b.problem)])
 
     def add_rows(self, at: int) -> None:
         """``at``: number of the first output of its instance."""
@@ -108,6 +108,11 @@ class FirstInstant:
         self.w.write(x, w)
 
 
+def friction_numbers(problem: ImpactProblem) -> Array:
+    """Parameters of the striking points' friction (2,); (0,) where there is none."""
+    return np.array(() if problem.friction is None else problem.friction.parameters, dtype=float)
+
+
 def jump(
     problem: ImpactProblem, c: StanceCoordinates, law: ContactLaw, y: Array, rates: Array, legs: Array
 ) -> tuple[float, Array, Array, Array]:
@@ -126,9 +131,12 @@ def jump(
     axes = pin.LOCAL_WORLD_ALIGNED
     found = [np.reshape(pin.getFrameJacobian(model, data, hand, axes), (6, model.nv))[:3] for hand in hands]
     rows = np.array([problem.normal @ jacobian for jacobian in found])
+    pushes = rows
+    if problem.friction is not None:
+        pushes = np.array([problem.friction.way(problem.normal, each @ v) @ each for each in found])
     rates = rows @ v - float(problem.target.speed_before())
     forces = np.array([float(law.branch(0.0, float(rate), True)) for rate in rates])
-    both = np.linalg.solve(inertia, np.column_stack([soles.T, -forces @ rows]))
+    both = np.linalg.solve(inertia, np.column_stack([soles.T, -forces @ pushes]))
     spread, free = both[:, :-1], both[:, -1]
     w: Array = np.zeros(0)
     if len(soles):
@@ -385,7 +393,8 @@ class Collision(ContactNumbers, Collocated):
             given, x1 = self._slots(self.p, i, none)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
             force.append([*self._of_hand(i), self.f[i], *state, *travelled, x1, given])
-        gains = np.concatenate([*self._gains(), b.robot.torque_limit, b.limits.units])
+        of_all = [*self._gains(), b.robot.torque_limit, b.limits.units, friction_numbers(p)]
+        gains = np.concatenate(of_all)
         collision_p = [np.concatenate([p.normal, [s.place, s.phase > 0], gains]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
             "collision": (collision, collision_p),

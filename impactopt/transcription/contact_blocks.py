@@ -79,7 +79,12 @@ def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpres
 
 
 def collision(
-    c: StanceCoordinates, striker: str, frozen: Effects | None = None, second: str = "", chosen: Joints = ()
+    c: StanceCoordinates,
+    striker: str,
+    frozen: Effects | None = None,
+    second: str = "",
+    chosen: Joints = (),
+    rubs: bool = False,
 ) -> BlockExpression:
     """Equation of motion (6) at one collocation point of the collision.
 
@@ -97,7 +102,7 @@ def collision(
         slope; slope of the hand's speed; wrenches that carry the weight, where the model has no bias (nw).
       last: logarithms of the factors on the gains of ``chosen`` joints.
     p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight
-        [N], lever [m].
+        [N], lever [m]; if the striking point ``rubs`` the parameters of `ContactFriction`.
     out = closure [m, rad], base rows, joint rows over torque limit, servo torque over limit; frozen: what the
         slopes of the legs' rates, of their lag and of the hand's speed are off by.
     """
@@ -109,6 +114,7 @@ def collision(
     normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
     kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
     weight, lever, logs = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("logs", len(chosen))
+    rub = ca.SX.sym("rub", 2 * rubs)
     t = after * T1 + T * s
     y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
     through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
@@ -130,7 +136,7 @@ def collision(
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
     for k, name in enumerate(strikers):
         row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{name}")[:3, :])])(q)
-        tau += ca.mtimes(row.T, normal) * f[k]
+        tau += ca.mtimes(row.T, _pushed_way(normal, ca.mtimes(row, v), rub)) * f[k]
     tau -= c.sole_wrench_map(at[0], at[2], w - carried)
     # position and rate of the reference relative to the robot, by joint (the base's part is not the servo's)
     if frozen is None:
@@ -154,8 +160,18 @@ def collision(
     }
     z = [y0, u0, *more[: 2 * (frozen is None)], ff, d1, T1, d, T, u, u1, legs, f, w]
     z += [*(more if frozen is not None else []), logs]
-    p = [normal, s, after, kp, kd, limit, weight, lever]
+    p = [normal, s, after, kp, kd, limit, weight, lever, rub]
     return make_block(z, p, out, through, lanes=4, stages=stages)
+
+
+def _pushed_way(normal: Any, speed: Any, rub: Any) -> Any:
+    """(3) Force on the target over its normal part: the normal, and along the slide of a point with this
+    speed (3), with the parameters of friction (2), or none (0).
+    """
+    if not rub.numel():
+        return normal
+    slide = speed - normal * ca.dot(normal, speed)
+    return normal + slide * rub[0] / ca.sqrt(ca.dot(slide, slide) + rub[1] ** 2)
 
 
 def _strikers(striker: str, second: str) -> list[str]:
@@ -336,7 +352,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     return make_block([y, legs, u0, du, w, blow], p, out, lanes=2)
 
 
-def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpression:
+def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw, rubs: bool = False) -> BlockExpression:
     """The first instant of contact, at which a damped contact has a force already: accelerations jump.
 
     What changes is linear in the force: H da = J_c' dw - j' f, the frozen part of equation (6).
@@ -354,8 +370,12 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
     weight, lever, before = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("before")
     q, push = _pushed(c, striker, y, legs, normal)
     jump = c.velocity(y, legs, change)
-    balance = _inertia(c)(q, jump) + push * f - c.sole_wrench_map(y, legs, w)
     v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
+    rub, way = ca.SX.sym("rub", 2 * rubs), push
+    if rubs:
+        speed = striker_kinematics(c, striker)(q, v, 0 * v)[1]
+        way = _pushed(c, striker, y, legs, _pushed_way(normal, speed, rub))[1]
+    balance = _inertia(c)(q, jump) + way * f - c.sole_wrench_map(y, legs, w)
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     out = {
         "base": balance[: c.base, :] / base_scale(c, weight, lever),
@@ -363,7 +383,7 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
         "law": (f - law.branch(0.0, ca.dot(push, v) - before, True, named)) / FORCE_SCALE,
         "rotors": -armature * (a + jump)[c.base :] / limit,
     }
-    z, p = [y, legs, u0, change, w, f], [normal, of_law, before, armature, limit, weight, lever]
+    z, p = [y, legs, u0, change, w, f], [normal, of_law, before, armature, limit, weight, lever, rub]
     return make_block(z, p, out, lanes=2)
 
 

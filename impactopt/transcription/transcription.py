@@ -83,8 +83,9 @@ def block_functions(
     groups: list[FunctionGroup] = []
     springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
-    keys = {"force": (*contact, *second), "first": contact[:1], "coasting": frozen}
-    keys |= {"collision": (*frozen, *springs, *second), **dict.fromkeys(SECOND_BLOCKS, second)}
+    rubs = () if problem.friction is None else ("rubs",)
+    keys = {"force": (*contact, *second), "first": (*contact[:1], *rubs), "coasting": frozen}
+    keys |= {"collision": (*frozen, *springs, *second, *rubs), **dict.fromkeys(SECOND_BLOCKS, second)}
     if chosen := problem.gain_joints:
         keys |= {name: (*keys.get(name, ()), chosen) for name in ("collision", "spring")}
     found = {

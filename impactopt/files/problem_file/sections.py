@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from impactopt.bodies.world import Ground, Obstacle, TargetBody
 from impactopt.contact import laws, targets
 from impactopt.contact.fields import snake_case
+from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
 from impactopt.files.problem_file.diagnostics import section_at
 from impactopt.files.problem_file.robot_sections import RobotSection
@@ -362,6 +363,7 @@ class CollisionSection(Section):
 ScenarioSection: Any = section_of(Scenario)
 ObstacleSection: Any = section_of(Obstacle)
 GroundSection: Any = section_of(Ground)
+FrictionSection: Any = section_of(ContactFriction)
 ControllerSection: Any = section_of(ControllerSettings)
 
 
@@ -390,6 +392,7 @@ class File(Section):
     robot: RobotSection = optional("")
     target: Target
     contact: Contact
+    friction: FrictionSection = optional("")
     second: SecondSection = optional("")
     stance: StanceSection = optional("")
     stances: list[StancePhaseSection] = optional("")
@@ -486,6 +489,8 @@ class File(Section):
             out["obstacles"] = tuple(obstacle.build() for obstacle in self.obstacles)
         if self.ground is not None:
             out["ground"] = self.ground.build()
+        if self.friction is not None:
+            out["friction"] = self.friction.build()
         if self.stances is not None:
             out["stances"] = tuple(stance.build() for stance in self.stances)
         if self.scenarios is not None:

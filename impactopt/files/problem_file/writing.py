@@ -23,6 +23,7 @@ from impactopt.files.problem_file.sections import (
     CollisionSection,
     File,
     FollowSection,
+    FrictionSection,
     GroundSection,
     ObjectiveSection,
     ObjectiveSections,
@@ -297,6 +298,10 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     if problem.body != TargetBody():
         data["target"]["body"] = _section(Body, problem.body)
     data["obstacles"] = [_section(ObstacleSection, obstacle) for obstacle in problem.obstacles]
+    if problem.friction is not None:
+        data["friction"] = {"coefficient": problem.friction.coefficient} | _section(
+            FrictionSection, problem.friction
+        )
     if problem.ground is not None:
         data["ground"] = {"height_m": 0.0} | _section(GroundSection, problem.ground)
     order = ["problem", *(name for name in File.model_fields if name != "problem")]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.collision.settings import Effects, JointFriction, Settings, no_bend, servo_settings
-from impactopt.contact import ContactLaw, Target
+from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.errors import InputError, check_array
 from impactopt.robots.robot import Robot
 
@@ -148,13 +148,14 @@ class ReferenceModel(CollisionModel):
 
     Attributes
     ----------
-    friction : of the joints.
+    friction : of the joints.  contact_friction : of the striking point on the target.
     kp, kd : (n) or (n, n) gains in place of the robot's.
     step : [s] the longest.
     tolerance : relative, of the impulse.
     """
 
     friction: JointFriction | None = None
+    contact_friction: ContactFriction | None = None
     kp: ArrayLike | None = None
     kd: ArrayLike | None = None
     step: float = 5e-5

@@ -32,7 +32,7 @@ class FullDynamics(ReferenceModel):
 
     Attributes
     ----------
-    friction : of the joints.
+    friction : of the joints.  contact_friction : of the striking point on the target.
     kp, kd : (n) or (n, n) gains in place of the robot's.
     step : [s] the longest between instants of the histories, of which there are fifty at least.
     tolerance : relative, of the impulse.
@@ -59,7 +59,9 @@ class FullDynamics(ReferenceModel):
         self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
     ) -> tuple[Collision, float]:
         with np.errstate(over="ignore", invalid="ignore"):  # a motion that diverges says so itself
-            motion = Motion(FORMS[self.form](*self._held, normal), forces, q, v, self.horizon)
+            motion = Motion(
+                FORMS[self.form](*self._held, normal, self.contact_friction), forces, q, v, self.horizon
+            )
 
             def at(level: int) -> Run:
                 return motion.run(max(_OF_STEP * tolerance * _TIGHTER**level, _LEAST))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.collision.interface import Collision
+from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.mujoco_world import (
@@ -73,7 +74,7 @@ class MujocoDynamics(ReferenceModel):
     def _controlled(
         self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
     ) -> tuple[Collision, float]:
-        body = DenseBody(*self._held, normal)
+        body = DenseBody(*self._held, normal, self.contact_friction)
         rate = body.look(q, v) - forces.target_speed(np.zeros(forces.target.n_states))
         scales = contact_scales(body, forces, rate, self.horizon)
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
@@ -97,7 +98,7 @@ class MujocoDynamics(ReferenceModel):
     ) -> Collision:
         robot, frames, _, striker = self._held
         with no_log_file():
-            world = HeldRobot(robot, frames, striker, step)
+            world = HeldRobot(robot, frames, striker, step, self.contact_friction)
             world.start(q, v)
             soles = len(self.held_by.sole_names(robot))
             return march(world, forces, normal, self.horizon, soles, scales)
@@ -115,7 +116,14 @@ def _extrapolated(fine: Collision, coarse: Collision) -> Collision:
 class HeldRobot(MujocoRobot):
     """The robot with frames that are welded to where `start` finds them."""
 
-    def __init__(self, robot: Robot, frames: tuple[str, ...], striker: str, step: float) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        frames: tuple[str, ...],
+        striker: str,
+        step: float,
+        friction: ContactFriction | None = None,
+    ) -> None:
         mujoco, self.step = mujoco_module(), step
         spec = spec_of(robot, MujocoOptions(step, iterations=50, tolerance=0.0))
         spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -125,7 +133,7 @@ class HeldRobot(MujocoRobot):
         if striker not in frames:
             frame = robot.model.frames[robot.model.getFrameId(striker)]
             bodies[frame.parentJoint].add_site(name=striker, pos=frame.placement.translation)
-        super().__init__(robot, spec.compile(), striker)
+        super().__init__(robot, spec.compile(), striker, friction=friction)
         self.welds = Welds(self.world, frames)
 
     def start(self, q: Array, v: Array) -> None:

@@ -1,0 +1,48 @@
+"""Friction of the striking point on the target: Coulomb's, regularized."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.contact.fields import Described, about, check_numbers
+
+__all__ = ["ContactFriction"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactFriction(Described):
+    """Coulomb friction between the striking point and the target's surface, which does not move sideways.
+
+    The tangential force is against the slide v_t, and mu f |v_t| / sqrt(|v_t|^2 + v_s^2): below the slip speed
+    v_s it is less than Coulomb's, so that it has a slope at rest (Andersson, Soderberg, Bjorklund, "Friction
+    models for sliding dry, boundary and mixed lubricated contacts", Tribology International 40, 2007).
+    In the paper's equation (17) F_h = [f_r n; 0] becomes [f_r n + f_t; 0].
+    """
+
+    coefficient: float = field(metadata=about("Coulomb friction of the striking point", above=0, most=10))
+    slip_speed: float = field(
+        default=0.05,
+        metadata=about(
+            "slide at which friction is 0.7 of the full one; less is stiffer", unit="m/s", above=0
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+
+    @property
+    def parameters(self) -> tuple[float, float]:
+        """coefficient, slip_speed [m/s]."""
+        return self.coefficient, self.slip_speed
+
+    def way(self, normal: NDArray[np.float64], speed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(3,) Force on the target over its normal part, of a striking point with a speed (3,) [m/s]: the
+        normal (3,), and along the slide.
+        """
+        slide = speed - normal * (normal @ speed)
+        return np.asarray(
+            normal + slide * (self.coefficient / np.hypot(np.linalg.norm(slide), self.slip_speed))
+        )

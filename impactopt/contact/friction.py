@@ -16,15 +16,16 @@ __all__ = ["ContactFriction"]
 class ContactFriction(Described):
     """Coulomb friction between the striking point and the target's surface, which does not move sideways.
 
-    The tangential force is against the slide v_t, and mu f |v_t| / sqrt(|v_t|^2 + v_s^2): below the slip speed
-    v_s it is less than Coulomb's, so that it has a slope at rest (Andersson, Soderberg, Bjorklund, "Friction
-    models for sliding dry, boundary and mixed lubricated contacts", Tribology International 40, 2007).
+    The tangential force is against the slide v_t, and mu f |v_t| / sqrt(|v_t|^2 + v_s^2): below the slip
+    speed v_s it is less than Coulomb's, so that it has a slope at rest (Andersson, Soderberg, Bjorklund,
+    "Friction models for sliding dry, boundary and mixed lubricated contacts", Tribology International 40,
+    2007).
     In the paper's equation (17) F_h = [f_r n; 0] becomes [f_r n + f_t; 0].
     """
 
     coefficient: float = field(metadata=about("Coulomb friction of the striking point", above=0, most=10))
     slip_speed: float = field(
-        default=0.05,
+        default=0.1,
         metadata=about(
             "slide at which friction is 0.7 of the full one; less is stiffer", unit="m/s", above=0
         ),

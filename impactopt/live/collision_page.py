@@ -62,8 +62,10 @@ class LiveBlow(LivePage):
 
     def __init__(self, problem: ImpactProblem, *, host: str = LOCAL, port: int = 0) -> None:
         self.problem, c = problem, problem.coordinates
-        if problem.second is not None or c.hands:
-            raise InputError("a collision's page has one hand that strikes, and none that holds on: solve it")
+        if problem.second is not None or c.hands or problem.friction is not None:
+            raise InputError(
+                "a collision's page has one hand that strikes without friction, and none that holds on: solve it"
+            )
         self._y, self._legs = c.split(problem.contact_posture)
         self._polygon = support_polygon(problem.robot, c)
         names = ("robot", "striker", "normal", "law", "target", "stance")

@@ -9,6 +9,7 @@ slip, lift in the collision, and whether the robot stands at the end. What fails
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from support.meshes import Meshes
 from benchmarks.planning import DEMO, solved
 from benchmarks.report import Report, Say, columns_table
 from impactopt import Solution
+from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
@@ -129,11 +131,21 @@ def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> R
     return Report(name="truth", numbers={"rows": rows, "controller": controller}, tables=tables)
 
 
+# problems that are planned with friction of the striking point, too
+RUBBING, ROUGH = ("punch.toml", "door.toml", "punch_g1.toml", "chop.toml"), ContactFriction(coefficient=0.6)
+
+
 def problems(folder: Path, say: Say) -> Iterator[tuple[str, Callable[[], Solution]]]:
     """Names, and what solves them."""
     files = sorted(folder.glob("*.toml"))
     for file in files:
         yield file.name, lambda file=file: solved(file, say)  # type: ignore[misc]
+    for file in (file for file in files if file.name in RUBBING):
+
+        def rubbing(file: Path = file) -> Solution:
+            return solved(file, say, lambda problem: replace(problem, friction=ROUGH))
+
+        yield f"{file.stem}, friction {ROUGH.coefficient:g}", rubbing
     for name, changes in VARIANTS.items():
         if name != "demo" or folder / DEMO.name not in files:
             yield name, lambda name=name, changes=changes: _variant(name, changes, say)  # type: ignore[misc]

@@ -94,8 +94,8 @@ def verify_record(
     ------
     InputError : it does not say what its variables are.
     """
-    if problem.stances:
-        unknown = "not known to verify: stance phases"
+    if problem.stances or problem.friction is not None:
+        unknown = f"not known to verify: {'stance phases' if problem.stances else 'friction at the hit'}"
         return Verdict(ok=False, max_violation=np.inf, kkt=None, objective=None, rows={}, reason=unknown)
     claims = claims_of(arrays)
     program = Program(problem, claims)

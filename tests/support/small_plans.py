@@ -82,7 +82,8 @@ def transcribed(problem: ImpactProblem) -> Transcription:
             problem, c, _functions(found | own_blocks(problem, c, edges)) | _extra_functions(problem)
         )
     for instant in (False, True):
-        found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant, first=True)
+        given = c, problem.striker, problem.law, problem.target, edges
+        found |= builders(*given, instant=instant, first=True, rubs=problem.friction is not None)
     found |= {name: build for name, (_, build) in stance_blocks(problem).items()}
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))
 

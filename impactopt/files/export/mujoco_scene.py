@@ -64,6 +64,11 @@ def write(export: Export, directory: Path) -> None:
             "mujoco: the scene has one striker, and no hand that holds on; export to csv instead, or replay "
             "here (impactopt validate)"
         )
+    if p.friction is not None:
+        raise InputError(
+            "mujoco: the scene's contact has no friction at the hit, the plan has: export to csv instead, or "
+            "replay here (impactopt validate)"
+        )
     if isinstance(p.target, Board) and p.target.initial_velocity:
         raise InputError("mujoco: the scene's board stands still before contact; export to csv instead")
     try:

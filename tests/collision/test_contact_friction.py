@@ -1,0 +1,143 @@
+"""Friction of the striking point: closed form, the cone, another engine, derivatives, and a plan."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support.derivative_checks import check_derivatives
+from support.small_plans import BODILESS, arm_problem, biped_problem, transcribed
+from support.small_robots import arm, biped, table
+
+from impactopt import (
+    ContactFriction,
+    FreeMass,
+    FullDynamics,
+    Incidence,
+    MujocoDynamics,
+    RigidWall,
+    SpringDamper,
+)
+from impactopt.errors import InputError
+from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
+from impactopt.kinematics.operational_space import Held, striking_velocity
+from impactopt.kinematics.stance import FixedBase, Free
+from impactopt.problem.terms import GearLoad
+from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
+from impactopt.solvers.ipm import solve_ipm
+from impactopt.transcription.initial_guess import first_iterate
+
+ROUGH = ContactFriction(coefficient=0.5, slip_speed=1e-3)
+LAW = SpringDamper(stiffness=2e4, damping=20.0)
+GENTLE = ContactFriction(coefficient=0.6)
+
+
+def sliding(across: float, friction: ContactFriction | None) -> Any:
+    """A mass of 4 kg along x and 2 kg along y that hits a wall across x with 1 m/s."""
+    model = FullDynamics(
+        robot=table(4.0),
+        striker="tip",
+        normal=[1.0, 0.0, 0.0],
+        law=LAW,
+        target=RigidWall(),
+        stance=FixedBase(),
+        contact_friction=friction,
+    )
+    return model.collide(np.zeros(2), np.array([1.0, across]), np.zeros(2))
+
+
+def test_a_mass_that_slides_all_along_loses_mu_times_the_impulse() -> None:
+    for across in (4.0, -6.0):
+        found, without = sliding(across, ROUGH), sliding(across, None)
+        assert 4.0 * (1.0 - found.velocity[0]) == pytest.approx(found.impulse, rel=1e-9)
+        lost = 2.0 * (across - found.velocity[1])
+        assert lost == pytest.approx(np.sign(across) * 0.5 * found.impulse, rel=1e-6)
+        assert without.velocity[1] == pytest.approx(across, rel=1e-12)
+        assert found.impulse == pytest.approx(without.impulse, rel=1e-6)
+
+
+def test_a_mass_that_hardly_slides_sticks() -> None:
+    # it has 0.4 N s across, and friction could take half of some 7 N s
+    assert abs(sliding(0.2, ROUGH).velocity[1]) < 1e-6
+
+
+def test_the_change_of_momentum_is_in_the_cone() -> None:
+    robot = biped()
+    q = robot.posture("half_sitting")
+    n = np.array([0.8, 0.0, 0.6])
+    v = striking_velocity(robot, q, "fist", [1.0, 0.0, 0.0], 1.0)
+    model, data = robot.model, robot.model.createData()
+    model.gravity = pin.Motion.Zero()
+    shared = {"robot": robot, "striker": "fist", "normal": n, "law": LAW, "target": FreeMass(mass=3.0)}
+    found = FullDynamics(**shared, stance=Free(), contact_friction=GENTLE).collide(q, v, np.zeros(robot.n))
+    begin = pin.computeCentroidalMomentum(model, data, q, v).linear.copy()
+    end = pin.computeCentroidalMomentum(model, data, found.configuration, found.velocity).linear
+    lost = begin - end
+    across = lost - n * (n @ lost)
+    assert n @ lost == pytest.approx(found.impulse, rel=1e-6)
+    assert 0.3 * found.impulse < np.linalg.norm(across) < 0.6 * found.impulse
+    hand = Held.at(model, q, (), robot.striker("fist").model_frame).hand @ v
+    assert across @ (hand - n * (n @ hand)) > 0  # against the slide
+
+
+def test_mujoco_agrees() -> None:
+    robot = arm()
+    q = robot.posture("start")
+    n = np.array([0.0, 0.8, 0.6])
+    v = striking_velocity(robot, q, "hand", [0.0, 1.0, 0.0], 1.0, stance=FixedBase())
+    shared = {"robot": robot, "striker": "hand", "normal": n, "law": LAW, "target": FreeMass(mass=3.0)}
+    shared |= {"stance": FixedBase(), "contact_friction": GENTLE}
+    ours, theirs = (
+        kind(**shared).collide(q, v, np.zeros(robot.n)) for kind in (FullDynamics, MujocoDynamics)
+    )
+    assert theirs.impulse == pytest.approx(ours.impulse, rel=1e-4)
+    np.testing.assert_allclose(theirs.velocity, ours.velocity, atol=1e-3 * np.abs(v).max())
+    none = FullDynamics(**{**shared, "contact_friction": None}).collide(q, v, np.zeros(robot.n))
+    assert abs(none.impulse / ours.impulse - 1) > 1e-2  # and it matters
+
+
+def test_derivatives_are_those_of_differences() -> None:
+    # gears are there from the start: with the first instant of a damped contact
+    terms = (*BODILESS, GearLoad())
+    t = transcribed(dataclasses.replace(biped_problem(), friction=GENTLE, terms=terms))
+    x = first_iterate(t)
+    check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
+
+
+def test_a_plan_with_friction_is_what_both_engines_replay() -> None:
+    oblique = (*BODILESS, Incidence(speed=0.5))
+    problem = dataclasses.replace(arm_problem(), friction=GENTLE, terms=oblique)
+    t = transcribed(problem)
+    result = solve_ipm(t.program, first_iterate(t))
+    assert result.status.usable, result.message
+    plan = t.decode(result.x)
+    way = plan.trajectory()
+    until = float(way.contact_end) + 0.02
+    for engine in (simulate_pinocchio, simulate_mujoco):
+        done = engine(problem.robot, way, scene_of(problem), until=until)
+        assert done.impulse == pytest.approx(plan.impulse, rel=5e-3)
+    smooth = scene_of(dataclasses.replace(problem, friction=None))
+    done = simulate_pinocchio(problem.robot, way, smooth, until=until)
+    assert abs(done.impulse / plan.impulse - 1) > 5e-3
+
+
+def test_bad_input_and_models_without_friction_are_refused() -> None:
+    with pytest.raises(InputError, match=r"ContactFriction: coefficient: -1"):
+        ContactFriction(coefficient=-1.0)
+    with pytest.raises(InputError, match=r"the model 'sdc' of the collision has none"):
+        dataclasses.replace(arm_problem(), friction=GENTLE, collision="sdc")
+    with pytest.raises(InputError, match=r"must be a ContactFriction, not 0\.6"):
+        dataclasses.replace(arm_problem(), friction=0.6)
+
+
+def test_a_file_has_it_and_other_problems_keep_their_hash() -> None:
+    problem = load_problem("arm_planar")
+    rough = dataclasses.replace(problem, friction=GENTLE)
+    again = problem_from_data(problem_data(rough), where="again.toml")
+    assert again.friction == GENTLE and again.hash == rough.hash != problem.hash
+    data = {**problem_data(problem), "friction": {"coefficient": 0.4, "slip_speed_m_s": 0.02}}
+    read = problem_from_data(data, where="read.toml")
+    assert read.friction == ContactFriction(coefficient=0.4, slip_speed=0.02)

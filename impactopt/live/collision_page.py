@@ -64,7 +64,8 @@ class LiveBlow(LivePage):
         self.problem, c = problem, problem.coordinates
         if problem.second is not None or c.hands or problem.friction is not None:
             raise InputError(
-                "a collision's page has one hand that strikes without friction, and none that holds on: solve it"
+                "a collision's page has one hand that strikes, without friction, and none that holds on: "
+                "solve it"
             )
         self._y, self._legs = c.split(problem.contact_posture)
         self._polygon = support_polygon(problem.robot, c)

@@ -341,6 +341,12 @@ def parts_from(reference: Any, missed: Any) -> float:
     return min(float(reference.contact_end), float(missed.contact_end))
 
 
+def stance_begins(reference: Any, stance: int) -> int:
+    """Index of a reference's first instant in a stance phase; 0 where there is one stance."""
+    stances = np.asarray(getattr(reference, "stance", ()))
+    return int(np.argmax(stances == stance)) if stances.size else 0
+
+
 def stance_at(reference: Any, t: float) -> int:
     """Number of the stance phase of a reference at a time [s]; 0 where there is one stance."""
     stance = getattr(reference, "stance", ())

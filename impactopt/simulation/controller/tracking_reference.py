@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.settings import ControllerSettings
-from impactopt.simulation.result import Scene, distance_inside
+from impactopt.simulation.result import Scene, distance_inside, stance_at, stance_begins
 
 __all__ = ["Aim", "Recovery", "Target"]
 
@@ -61,8 +61,8 @@ class Recovery:
         last = np.asarray(reference.q[-1])
         shift = np.zeros(robot.nv)
         if not scene.hands:  # they would be torn off
-            hit = int(np.searchsorted(reference.time, reference.contact_start))
-            q = _moved(robot, last, np.asarray(reference.q[hit]), scene, settings.recovery_margin)
+            stood = np.asarray(reference.q[stance_begins(reference, stance_at(reference, np.inf))])
+            q = _moved(robot, last, stood, scene, settings.recovery_margin)
             shift = np.array(pin.difference(self.model, last, q))
         self.shift = shift * _clear_part(self.model, reference, scene, shift)
         q = pin.integrate(self.model, last, self.shift)

@@ -27,7 +27,7 @@ from impactopt.simulation.controller.sensors import Sensors, StateEstimate
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.controller.tracking_reference import Aim, Recovery, Target
 from impactopt.simulation.motors import Servo
-from impactopt.simulation.result import Scene, stance_at
+from impactopt.simulation.result import Scene, stance_at, stance_begins
 
 __all__ = ["Cones", "Footing", "HeldDynamics", "Tasks", "TorqueQP", "WholeBodyController", "cone_of"]
 
@@ -337,10 +337,9 @@ class WholeBodyController:
 
     def _footing(self, stance: int) -> Footing:
         """Parts on the soles of a stance phase, which stand where the reference has them as it begins."""
-        scene, stances = self.scene, np.asarray(getattr(self.followed, "stance", ()))
-        on = np.flatnonzero(scene.standing[stance]) if stances.size else np.arange(len(scene.soles))
-        begins = int(np.argmax(stances == stance)) if stances.size else 0
-        q0 = np.asarray(self.followed.q[begins])
+        scene = self.scene
+        on = np.flatnonzero(scene.standing[stance]) if scene.standing.size else np.arange(len(scene.soles))
+        q0 = np.asarray(self.followed.q[stance_begins(self.followed, stance)])
         return Footing(self.robot, scene, on, self.settings, q0)
 
     def torque(self, t: float, angles: Array, v: Array, rotation: Array, forces: Array) -> Array:

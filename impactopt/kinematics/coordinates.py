@@ -17,7 +17,7 @@ first of a leg of seven, a waist that leads to both legs. A hand that holds on i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -42,6 +42,7 @@ __all__ = [
     "base_motion",
     "elimination_order",
     "solve_in_order",
+    "solved",
     "striker_kinematics",
 ]
 
@@ -49,8 +50,9 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 _STEPS = 50  # of Newton, at most
 _LONGEST = 0.3  # [rad] of a Newton step
-_NEAR = 1e-7  # [m, rad]: Newton's next step leaves its square, so it is the last
+_NEAR = 1e-6  # [m, rad]: Newton's next step leaves its square, so it is the last
 _OFF = 1e-6  # [m, rad] and no more, where Newton ends without getting there
+_AHEAD = ((1.0,), (-1.0, 2.0), (1.0, -3.0, 3.0))  # a polynomial through the last ones, one step ahead
 _DAMPING = 1e-12 * np.eye(6)  # a stretched leg's Jacobian is singular
 
 
@@ -94,16 +96,16 @@ class Closing:
 
     def legs(self, y: Array, guess: Array) -> Array:
         """`StanceCoordinates.solve_legs`."""
+        return self._close(self._join(y, guess), y, guess)
+
+    def _close(self, q: Array, y: Array, guess: Array) -> Array:
+        """Legs (nl,) of coordinates (ny,), which a configuration (nq,) has already: it gets the legs too."""
         legs = np.array(guess, dtype=float)
         if not self._limbs:
             return legs
         model, data, worst = self._model, self._data, np.inf
-        q = self._join(y, legs)
         for _ in range(_STEPS):
-            if self._places is None:
-                q = self._join(y, legs)
-            else:
-                q[self._places] = legs
+            self._put(q, y, legs)
             pin.computeJointJacobians(model, data, q)
             worst = 0.0
             for frame, placement, columns, own in self._limbs:
@@ -114,22 +116,33 @@ class Closing:
                 step = dgesv(jac.T @ jac + _DAMPING, jac.T @ error)[2]
                 legs[own] += np.minimum(np.maximum(step, -_LONGEST), _LONGEST)
             if worst < _NEAR:
-                return legs
+                break
         if worst < _OFF:
+            self._put(q, y, legs)
             return legs
         raise InputError(
             f"the legs cannot hold the soles in place here (off by {worst:.2g} m or rad): the base is out of "
             "the legs' reach"
         )
 
-    def follow(self, rows: Iterable[Array], guess: Array) -> Iterator[Array]:
-        """Legs (nl,) of one row of coordinates (ny,) after the other, each near the next."""
-        before, legs = None, guess
-        for y in rows:
-            ahead = legs if before is None else 2 * legs - before
-            found = self.legs(y, ahead)
-            before, legs = None if legs is guess else legs, found
-            yield found
+    def _put(self, q: Array, y: Array, legs: Array) -> None:
+        """Give a configuration (nq,) of coordinates (ny,) other legs (nl,)."""
+        if self._places is None:
+            q[:] = self._join(y, legs)
+        else:
+            q[self._places] = legs
+
+    def follow(self, rows: Array, guess: Array) -> Iterator[tuple[Array, Array]]:
+        """Configuration (nq,) and legs (nl,) of one row of coordinates (k, ny) after the other, each near the
+        next.
+        """
+        # all at once, as one by one this takes as long as the legs do
+        q = self._join(rows, np.zeros((len(rows), len(self._dependent))))
+        known = [guess]
+        for k, y in enumerate(rows):
+            legs = self._close(q[k], y, np.array(_AHEAD[len(known) - 1]) @ np.array(known))
+            known = [*(known if k else ())[-2:], legs]
+            yield q[k], legs
 
     def jacobians(self, q: Array) -> Array:
         """(6 a sole, nv) of the fixed soles, each in its own frame, at a pin configuration."""
@@ -140,10 +153,14 @@ class Closing:
             out[6 * k : 6 * k + 6] = pin.getFrameJacobian(model, data, frame, pin.LOCAL)
         return out
 
-    def motion(self, y: Array, yd: Array, ydd: Array, legs: Array) -> tuple[Array, Array, Array, Array]:
-        """`StanceCoordinates.complete_motion`, and the soles' Jacobians at its configuration."""
-        model, data, b = self._model, self._data, self._base
+    def motion(self, y: Array, yd: Array, ydd: Array, legs: Array) -> tuple[Array, Array, Array]:
+        """`StanceCoordinates.complete_motion`."""
         q = self._join(y, legs)
+        return q, *self.rates(q, y, yd, ydd)[:2]
+
+    def rates(self, q: Array, y: Array, yd: Array, ydd: Array) -> tuple[Array, Array, Array]:
+        """v and a (nv,) at a configuration (nq,), whose coordinates are y (ny,), and the soles' Jacobians."""
+        model, data, b = self._model, self._data, self._base
         v, a = np.zeros(model.nv), np.zeros(model.nv)
         if b:
             v[:6], a[:6] = base_motion(y[:6], yd[:6], ydd[:6])
@@ -151,11 +168,16 @@ class Closing:
         jac = self.jacobians(q)
         if self._frames:
             block = jac[:, self._dependent]
-            v[self._dependent] = np.linalg.solve(block, -jac @ v)
+            v[self._dependent] = solved(block, -jac @ v)
             pin.forwardKinematics(model, data, q, v, a)
             drift = [pin.getFrameAcceleration(model, data, k, pin.LOCAL).vector for k in self._frames]
-            a[self._dependent] = np.linalg.solve(block, -np.concatenate(drift))
-        return q, v, a, jac
+            a[self._dependent] = solved(block, -np.concatenate(drift))
+        return v, a, jac
+
+
+def solved(matrix: Array, right: Array) -> Array:
+    """Solution of a linear system, without the checks that take NumPy's longer than solving it."""
+    return np.asarray(dgesv(matrix, right)[2])
 
 
 def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
@@ -550,8 +572,7 @@ class StanceCoordinates:
 
     def complete_motion(self, y: Array, yd: Array, ydd: Array, legs: Array) -> tuple[Array, Array, Array]:
         """pin q, v, a of independent coordinates and rates; the legs' part is from the soles' constraint."""
-        q, v, a, _ = self.closing.motion(y, yd, ydd, legs)
-        return q, v, a
+        return self.closing.motion(y, yd, ydd, legs)
 
 
 def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:

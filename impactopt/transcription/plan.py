@@ -16,7 +16,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.coordinates import StanceCoordinates, solved
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
@@ -83,14 +83,15 @@ def complete_reference(
     rows = np.hstack([y, yd, ydd, wrench])
     moves = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))[:n]  # at rest one row is as the one before
     kept = np.flatnonzero(moves)
-    for k, leg in zip(kept.tolist(), c.closing.follow(y[kept], legs), strict=True):
-        q[k], v[k], a[k], jac = c.closing.motion(y[k], yd[k], ydd[k], leg)
+    for k, (whole, _) in zip(kept.tolist(), c.closing.follow(y[kept], legs), strict=True):
+        q[k] = whole
+        v[k], a[k], jac = c.closing.rates(whole, y[k], yd[k], ydd[k])
         tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
         if c.legs:
             # least |cost dw|^2 with B' dw = miss: dw = C^-2 B (B' C^-2 B)^-1 miss, base = B' C^-1
             base = jac[:, c.undriven].T / cost[k]
             miss = tau[c.undriven] - jac[:, c.undriven].T @ wrench[k]
-            corrected[k] = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / cost[k]
+            corrected[k] = wrench[k] + base.T @ solved(base @ base.T, miss) / cost[k]
             tau = tau - jac.T @ corrected[k]
         torque[k] = tau[c.base :]
     last = np.maximum.accumulate(np.where(moves, np.arange(n), 0))
@@ -592,8 +593,7 @@ class Plan:
         those of the stance with the blow.
         """
         c = coordinates or self.coordinates
-        legs = list(c.closing.follow(y, c.start_legs))
-        return c.join(y, np.array(legs).reshape(len(y), -1))
+        return np.array([q for q, _ in c.closing.follow(y, c.start_legs)]).reshape(len(y), c.model.nq)
 
     def margins(
         self,

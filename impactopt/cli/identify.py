@@ -60,7 +60,7 @@ def identify(
         import numpy as np
 
         from impactopt.contact.laws import LAWS
-        from impactopt.errors import printable
+        from impactopt.errors import InputError, printable
         from impactopt.files.output import write_file
         from impactopt.files.problem_file import load_problem
         from impactopt.identification import identify as fit
@@ -70,6 +70,8 @@ def identify(
             measured = read_log(log)
         else:
             of = load_problem(problem)
+            if of.friction is not None:
+                raise InputError(f"{problem}: [friction]: laws are fitted to a blow without it: leave it out")
             measured = read_log(log, robot=of.robot, striker=of.striker, normal=of.normal)
         mass = np.inf if target_mass is None else target_mass
         found = fit(measured, target_mass=mass, laws=law or LAWS)

@@ -49,7 +49,7 @@ OUTPUTS = {
 SCALARS = ("impulse", "peak_force", "duration", "energy", "step_error", "separated")
 HISTORIES = tuple(OUTPUTS)[tuple(OUTPUTS).index("time") :]
 OF_SOLES = ("sole_wrench", "ground_wrench", "zmp")
-# what a point mass knows nothing of
+# what a point mass and a rigid impact know nothing of
 OF_SERVO = ("joint_velocity", "torque", "demand", "hand_wrench", *OF_SOLES)
 
 

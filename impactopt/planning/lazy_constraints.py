@@ -102,7 +102,7 @@ def slide_caution(length: float) -> str:
     if length <= FAR:
         return ""
     return (
-        f"The striking point slides {1e3 * length:.0f} mm across the target: contact has no friction. "
+        f"The striking point slides {1e3 * length:.0f} mm across the target. "
         f"In replays the face ends {1e3 * FACE:.0f} mm from the hit point; [terms.slide] keeps it there."
     )
 

@@ -162,6 +162,7 @@ def collision_table(found: Mapping[str, Any]) -> Table:
     table = Table(title=_plain(f"{found['problem']}: {model}"), title_justify="left")
     words = [f"caution: {found['caution']}"] if found.get("caution") else []
     words += [f"{found['model']}: {found['believe']}"] if "believe" in found else []
+    words += ["no peak force: the impact takes no time"] if found["model"] == "rigid" else []
     if words:
         table.caption, table.caption_justify = _plain("\n".join(words)), "left"
     table.add_column("")

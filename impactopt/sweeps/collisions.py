@@ -30,7 +30,8 @@ from impactopt.collide.single_collision import (
 )
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import FREEZE_ERROR, too_large
-from impactopt.collision.outputs import HISTORIES
+from impactopt.collision.outputs import HISTORIES, OF_SERVO
+from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError, did_you_mean, raw_array
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file
@@ -473,9 +474,11 @@ class Collisions:
             states = self._body(file)
             model = collision_model(file.content, states.robot, states.stance, section)
             measures = chosen(self.outputs, model.target)
+            needed = [name for m in measures.values() for name in m.outputs if name != FREEZE_ERROR]
             if isinstance(model, SymbolicModel):
-                needed = [name for m in measures.values() for name in m.outputs if name != FREEZE_ERROR]
                 model._check_outputs(tuple(needed), 1)
+            elif isinstance(model, RigidImpact) and (unknown := [x for x in needed if x in OF_SERVO]):
+                raise InputError(f"output {unknown[0]!r}: a rigid impact knows nothing of it; leave it out")
             self._alike[key] = AlikeCollisions(
                 file=file, section=section, model=model, states=states, measures=measures
             )

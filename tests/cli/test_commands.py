@@ -170,6 +170,13 @@ def test_a_collision_that_there_is_not_exits_1(file: Path) -> None:
     assert "did you mean 'ready'" in run("collide", file, "--speed", 1, "--posture", "redy", code=2)[1]
 
 
+def test_a_rigid_impact_has_no_peak_force(file: Path) -> None:
+    out, _ = run("collide", file, "--speed", 0.5, "--model", "rigid")
+    assert "no peak force" in out and "peak force [N]" not in out
+    found = json.loads(run("collide", file, "--speed", 0.5, "--model", "rigid", "--json")[0])
+    assert found["peak_force_N"] is None and found["impulse_Ns"] > 0
+
+
 def test_collide_takes_a_saved_result(file: Path, tmp_path: Path) -> None:
     problem = load_problem(file)
     robot, rng = problem.robot, np.random.default_rng(0)

@@ -32,6 +32,7 @@ from impactopt import (
 from impactopt.cli.app import app
 from impactopt.contact.laws import LAWS
 from impactopt.files.problem_file import problem_data, problem_from_data, read_toml
+from impactopt.files.problem_file.names import problem_file
 from impactopt.identification.fitting import Lump
 
 MASS = 3.0
@@ -312,3 +313,10 @@ def test_the_command_prints_numbers_and_writes_a_section(tmp_path: Path) -> None
 def test_the_command_refuses_in_words(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["identify", str(tmp_path / "none.csv")])
     assert result.exit_code == 2 and "none.csv: cannot be read" in result.stderr
+    rough = tmp_path / "rough.toml"
+    rough.write_text(
+        problem_file("arm_planar").read_text(encoding="utf-8") + "\n[friction]\ncoefficient = 0.6\n",
+        encoding="utf-8",
+    )
+    result = CliRunner().invoke(app, ["identify", str(tmp_path / "none.csv"), "--problem", str(rough)])
+    assert result.exit_code == 2 and "[friction]: laws are fitted to a blow without it" in result.stderr

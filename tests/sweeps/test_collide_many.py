@@ -296,6 +296,10 @@ def test_mistakes_in_what_is_asked_for() -> None:
         collide_many(arm_file(), {}, outputs=("impulse",), at_contact={"speed_m_s": 1.0})
     with pytest.raises(InputError, match="soles"):
         collide_many(arm_file(), {}, outputs=("zmp_margin_m",), at_contact={"speed_m_s": 1.0})
+    for model, what in (("rigid", "a rigid impact"), ("virtual-mass", "a point mass")):
+        with pytest.raises(InputError, match=f"output 'demand': {what} knows nothing of it"):
+            given = {"speed_m_s": 1.0, "model": model}
+            collide_many(arm_file(), {}, outputs=("torque_ratio",), at_contact=given)
     with pytest.raises(InputError, match="which is held"):
         given = {"speed_m_s": 1.0, "joints_rad": {standin_leg(): 0.1}}
         collide_many(standin_file(), {}, at_contact=given)

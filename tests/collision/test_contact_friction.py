@@ -26,6 +26,7 @@ from impactopt.files.problem_file import load_problem, problem_data, problem_fro
 from impactopt.kinematics.operational_space import Held, striking_velocity
 from impactopt.kinematics.stance import FixedBase, Free
 from impactopt.problem.terms import GearLoad
+from impactopt.robots.robot import Robot, Striker
 from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.transcription.initial_guess import first_iterate
@@ -62,6 +63,56 @@ def test_a_mass_that_slides_all_along_loses_mu_times_the_impulse() -> None:
 def test_a_mass_that_hardly_slides_sticks() -> None:
     # it has 0.4 N s across, and friction could take half of some 7 N s
     assert abs(sliding(0.2, ROUGH).velocity[1]) < 1e-6
+
+
+def disc(mass: float, radius: float) -> Robot:
+    """A disc in the plane, of inertia 0.4 m R^2, that strikes with the point of its rim ahead along x."""
+    model = pin.Model()
+    model.name = "disc"
+    joint = 0
+    for kind, name in ((pin.JointModelPX, "x"), (pin.JointModelPY, "y"), (pin.JointModelRZ, "turn")):
+        joint = model.addJoint(joint, kind(), pin.SE3.Identity(), name)
+        model.addJointFrame(joint)
+        light = pin.Inertia(1e-9, np.zeros(3), 1e-12 * np.eye(3))
+        model.appendBodyToJoint(joint, light, pin.SE3.Identity())
+    body = pin.Inertia(mass, np.zeros(3), 0.4 * mass * radius**2 * np.eye(3))
+    model.appendBodyToJoint(joint, body, pin.SE3.Identity())
+    return Robot.from_model(
+        model,
+        kp=0.0,
+        kd=0.0,
+        torque_limit=200.0,
+        velocity_limit=50.0,
+        position_limit=dict.fromkeys(("x", "y", "turn"), (-5.0, 5.0)),
+        strikers=[Striker(name="rim", frame="turn", point=np.array([radius, 0.0, 0.0]))],
+    )
+
+
+@pytest.mark.parametrize(
+    ("across", "spin", "sticks"), [(0.0, 30.0, False), (3.0, -5.0, False), (0.2, 0.5, True)]
+)
+def test_a_ball_with_spin_leaves_a_wall_as_in_closed_form(across: float, spin: float, sticks: bool) -> None:
+    """Routh's: it slides all along, or until it sticks; and the duration makes all the difference."""
+    mass, radius, mu = 4.0, 0.1, 0.3
+    inertia = 0.4 * mass * radius**2
+    to_stick = (across + radius * spin) / (1 / mass + radius**2 / inertia)
+    most = mu * 2 * mass
+    assert (abs(to_stick) < most) == sticks
+    push = np.clip(to_stick, -most, most)
+    expected = np.array([-1.0, across - push / mass, spin - radius * push / inertia])
+    off = []
+    for stiffness in (1e10, 1e12):
+        found = FullDynamics(
+            robot=disc(mass, radius),
+            striker="rim",
+            normal=[1.0, 0.0, 0.0],
+            law=SpringDamper(stiffness=stiffness, damping=0.0),
+            target=RigidWall(),
+            stance=FixedBase(),
+            contact_friction=ContactFriction(coefficient=mu, slip_speed=1e-3),
+        ).collide(np.zeros(3), np.array([1.0, across, spin]), np.zeros(3))
+        off.append(np.abs(found.velocity - expected).max())
+    assert off[0] < 0.1 and off[1] == pytest.approx(0.1 * off[0], rel=0.1)
 
 
 def test_the_change_of_momentum_is_in_the_cone() -> None:

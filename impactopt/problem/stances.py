@@ -65,8 +65,12 @@ class StancePhase:
 
 
 def names_of(stances: Sequence[StancePhase]) -> str:
-    """Soles of each phase in words."""
-    return ", then ".join(" and ".join(stance.soles) for stance in stances)
+    """Soles and steps of each phase in words."""
+    return ", then ".join(
+        " and ".join(stance.soles)
+        + "".join(f" ({name} steps {x:g} m ahead, {y:g} m left)" for name, (x, y) in stance.steps.items())
+        for stance in stances
+    )
 
 
 def check_stances(problem: Any) -> None:

@@ -172,13 +172,13 @@ def pace() -> BlockExpression:
 
 def corner_heights(c: StanceCoordinates, frame: str, corners: int) -> BlockExpression:
     """A sole that is not held.  z = y;  p = its corners in its frame [m] (2 each);  out = their heights
-    [m].
+    [m]; where its frame is on the ground (2) [m].
     """
     y, zero, p = ca.SX.sym("y", c.ny), ca.SX.zeros(c.ny), ca.SX.sym("corners", 2 * corners)
     q, _, _ = c.upper_motion(y, zero, zero)
     rotation, point = c.rb_frame(frame, q)
     heights = ca.mtimes(ca.reshape(p, 2, corners).T, rotation[2, :2].T) + point[2]
-    return make_block([y], [p], {"height": heights})
+    return make_block([y], [p], {"height": heights, "place": point[:2]})
 
 
 def spring(c: StanceCoordinates, chosen: Joints = ()) -> BlockExpression:

@@ -40,6 +40,7 @@ from impactopt.transcription.plan import PlannedStand
 # [m] that a sole in the air is above the ground, from so long [s] after it has left it until so long before
 # it is back
 HEIGHT, WITHIN = 0.01, 0.2
+ASIDE = 0.02  # [m] that it is beside its foothold at most then: who is early by a millimetre hardly slides
 
 
 class Stand(MotionPhase):
@@ -242,7 +243,7 @@ class Course:
         return b.add_block("pace", [[y1[i : i + 1], T] for i in range(b.ny)], np.zeros(0)) + np.arange(b.ny)
 
     def _add_heights(self, k: int) -> None:
-        """Soles in the air are above the ground."""
+        """Soles in the air are above the ground, and come down from above their footholds."""
         b, phase, p = self.builders[k], self.phases[k], self._b.problem
         T = float(np.mean(phase.phase.duration))
         for i, sole in enumerate(p.soles):
@@ -256,13 +257,29 @@ class Course:
             spots = [[phase.at(float(phase.nodes[j]))[0]] for j in up]
             at, corners = b.add_block(f"stance{k}_heights{i}", spots, sole.polygon.ravel()), len(sole.polygon)
             for number, j in enumerate(up):
+                outputs, place = at + number * (corners + 2), phase.place_at(float(phase.nodes[j]))
                 b.rows.add(
                     term="swing foot off the ground",
-                    place=phase.place_at(float(phase.nodes[j])),
+                    place=place,
                     components=[f"{sole.name}, corner {corner}" for corner in range(corners)],
-                    outputs=at + number * corners + np.arange(corners),
+                    outputs=outputs + np.arange(corners),
                     lower=HEIGHT * way[j] ** 3,
                     measure=millimetres("too low"),
+                    whole=sole.name,
+                )
+                if until[j] >= WITHIN:
+                    continue
+                legs = self.builders[k + 1].coordinates.legs
+                foothold = next(leg.placement.translation[:2] for leg in legs if leg.name == sole.name)
+                most = ASIDE * (until[j] / WITHIN) ** 3
+                b.rows.add(
+                    term="swing foot above its foothold",
+                    place=place,
+                    components=[f"{sole.name}, {axis}" for axis in "xy"],
+                    outputs=outputs + corners + np.arange(2),
+                    lower=foothold - most,
+                    upper=foothold + most,
+                    measure=millimetres("beside it"),
                     whole=sole.name,
                 )
 

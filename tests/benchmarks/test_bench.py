@@ -57,6 +57,7 @@ def planner(monkeypatch: pytest.MonkeyPatch, problem: ImpactProblem, tmp_path: P
     monkeypatch.setattr("benchmarks.planning.solve", planner)
     monkeypatch.setattr(ProblemFile, "build", lambda self: problem)
     monkeypatch.setattr(truth, "VARIANTS", {})
+    monkeypatch.setattr(truth, "RUBBING", ())
     (tmp_path / "problems").mkdir()
     (tmp_path / "problems" / "punch.toml").write_text(PROBLEM_FILE, encoding="utf-8")
     monkeypatch.chdir(tmp_path)

@@ -148,7 +148,8 @@ def _stances(record: Record, arrays: Arrays) -> dict[str, Any] | None:
     if not series:
         return None
     around = [-1.0, float(len(series))]
-    return _chart("Soles on the ground", "", series, bands=_bands(record), include=around, height=120)
+    more: dict[str, Any] = {"word": "stands", "include": around, "height": 120}  # its heights are no numbers
+    return _chart("Soles on the ground", "", series, bands=_bands(record), **more)
 
 
 def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any] | None:

@@ -81,7 +81,7 @@ class Frame {
       parts.append(svg("line", { x1: x(value), x2: x(value), y1: PAD.top, y2: height - PAD.bottom }));
       parts.append(svg("text", { x: x(value), y: height - PAD.bottom + 15, "text-anchor": "middle" }, text.replace("-", "−")));
     }
-    for (const [value, text] of ticks(y0, y1, inner.y / 38)) {
+    for (const [value, text] of this.spec.word ? [] : ticks(y0, y1, inner.y / 38)) {
       parts.append(svg("line", { x1: PAD.left, x2: width - PAD.right, y1: y(value), y2: y(value) }));
       const shown = spec.log ? `1e${text}`.replace("-", "−") : text.replace("-", "−");
       if (!spec.log || Number.isInteger(+text)) parts.append(svg("text", { x: PAD.left - 6, y: y(value) + 4, "text-anchor": "end" }, shown));
@@ -213,7 +213,8 @@ class Chart extends Frame {
       const there = Number.isFinite(py);
       dot.style.display = there ? "" : "none";
       if (there) { dot.setAttribute("cx", this.x(px)); dot.setAttribute("cy", this.y(py)); }
-      this.values[n].textContent = there ? `${shortNumber(this.spec.log ? 10 ** py : py)} ${unitOf(this.spec.y)}`.trim() : "";
+      const value = this.spec.word ?? `${shortNumber(this.spec.log ? 10 ** py : py)} ${unitOf(this.spec.y)}`.trim();
+      this.values[n].textContent = there ? value : "";
     });
     const unit = this.timed ? " s" : "";
     this.when ??= this.legend.appendChild(make("span", { class: "when" }));

@@ -16,7 +16,6 @@ from impactopt.kinematics.operational_space import Held
 __all__ = ["RigidImpact"]
 
 Array = NDArray[np.float64]
-_DEPENDENT = 1e-12  # of the largest: a robot of few joints has constraints that depend on each other
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,10 +63,8 @@ class RigidImpact(CollisionModel):
         frames = self.held_by.constraint_frames(self.robot)
         body = Held.at(self.robot.model, q, frames, self.robot.striker(self.striker).model_frame)
         hand = np.asarray(self.normal) @ body.hand
-        moves = np.linalg.solve(body.inertia, np.vstack([body.held, hand]).T)
-        held, free = moves[:, :-1], moves[:, -1]
-        inner = body.held @ held + np.diag(np.tile(self.held_by.compliance, len(frames)))
-        return hand, free - held @ np.linalg.lstsq(inner, body.held @ free, rcond=_DEPENDENT)[0]
+        compliance = np.tile(self.held_by.compliance, len(frames))
+        return hand, body.by_impulses(hand[None], compliance)[:, 0]
 
     def collide(
         self,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.contact.fields import Described, about, check_numbers
 
-__all__ = ["ContactFriction"]
+__all__ = ["ContactFriction", "pushed_way"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,14 @@ class ContactFriction(Described):
         """(3,) Force on the target over its normal part, of a striking point with a speed (3,) [m/s]: the
         normal (3,), and along the slide.
         """
-        slide = speed - normal * (normal @ speed)
-        return np.asarray(
-            normal + slide * (self.coefficient / np.hypot(np.linalg.norm(slide), self.slip_speed))
-        )
+        return np.asarray(pushed_way(normal, speed, *self.parameters))
+
+
+def pushed_way(normal: Any, speed: Any, coefficient: Any, slip_speed: Any) -> Any:
+    """`ContactFriction.way`, of arrays or CasADi expressions."""
+    slide = speed - normal * _dot(normal, speed)
+    return normal + slide * (coefficient / (_dot(slide, slide) + slip_speed**2) ** 0.5)
+
+
+def _dot(a: Any, b: Any) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -28,7 +28,7 @@ from impactopt.files.problem_file.reading import change_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.toml import read_toml, write_toml
 from impactopt.files.record_schema import check_arrays, check_summary
-from impactopt.kinematics.support import support_polygon
+from impactopt.kinematics.support import corners_at, support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
 from impactopt.solvers.program import SolverResult, Status
@@ -206,9 +206,7 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
     for leg in legs.values():
         if leg.sole is None:
             continue
-        corners = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])
-        world = corners @ leg.placement.rotation.T + leg.placement.translation
-        out[f"sole_{leg.sole.name}"] = world[:, :2]
+        out[f"sole_{leg.sole.name}"] = corners_at(leg.sole.polygon, leg.placement)[:, :2]
     return out
 
 

@@ -176,8 +176,11 @@ class Closing:
 
 
 def solved(matrix: Array, right: Array) -> Array:
-    """Solution of a linear system, without the checks that take NumPy's longer than solving it."""
-    return np.asarray(dgesv(matrix, right)[2])
+    """Solution of a linear system, as of `np.linalg.solve`, whose checks take longer than solving it."""
+    _, _, found, singular = dgesv(matrix, right)
+    if singular:
+        raise np.linalg.LinAlgError("Singular matrix")
+    return np.asarray(found)
 
 
 def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:

@@ -75,11 +75,17 @@ class Held:
 
         1 / (n' J P J' n) is the effective mass along n (the paper's virtual mass, its section III).
         """
-        rows = np.vstack([self.held, self.hand])
-        inner = rows @ np.linalg.solve(self.inertia, rows.T)
-        c = len(self.held)
-        lost = np.linalg.lstsq(inner[:c, :c], inner[:c, c:], rcond=_DEPENDENT)[0]
-        return np.asarray(inner[c:, c:] - inner[c:, :c] @ lost)
+        return np.asarray(self.hand @ self.by_impulses(self.hand))
+
+    def by_impulses(self, rows: Array, compliance: Array | float = 0.0) -> Array:
+        """P rows' (nv, k): velocities by a unit impulse along each of some rows (k, nv).
+
+        compliance : of what is held, (c,), as `Stance.compliance` has it of a frame.
+        """
+        moves = np.linalg.solve(self.inertia, np.vstack([self.held, rows]).T)
+        held, free = np.split(moves, [len(self.held)], axis=1)
+        inner = self.held @ held + compliance * np.eye(len(self.held))
+        return np.asarray(free - held @ np.linalg.lstsq(inner, self.held @ free, rcond=_DEPENDENT)[0])
 
 
 def striking_velocity(

@@ -98,18 +98,20 @@ def _facets(corners: tuple[tuple[float, float], ...], friction: float) -> Array:
 MERGED = 1e-6  # [m] a corner nearer than this to the line of its neighbours is no corner
 
 
+def corners_at(polygon: Array, placement: Any) -> Array:
+    """Corners (k, 3) [m] of a sole's polygon (k, 2) at the sole's placement, a pin.SE3."""
+    flat = np.column_stack([polygon, np.zeros(len(polygon))])
+    return np.asarray(flat @ placement.rotation.T + placement.translation)
+
+
 def support_polygon(robot: Any, coordinates: Any) -> Array:
     """Convex hull (k, 2) [m] of the fixed soles' corners on the ground, counter-clockwise, world x and y.
 
     (0, 2) without soles.
     """
-    corners = [
-        (leg.placement.rotation @ np.array([x, y, 0.0]) + leg.placement.translation)[:2]
-        for leg in coordinates.legs
-        if leg.sole is not None
-        for x, y in leg.sole.polygon
-    ]
-    return convex_polygon(np.array(corners)) if corners else np.zeros((0, 2))
+    standing = [leg for leg in coordinates.legs if leg.sole is not None]
+    corners = [corners_at(leg.sole.polygon, leg.placement)[:, :2] for leg in standing]
+    return convex_polygon(np.vstack(corners)) if corners else np.zeros((0, 2))
 
 
 def convex_polygon(points: Array) -> Array:

@@ -19,11 +19,7 @@ __all__ = ["Parameter", "changed", "moved_problem", "parameter_of"]
 
 # what no term changes but that on the world's bodies, which may be switched off
 _BODIES = ("world", "bodies")
-_KEPT = (
-    "coordinates",
-    "stance_coordinates",
-    "start_posture",
-)  # of a problem on the same robot, stance and start
+_KEPT = ("stance_coordinates", "start_posture")  # of a problem on the same robot, stance and start
 
 
 def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:

@@ -186,8 +186,7 @@ class ImpactProblem:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but its coordinates, whose symbols CasADi does not pickle: they are made anew when needed."""
-        left_out = ("coordinates", "stance_coordinates")
-        return {name: value for name, value in vars(self).items() if name not in left_out}
+        return {name: value for name, value in vars(self).items() if name != "stance_coordinates"}
 
     def __post_init__(self) -> None:
         found = Mistakes()
@@ -327,7 +326,7 @@ class ImpactProblem:
             return np.array(self.robot.posture(self.start))
         return self.robot.check_configuration(self.start, name="the start posture")
 
-    @cached_property
+    @property
     def coordinates(self) -> StanceCoordinates:
         """Independent coordinates of the stance with the blow, in which hands hold on, too."""
         return self.stance_coordinates[self.blow]

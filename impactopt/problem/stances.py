@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, check_array, shortened
 from impactopt.kinematics.coordinates import Closing, Limb, StanceCoordinates
 from impactopt.kinematics.stance import BothSoles, OneSole, Stance
-from impactopt.kinematics.support import overlap
+from impactopt.kinematics.support import corners_at, overlap
 from impactopt.problem.scenario import Phase
 from impactopt.robots.robot import Robot
 
@@ -152,8 +152,7 @@ def stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64
         placement = pin.SE3(leg.placement.rotation, leg.placement.translation + step)
         limbs.append(Limb(leg.frame, placement, c.base + leg.joints))
         if leg.sole is not None:
-            flat = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])
-            corners[leg.name] = (flat @ placement.rotation.T + placement.translation)[:, :2]
+            corners[leg.name] = corners_at(leg.sole.polygon, placement)[:, :2]
     steps = ", ".join(f"{name} by {np.round(step, 3).tolist()} m" for name, step in moved.items())
     for (one, a), (other, b) in combinations(corners.items(), 2):
         if overlap(a, b):

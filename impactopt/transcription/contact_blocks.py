@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.collision.settings import Effects
+from impactopt.contact.friction import pushed_way
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
@@ -136,7 +137,8 @@ def collision(
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
     for k, name in enumerate(strikers):
         row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{name}")[:3, :])])(q)
-        tau += ca.mtimes(row.T, _pushed_way(normal, ca.mtimes(row, v), rub)) * f[k]
+        way = pushed_way(normal, ca.mtimes(row, v), *ca.vertsplit(rub)) if rubs else normal
+        tau += ca.mtimes(row.T, way) * f[k]
     tau -= c.sole_wrench_map(at[0], at[2], w - carried)
     # position and rate of the reference relative to the robot, by joint (the base's part is not the servo's)
     if frozen is None:
@@ -162,16 +164,6 @@ def collision(
     z += [*(more if frozen is not None else []), logs]
     p = [normal, s, after, kp, kd, limit, weight, lever, rub]
     return make_block(z, p, out, through, lanes=4, stages=stages)
-
-
-def _pushed_way(normal: Any, speed: Any, rub: Any) -> Any:
-    """(3) Force on the target over its normal part: the normal, and along the slide of a point with this
-    speed (3), with the parameters of friction (2), or none (0).
-    """
-    if not rub.numel():
-        return normal
-    slide = speed - normal * ca.dot(normal, speed)
-    return normal + slide * rub[0] / ca.sqrt(ca.dot(slide, slide) + rub[1] ** 2)
 
 
 def _strikers(striker: str, second: str) -> list[str]:
@@ -358,7 +350,7 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw, rubs: boo
     What changes is linear in the force: H da = J_c' dw - j' f, the frozen part of equation (6).
     z = y, legs, u0 (ydot) at contact; change of ydd; of the sole wrenches (6 a sole); f [N].
     p = normal (3), the law's parameters, the target's speed before [m/s], armature (n), torque limits (n),
-        weight [N], lever [m].
+        weight [N], lever [m]; if the striking point ``rubs`` the parameters of `ContactFriction`.
     out = base rows, joint rows over torque limit, (f - law) / 100 N, torque that the rotors take off the
         gears, over limit: -armature x acceleration.
     """
@@ -374,7 +366,7 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw, rubs: boo
     rub, way = ca.SX.sym("rub", 2 * rubs), push
     if rubs:
         speed = striker_kinematics(c, striker)(q, v, 0 * v)[1]
-        way = _pushed(c, striker, y, legs, _pushed_way(normal, speed, rub))[1]
+        way = _pushed(c, striker, y, legs, pushed_way(normal, speed, *ca.vertsplit(rub)))[1]
     balance = _inertia(c)(q, jump) + way * f - c.sole_wrench_map(y, legs, w)
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     out = {

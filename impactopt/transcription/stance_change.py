@@ -256,6 +256,8 @@ class Course:
             up = np.flatnonzero(way > 0)
             spots = [[phase.at(float(phase.nodes[j]))[0]] for j in up]
             at, corners = b.add_block(f"stance{k}_heights{i}", spots, sole.polygon.ravel()), len(sole.polygon)
+            legs = self.builders[k + 1].coordinates.legs if meets else ()
+            foothold = [leg.placement.translation[:2] for leg in legs if leg.name == sole.name]
             for number, j in enumerate(up):
                 outputs, place = at + number * (corners + 2), phase.place_at(float(phase.nodes[j]))
                 b.rows.add(
@@ -269,16 +271,14 @@ class Course:
                 )
                 if until[j] >= WITHIN:
                     continue
-                legs = self.builders[k + 1].coordinates.legs
-                foothold = next(leg.placement.translation[:2] for leg in legs if leg.name == sole.name)
                 most = ASIDE * (until[j] / WITHIN) ** 3
                 b.rows.add(
                     term="swing foot above its foothold",
                     place=place,
                     components=[f"{sole.name}, {axis}" for axis in "xy"],
                     outputs=outputs + corners + np.arange(2),
-                    lower=foothold - most,
-                    upper=foothold + most,
+                    lower=foothold[0] - most,
+                    upper=foothold[0] + most,
                     measure=millimetres("beside it"),
                     whole=sole.name,
                 )

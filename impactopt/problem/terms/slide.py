@@ -18,9 +18,9 @@ from impactopt.problem.violation import millimetres
 class Slide(Term):
     """The striking point stays near the hit point until contact ends.
 
-    Bounded along each of two tangents, with the expected target. With little friction at the hit
-    or none, a long push at an angle may slide off what it pushes: in replays a target's face ends 0.2 m from
-    the hit point.
+    Bounded along each of two tangents, with the expected target. With little friction at the hit, or none, a
+    long push at an angle may slide off what it pushes: in replays a target's face ends 0.2 m from the hit
+    point.
 
     It holds with its defaults where a problem does not have it. Rows are then added once a motion without
     them goes beyond; where it is given they are there from the start, and in strikes.

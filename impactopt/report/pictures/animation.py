@@ -21,6 +21,7 @@ from impactopt.bodies.visuals import surroundings_of
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
 from impactopt.files.replay import Replay
+from impactopt.kinematics.support import corners_at
 from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
 from impactopt.robots.loads import BEARS, weight_of
 from impactopt.simulation import scene_of
@@ -96,8 +97,7 @@ class _Drawing:
         sticks = joints[np.array(self.links)]
         frames = [data.oMf[model.getFrameId(sole.frame)] for sole in self.robot.soles]
         soles = [
-            np.column_stack([s.polygon, np.zeros(len(s.polygon))]) @ m.rotation.T + m.translation
-            for s, m in zip(self.robot.soles, frames, strict=True)
+            corners_at(sole.polygon, frame) for sole, frame in zip(self.robot.soles, frames, strict=True)
         ]
         cops, ground = sim.sole_cop()[k], sim.sole_ground[k]
         loaded = sim.sole_normal[k] >= BEARS * weight_of(self.robot)

@@ -24,7 +24,6 @@ from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.refinement import refine as refine_with
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.predictor import ActiveSystem, Change, Offset, Prediction, Predictor
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.transcription import Transcription, statement_of
@@ -291,8 +290,7 @@ def moved_solution(
     began = time.perf_counter()
     t = bent.program_for(problem, anew=polish)
     built = time.perf_counter()
-    solver, options = with_todays_name("ipm", options)
-    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback).started()
+    budget = Budget(solver="ipm", options=options, time_limit=time_limit, callback=callback).started()
     first = _first_order(solution, t, bent)
     if not polish:
         return _solution(solution, Outcome.of(t, first), (built - began, time.perf_counter() - built))

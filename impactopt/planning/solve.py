@@ -39,7 +39,6 @@ from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.mesh import NO_MORE
@@ -76,8 +75,8 @@ def solve(
         the path of a problem file, or the name of one that comes with the package (`impactopt problems`);
         its [solver] section then holds where nothing else is given.
     solver : {"ipm", "sqp", "ipopt"}
-        "ipm" is our primal-dual interior-point method; "sqp" with ``options={"qp_solver": "osqp"}`` our SQP,
-        which solves its QPs to their end, for small programs.
+        "ipm" is our primal-dual interior-point method; "sqp" our SQP, which solves its QPs to their end, by
+        OSQP, for small programs.
     start : str, array_like (n,) or Solution
         "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such a
         reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables; or the
@@ -118,7 +117,6 @@ def solve(
     InputError
         Unknown solver, option or start, a start of the wrong length, several of a given start.
     """
-    solver, options = with_todays_name(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
     check_starts(starts, seed, workers, callback, given=not isinstance(start, str))
     if isinstance(start, str) and start not in STARTS:

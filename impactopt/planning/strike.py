@@ -28,7 +28,6 @@ from impactopt.planning.multistart import (
 from impactopt.planning.refinement import Additions, Guess, Outcome, carried, program_for, refine
 from impactopt.planning.solution import Solved, impact_summary, versions
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Callback, Status
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.mesh import contact_elements
@@ -114,7 +113,6 @@ def optimize_strike(
     if method != "collocation":
         gone = "is no longer supported" if method == "shooting" else "is unknown"
         raise InputError(f'method {method!r} {gone}: give "collocation", or leave it out')
-    solver, options = with_todays_name(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
     check_starts(starts, seed, workers, callback, given=start is not None)
     if all(o.whole_motion for o in problem.objectives):

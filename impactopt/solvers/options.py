@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.solvers.qp.registry import QP_SOLVERS, check_qp_solver
@@ -107,28 +105,3 @@ class SQPOptions(SolverOptions):
 
 OPTIONS: Mapping[str, type[SolverOptions]] = {"ipm": IPMOptions, "sqp": SQPOptions}
 """Options of our solvers, by the solver's name."""
-INTERIOR = "interior"  # the QP solver that once said "ipm"
-
-
-def with_todays_name(solver: str, options: Mapping[str, Any] | None) -> tuple[str, Mapping[str, Any] | None]:
-    """Name of a solver, and its options, as they are spelled now.
-
-    For one version "sqp" without a QP solver means the interior-point method, as it did, and the default
-    solver with a QP solver means the SQP.
-
-    Warns
-    -----
-    FutureWarning : the spelling has changed; it says what to write.
-    """
-    named = options.get("qp_solver") if isinstance(options, Mapping) else None
-    if solver == "sqp" and named in (None, INTERIOR):
-        write, new = 'the interior-point method is now solver "ipm"; for the SQP name a qp_solver too', "ipm"
-    elif solver == "ipm" and named is not None:
-        write = 'a qp_solver is an option of solver "sqp"; name that'
-        new = "ipm" if named == INTERIOR else "sqp"
-    else:
-        return solver, options
-    warnings.warn(write, FutureWarning, stacklevel=4)
-    if options is not None and named == INTERIOR:
-        options = {name: value for name, value in options.items() if name != "qp_solver"}
-    return new, options

@@ -220,23 +220,6 @@ price = 50.0
     assert solver.options == {"ipopt": {"max_iter": 77}, "ipm": {"max_iterations": 99, "price": 50.0}}
 
 
-@pytest.mark.parametrize(
-    ("section", "name", "options"),
-    [
-        ('[solver]\nname = "sqp"\n', "ipm", {}),
-        ("[solver.sqp]\nbarrier = 0.1\n", "ipm", {"ipm": {"barrier": 0.1}}),
-        ('[solver]\nname = "sqp"\n[solver.sqp]\nqp_solver = "interior"\n', "ipm", {"ipm": {}}),
-        ('[solver.sqp]\nqp_solver = "osqp"\n', "sqp", {"sqp": {"qp_solver": "osqp"}}),
-    ],
-)
-def test_solvers_as_they_were_spelled_are_read_with_a_warning(
-    tmp_path: Path, section: str, name: str, options: dict[str, Any]
-) -> None:
-    with pytest.warns(FutureWarning, match="name = "):
-        solver = read_problem_file(write(tmp_path, GOOD + section)).solver
-    assert (solver.name, solver.options) == (name, options)
-
-
 EXTRA = """
 [terms.torque_rate]
 limit_N_m_s = {arm_right_4_joint = 300}

@@ -11,7 +11,6 @@ from support.textbook import CASES, INF, Textbook, assert_optimal, infeasible, s
 
 from impactopt.errors import InputError
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
-from impactopt.solvers.options import with_todays_name
 from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import QP_SOLVERS, QPSolution, QPStatus, SQPOptions, solve_sqp
 
@@ -241,17 +240,3 @@ def test_own_qp_solvers_can_be_added_and_may_fail():
         del QP_SOLVERS["hopeless"]
     assert result.status is Status.FAILED
     np.testing.assert_array_equal(result.x, case.x0)
-
-
-@pytest.mark.parametrize(
-    ("solver", "options", "today"),
-    [
-        ("sqp", None, ("ipm", None)),
-        ("sqp", {"qp_solver": "interior", "push": 1.0}, ("ipm", {"push": 1.0})),
-        ("ipm", {"qp_solver": "osqp"}, ("sqp", {"qp_solver": "osqp"})),
-    ],
-)
-def test_solvers_as_they_were_named_are_taken_with_a_warning(solver, options, today):
-    with pytest.warns(FutureWarning, match='solver "(ipm|sqp)"'):
-        assert with_todays_name(solver, options) == today
-    assert with_todays_name(*today) == today

@@ -21,7 +21,7 @@ from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.problem_file.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.files.problem_file.names import problem_file
-from impactopt.files.problem_file.sections import File, SolverSettings, with_kinds, with_todays_names
+from impactopt.files.problem_file.sections import File, SolverSettings, with_kinds
 from impactopt.files.problem_file.toml import (
     LONGEST_TEXT,
     Place,
@@ -373,13 +373,12 @@ def _checked(
             raise InputError(f"{path}: there are {len(there)} [[{'.'.join(place)}]]; give at most {MANY}")
     if found := text_with_control(data):
         raise InputError(f"{path}: the text {shortened(repr(found))} has control characters; take them out")
-    today, lines = with_todays_names(data, lines)
-    mistakes, model = _robot_given_once(today), with_kinds(File, today)
+    mistakes, model = _robot_given_once(data), with_kinds(File, data)
     try:
-        content = model.model_validate(today)
+        content = model.model_validate(data)
     except ValidationError as error:
         mistakes += mistakes_of(error, model)
-        mistakes += _besides(today, mistakes, _Collector(lines), path.parent if names else None)
+        mistakes += _besides(data, mistakes, _Collector(lines), path.parent if names else None)
     if mistakes:
         raise InputError(report_mistakes(str(path), lines, mistakes))
     given = content.solver.model_dump(exclude_unset=True) if content.solver else {}

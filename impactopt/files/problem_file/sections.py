@@ -7,7 +7,6 @@ stand nowhere twice.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
@@ -57,7 +56,7 @@ from impactopt.problem.stances import StancePhase
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS, TERMS
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
-from impactopt.solvers.options import INTERIOR, IPMOptions, SolverOptions, SQPOptions
+from impactopt.solvers.options import IPMOptions, SolverOptions, SQPOptions
 
 
 def _section(kind: type[SolverOptions], about: str) -> Any:
@@ -88,42 +87,7 @@ class SolverSettings:
         """Solver arguments of `solve` and its like; given ones take precedence over the file's."""
         chosen = self.name if solver is None else solver
         limit = self.time_limit if time_limit is None else time_limit
-        # for one version "sqp" without a QP solver means "ipm": `with_todays_name`
-        options = self.options.get(chosen, self.options.get("ipm") if chosen == "sqp" else None)
-        return {"solver": chosen, "options": options, "time_limit": limit}
-
-
-def with_todays_names(
-    data: Mapping[str, Any], lines: Mapping[Place, int]
-) -> tuple[Mapping[str, Any], Mapping[Place, int]]:
-    """Data of a file, and its lines, with the section [solver] as it is spelled now.
-
-    For one version "sqp" without a QP solver means "ipm", as it did, and "sqp" with one needs no name.
-
-    Warns
-    -----
-    FutureWarning : the spelling has changed; it says what to write.
-    """
-    section = data.get("solver")
-    if not isinstance(section, Mapping) or "ipm" in section or section.get("name") not in (None, "sqp"):
-        return data, lines
-    options = section.get("sqp")
-    named = options.get("qp_solver") if isinstance(options, Mapping) else None
-    if named not in (None, INTERIOR):
-        if "name" in section:
-            return data, lines
-        write, new = 'give [solver] name = "sqp" beside [solver.sqp] qp_solver', {**section, "name": "sqp"}
-    elif options is None and "name" not in section:
-        return data, lines
-    else:
-        write = 'the interior-point method, the default, is now name = "ipm", its options [solver.ipm]'
-        new = {key: value for key, value in section.items() if key not in ("name", "sqp")}
-        if isinstance(options, Mapping):
-            new["ipm"] = {key: value for key, value in options.items() if key != "qp_solver"}
-        here = {place: n for place, n in lines.items() if place[:2] == ("solver", "sqp")}
-        lines = {**lines, **{("solver", "ipm", *place[2:]): n for place, n in here.items()}}
-    warnings.warn(write, FutureWarning, stacklevel=2)
-    return {**data, "solver": new}, lines
+        return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
 
 
 class SolverSection(Section):

@@ -115,13 +115,12 @@ def collision_model(
     friction = None if content.friction is None else content.friction.build()
     if section.model == "full":
         return FullDynamics(**options, step=_STEP, contact_friction=friction)
-    if friction is not None:
-        raise InputError(
-            f"[friction]: the model {section.model!r} has none: take the full dynamics, or leave it out"
-        )
     if section.model == "rigid":
+        if friction is not None:
+            raise InputError("[friction]: a rigid impact has none: take another model, or leave it out")
         e = content.collision.given().get("coefficient_of_restitution", 0.0) if content.collision else 0.0
         return RigidImpact(**options, coefficient_of_restitution=e)
+    options["contact_friction"] = friction
     return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)
 
 

@@ -119,7 +119,7 @@ def spoiled(frozen: dict[str, Array]) -> Any:
     bad = ~(frozen["pivots"] > LEAST_PIVOT).all(axis=1)
     bad |= ~(frozen["freedom"][:, 0] > LEAST_PIVOT) & (frozen["m"][:, 0] != 0)
     for name in {*frozen} - {"pivots", "freedom"}:
-        bad |= ~np.isfinite(frozen[name]).all(axis=1)
+        bad |= ~np.isfinite(frozen[name]).reshape(len(bad), -1).all(axis=1)
     return bad
 
 
@@ -285,7 +285,7 @@ class Stability:
 
     @cached_property
     def _freeze(self) -> Any:
-        names = ("A", "s", "m") if self._collision.n_servos else ("m",)
+        names = [name for name in ("A", "s", "m", "s_point", "m_point") if name in self._model.data]
         return frozen_dynamics(self._collision).function("frozen", (*names, "pivots", "freedom"))
 
     @cached_property
@@ -304,8 +304,8 @@ class Stability:
     def longest(self, frozen: dict[str, Array], values: dict[str, Array]) -> float:
         """[s], of what is frozen and the settings' values."""
         data: dict[str, Any] = frozen | values
-        if self._collision.effects.bias or self._collision.effects.jdot:
-            data |= {"d": np.zeros(self._collision.robot.n), "e": 0.0}
+        drifts = {name for name in self._model.data if name not in data}
+        data |= {name: np.zeros(self._model.data[name]) for name in drifts}
         return longest_stable_step(self._model, self._slope, data)
 
     def unstable(self, given: Mapping[str, Array]) -> NDArray[np.bool_]:
@@ -315,10 +315,13 @@ class Stability:
         inputs = (given["q"], np.zeros((1, collision.robot.nv)), given["normal"], np.zeros((1, 2)))
         columns = [np.broadcast_to(x, (count, x.shape[1])).T for x in inputs]
         found = self._freeze.map(count).call([ca.DM(x) for x in columns])
-        frozen = {name: np.array(x).T for name, x in zip(self._freeze.name_out(), found, strict=True)}
+        frozen = {
+            name: np.array(x).reshape(x.shape[0], count, x.shape[1] // count).swapaxes(0, 1)
+            for name, x in zip(self._freeze.name_out(), found, strict=True)
+        }
+        frozen = {name: x[..., 0] if x.shape[2] == 1 else x for name, x in frozen.items()}
         data: dict[str, Any] = frozen | {name: given[name] for name in collision.settings}
-        if collision.effects.bias or collision.effects.jdot:
-            data |= {"d": np.zeros((1, collision.robot.n)), "e": np.zeros((1, 1))}
         own = {name: x for name, x in data.items() if name in self._model.data}
+        own |= {name: np.zeros((1, *shape)) for name, shape in self._model.data.items() if name not in own}
         step = collision.step_length
         return np.asarray(unstable_rows(self._model, self._slope, own, step) | spoiled(frozen))

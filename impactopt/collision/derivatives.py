@@ -170,7 +170,8 @@ def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...
     refrozen, name = model.n_freezes > 0, ""
     carried: tuple[str, ...]
     by: tuple[str, ...]
-    if not refrozen and len(outputs) == 1 and outputs[0] in SCALARS and outputs[0] != "step_error":
+    single = len(outputs) == 1 and outputs[0] in SCALARS and outputs[0] != "step_error"
+    if single and not refrozen and model.contact_friction is None:
         carried, name = outputs, "collision_gradient"
         by = tuple(x for x in ("q", "v") if x in inputs)
         if "feedforward" in inputs and model.stepping == "implicit":

@@ -14,6 +14,9 @@ j = n' J_hand,
     dw/dt = s' tau - m f + e,   m = j P j' = 1 / effective mass
     wrenches of what is held = L_tau tau - L_f f + L_0
 
+With friction the force on the target is f n + f_t, and the same with J_hand in the place of j (`s_point`,
+`m_point`, `e_point`, `L_point`) tells what f_t does, and the striking point's velocity.
+
 The drifts d, e, L_0 are quadratic in the velocity, and the blow changes the velocity within the first few
 milliseconds. So they are frozen at the velocity with which hand and target have met, at the end of
 compression, as two point masses would reach it,
@@ -107,7 +110,8 @@ class FrozenDynamics:
     @cached_property
     def _roots(self) -> dict[str, Any]:
         root = self._inverse_root
-        rows = {"hand": self._call("hand_row").T, "held": self._call("held_jacobian").T}
+        names = {"hand": "hand_row", "held": "held_jacobian", "point": "point_jacobian"}
+        rows = {key: self._call(name).T for key, name in names.items()}
         return {k: ca.mtimes(root, x) for k, x in rows.items()} | {"joints": root[:, -self.robot.n :]}
 
     @cached_property
@@ -138,6 +142,21 @@ class FrozenDynamics:
     def m(self) -> Any:
         """j P j' [1/kg]: one over the effective mass."""
         return self._form("hand", "hand")
+
+    @cached_property
+    def point_velocity(self) -> Any:
+        """J_hand v (3) [m/s]."""
+        return self._call("point_velocity")
+
+    @cached_property
+    def s_point(self) -> Any:
+        """S P J_hand' (n, 3) [rad/(kg m)]."""
+        return self._form("joints", "point")
+
+    @cached_property
+    def m_point(self) -> Any:
+        """J_hand P J_hand' (3, 3) [1/kg]."""
+        return self._form("point", "point")
 
     # ------------------------------------------------------------ what rounding leaves
     @cached_property
@@ -186,6 +205,12 @@ class FrozenDynamics:
         drift = self._drift("hand")
         return drift + self._call("hand_drift", drifting=True) if self.jdot else drift
 
+    @cached_property
+    def e_point(self) -> Any:
+        """(3) [m/s2]: drift of the striking point's velocity."""
+        drift = self._drift("point")
+        return drift + self._call("point_drift", drifting=True) if self.jdot else drift
+
     # ------------------------------------------------------------ wrenches
     @cached_property
     def L_tau(self) -> Any:
@@ -196,6 +221,11 @@ class FrozenDynamics:
     def L_f(self) -> Any:
         """(c): wrenches lost per normal force at the hand."""
         return -ca.mtimes(self._cholesky.T, self._held["hand"])
+
+    @cached_property
+    def L_point(self) -> Any:
+        """(c, 3): wrenches lost per force at the hand."""
+        return -ca.mtimes(self._cholesky.T, self._held["point"])
 
     @cached_property
     def L_0(self) -> Any:
@@ -218,11 +248,12 @@ class FrozenDynamics:
     # ------------------------------------------------------------ whole motion
     @cached_property
     def velocity_change(self) -> Any:
-        """ca.Function (q, drift velocity, normal, torque, force, wrenches, time) -> change of v (nv).
+        """ca.Function (q, drift velocity, normal, torque, force, friction, wrenches, time) -> change of v
+        (nv).
 
-        From time, and integrals over it of torque (n), contact force and wrenches of what is held (c), with
-        what was frozen at (q, drift velocity). With double integrals in their place and time^2 / 2, the
-        change of position.
+        From time, and integrals over it of torque (n), contact force, friction (3) and wrenches of what is
+        held (c), with what was frozen at (q, drift velocity). With double integrals in their place and
+        time^2 / 2, the change of position.
         """
         return self._tree.velocity_change(self.bias)
 
@@ -236,6 +267,11 @@ class FrozenDynamics:
     def speed_of_hand(self) -> Any:
         """ca.Function (q, v, normal) -> `hand_speed`."""
         return self._tree.function("hand_speed")
+
+    @cached_property
+    def velocity_of_point(self) -> Any:
+        """ca.Function (q, v, normal) -> `point_velocity`."""
+        return self._tree.function("point_velocity")
 
 
 class _TreeQuantities:
@@ -266,7 +302,12 @@ class _TreeQuantities:
     @cached_property
     def hand_row(self) -> Any:
         """j (1, nv)."""
-        return ca.mtimes(self.normal.T, self.rb.jacobian(self.frame)[:3, :])
+        return ca.mtimes(self.normal.T, self.point_jacobian)
+
+    @cached_property
+    def point_jacobian(self) -> Any:
+        """J_hand (3, nv)."""
+        return self.rb.jacobian(self.frame)[:3, :]
 
     @cached_property
     def held_jacobian(self) -> Any:
@@ -279,12 +320,20 @@ class _TreeQuantities:
         return self.rb.rnea(self.rb.v, None)
 
     @property
+    def point_velocity(self) -> Any:
+        return self.rb.frame_velocity(self.frame, self.rb.v)[:3]
+
+    @property
+    def point_drift(self) -> Any:
+        return self.rb.frame_acceleration(self.frame, self.rb.v, None)[:3]
+
+    @property
     def hand_speed(self) -> Any:
-        return ca.dot(self.normal, self.rb.frame_velocity(self.frame, self.rb.v)[:3])
+        return ca.dot(self.normal, self.point_velocity)
 
     @property
     def hand_drift(self) -> Any:
-        return ca.dot(self.normal, self.rb.frame_acceleration(self.frame, self.rb.v, None)[:3])
+        return ca.dot(self.normal, self.point_drift)
 
     @property
     def held_drift(self) -> Any:
@@ -306,13 +355,14 @@ class _TreeQuantities:
 
     def velocity_change(self, bias: bool) -> Any:
         torque, force, time = ca.SX.sym("torque", self.robot.n), ca.SX.sym("force"), ca.SX.sym("time")
+        friction = ca.SX.sym("friction", 3)
         wrench = ca.SX.sym("wrench", 6 * len(self.held))
         push = ca.vertcat(ca.SX.zeros(self.base, 1), torque) - self.hand_row.T * force
-        push += ca.mtimes(self.held_jacobian.T, wrench)
+        push += ca.mtimes(self.held_jacobian.T, wrench) - ca.mtimes(self.point_jacobian.T, friction)
         if bias:
             push -= self.bias_force * time
         change = ca.densify(self.rb.factorize().solve(push))
-        inputs = [self.rb.q, self.rb.v, self.normal, torque, force, wrench, time]
+        inputs = [self.rb.q, self.rb.v, self.normal, torque, force, friction, wrench, time]
         return ca.Function("velocity_change", inputs, [change])
 
 

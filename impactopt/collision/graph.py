@@ -53,6 +53,7 @@ def joint_space_model(
         peak="peak_force" in outputs,
         error="step_error" in outputs,
         second_integrals="configuration" in outputs or freezes > 0,
+        slides=collision.contact_friction is not None,
         refrozen=freezes > 0,
         horizon=collision.horizon,
     )
@@ -127,7 +128,7 @@ def _expressions(
         loop=(_implicit if implicit else _explicit)(collision, model, record),
         horizon=collision.horizon,
         freezes=collision.n_freezes,
-        wanted=frozen_for(outputs),
+        wanted=frozen_for(outputs, slides=model.slides),
     )
     gives_way = target_start(model.target, model.target_numbers(inputs))
     segments = course.run(inputs, gives_way)
@@ -238,7 +239,7 @@ def instructions(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str,
     """
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     whole = ("L_tau", "L_f", "L_0", "drift_velocity") if collision.n_freezes else ()
-    names = tuple(dict.fromkeys((*model.frozen, *frozen_for(outputs), *whole)))
+    names = tuple(dict.fromkeys((*model.frozen, *frozen_for(outputs, slides=model.slides), *whole)))
     freeze = frozen_dynamics(collision).function("frozen", names)
     step = rk4_step(model, collision.step_of_graph)
     return {"freeze": int(freeze.expand().n_instructions()), "step": int(step.expand().n_instructions())}

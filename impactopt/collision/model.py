@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from impactopt.collision.frozen import FrozenDynamics
 from impactopt.collision.settings import Effects, Settings
 from impactopt.contact import ContactLaw, Target
+from impactopt.contact.friction import pushed_way
 
 __all__ = ["GIVES_WAY", "Course", "JointSpaceModel", "Loop", "Segment", "cuts", "relative_to", "shape_of"]
 
@@ -43,7 +44,8 @@ class JointSpaceModel:
 
         time [s]; penetration [m]; impulse [N s] = integral of f; target's state; and, where they are asked
         for or needed, peak force [N], what steps left out [N s], torque (n) [N m s] = integral of tau - F,
-        deviation (n) [rad] = phi_ref - phi, torque2 (n), impulse2: second integrals.
+        deviation (n) [rad] = phi_ref - phi, sliding (3) [N s] = integral of the friction on the target,
+        torque2 (n), impulse2, sliding2 (3): second integrals.
 
     Attributes
     ----------
@@ -53,6 +55,7 @@ class JointSpaceModel:
     peak : keep the largest force in the state.
     error : keep in the state what the steps are estimated to leave out of the impulse, `left_out` [N s].
     second_integrals : keep torque2 and impulse2 in the state.
+    slides : friction at the striking point is in the state and the data.
     refrozen : whether there are several freezes. Then `velocity_before` (n), the change of the joint velocity
         from contact to the freeze, and `until` [s], when the freeze ends, are among the data.
     horizon : [s] at which everything ends; several freezes have it in `until`.
@@ -67,6 +70,7 @@ class JointSpaceModel:
     peak: bool = False
     error: bool = False
     second_integrals: bool = False
+    slides: bool = False
     refrozen: bool = False
     horizon: float = np.inf
 
@@ -82,8 +86,10 @@ class JointSpaceModel:
         sizes["torque"] = self.n
         if self.effects.stiffness:
             sizes["deviation"] = self.n
+        if self.slides:
+            sizes["sliding"] = 3
         if self.second_integrals:
-            sizes |= {"torque2": self.n, "impulse2": 1}
+            sizes |= {"torque2": self.n, "impulse2": 1} | ({"sliding2": 3} if self.slides else {})
         ends = np.cumsum(list(sizes.values()))
         return {
             name: slice(int(end) - size, int(end))
@@ -101,6 +107,9 @@ class JointSpaceModel:
         names += ["m", "hand_speed"]
         if self.effects.bias or self.effects.jdot:
             names += ["d", "e"]
+        if self.slides:
+            names += ["s_point"] if self.n else []
+            names += ["m_point", "point_velocity", *(["e_point"] if "e" in names else [])]
         return tuple(names)
 
     @cached_property
@@ -108,6 +117,7 @@ class JointSpaceModel:
         """Names and shapes of what is constant during the collision."""
         n = self.n
         shapes = {"A": (n * (n + 1) // 2, 1), "m": (1, 1), "hand_speed": (1, 1), "e": (1, 1)}
+        shapes |= {"s_point": (n, 3), "m_point": (3, 3), "point_velocity": (3, 1), "e_point": (3, 1)}
         out = {name: shapes.get(name, (n, 1)) for name in self.frozen}
         if self.refrozen:
             out |= {"velocity_before": (n, 1), "until": (1, 1)}
@@ -115,7 +125,7 @@ class JointSpaceModel:
             out["joint_velocity"] = (n, 1)
         if self.effects.feedforward:
             out["feedforward"] = (n, 1)
-        no_data = ("normal", "reference", "reference_until")
+        no_data = ("reference", "reference_until", *(() if self.slides else ("normal",)))
         return out | {name: shape_of(v) for name, v in self.settings.items() if name not in no_data}
 
     def symbols(self, kind: Any = ca.SX) -> dict[str, Any]:
@@ -149,15 +159,14 @@ class JointSpaceModel:
     def velocity_change(self, y: Any, data: dict[str, Any]) -> Any:
         """Joint velocities less those of the servo's reference (n) [rad/s]: integral of eq. (9). It keeps
         those at contact, unless d is relative to another (`Freezes`)."""
-        u = self.velocity_from(self.part(y, "torque"), self.part(y, "impulse"), self.part(y, "time"), data)
-        return u + _spread(data["velocity_before"], u) if self.refrozen else u
-
-    def velocity_from(self, torque: Any, impulse: Any, time: Any, data: dict[str, Any]) -> Any:
-        """Joint velocities less those at the freeze, from the state's parts that they depend on. Linear."""
         if not self.n:
-            return ca.mtimes(ca.DM(0, 1), impulse)
-        u = self._product(data["A"], torque) - ca.mtimes(data["s"], impulse)
-        return u + ca.mtimes(data["d"], time) if "d" in data else u
+            return ca.mtimes(ca.DM(0, 1), self.part(y, "impulse"))
+        u = self._product(data["A"], self.part(y, "torque")) - ca.mtimes(data["s"], self.part(y, "impulse"))
+        if self.slides:
+            u -= ca.mtimes(data["s_point"], self.part(y, "sliding"))
+        if "d" in data:
+            u += ca.mtimes(data["d"], self.part(y, "time"))
+        return u + _spread(data["velocity_before"], u) if self.refrozen else u
 
     def _product(self, lower: Any, columns: Any) -> Any:
         """A times columns, from A's lower triangle."""
@@ -178,7 +187,22 @@ class JointSpaceModel:
         w = -data["m"] * self.part(y, "impulse")
         if self.n:
             w = ca.mtimes(data["s"].T, self.part(y, "torque")) + w
+        if self.slides:
+            w -= ca.mtimes(ca.mtimes(data["normal"].T, data["m_point"]), self.part(y, "sliding"))
         return w + data["e"] * self.part(y, "time") if "e" in data else w
+
+    def point_velocity(self, y: Any, data: dict[str, Any]) -> Any:
+        """The striking point's velocity (3) [m/s]. Linear in y."""
+        pushed = ca.mtimes(data["normal"], self.part(y, "impulse")) + self.part(y, "sliding")
+        velocity = _spread(data["point_velocity"], pushed) - ca.mtimes(data["m_point"], pushed)
+        if self.n:
+            velocity += ca.mtimes(data["s_point"].T, self.part(y, "torque"))
+        return velocity + ca.mtimes(data["e_point"], self.part(y, "time")) if "e_point" in data else velocity
+
+    def friction_on_target(self, velocity: Any, force: Any, data: dict[str, Any]) -> Any:
+        """(3) [N] at one instant, of a striking point with a velocity (3) [m/s] and a contact force [N]."""
+        way = pushed_way(data["normal"], velocity, data["friction_coefficient"], data["friction_slip_speed"])
+        return force * (way - data["normal"])
 
     def target_state(self, y: Any) -> list[Any]:
         states = self.part(y, "target")
@@ -203,6 +227,9 @@ class JointSpaceModel:
         u = data["velocity_before"] if self.refrozen else ca.DM.zeros(self.n, 1)
         force = self.law.force(self.part(y, "penetration"), 0.0, self.law_numbers(data))
         hand = -data["m"] * force
+        if self.slides:
+            friction = self.friction_on_target(data["point_velocity"], force, data)
+            hand -= ca.mtimes(ca.mtimes(data["normal"].T, data["m_point"]), friction)
         if self.n:
             tau = self.saturate(self.with_feedforward(self.servo(y, u, data), data), data)
             hand += ca.mtimes(data["s"].T, tau - self.friction(u, data) if self.effects.friction else tau)
@@ -338,7 +365,8 @@ class Course:
     ) -> None:
         self.model, self.frozen, self.loop = model, frozen, loop
         self.horizon, self.freezes = horizon, freezes
-        whole = ("L_tau", "L_f", "L_0", "drift_velocity") if freezes else ()
+        of_point = ("L_point",) if model.slides else ()
+        whole = ("L_tau", "L_f", "L_0", "drift_velocity", *of_point) if freezes else ()
         self._names = tuple(dict.fromkeys((*model.frozen, *wanted, *whole)))
         self._freeze = frozen.function("frozen", self._names)
 
@@ -376,6 +404,8 @@ class Course:
             data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], ca.DM([GIVES_WAY, 0.0]))
             data = relative_to(inputs, duration * (a + b) / 2, data)
             data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
+            if self.model.slides:
+                data["point_velocity"] = self.frozen.velocity_of_point(q, v, inputs["normal"])
             data["velocity_before"] = (v - inputs["v"])[-n:]
             if "reference" in inputs:
                 data["reference_before"] = _gained(inputs, duration * a)
@@ -446,5 +476,9 @@ class Course:
         if not model.n:
             torque = ca.MX.zeros(self.frozen.robot.n)
         wrench = ca.mtimes(data["L_tau"], torque) - data["L_f"] * impulse + data["L_0"] * time
+        sliding = ca.MX.zeros(3)
+        if model.slides:
+            sliding = model.part(y, "sliding2" if second else "sliding")
+            wrench -= ca.mtimes(data["L_point"], sliding)
         at = (frozen_at, data["drift_velocity"], data["normal"])
-        return self.frozen.velocity_change(*at, torque, impulse, wrench, time)
+        return self.frozen.velocity_change(*at, torque, impulse, sliding, wrench, time)

@@ -74,13 +74,13 @@ def check_jacobian(names: tuple[str, ...], method: str, freezes: int) -> None:
         raise InputError(f"jacobian_function: only without further freezes; give freezes=0, or {instead}")
 
 
-def frozen_for(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Attributes of FrozenDynamics that these outputs need besides what the model does."""
+def frozen_for(names: tuple[str, ...], *, slides: bool = False) -> tuple[str, ...]:
+    """Attributes of FrozenDynamics that these outputs need besides what the model does; slides: as of it."""
     motion = {"velocity", "configuration"} & {*names}
     wrench = {*OF_SOLES, "hand_wrench"} & {*names}
     whole = {"ground_wrench", "zmp"} & {*names}
     return (
-        (("L_tau", "L_f", "L_0") if motion or wrench else ())
+        (("L_tau", "L_f", "L_0", *(("L_point",) if slides else ())) if motion or wrench else ())
         + (("drift_velocity",) if motion else ())
         + (("sole_positions", "unmodelled_wrench") if whole else ())
     )
@@ -195,6 +195,19 @@ class Instants:
         return law.map(columns)(self._row("penetration"), rates, *values)
 
     @cached_property
+    def friction_on_target(self) -> Any:
+        """(3, k) [N]."""
+        model, velocity, force = self._model, ca.SX.sym("velocity", 3), ca.SX.sym("force")
+        names = ("normal", "friction_coefficient", "friction_slip_speed")
+        data = {name: ca.SX.sym(name, *model.data[name]) for name in names}
+        found = model.friction_on_target(velocity, force, data)
+        function = ca.Function("friction", [velocity, force, *data.values()], [found])
+        columns = self._states.size2()
+        values = [ca.repmat(self._data[name], 1, columns) for name in names]
+        velocities = model.point_velocity(self._states, self._data)
+        return function.map(columns)(velocities, self.force, *values)
+
+    @cached_property
     def hand_speed(self) -> Any:
         return self._model.hand_speed_change(self._states, self._data) + self._data["hand_speed"]
 
@@ -237,7 +250,10 @@ class Instants:
         torque = self.torque
         if self._model.effects.friction:
             torque = torque - self._model.friction(self._joint_change, self._data)
-        return self._wrench(torque, self.force, ca.DM.ones(1, torque.size2()))
+        wrench = self._wrench(torque, self.force, ca.DM.ones(1, torque.size2()))
+        if not self._model.slides:
+            return wrench
+        return wrench - ca.mtimes(self._data["L_point"], self.friction_on_target)
 
     @cached_property
     def sole_wrench(self) -> Any:

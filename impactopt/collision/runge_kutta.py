@@ -113,6 +113,9 @@ def rate_of_change(model: JointSpaceModel, y: Any, u: Any, data: dict[str, Any])
         "torque": tau,
         "deviation": -u,
     }
+    if model.slides:
+        rates["sliding"] = model.friction_on_target(model.point_velocity(y, data), force, data)
     if model.second_integrals:
-        rates |= {"torque2": model.part(y, "torque"), "impulse2": model.part(y, "impulse")}
+        once = ("torque", "impulse", *(("sliding",) if model.slides else ()))
+        rates |= {f"{name}2": model.part(y, name) for name in once}
     return model.join(rates)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from impactopt.collision.checks import caution, more_often
 from impactopt.collision.settings import Effects, JointFriction, servo_settings
 from impactopt.collision.symbolic import SymbolicModel
-from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
+from impactopt.contact import ContactFriction, ContactLaw, FreeMass, SpringDamper, Target
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.kinematics.stance import BothSoles, FixedBase, Stance
 from impactopt.robots.robot import Robot
@@ -92,6 +92,7 @@ class SDC(SymbolicModel):
         target: Target | None = None,
         stance: Stance | None = None,
         friction: JointFriction | None = None,
+        contact_friction: ContactFriction | None = None,
         horizon: float = 0.1,
         report: Callable[[str], None] | None = None,
     ) -> SDC:
@@ -115,6 +116,7 @@ class SDC(SymbolicModel):
             stance=stance,
             effects=Effects.paper(friction=friction is not None),
             friction=friction,
+            contact_friction=contact_friction,
             method="rk4",
             step=1e-4,
             horizon=horizon,
@@ -158,7 +160,7 @@ def frozen_model(
     ----------
     name : one of `FROZEN`.
     freezes, accuracy : of "sdc": as of `SDC`.
-    scene : robot, striker, normal, law, target, stance, horizon: as of `SDC`.
+    scene : robot, striker, normal, law, target, stance, horizon, contact_friction: as of `SDC`.
 
     Raises
     ------

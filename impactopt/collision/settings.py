@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.contact import ContactLaw, Target
+from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, raw_array
 from impactopt.robots.robot import Robot
 
@@ -94,6 +94,10 @@ _SIGN = {"kp": ">= 0", "kd": ">= 0", "torque_limit": "> 0", "viscous": ">= 0", "
 _SIGN |= {"reference_until": "> 0"}
 
 
+_SIGN |= {"friction_coefficient": "> 0", "friction_slip_speed": "> 0"}
+_OF_FRICTION = ("friction_coefficient", "friction_slip_speed")
+
+
 _FOR_EVER = 1e6  # [s]
 # the highest power of time in what bends the servo's reference
 REFERENCE_ORDER = 10
@@ -108,7 +112,8 @@ class Settings(Mapping[str, Array]):
 
     Only numbers that its effects need are there.
 
-    normal (3); contact_<number of the law>; target_<number of the target>; and with a servo
+    normal (3); contact_<number of the law>; target_<number of the target>; with friction at the striking
+    point friction_coefficient and friction_slip_speed [m/s]; and with a servo
     (`servo_settings`) kd; kp with servo stiffness; torque_limit (n) with saturation; viscous, coulomb (n)
     with friction. kp and kd are (n), or (n, n) where the model was given matrices. With dJ/dt v, and without
     friction, reference (n, 10) [rad/s^(k + 1)]: what the joint velocities of the servo's reference gain, of
@@ -117,12 +122,19 @@ class Settings(Mapping[str, Array]):
     """
 
     def __init__(
-        self, law: ContactLaw, target: Target, normal: ArrayLike, servo: Mapping[str, ArrayLike]
+        self,
+        law: ContactLaw,
+        target: Target,
+        normal: ArrayLike,
+        servo: Mapping[str, ArrayLike],
+        friction: ContactFriction | None = None,
     ) -> None:
         self._law, self._target = law, target
         values: dict[str, Any] = {"normal": normal}
         values |= {f"contact_{name}": number for name, number in law.parameters.items()}
         values |= {f"target_{name}": number for name, number in target.parameters.items()}
+        if friction is not None:
+            values |= dict(zip(_OF_FRICTION, friction.parameters, strict=True))
         values |= servo
         self._values = {name: np.asarray(value, dtype=float) for name, value in values.items()}
         self._values = {name: self._check(name, value) for name, value in self._values.items()}

@@ -16,7 +16,7 @@ from impactopt.codegen.cache import model_hash
 from impactopt.collision.interface import CollisionModel
 from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS
 from impactopt.collision.settings import Effects, JointFriction, Settings
-from impactopt.contact import ContactLaw, Target
+from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.errors import InputError, check_array, did_you_mean
 
 __all__ = ["SteppedModel", "contact_functions", "law_is_linear", "number_of_steps", "target_is_linear"]
@@ -154,17 +154,20 @@ class SteppedModel(CollisionModel):
         changes, and in what says when the target breaks, starts or stops, relative to its parts. The impulse
         is mostly as exact as that. Errors add up in long contacts, where a servo swings undamped or saturates
         again and again.
+    contact_friction : of the striking point on the target. Only with "rk4", which is then the method (None).
     report : called with a line of text while functions are compiled.
 
     Raises
     ------
-    InputError : as `CollisionModel`; an unknown method; a step that is not positive, or makes too many steps.
+    InputError : as `CollisionModel`; an unknown method, or "implicit" with contact_friction; a step that is
+        not positive, or makes too many steps.
     """
 
     effects: Effects = field(default_factory=Effects)
     method: str | None = None
     step: float | None = None
     tolerance: float = 1e-7
+    contact_friction: ContactFriction | None = None
     report: Callable[[str], None] | None = None
 
     def __post_init__(self) -> None:
@@ -173,6 +176,8 @@ class SteppedModel(CollisionModel):
             raise InputError(
                 f"method {self.method!r}{did_you_mean(self.method, STEPS)}; there are {', '.join(STEPS)}"
             )
+        if self.contact_friction is not None and self.method == "implicit":
+            raise InputError("method 'implicit': its steps have no contact_friction; give 'rk4', or none")
         if not 1e-14 <= check_array("tolerance", self.tolerance, ()) <= 1e-2:
             raise InputError(f"tolerance: {self.tolerance:g}; give a number from 1e-14 to 1e-2")
         if not check_array("step [s]", self.step_length, ()) > 0:
@@ -207,7 +212,7 @@ class SteppedModel(CollisionModel):
     @property
     def stepping(self) -> str:
         """The method, or the usual one."""
-        return self.method or "implicit"
+        return self.method or ("implicit" if self.contact_friction is None else "rk4")
 
     @property
     def step_length(self) -> float:
@@ -223,7 +228,7 @@ class SteppedModel(CollisionModel):
     @cached_property
     def settings(self) -> Settings:
         """Numbers that are inputs of the functions, with their defaults."""
-        return Settings(self.law, self.target, self.normal, self._servo_settings())
+        return Settings(self.law, self.target, self.normal, self._servo_settings(), self.contact_friction)
 
     def _servo_settings(self) -> dict[str, ArrayLike]:
         return {}
@@ -253,7 +258,7 @@ class SteppedModel(CollisionModel):
         shapes = tuple((name, value.shape) for name, value in self.settings.items())
         frame = self.robot.striker(self.striker).model_frame
         steps = (self.stepping, self.step_length, self.tolerance, self.step_of_graph)
-        course = (*steps, self.horizon, self.n_freezes)
+        course = (*steps, self.horizon, self.n_freezes, self.contact_friction is not None)
         return (model_hash(self.robot.model), self.n_servos, frame, *held_by, *kinds, shapes, *course)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -13,6 +14,7 @@ from support.small_plans import BODILESS, arm_problem, biped_problem, transcribe
 from support.small_robots import arm, biped, table
 
 from impactopt import (
+    SDC,
     ContactFriction,
     FreeMass,
     FullDynamics,
@@ -20,10 +22,11 @@ from impactopt import (
     MujocoDynamics,
     RigidWall,
     SpringDamper,
+    VirtualMass,
 )
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
-from impactopt.kinematics.operational_space import Held, striking_velocity
+from impactopt.kinematics.operational_space import Held, holding_torque, striking_velocity
 from impactopt.kinematics.stance import FixedBase, Free
 from impactopt.problem.terms import GearLoad
 from impactopt.robots.robot import Robot, Striker
@@ -36,9 +39,9 @@ LAW = SpringDamper(stiffness=2e4, damping=20.0)
 GENTLE = ContactFriction(coefficient=0.6)
 
 
-def sliding(across: float, friction: ContactFriction | None) -> Any:
+def sliding(across: float, friction: ContactFriction | None, kind: Any = FullDynamics, **options: Any) -> Any:
     """A mass of 4 kg along x and 2 kg along y that hits a wall across x with 1 m/s."""
-    model = FullDynamics(
+    model = kind(
         robot=table(4.0),
         striker="tip",
         normal=[1.0, 0.0, 0.0],
@@ -46,13 +49,16 @@ def sliding(across: float, friction: ContactFriction | None) -> Any:
         target=RigidWall(),
         stance=FixedBase(),
         contact_friction=friction,
+        **options,
     )
     return model.collide(np.zeros(2), np.array([1.0, across]), np.zeros(2))
 
 
-def test_a_mass_that_slides_all_along_loses_mu_times_the_impulse() -> None:
+@pytest.mark.parametrize("kind", [FullDynamics, SDC, VirtualMass])
+def test_a_mass_that_slides_all_along_loses_mu_times_the_impulse(kind: Any) -> None:
     for across in (4.0, -6.0):
-        found, without = sliding(across, ROUGH), sliding(across, None)
+        options = {} if kind is FullDynamics else {"method": "rk4", "step": 1e-5}
+        found, without = (sliding(across, friction, kind, **options) for friction in (ROUGH, None))
         assert 4.0 * (1.0 - found.velocity[0]) == pytest.approx(found.impulse, rel=1e-9)
         lost = 2.0 * (across - found.velocity[1])
         assert lost == pytest.approx(np.sign(across) * 0.5 * found.impulse, rel=1e-6)
@@ -63,6 +69,79 @@ def test_a_mass_that_slides_all_along_loses_mu_times_the_impulse() -> None:
 def test_a_mass_that_hardly_slides_sticks() -> None:
     # it has 0.4 N s across, and friction could take half of some 7 N s
     assert abs(sliding(0.2, ROUGH).velocity[1]) < 1e-6
+    frozen = [sliding(0.2, GENTLE, kind, step=1e-5).velocity for kind in (SDC, VirtualMass)]
+    for velocity in frozen:
+        np.testing.assert_allclose(velocity, sliding(0.2, GENTLE).velocity, atol=1e-4)
+
+
+OBLIQUE = np.array([0.8, 0.0, 0.6])
+
+
+def oblique(kind: Any = SDC, **options: Any) -> tuple[Any, tuple[Any, Any, Any]]:
+    """A biped's blow that slides 0.6 of its speed along a box, and its state at contact."""
+    robot = biped()
+    q = robot.posture("half_sitting")
+    v = striking_velocity(robot, q, "fist", [1.0, 0.0, 0.0], 1.0)
+    shared = {"robot": robot, "striker": "fist", "normal": OBLIQUE, "law": LAW, "target": FreeMass(mass=3.0)}
+    return kind(**shared, **options), (q, v, holding_torque(robot, q, v))
+
+
+def test_frozen_dynamics_come_to_full_dynamics_with_friction_too() -> None:
+    model, at = oblique(FullDynamics, contact_friction=GENTLE)
+    full = model.collide(*at)
+    off = []
+    for freezes in (0, 2, 8):
+        model, at = oblique(contact_friction=GENTLE, freezes=freezes, accuracy=None, step=2e-5)
+        found = model.collide(*at)
+        off.append(abs(found.impulse / full.impulse - 1))
+    assert off[2] < off[1] < off[0] and off[2] < 3e-4
+    np.testing.assert_allclose(found.velocity, full.velocity, atol=2e-3)
+    # the last instant is separation's, which is not quite at the same time
+    whole = np.linspace(0.0, 0.9 * full.duration, 20)
+    for name in ("sole_wrench", "torque"):
+        ours, theirs = (
+            np.array([np.interp(whole, x.time, y) for y in getattr(x, name).reshape(len(x.time), -1).T])
+            for x in (found, full)
+        )
+        np.testing.assert_allclose(ours, theirs, atol=0.02 * np.abs(theirs).max())
+    model, at = oblique(accuracy=None)
+    assert abs(model.collide(*at).impulse / full.impulse - 1) > 1e-2  # and friction matters
+
+
+def test_compiled_code_is_its_graph_with_friction_too() -> None:
+    outputs = ("impulse", "velocity", "configuration", "sole_wrench", "zmp", "hand_speed")
+    model, at = oblique(contact_friction=GENTLE)
+    numbers = [*at, *model.settings.values()]
+    graph = model.graph(outputs, every=50)
+    compiled = model.function(outputs, parameters=tuple(model.settings), every=50)
+    for one, two in zip(compiled.call(numbers), graph.call(numbers), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)
+
+
+def test_frozen_models_have_derivatives_with_friction() -> None:
+    model, (q, v, torque) = oblique(contact_friction=GENTLE)
+    value, _, by_v = model.gradient_function("impulse")(q, v, torque)
+    named = ("friction_coefficient", "friction_slip_speed")
+    function = model.function(parameters=named)
+    numbers = [q, v, torque, *(model.settings[name] for name in named)]
+    jacobian = dict(zip(function.jacobian().name_out(), function.jacobian()(*numbers, value), strict=True))
+    np.testing.assert_allclose(jacobian["jac_impulse_v"], ca.DM(by_v).T, rtol=1e-5, atol=1e-8)
+    for name in named:
+        h = 1e-5 * float(model.settings[name])
+        ends = [
+            model.collide(q, v, torque, **{name: model.settings[name] + side * h}).impulse for side in (1, -1)
+        ]
+        slope = (ends[0] - ends[1]) / (2 * h)
+        assert float(jacobian[f"jac_impulse_{name}"]) == pytest.approx(slope, rel=1e-4)
+
+
+def test_many_frozen_collisions_have_friction_of_their_own() -> None:
+    model, (q, v, torque) = oblique(contact_friction=GENTLE, freezes=1)
+    coefficients = np.array([0.1, 0.6, 1.2])
+    many = model.batch(np.tile(q, (3, 1)), np.tile(v, (3, 1)), torque, friction_coefficient=coefficients)
+    alone = [model.collide(q, v, torque, friction_coefficient=mu).impulse for mu in coefficients]
+    np.testing.assert_allclose(many["impulse"], alone, rtol=1e-12)
+    assert np.ptp(alone) > 1e-2 * np.mean(alone)
 
 
 def disc(mass: float, radius: float) -> Robot:
@@ -180,6 +259,11 @@ def test_bad_input_and_models_without_friction_are_refused() -> None:
         ContactFriction(coefficient=-1.0)
     with pytest.raises(InputError, match=r"the model 'sdc' of the collision has none"):
         dataclasses.replace(arm_problem(), friction=GENTLE, collision="sdc")
+    with pytest.raises(InputError, match=r"method 'implicit': its steps have no contact_friction"):
+        oblique(contact_friction=GENTLE, method="implicit")
+    with pytest.raises(InputError, match=r"friction_coefficient: has -1; all must be > 0"):
+        model, at = oblique(contact_friction=GENTLE)
+        model.collide(*at, friction_coefficient=-1.0)
     with pytest.raises(InputError, match=r"must be a ContactFriction, not 0\.6"):
         dataclasses.replace(arm_problem(), friction=0.6)
 

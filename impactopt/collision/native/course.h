@@ -44,6 +44,11 @@ static void load_data(const double **arg, Data *d) {
 #if FEEDFORWARD
   pad(d->feedforward, V, arg[ARG_feedforward], N, 0.0);
 #endif
+#if SLIDES
+  load(arg[ARG_friction_coefficient], &d->coefficient, 1);
+  load(arg[ARG_friction_slip_speed], &d->slip_speed, 1);
+  load(arg[ARG_normal], d->normal, 3);
+#endif
   FOR(i, N_LAW) load(arg[ARG_law + i], d->law + i, 1);
   FOR(i, N_TARGET) load(arg[ARG_target + i], d->target + i, 1);
 }
@@ -82,8 +87,8 @@ static void moved(const Frozen *F, const double *q, const double *v, const State
                   double *v_then) {
   double way[NV], change[NV], from[NQ];
   memcpy(from, q, sizeof from);
-  velocity_change(F, y->torque2, y->impulse2, y->time * y->time / 2, way);
-  velocity_change(F, y->torque, y->impulse, y->time, change);
+  velocity_change(F, y->torque2, y->impulse2, SLIDING2(y), y->time * y->time / 2, way);
+  velocity_change(F, y->torque, y->impulse, SLIDING(y), y->time, change);
   FOR(i, NV) way[i] = v[i] * y->time + way[i];
   const double *in[] = {from, way};
   double *out[] = {q_then};
@@ -129,7 +134,12 @@ static void segments(const double **arg, Work *w, Course *c, double duration, in
     freeze(q_middle, v_middle, normal, GIVES_WAY, 0.0, F);
     follow(arg, duration * (begin + end) / 2, duration * begin, w);
     const double *in[] = {c->q, c->v, normal};
-    double *out[] = {&d->hand_speed};
+    double *out[] = {
+      &d->hand_speed,
+#if SLIDES
+      d->point_velocity,
+#endif
+    };
     hand_speed_at(in, out, 0, 0, 0);
     double before[NV];
     FOR(k, NV) before[k] = c->v[k] - v[k];
@@ -152,6 +162,10 @@ static void segments(const double **arg, Work *w, Course *c, double duration, in
     start.time = start.impulse = start.impulse2 = 0.0;
     memset(start.torque, 0, sizeof start.torque);
     memset(start.torque2, 0, sizeof start.torque2);
+#if SLIDES
+    memset(start.sliding, 0, sizeof start.sliding);
+    memset(start.sliding2, 0, sizeof start.sliding2);
+#endif
   }
 }
 #endif
@@ -168,6 +182,9 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
   follow(arg, 0.0, 0.0, w);
   d->frozen = F;
   d->hand_speed = F->hand_speed;
+#if SLIDES
+  memcpy(d->point_velocity, F->point_velocity, sizeof d->point_velocity);
+#endif
   memset(&c->final, 0, sizeof c->final);
   d->until = HORIZON;
 #if !FREEZES

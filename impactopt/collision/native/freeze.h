@@ -1,7 +1,8 @@
 /* Steps 1b and 2b: what is computed once, at the moment of a freeze. Symbols as in collision/frozen.py.
 
    With roots W of joints and hand in one matrix B, and Z = R^-1 W_c' B,  Q = B' B - Z' Z = [A s; s' m]. A product
-   of Q with (integral of the torque, minus the impulse) gives the joints' velocity and the hand's speed. */
+   of Q with (integral of the torque, minus the impulse) gives the joints' velocity and the hand's speed. With
+   friction the same of the striking point's three rows: `of_point` are columns, m_point is between them. */
 
 typedef struct {
   vec root[NV][VF];     /* D^-1/2 L^-T; columns: joints, hand, the other velocities */
@@ -18,6 +19,10 @@ typedef struct {
   double hand_speed, closing; /* of the hand, and against the target, both along the normal */
   double soles[AT_LEAST_1(3 * SOLES)];
   double unmodelled[6];
+#if SLIDES
+  double point_root[3][NV], point_held[3][C1], m_point[3][3], point_velocity[3], e_point[3];
+  vec of_point[3][V], L_point[3][VC];
+#endif
   int spoiled;          /* whether rounding has spoilt it */
 } Frozen;
 
@@ -31,7 +36,18 @@ typedef struct {
 static void roots(const double *q, const double *v, const double *normal, Frozen *F) {
   double root[ROOT_NONZEROS], held[AT_LEAST_1(HELD_NONZEROS)];
   const double *in[] = {q, v, normal};
-  double *out[] = {root, held, &F->hand_speed, F->soles, F->unmodelled};
+  double *out[] = {
+    root, held, &F->hand_speed,
+#if GROUND
+    F->soles,
+#if !BIAS
+    F->unmodelled,
+#endif
+#endif
+#if SLIDES
+    F->point_root[0], F->point_velocity,
+#endif
+  };
   memset(F->unmodelled, 0, sizeof F->unmodelled);
   tree(in, out, 0, 0, 0);
   memset(F->root, 0, sizeof F->root);
@@ -108,6 +124,29 @@ static void inverse_inertia(Frozen *F) {
   }
 }
 
+/* s_point and m_point, by the columns of W and Z of the striking point */
+static void inertia_at_point(Frozen *F) {
+#if SLIDES
+  FOR(k, 3) {
+    double *z = F->point_held[k];
+    FOR(c, C) z[c] = 0.0;
+    FOR(r, NV) FOR(c, C) z[c] += F->point_root[k][r] * ((double *)F->held[r])[c];
+    SOLVE(F, z, double)
+    vec s[V] = {0};
+    FOR(r, NV) FOR(i, V) s[i] += F->point_root[k][r] * F->root[r][i];
+    FOR(c, C) FOR(i, V) s[i] -= z[c] * F->Z[c][i];
+    s[V - 1] = to_hand(s[V - 1]);
+    FOR(i, V) F->of_point[k][i] = s[i];
+  }
+  FOR(k, 3) FOR(l, 3) {
+    double m = 0.0;
+    FOR(r, NV) m += F->point_root[k][r] * F->point_root[l][r];
+    FOR(c, C) m -= F->point_held[k][c] * F->point_held[l][c];
+    F->m_point[k][l] = m;
+  }
+#endif
+}
+
 /* W of a vector over v, in `root`'s order of columns: a number a row; and its transpose */
 static void times_root(const Frozen *F, const vec *x, double *out) {
   FOR(r, NV) out[r] = dot(F->root[r], x, VF);
@@ -147,9 +186,15 @@ static void drifts(const double *q, const double *normal, Frozen *F) {
     bias,
 #endif
 #if JDOT
-    &of_hand, of_held
+    &of_hand, of_held,
+#if SLIDES
+    F->e_point
+#endif
 #endif
   };
+#if SLIDES
+  memset(F->e_point, 0, sizeof F->e_point);
+#endif
   drift(in, out, 0, 0, 0);
 #if BIAS
   vec x[VF] = {0}, pushed[VC] = {0}, sum_of[V] = {0};
@@ -170,6 +215,12 @@ static void drifts(const double *q, const double *normal, Frozen *F) {
   FOR(c, C) FOR(i, V) F->drift[i] += push[c] * F->Z[c][i];
   for (int i = N + 1; i < V * LANES; i++) ((double *)F->drift)[i] = 0.0;
   ((double *)F->drift)[N] += of_hand;
+#if SLIDES
+  FOR(k, 3) {
+    FOR(r, NV) F->e_point[k] -= F->bias_root[r] * F->point_root[k][r];
+    FOR(c, C) F->e_point[k] += F->push[c] * F->point_held[k][c];
+  }
+#endif
 #endif
 #if WRENCHES
   SOLVE_TRANSPOSED(F, push, double)
@@ -190,6 +241,15 @@ static void wrenches(Frozen *F) {
     FOR(i, V) y[c][i] = s[i] * F->R[c][c];
   }
   FOR(j, N + 1) FOR(c, C) ((double *)F->wrench[j])[c] = -((double *)y[c])[j];
+#if SLIDES
+  FOR(k, 3) {
+    double x[C1];
+    memcpy(x, F->point_held[k], sizeof x);
+    SOLVE_TRANSPOSED(F, x, double)
+    pad(F->L_point[k], VC, x, C, 0.0);
+    FOR(i, VC) F->L_point[k][i] = -F->L_point[k][i];
+  }
+#endif
 #endif
 }
 
@@ -210,26 +270,36 @@ static void freeze(const double *q, const double *v, const double *normal, doubl
   F->closing = F->hand_speed - before;
   hold(F);
   inverse_inertia(F);
+  inertia_at_point(F);
   no_number_of_spoiled(F);
   meeting(v, yields, F);
   drifts(q, normal, F);
   wrenches(F);
 }
 
-/* wrench of all that is held for a torque, a force at the hand and the drift's weight */
-static void wrench_of(const Frozen *F, const double *torque, double force, double weight, vec *out) {
+/* wrench of all that is held for a torque, a force at the hand, its friction (3), and the drift's weight */
+static void wrench_of(const Frozen *F, const double *torque, double force, const double *sliding, double weight,
+                      vec *out) {
   FOR(i, VC) out[i] = weight * F->L_0[i] - force * F->wrench[N][i];
+#if SLIDES
+  FOR(k, 3) FOR(i, VC) out[i] -= sliding[k] * F->L_point[k][i];
+#endif
   FOR(j, N) FOR(i, VC) out[i] += torque[j] * F->wrench[j][i];
 }
 
-/* change of v (nv) from integrals of torque and force over a time; or of position, from second integrals */
-static void velocity_change(const Frozen *F, const vec *torque, double impulse, double time, double *out) {
+/* change of v (nv) from integrals of torque, force and friction over a time; or of position, from second
+   integrals */
+static void velocity_change(const Frozen *F, const vec *torque, double impulse, const double *sliding, double time,
+                            double *out) {
   vec w[VC], x[VF] = {0};
   double inner[NV];
-  wrench_of(F, (const double *)torque, impulse, time, w);
+  wrench_of(F, (const double *)torque, impulse, sliding, time, w);
   FOR(i, N) ((double *)x)[i] = ((const double *)torque)[i];
   ((double *)x)[N] = -impulse;
   times_root(F, x, inner);
   FOR(r, NV) inner[r] += dot(F->held[r], w, VC) - F->bias_root[r] * time;
+#if SLIDES
+  FOR(r, NV) FOR(k, 3) inner[r] -= F->point_root[k][r] * sliding[k];
+#endif
   times_root_transposed(F, inner, out);
 }

@@ -4,7 +4,17 @@ typedef struct {
   vec torque[V], deviation[V], torque2[V];
   double time, penetration, impulse, peak, impulse2, left_out;
   double target[NZ1];
+#if SLIDES
+  double sliding[3], sliding2[3]; /* integrals of the friction on the target */
+#endif
 } State;
+#if SLIDES
+#define SLIDING(y) (y)->sliding
+#define SLIDING2(y) (y)->sliding2
+#else
+#define SLIDING(y) 0
+#define SLIDING2(y) 0
+#endif
 
 /* what is constant during a segment of the collision */
 typedef struct {
@@ -24,6 +34,9 @@ typedef struct {
   vec kp[V];
 #endif
   double law[AT_LEAST_1(N_LAW)], target[AT_LEAST_1(N_TARGET)];
+#if SLIDES
+  double coefficient, slip_speed, normal[3], point_velocity[3];
+#endif
 } Data;
 
 typedef struct {
@@ -54,8 +67,9 @@ INLINE void add_columns(const vec (*M)[V], int columns, const double *x, vec *a)
   FOR(i, V) a[i] += b[i];
 }
 
-/* u, relative to the servo's reference, and the hand's speed, from integrals of torque and force, and time; or from derivatives of them */
-INLINE double velocity(const Data *d, const vec *torque, double impulse, double time, vec *u) {
+/* u, relative to the servo's reference, and the hand's speed, from integrals of torque, force and friction, and time;
+   or from derivatives of them */
+INLINE double velocity(const Data *d, const vec *torque, double impulse, const double *sliding, double time, vec *u) {
   const Frozen *F = d->frozen;
   AFRESH(F);
   vec a[V];
@@ -66,6 +80,9 @@ INLINE double velocity(const Data *d, const vec *torque, double impulse, double 
 #endif
   add_columns(F->Q, N, (const double *)torque, a);
   FOR(i, V) u[i] = a[i] - F->Q[N][i] * impulse;
+#if SLIDES
+  FOR(k, 3) FOR(i, V) u[i] -= F->of_point[k][i] * sliding[k];
+#endif
   const double speed = u[N / LANES][N % LANES];
   u[V - 1] *= d->kept[V - 1];
   return speed;
@@ -116,10 +133,30 @@ INLINE void torques(const Data *d, Instant *now) {
 #endif
 }
 
+#if SLIDES
+/* friction on the target (3) of a striking point with a velocity (3), under a contact force: see contact/friction.py */
+INLINE void friction_on_target(const Data *d, const double *velocity, double force, double *out) {
+  double along = 0.0, square = d->slip_speed * d->slip_speed, slide[3];
+  FOR(k, 3) along += d->normal[k] * velocity[k];
+  FOR(k, 3) slide[k] = velocity[k] - d->normal[k] * along, square += slide[k] * slide[k];
+  const double scale = force * d->coefficient / sqrt(square);
+  FOR(k, 3) out[k] = scale * slide[k];
+}
+INLINE void friction_at(const Data *d, const State *y, double force, double *out) {
+  const Frozen *F = d->frozen;
+  double velocity[3];
+  FOR(k, 3) {
+    velocity[k] = d->point_velocity[k] + F->e_point[k] * y->time + dot(F->of_point[k], y->torque, V);
+    FOR(l, 3) velocity[k] -= F->m_point[k][l] * (d->normal[l] * y->impulse + y->sliding[l]);
+  }
+  friction_on_target(d, velocity, force, out);
+}
+#endif
+
 /* velocities, rate of penetration and servo at a state */
 INLINE void look(const Data *d, const State *y, Instant *now) {
   AFRESH(d);
-  now->speed = velocity(d, y->torque, y->impulse, y->time, now->u) + d->hand_speed;
+  now->speed = velocity(d, y->torque, y->impulse, SLIDING(y), y->time, now->u) + d->hand_speed;
   now->target_speed = call(target_velocity, y->target, d->target, 0);
   now->rate = now->speed - now->target_speed;
 #if FREEZES
@@ -153,7 +190,13 @@ static int closing(const Data *d, const State *y, const Instant *now) {
   target_rates(in, out, 0, 0, 0);
   FOR(i, NZ) then[i] = y->target[i] + 1e-9 * rates[i];
   const double gained = (call(target_velocity, then, d->target, 0) - now->target_speed) / 1e-9;
-  return velocity(d, now->net, force, 1.0, u) > gained;
+#if SLIDES
+  double friction[3];
+  friction_on_target(d, d->point_velocity, force, friction);
+#else
+  const double *friction = 0;
+#endif
+  return velocity(d, now->net, force, friction, 1.0, u) > gained;
 }
 
 /* phase: contact is over when, in restitution, no force is left */

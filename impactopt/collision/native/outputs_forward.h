@@ -31,7 +31,7 @@ static void column_of(const Data *d, double penetration, Column *c) {
   c->force = call(contact_force, &penetration, &c->at.rate, d->law);
 #ifdef OUT_zmp
   vec wrench[VC];
-  wrench_of(d->frozen, (const double *)c->at.net, c->force, 1.0, wrench);
+  wrench_of(d->frozen, (const double *)c->at.net, c->force, 0, 1.0, wrench);
   ground_wrench_of(d->frozen, (const double *)wrench, c->ground);
 #endif
 }

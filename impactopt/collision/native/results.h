@@ -33,14 +33,14 @@ static void outputs_of(const Course *c, Work *w, double **res) {
 #ifdef OUT_velocity
   if (res[OUT_velocity]) {
     double change[NV];
-    velocity_change(&w->frozen, y->torque, y->impulse, y->time, change);
+    velocity_change(&w->frozen, y->torque, y->impulse, SLIDING(y), y->time, change);
     FOR(i, NV) res[OUT_velocity][i] = c->v[i] + change[i];
   }
 #endif
 #ifdef OUT_configuration
   if (res[OUT_configuration]) {
     double way[NV];
-    velocity_change(&w->frozen, y->torque2, y->impulse2, y->time * y->time / 2, way);
+    velocity_change(&w->frozen, y->torque2, y->impulse2, SLIDING2(y), y->time * y->time / 2, way);
     FOR(i, NV) way[i] = c->v[i] * y->time + way[i];
     const double *in[] = {c->q, way};
     integrate(in, &res[OUT_configuration], 0, 0, 0);

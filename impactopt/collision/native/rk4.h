@@ -3,6 +3,9 @@
 typedef struct {
   vec torque[V], deviation[V], torque2[V];
   double penetration, impulse, impulse2, target[NZ1];
+#if SLIDES
+  double sliding[3], sliding2[3];
+#endif
 } Slope;
 
 INLINE void slope_at(const Data *d, const State *y, const Instant *now, Slope *s) {
@@ -17,6 +20,10 @@ INLINE void slope_at(const Data *d, const State *y, const Instant *now, Slope *s
     if (SECOND_INTEGRALS) s->torque2[i] = y->torque[i];
   }
   s->impulse2 = y->impulse;
+#if SLIDES
+  friction_at(d, y, s->impulse, s->sliding);
+  memcpy(s->sliding2, y->sliding, sizeof s->sliding2);
+#endif
 }
 
 /* y := x + h s */
@@ -31,6 +38,12 @@ INLINE void shifted(const State *x, const Slope *s, double h, State *y) {
   y->impulse = x->impulse + h * s->impulse;
   y->impulse2 = x->impulse2 + h * s->impulse2;
   FOR(i, NZ) y->target[i] = x->target[i] + h * s->target[i];
+#if SLIDES
+  FOR(k, 3) {
+    y->sliding[k] = x->sliding[k] + h * s->sliding[k];
+    y->sliding2[k] = x->sliding2[k] + h * s->sliding2[k];
+  }
+#endif
 }
 
 #define MEAN(part) ((k1.part + 2.0 * k2.part + 2.0 * k3.part + k4.part) / 6.0)
@@ -58,6 +71,9 @@ INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
   k1.impulse = MEAN(impulse);
   k1.impulse2 = MEAN(impulse2);
   FOR(i, NZ) k1.target[i] = MEAN(target[i]);
+#if SLIDES
+  FOR(i, 3) k1.sliding[i] = MEAN(sliding[i]), k1.sliding2[i] = MEAN(sliding2[i]);
+#endif
   shifted(y, &k1, h, y);
 }
 

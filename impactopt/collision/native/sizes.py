@@ -63,7 +63,8 @@ class TreeFunctions:
     ----------
     functions : `tree` (q, v, normal) -> nonzeros of the roots W of all velocities and the hand, of those of
         what is held, hand speed, and further ones; `drift` (q, v, normal) -> bias force, drifts of the hand
-        and of what is held, as far as they act; `integrate` (q, d) and `hand_speed_at` (q, v, normal).
+        and of what is held, as far as they act; `integrate` (q, d) and `hand_speed_at` (q, v, normal). With
+        friction also the striking point's root, velocity and drift.
     root, held : (row, column) of the nonzeros. Columns of `root` are joints, hand, other velocities.
     """
 
@@ -72,9 +73,9 @@ class TreeFunctions:
     held: list[tuple[int, int]]
 
 
-def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool) -> TreeFunctions:
-    """Functions of the robot's tree, with those for the ground's wrench on request; n is the number of
-    servos.
+def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool, slides: bool = False) -> TreeFunctions:
+    """Functions of the robot's tree, with those for the ground's wrench, and for friction at the striking
+    point, on request; n is the number of servos.
     """
     tree, robot = frozen._tree, frozen.robot
     rb, normal = tree.rb, tree.normal
@@ -90,13 +91,18 @@ def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool) -> TreeFunct
         out += [] if frozen.bias else [tree.carrying_wrench]
     drifts = [ca.densify(tree.bias_force)] if frozen.bias else []
     drifts += [tree.hand_drift, ca.densify(tree.held_drift)] if frozen.jdot else []
+    speeds = [tree.hand_speed]
+    if slides:
+        out += [ca.densify(ca.mtimes(root, tree.point_jacobian.T)), tree.point_velocity]
+        drifts += [tree.point_drift] if frozen.jdot else []
+        speeds += [tree.point_velocity]
     d = ca.SX.sym("d", robot.nv)
     known = [rb.q, rb.v, normal]
     functions = [
         ca.Function("tree", known, out),
         ca.Function("drift", known, drifts),
         ca.Function("integrate", [rb.q, d], [rb.integrate(d)]),
-        ca.Function("hand_speed_at", known, [tree.hand_speed]),
+        ca.Function("hand_speed_at", known, speeds),
     ]
     return TreeFunctions(functions=functions, root=places, held=_nonzeros(held))
 
@@ -422,11 +428,13 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         "JDOT": int(effects.jdot),
         "KD_MATRIX": int(n > 0 and settings["kd"].ndim == 2),
         "KP_MATRIX": int(n > 0 and effects.stiffness and settings["kp"].ndim == 2),
+        "SLIDES": int(model.slides),
         "PEAK": int(model.peak),
         "STEP_ERROR": int(model.error),
         "LEFT_OUT_BY_RK4": repr(LEFT_OUT_BY_RK4),
         "SECOND_INTEGRALS": int(model.second_integrals),
         "FREEZES": freezes,
+        "GROUND": int(bool({"ground_wrench", "zmp"} & {*outputs})),
         "WRENCHES": int(bool(frozen_for(outputs)) or freezes > 0),
         "HELD_HISTORY": int(bool({*OF_SOLES, "hand_wrench"} & {*outputs})),
         "HISTORIES": int(bool({*HISTORIES} & {*outputs})),

@@ -67,7 +67,7 @@ def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every
     )
 
 
-def native_gradient(collision: SteppedModel, output: str) -> NativeCode:
+def native_gradient(collision: SteppedModel, output: str) -> NativeCode | ca.Function:
     """C code of the function that `gradient_graph` gives.
 
     Where there is no compiler, the graph takes its place, but not that of implicit steps or several freezes:
@@ -80,6 +80,10 @@ def native_gradient(collision: SteppedModel, output: str) -> NativeCode:
             raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4'"))
         return _guarded(collision, gradient_graph(collision, output))
 
+    if collision.contact_friction is not None:
+        if collision.n_freezes:
+            raise InputError("gradient_function: with contact_friction only of a model without freezes")
+        return graph()
     return NativeCode(
         name="collision_gradient",
         code=_code(collision, "collision_gradient", (output,), 1),
@@ -150,8 +154,8 @@ def _code(
     frozen, gradient = frozen_dynamics(collision), name == "collision_gradient"
     jacobian = name == "collision_jacobian"
     ground = bool({"ground_wrench", "zmp"} & {*outputs})
-    tree = tree_functions(frozen, collision.n_servos, ground=ground)
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
+    tree = tree_functions(frozen, collision.n_servos, ground=ground, slides=model.slides)
     scalars = scalar_functions(model, method=collision.stepping)
     shapes, of_tree = shapes_out(collision, outputs, every), tree.functions
     differs = name == "collision_differences"

@@ -257,7 +257,10 @@ def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Sol
     from impactopt.solvers.program import Status
 
     done, violation = {}, solution.result.max_violation
-    engines = {"pinocchio": "in full dynamics", "mujoco": "on free soles"}
+    engines = {
+        "pinocchio": "in full dynamics",
+        "mujoco": "on free soles" if solution.problem.soles else "in MuJoCo",
+    }
     if validate and solution.status is Status.INTERRUPTED:
         progress.say("no replay of what was interrupted; `impactopt validate` does it")
     elif validate and not violation <= VIOLATED:

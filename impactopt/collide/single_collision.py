@@ -296,6 +296,9 @@ def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
         planned["sole_force_N"] = float(a["collision_sole_wrench"][:, 2 : 6 * soles : 6].min())
     out = {"planned": planned}
     names = {"torque_ratio": "torque_ratio_by_phase", "zmp_margin_m": "zmp_margin_by_phase_m"}
+    free = (
+        "free soles" if told.get("sole_cop_margin_mm") else "MuJoCo"
+    )  # nothing holds soles, if there are any
     for name, by_phase in (("simulated", {key: key for key in names}), ("replayed", names)):
         report = told.get(name) or {}
         numbers = {key: report[key] for key in keys if key in report}
@@ -303,7 +306,7 @@ def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
             found = report.get(source) or {}
             numbers |= {key: found["collision"]} if "collision" in found else {}
         if numbers:
-            out["simulated" if name == "simulated" else "free soles"] = numbers
+            out["simulated" if name == "simulated" else free] = numbers
     return out
 
 

@@ -151,7 +151,7 @@ def record_of(
     if replay is not None:
         arrays |= replay_arrays(replay)
     for prefix in {"reference", "simulated"} & parts.keys():
-        arrays[f"{prefix}_angle"] = np.array([robot.joint_positions(q) for q in parts[prefix].q])
+        arrays[f"{prefix}_angle"] = robot.joint_positions(parts[prefix].q)
     arrays |= _parts_arrays(parts, result)
     if solution.statement:
         arrays["program_statement"] = solution.statement

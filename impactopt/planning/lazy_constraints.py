@@ -1,4 +1,4 @@
-"""Lazy constraints of gear loads and slide, where a plan without them breaks them; cautions about it."""
+"""Lazy constraints of gear loads, slide and reference, where a plan without them breaks them; cautions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impactopt.kinematics.operational_space import across, striking_point
 from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import Additions, Guess, Outcome, Program, program_for, start_of
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, Slide, Term
+from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, ReferenceRange, Slide, Term
 from impactopt.robots.loads import DriveLoads
 from impactopt.robots.robot import Robot
 from impactopt.simulation.target_dynamics import FACE
@@ -29,6 +29,7 @@ __all__ = [
     "LazyTerms",
     "gear_caution",
     "gears_beyond",
+    "reference_beyond",
     "rows_on_demand",
     "slide",
     "slide_caution",
@@ -40,6 +41,7 @@ __all__ = [
 REPLAYED = 0.1  # beyond what gears may bear: replays of a plan that keeps to it stay within this
 FAR = 0.15  # [m] across the target's face: a plan that slides so far is reported so
 INSTANTS = 9  # of the contact
+BEYOND = 1e-3  # [rad] of a reference out of its range: no more than a mesh leaves it
 MORE = 0.03  # of what it may be: no more than a mesh leaves it
 _AT = 1e-3  # of the bound: so near is at it
 _COSTLY = 0.1  # of the objective, for a window twice as long and to first order: what is said
@@ -95,6 +97,20 @@ def slides_beyond(term: Slide, plan: Plan) -> str:
         return ""
     most = f"which may be {1e3 * term.most:.0f} mm"
     return f"the striking point slides {1e3 * far:.0f} mm across the target, {most}"
+
+
+def reference_beyond(term: ReferenceRange, plan: Plan) -> str:
+    """Message with the joint whose reference is farthest beyond its range in contact; "" if none is by more
+    than a tolerance.
+    """
+    reference, robot = plan.reference, plan.problem.robot
+    angles = robot.joint_positions(reference.q[reference.phase == 1][-1:])  # where it has gone farthest
+    lower, upper = term.limits(robot)
+    beyond = np.maximum(lower - angles, angles - upper).max(axis=0)
+    k = int(beyond.argmax())
+    if beyond[k] <= BEYOND:
+        return ""
+    return f"the servo's reference of {robot.joint_names[k]} coasts {beyond[k]:.3f} rad beyond its range"
 
 
 def slide_caution(length: float) -> str:
@@ -205,6 +221,9 @@ class LazyTerms(Generic[Program]):
                 words = gears_beyond(problem, _loads(outcome.program.robot, planned, finer))
             elif isinstance(term, Slide) and isinstance(planned, Plan):
                 words = slides_beyond(term, planned)
+            elif isinstance(term, ReferenceRange) and isinstance(planned, Plan):
+                with contextlib.suppress(InputError):  # legs that do not reach
+                    words = reference_beyond(term, planned)
             if words:
                 out[name] = words
         return out

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import Mistakes, check_array
+from impactopt.errors import Mistakes, check_array, raw_array
 from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
 from impactopt.robots import urdf as _urdf
@@ -360,8 +360,12 @@ class Robot:
         return dataclasses.replace(self, model=model, actuators=drives)
 
     def joint_positions(self, q: ArrayLike) -> Array:
-        """Joint angles (n,) [rad] of a configuration (nq,); a continuous joint's lies in [-pi, pi]."""
-        return build.joint_positions(self.model, check_array("q", q, (self.nq,), finite=False))
+        """Joint angles (n,) [rad] of a configuration (nq,), or (k, n) of several (k, nq).
+
+        A continuous joint's lies in [-pi, pi].
+        """
+        shape = (None,) * (raw_array("q", q).ndim - 1) + (self.nq,)
+        return build.joint_positions(self.model, check_array("q", q, shape, finite=False).T).T
 
     def place(self, q: ArrayLike, soles: Sequence[Sole] | None = None) -> Array:
         """The configuration with the base moved: mean of the soles at the origin of the ground, at yaw 0.

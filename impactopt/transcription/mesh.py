@@ -18,8 +18,9 @@ from impactopt.contact.targets import Target
 from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
+from impactopt.problem.terms import ContactWrenchCone, PositionLimit, TorqueLimit
 from impactopt.robots.loads import BEARS, cop_margin, fading, least_kept, weight_of
+from impactopt.robots.tools import inside
 from impactopt.transcription.contact_guess import mass_at_contact, natural_durations
 from impactopt.transcription.plan import Piece, Plan, Trajectory, gear_share
 
@@ -58,7 +59,8 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     It is looked at every millisecond. That is where a sole gives up more than half of a margin that it has at
     the nodes: of its centre of pressure to its own edges, or of its least normal force; or uses a tenth more
     friction than it may; where torques give up half of the room to all that the motors have; where a joint of
-    a constrained leg is faster than it may be; and where a gear carries 3 % more than it may.
+    a constrained leg is faster than it may be, or gives up half of its distance to a limit; and where a gear
+    carries 3 % more than it may.
     """
     blow, found = plan.problem.blow, dict[tuple[int, int], set[float]]()
     for piece in plan.pieces():
@@ -89,8 +91,11 @@ def _middles_outside(plan: Plan, way: Trajectory, piece: Piece) -> list[float]:
     limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)
     ratio = np.abs(way.torque[at] / p.robot.torque_limit).max(axis=1, initial=0.0)
     outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
-    # the others' rates are bounded by their splines' control points
+    # the others' positions and rates are bounded by their splines' control points
     outside |= (np.abs(way.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
+    lower, upper = inside(p.robot, _SHARE * p.term(PositionLimit).margin)
+    angles = p.robot.joint_positions(way.q[at])
+    outside |= ((angles < lower) | (angles > upper))[:, c.dependent].any(axis=1)
     outside |= gear_share(p, way.torque[at], way.a[at, joints]) > 1.0 + GEAR
     outside |= _soles_outside(p, piece.number, way.sole_wrench[at])
     time = (way.time[at[outside]] - piece.start) / duration

@@ -197,6 +197,7 @@ CALLS: dict[str, Callable[[], Call]] = {
     "Gaze": _of("Gaze", frame="wrist", axis=(1.0, 0.0, 0.0), angle=0.2, since=0.5),
     "HitRegion": _of("HitRegion", size=(0.1, 0.1)),
     "Slide": _of("Slide", most=0.1),
+    "ReferenceRange": _of("ReferenceRange", margin=0.1),
     "Grip": _of("Grip", force=150.0, moment=10.0),
     "SecondStriker": _of("SecondStriker", striker="hand", point=(0.5, 0.0, 1.0)),
     "TargetSpeed": _of("TargetSpeed", least=0.5, most=3.0),

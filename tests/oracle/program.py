@@ -30,6 +30,7 @@ from impactopt.problem.terms import (
     GroundForce,
     HandOrientation,
     Incidence,
+    ReferenceRange,
     Slide,
     TargetSpeed,
 )
@@ -54,6 +55,7 @@ _KNOWN_TERMS = (
     Grip,
     GroundForce,
     HandOrientation,
+    ReferenceRange,
     Slide,
     TargetSpeed,
 )
@@ -119,6 +121,7 @@ class Program:
         self._touch()
         self._clearance()
         self._slide()
+        self._reference_range()
         self._first_touch()
         self._ground_force()
         found, strange = apart_pieces(problem, self.robot, self.nodes(), claims.apart)
@@ -254,6 +257,32 @@ class Program:
 
         names = ["tangent 1", "tangent 2"]
         self.rows.append(Piece.of(value, [(term.name, "after contact", names, -term.most, term.most)]))
+
+    def _reference_range(self) -> None:
+        """How far the joints are of a reference that has coasted until contact ends."""
+        term, r, blow = self.problem.extra(ReferenceRange), self.problem.robot, self.blows[0]
+        if term is None or not term.enabled:
+            return
+        c, base, last = self.problem.coordinates, self.robot.base, len(blow.stages) - 1
+        lower = np.where(r.hinges, -np.inf, r.lower + term.margin)
+        upper = np.where(r.hinges, np.inf, r.upper - term.margin)
+        kept = np.isfinite(lower) | np.isfinite(upper)
+
+        def independent(v: Variables) -> Array:
+            time = sum(v.one(name) for name in blow.durations)
+            y = self.at_contact(v) + v.get("rate at contact") * time
+            return y[base:][kept[c.independent]]
+
+        def dependent(v: Variables) -> Array:
+            return blow.get(v, "coasting legs", last)[kept[c.dependent]]
+
+        for value, joints in ((independent, c.independent), (dependent, c.dependent)):
+            own = [int(j) for j in joints if kept[j]]
+            if own:
+                names = [r.joint_names[j] for j in own]
+                self.rows.append(
+                    Piece.of(value, [(term.name, "end of contact", names, lower[own], upper[own])])
+                )
 
     def _first_touch(self) -> None:
         """How far the striking link's corners are beyond the target's plane, and where its face looks."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.small_plans import Planned, arm_problem, changed, transcribed
+from support.small_plans import Planned, arm_problem, biped_problem, changed, transcribed
 
 from impactopt.contact import FreeMass
 from impactopt.files.problem_file import load_problem
@@ -18,7 +18,15 @@ from impactopt.planning.clearance_constraints import Margins, Watch
 from impactopt.problem.objectives import Effort
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import ContactWrenchCone, FirstTouch, GearLoad, GroundForce, Slide, TargetSpeed
+from impactopt.problem.terms import (
+    ContactWrenchCone,
+    FirstTouch,
+    GearLoad,
+    GroundForce,
+    ReferenceRange,
+    Slide,
+    TargetSpeed,
+)
 from impactopt.robots.attachments import SoftGrip
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Trajectory
@@ -107,6 +115,12 @@ def test_of_a_ball_that_comes_and_is_caught() -> None:
 def test_of_a_slide_that_is_bounded() -> None:
     p = arm_problem()
     check_rows(transcribed(dataclasses.replace(p, terms=(*p.terms, Slide(most=0.02)))))
+
+
+@pytest.mark.parametrize("make", [arm_problem, biped_problem])
+def test_of_the_reference_s_range(make: Any) -> None:
+    p = make()
+    check_rows(transcribed(dataclasses.replace(p, terms=(*p.terms, ReferenceRange(margin=0.1)))))
 
 
 def test_of_the_ground_s_force_and_the_first_touch(biped_transcription: Transcription) -> None:

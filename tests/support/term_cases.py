@@ -22,6 +22,7 @@ from impactopt.problem.terms import (
     JointAcceleration,
     MotorCurve,
     PowerLimit,
+    ReferenceRange,
     Slide,
     TargetSpeed,
     Term,
@@ -131,6 +132,13 @@ def slid(plan: Solved, term: Slide) -> float:
     return float(np.abs(rows[1:] @ way).max()) / term.most
 
 
+def coasted(plan: Solved, term: ReferenceRange) -> float:
+    """By the reference every millisecond: the margin over what is left of it."""
+    way, robot = plan.plan.reference, plan.plan.problem.robot
+    angles = robot.joint_positions(way.q[way.phase == 1][-1])
+    return term.margin / float(np.minimum(angles - robot.lower, robot.upper - angles).min())
+
+
 CASES: dict[str, Case] = {
     "torque rate": Case(TorqueRate(limit=20.0), TorqueRate(limit=30.0), TorqueRate(limit=200.0), torque_rate),
     "rate of some joints": Case(
@@ -175,6 +183,9 @@ CASES: dict[str, Case] = {
         TargetSpeed(least=-np.inf, most=1.0),
         TargetSpeed(least=0.0, most=5.0),
         target_speed,
+    ),
+    "reference range": Case(
+        ReferenceRange(margin=1.935), ReferenceRange(margin=1.9315), ReferenceRange(margin=0.1), coasted
     ),
     "slide": Case(Slide(most=1e-4), Slide(most=2.5e-3), Slide(most=0.1), slid),
     "hit cone": Case(HitCone(angle=0.05), HitCone(angle=0.2), HitCone(angle=0.2), hit_cone),

@@ -168,7 +168,7 @@ def _curves(reference: Trajectory, robot: Robot) -> tuple[Array, Array, Array]:
     q, v, a = reference.q, reference.v, reference.a
     joints = list(robot.model.joints)[-robot.n :]
     turning = [k for k, joint in enumerate(joints) if joint.nq == 2]
-    angle = np.array([robot.joint_positions(row) for row in q])
+    angle = robot.joint_positions(q)
     angle[:, turning] = np.unwrap(angle[:, turning], axis=0)
     values, rates, bends = [angle], [v[:, -robot.n :]], [a[:, -robot.n :]]
     if robot.floating:

@@ -25,6 +25,7 @@ from impactopt.problem.terms.leg_extension import LegExtension
 from impactopt.problem.terms.motor_curve import MotorCurve
 from impactopt.problem.terms.position_limit import PositionLimit
 from impactopt.problem.terms.power_limit import PowerLimit
+from impactopt.problem.terms.reference_range import ReferenceRange
 from impactopt.problem.terms.self_collision import SelfCollision
 from impactopt.problem.terms.slide import Slide
 from impactopt.problem.terms.target_speed import TargetSpeed
@@ -46,7 +47,7 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     GroundForce(),
     FirstTouch(),
 )
-ON_DEMAND_TERMS: tuple[Term, ...] = (GearLoad(), Slide())
+ON_DEMAND_TERMS: tuple[Term, ...] = (GearLoad(), Slide(), ReferenceRange())
 # all that problem files know, in their order
 TERMS: tuple[type[Term], ...] = (
     *map(type, DEFAULT_TERMS),
@@ -62,6 +63,7 @@ TERMS: tuple[type[Term], ...] = (
     VelocityJump,
     TargetSpeed,
     Slide,
+    ReferenceRange,
     Grip,
 )
 
@@ -86,6 +88,7 @@ __all__ = [
     "MotorCurve",
     "PositionLimit",
     "PowerLimit",
+    "ReferenceRange",
     "SelfCollision",
     "Slide",
     "TargetSpeed",

@@ -1,0 +1,79 @@
+"""Range of the servo's reference while it coasts through the contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.contact.fields import about
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import Measure
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceRange(Term):
+    """The servo's reference stays inside the joints' position limits until contact ends.
+
+    It coasts at the rates at contact, while the target brakes the robot. So in a long contact it goes farther
+    than the joints do, to where a robot's controller cuts it off. Hinges of soles follow no reference.
+
+    It holds with its defaults where a problem does not have it. Rows are then added once a motion without
+    them goes beyond; where it is given they are there from the start, and in strikes.
+    """
+
+    name: ClassVar[str] = "reference range"
+    unit: ClassVar[str] = "rad"
+    margin: float = field(
+        default=0.0, metadata=about("distance from each limit as contact ends", unit="rad", least=0)
+    )
+    enabled: bool = field(default=True, metadata=about("false: it goes as far as it goes"))
+
+    def limits(self, robot: Any) -> tuple[Any, Any]:
+        """(n,) Least and largest angles of the reference [rad], infinite for hinges."""
+        less = np.where(robot.hinges, -np.inf, self.margin)
+        return robot.lower + less, robot.upper - less
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        phases = len(problem.target.phases)
+        return {"coasted": BlockRecipe(lambda: coasted(coordinates, phases), key=(phases,))}
+
+    def add_rows(self, program: Any) -> None:
+        if not program.problem.lasts:
+            return
+        c, hit = program.coordinates, program.expected
+        lower, upper = self.limits(program.robot)
+        z = [program.contact_state[0], program.u0[0], *(duration[0] for duration in hit.T)]
+        at = program.add_block("coasted", [z], np.zeros(0))
+        bounds = {
+            "term": self.name,
+            "place": "end of contact",
+            "measure": Measure("rad", 1.0, "too far"),
+        }
+        program.rows.add(
+            components=c.labels[c.base :],
+            outputs=at + np.arange(c.ny - c.base),
+            lower=lower[c.independent],
+            upper=upper[c.independent],
+            **bounds,
+        )
+        if c.legs:
+            program.rows.add(
+                components=c.leg_labels,
+                affine=hit.coast_legs[hit.coast_legs.count - 1],
+                lower=lower[c.dependent],
+                upper=upper[c.dependent],
+                **bounds,
+            )
+
+
+def coasted(c: StanceCoordinates, phases: int) -> BlockExpression:
+    """z = y, ydot at contact, duration [s] of each phase of the contact;  out = joints at its end [rad]."""
+    y, rate, times = ca.SX.sym("y", c.ny), ca.SX.sym("rate", c.ny), ca.SX.sym("T", phases)
+    return make_block([y, rate, times], [], {"joints": (y + rate * ca.sum1(times))[c.base :]}, lanes=1)

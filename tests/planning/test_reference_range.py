@@ -1,0 +1,45 @@
+"""A servo's reference that coasts out of the joints' limits in a long contact: bounded once it does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_plans import Planned, arm_problem
+
+from impactopt import solve
+from impactopt.planning import lazy_constraints
+from impactopt.planning.lazy_constraints import reference_beyond
+from impactopt.problem import problem as problems
+from impactopt.problem.terms import GearLoad, ReferenceRange
+from impactopt.transcription import mesh
+from impactopt.transcription.mesh import NO_MORE, nodes_to_add
+
+
+def test_a_reference_that_goes_too_far_gets_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And none where the term is switched off."""
+    narrow = ReferenceRange(margin=1.935)
+    monkeypatch.setattr(lazy_constraints, "_KINDS", {"reference_range": ReferenceRange})
+    monkeypatch.setattr(problems, "ON_DEMAND_TERMS", (GearLoad(), narrow))
+    kept = solve(arm_problem())
+    assert kept.status.usable
+    assert kept.summary()["rows_on_demand"] == ["reference_range"]
+    assert reference_beyond(narrow, kept.plan) == ""
+    off = ReferenceRange(margin=1.935, enabled=False)
+    free = solve(replace(arm_problem(), terms=(*arm_problem().terms, off)))
+    assert free.summary()["rows_on_demand"] == []
+    assert "reference of shoulder coasts 0.005 rad beyond" in reference_beyond(narrow, free.plan)
+
+
+def test_a_leg_that_leaves_its_range_between_nodes_gets_nodes_there(
+    monkeypatch: pytest.MonkeyPatch, biped_plan: Planned
+) -> None:
+    plan = biped_plan.plan
+    robot, knee = plan.problem.robot, int(plan.coordinates.dependent[0])
+    angles = robot.joint_positions(plan.reference.q)[plan.reference.phase == 0, knee]
+    upper = robot.upper.copy()
+    upper[knee] = np.quantile(angles, 0.9)
+    known = set(nodes_to_add(plan, NO_MORE).swing)
+    monkeypatch.setattr(mesh, "inside", lambda robot, margin: (robot.lower, upper))
+    assert set(nodes_to_add(plan, NO_MORE).swing) > known

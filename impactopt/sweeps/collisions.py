@@ -87,12 +87,14 @@ def role_of(place: Place) -> Role:
         return "number"
     if place[:2] == ("problem", "point_m"):
         return "point"
-    if table in ("problem", "robot", "stance", "at_contact") and rest != ["name"]:
+    if table in ("problem", "robot", "stance", "friction", "at_contact") and rest != ["name"]:
+        return "structure"
+    if place == ("collision", "coefficient_of_restitution"):
         return "structure"
     key = ".".join(map(str, place))
     raise InputError(
         f"{key}: no collision depends on it; vary it in a sweep of solves, or vary a key of [target], "
-        "[contact], [at_contact], [robot], [stance] or [problem]"
+        "[contact], [friction], [at_contact], [robot], [stance] or [problem]"
     )
 
 
@@ -342,7 +344,7 @@ def collide_many(
     Parameters
     ----------
     problem : a problem file, its path, or its name.
-    columns : by key path (N) values: numbers of the problem file's [target], [contact] and servo
+    columns : by key path (N) values: numbers of the problem file's [target], [contact], [friction] and servo
         (robot.kp, robot.kd, robot.torque_limit, of all joints or of one), of [at_contact], and problem.point;
         names and numbers that make another robot or model are in few combinations. Of one value: for all.
     outputs : names of columns; see docs/sweeps.md. Only what they need is computed: where a million rows are

@@ -149,6 +149,19 @@ def test_freezes_come_near_the_full_dynamics() -> None:
     assert errors[-1] < 1e-5
 
 
+def test_friction_and_restitution_vary_too() -> None:
+    """The hammer slides along the nail's head as it comes down: friction takes part of its momentum."""
+    columns = {"at_contact.speed": [1.0] * 3, "friction.coefficient": [0.1, 0.3, 0.9]}
+    found = collide_many(arm_file(), columns, at_contact={"velocity": "least rates"})
+    assert (found["reason"] == "").all()
+    impulses = found["impulse_Ns"]
+    assert (np.diff(impulses) > 0).all() or (np.diff(impulses) < 0).all()
+    e = np.array([0.0, 0.5, 1.0])
+    columns = {"at_contact.speed": [1.0] * 3, "collision.coefficient_of_restitution": e.tolist()}
+    rigid = collide_many(arm_file(), columns, at_contact={"model": "rigid"}, outputs=("impulse_Ns",))
+    np.testing.assert_allclose(rigid["impulse_Ns"], (1 + e) * rigid["impulse_Ns"][0], rtol=1e-9)
+
+
 def test_gains_of_one_joint_and_of_all() -> None:
     robot, given = load_robot("planar_arm"), {"posture": "ready", "speed_m_s": 1.0}
     stiff = float(2 * robot.kd[0])

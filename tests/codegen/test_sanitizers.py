@@ -20,7 +20,7 @@ from support.native_cases import ROBOTS, robot_named, situation
 from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
-from impactopt.contact import Board, FreeMass, HuntCrossley, Nail, SpringDamper
+from impactopt.contact import Board, ContactFriction, FreeMass, HuntCrossley, Nail, SpringDamper
 
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-g1")
 BRANCHES = {"widest": (), "AVX2": ("-mno-avx512f",), "SSE2": ("-mno-avx",)}
@@ -80,6 +80,10 @@ PROGRAMS: dict[str, tuple[dict[str, Any], Callable[[SDC], Any]]] = {
     "Runge-Kutta": (
         {"law": HUNT, "method": "rk4"},
         lambda one: native_collision(one, ("impulse", "force", "step_error")),
+    ),
+    "friction at the hit": (
+        {"contact_friction": ContactFriction(coefficient=0.5), "freezes": 1},
+        lambda one: native_collision(one, ("impulse", "velocity", "peak_force")),
     ),
     "gradient": ({}, lambda one: native_gradient(one, "impulse")),
     "gradient, bent law": ({"law": HUNT, "kd": GAINS}, lambda one: native_gradient(one, "impulse")),

@@ -19,15 +19,17 @@ from impactopt import (
     FreeMass,
     FullDynamics,
     Incidence,
+    JointFriction,
     MujocoDynamics,
     RigidWall,
     SpringDamper,
     VirtualMass,
 )
+from impactopt.collision import Effects
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
 from impactopt.kinematics.operational_space import Held, holding_torque, striking_velocity
-from impactopt.kinematics.stance import FixedBase, Free
+from impactopt.kinematics.stance import BothSoles, FixedBase, Free
 from impactopt.problem.terms import GearLoad
 from impactopt.robots.robot import Robot, Striker
 from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
@@ -108,10 +110,21 @@ def test_frozen_dynamics_come_to_full_dynamics_with_friction_too() -> None:
     assert abs(model.collide(*at).impulse / full.impulse - 1) > 1e-2  # and friction matters
 
 
-def test_compiled_code_is_its_graph_with_friction_too() -> None:
-    outputs = ("impulse", "velocity", "configuration", "sole_wrench", "zmp", "hand_speed")
-    model, at = oblique(contact_friction=GENTLE)
-    numbers = [*at, *model.settings.values()]
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (SDC, {}),
+        (SDC, {"effects": Effects(bias=False, jdot=False, feedforward=False)}),
+        (SDC, {"effects": Effects(jdot=False), "stance": BothSoles(base_mass=1e5, base_inertia=1e5)}),
+        (SDC, {"effects": Effects(friction=True), "friction": JointFriction(viscous=1.0, coulomb=0.5)}),
+        (VirtualMass, {}),
+    ],
+)
+def test_compiled_code_is_its_graph_with_friction_too(kind: Any, options: Any) -> None:
+    wanted = ("impulse", "velocity", "configuration", "sole_wrench", "zmp", "hand_speed")
+    model, at = oblique(kind, contact_friction=GENTLE, **options)
+    outputs = tuple(name for name in wanted if name in model.available)
+    numbers = [*(at if model.effects.feedforward else at[:2]), *model.settings.values()]
     graph = model.graph(outputs, every=50)
     compiled = model.function(outputs, parameters=tuple(model.settings), every=50)
     for one, two in zip(compiled.call(numbers), graph.call(numbers), strict=True):

@@ -152,19 +152,19 @@ class Scenario(Described):
     abort_after: float | None = field(
         default=None,
         metadata=about(
-            "time after the planned contact at which the motion is aborted, to a planned stop",
+            "time from the planned contact to the abort motion",
             unit="s",
             above=0,
         ),
     )
     torque: float = field(
         default=1.0,
-        metadata=about("share of each joint's torque limit that may be used in the collision", above=0),
+        metadata=about("share of each torque limit in the collision", above=0),
     )
     cone_margin: float = field(
         default=0.005,
         metadata=about(
-            "least distance from each sole's centre of pressure to its edges in the collision",
+            "margin of each sole's centre of pressure in the collision",
             unit="m",
             least=0,
         ),
@@ -172,7 +172,7 @@ class Scenario(Described):
     capture_margin: float = field(
         default=0.0,
         metadata=about(
-            "least distance from the capture point to the support polygon's edges, after contact",
+            "margin of the capture point after contact",
             unit="m",
             least=0,
         ),

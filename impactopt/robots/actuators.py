@@ -30,7 +30,7 @@ class Actuator(Described):
     armature: float | None = field(
         default=None,
         metadata=about(
-            "reflected rotor inertia; left out: the robot's own",
+            "reflected rotor inertia",
             unit="kg m2",
             least=0,
             most=HEAVIEST,
@@ -39,7 +39,7 @@ class Actuator(Described):
     viscous_friction: float | None = field(
         default=None,
         metadata=about(
-            "viscous friction in motor and gear; left out: the robot's own",
+            "viscous friction of motor and gear",
             unit="N m s/rad",
             least=0,
             most=STRONGEST,
@@ -48,7 +48,7 @@ class Actuator(Described):
     coulomb_friction: float | None = field(
         default=None,
         metadata=about(
-            "coulomb friction in motor and gear; left out: the robot's own",
+            "Coulomb friction of motor and gear",
             unit="N m",
             least=0,
             most=STRONGEST,
@@ -56,19 +56,15 @@ class Actuator(Described):
     )
     continuous_torque: float | None = field(
         default=None,
-        metadata=about("torque that the gear carries all the time", unit="N m", above=0, most=STRONGEST),
+        metadata=about("the gear's continuous torque", unit="N m", above=0, most=STRONGEST),
     )
     peak_torque: float | None = field(
         default=None,
-        metadata=about(
-            "torque that the gear carries at each start and stop", unit="N m", above=0, most=STRONGEST
-        ),
+        metadata=about("the gear's torque at each start and stop", unit="N m", above=0, most=STRONGEST),
     )
     momentary_torque: float | None = field(
         default=None,
-        metadata=about(
-            "torque that the gear carries now and then, in an impact", unit="N m", above=0, most=STRONGEST
-        ),
+        metadata=about("the gear's torque now and then, in an impact", unit="N m", above=0, most=STRONGEST),
     )
     stall_torque: float | None = field(
         default=None,
@@ -82,7 +78,7 @@ class Actuator(Described):
     no_load_speed: float | None = field(
         default=None,
         metadata=about(
-            "speed of the motor without torque; between the two its torque is linear",
+            "speed of the motor without torque",
             unit="rad/s",
             above=0,
             most=STRONGEST,

@@ -20,7 +20,7 @@ class SolverOptions:
     violation_tolerance : largest violation of a constraint or bound at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
     acceptable_tolerance : tolerance in place of kkt_tolerance for the status ACCEPTABLE, if no step helps.
-    max_iterations : most iterations; then the best iterate is returned.
+    max_iterations : most iterations.
     time_limit : [s]; then the best iterate is returned.
     price : first price of violations; it rises by itself.
     price_max : largest price of violations; if it is too low, the end may be infeasible.

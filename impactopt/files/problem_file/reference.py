@@ -103,7 +103,7 @@ defaults. In parentheses below: what is permitted, and the default.
 ```sh
 impactopt new                                 # lists the problems that come with the package
 impactopt new punch > my.toml                 # copies one, with a comment to each key, and the other keys
-impactopt check my.toml                       # names all mistakes: where, what was meant, what is allowed
+impactopt check my.toml                       # names all mistakes
 impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit may be left out
 ```
 
@@ -116,7 +116,7 @@ without defaults. What is made in Python, of functions or models, cannot be writ
 
 ## Limits
 
-Larger values are refused before work starts: they are mistakes in a unit or a key, or would take hours.
+Larger values are refused before work starts.
 
 | | at most |
 |---|---|
@@ -212,22 +212,26 @@ def _keys(section: type[BaseModel]) -> Iterator[str]:
         if _inner(info)[0] is not None or name == getattr(section, "choice", ""):
             continue  # a section of its own; or the header has it
         if info.is_required():
-            default = "; **needed**"
+            default = "**needed**"
         else:
             value = usual.get(name, info.default)
-            default = "" if value is None or np.size(value) == 0 else f"; `{_show(value)}`"
-        yield f"- `{info.alias or name}` ({_allowed(info)}{default}): {info.description}"
+            default = "" if value is None or np.size(value) == 0 else f"`{_show(value)}`"
+        said = "; ".join(part for part in (_allowed(info, bool(default)), default) if part)
+        yield f"- `{info.alias or name}` ({said}): {info.description}"
 
 
-def _allowed(info: FieldInfo) -> str:
-    """Permitted values of a key."""
+def _allowed(info: FieldInfo, defaulted: bool = False) -> str:
+    """Permitted values of a key; "" where its default shows that it is any number, text, or truth value."""
     for check in reversed(info.metadata):
         if isinstance(check, (AfterValidator, PlainValidator)) and check.func.__doc__:
             return _sentence(check.func.__doc__)
     if get_origin(info.annotation) is Literal:
         return ", ".join(f"`{_show(choice)}`" for choice in get_args(info.annotation))
     if info.annotation in _TYPES:
-        limits = re.sub(r"^>= (\S+) and <= (\S+)$", r"\1 to \2", range_of(info))
+        limits = range_of(info).removesuffix(f" and <= {MOST:g}")
+        if defaulted and not info.is_required() and not limits and info.annotation is not int:
+            return ""
+        limits = re.sub(r"^>= (\S+) and <= (\S+)$", r"\1 to \2", limits)
         return (
             limits if limits and info.annotation is float else f"{_TYPES[info.annotation]} {limits}".strip()
         )

@@ -45,19 +45,15 @@ class SoleSection(Section):
     kind = Sole
     name: str = required("what [stance] and messages call it")
     frame: str = required("frame at the sole, z up out of the ground, x forward")
-    polygon: list[Point2] = required(
-        "corners in the frame's x-y plane, counter-clockwise from above [m]", "polygon_m"
-    )
+    polygon: list[Point2] = required("corners in its x-y plane, counter-clockwise [m]", "polygon_m")
     parent: str = optional("frame of the model in which a new `frame` is placed")
-    position: Vector = optional("position of a new frame in its parent [m]", "position_m")
-    rotation: Rotation = optional("rotation of a new frame in its parent: a matrix by rows; left out: none")
+    position: Vector = optional("its position in the parent [m]", "position_m")
+    rotation: Rotation = optional("its rotation: a matrix by rows; left out: none")
 
     hinge: Literal["x", "y", "z"] = optional(
-        "axis of the frame about which the foot may turn on the sole, of a leg of five joints"
+        "of a leg of five joints: axis about which the foot may turn on the sole"
     )
-    hinge_range: Positive = optional(
-        "how far a plan may turn the foot so, either way [rad]", "hinge_range_rad"
-    )
+    hinge_range: Positive = optional("how far a plan may turn it, either way [rad]", "hinge_range_rad")
 
     @model_validator(mode="after")
     def _placed_on_a_parent(self) -> SoleSection:
@@ -88,7 +84,7 @@ class GripSection(Section):
     """A hand that holds a tool by a spring and a damper about one axis; left out: it holds it firmly."""
 
     kind = SoftGrip
-    axis: Vector = required("unit vector in the frame that the tool turns about")
+    axis: Vector = required("unit vector, in the frame")
     stiffness: Positive = required("stiffness of the spring [N m/rad]", "stiffness_N_m_rad")
     damping: Positive = required("damping of the damper [N m s/rad]", "damping_N_m_s_rad")
     point: Vector = optional("a point on the axis, in the frame [m]", "point_m")
@@ -100,16 +96,12 @@ class ToolSection(Section):
 
     kind = Tool
     name: str = required("name of the tool and of its striker")
-    frame: str = required("frame of the model at the link that holds the tool")
+    frame: str = required("frame at the link that holds the tool")
     mass: Positive = required("mass [kg]", "mass_kg")
     center: Vector = required("centre of mass in the frame [m]", "center_m")
-    inertia: Inertia = required(
-        "about the centre of mass [kg m2]: its diagonal, or a matrix by rows", "inertia_kg_m2"
-    )
+    inertia: Inertia = required("about the centre of mass [kg m2]", "inertia_kg_m2")
     head: Vector = required("the point that hits, in the frame [m]", "head_m")
-    bar: Vector = optional(
-        "of a hammer: from its bar's back to the face that hits, in the frame [m]", "bar_m"
-    )
+    bar: Vector = optional("of a hammer: from the bar's back to the face that hits [m]", "bar_m")
     bar_width: Positive = optional("of that bar [m]", "bar_width_m")
 
 
@@ -117,9 +109,9 @@ _OfActuator: Any = section_of(Actuator)
 
 
 class ActuatorSection(_OfActuator):
-    """A motor with its gear, of one joint or of many; of sections that name the same joint the last holds."""
+    """A motor with its gear; the last section that names a joint holds. Left out: the robot's own."""
 
-    joints: JointNames = required("names of joints, or patterns such as `arm_*_4_joint`")
+    joints: JointNames = required("names, or patterns such as `arm_*_4_joint`")
 
     def build(self) -> Any:
         return Actuator(**{name: value for name, value in self.given().items() if name != "joints"})
@@ -128,10 +120,8 @@ class ActuatorSection(_OfActuator):
 class GainSection(Section):
     """A factor on the stiffness of some joints; their damping gets its root, so its ratio stays."""
 
-    joints: JointNames = required(
-        "names of joints, or patterns; that of a tool in a soft grip is its name with `_grip` behind"
-    )
-    factor: Factor = required("one number, or [least, largest] for the plan to choose")
+    joints: JointNames = required("names, or patterns; NAME_grip: a tool in a soft grip")
+    factor: Factor = required("the plan chooses from a range")
 
     @property
     def open(self) -> bool:
@@ -158,15 +148,13 @@ class RobotSection(Section):
 
     preset: Preset = optional("see `impactopt robots`")
     urdf: str = optional("the robot's URDF, in place of a preset")
-    mjcf: str = optional(
-        "the robot's MJCF, in place of a preset: with its armature, friction, actuators, keyframes, sites"
-    )
-    srdf: str = optional("file with the URDF's named postures and rotors")
+    mjcf: str = optional("the robot's MJCF, in place of a preset")
+    srdf: str = optional("named postures and rotors of the URDF")
     name: str = optional("what reports call it")
     floating: bool = optional("true: the base is free; false: the root link is fixed to the ground")
     locked: dict[str, float] = optional("joints to remove, and their angles [rad]", "locked_rad")
     inertias: Literal["given", "repaired"] = optional(
-        '"repaired": those that no body can have are changed to ones that it can; `check` lists them'
+        '"repaired": impossible ones are changed; `check` lists them'
     )
     armature: PerJoint = optional("reflected rotor inertia, of all or by joint [kg m2]", "armature_kg_m2")
     kp: PerJoint = optional("servo stiffness, of all or by joint [N m/rad]", "kp_N_m_rad")
@@ -182,7 +170,7 @@ class RobotSection(Section):
     actuators: list[ActuatorSection] = optional("motors and gears; joints that none names keep the preset's")
     gains: list[GainSection] = optional("factors on gains of servos, and on springs of soft grips")
     postures: dict[str, dict[str, float]] = optional(
-        "named postures: joint angles by joint, the others 0 or the SRDF's [rad]", "postures_rad"
+        "named postures, angles by joint; others 0 or the SRDF's [rad]", "postures_rad"
     )
 
     @model_validator(mode="after")

@@ -94,9 +94,7 @@ class SolverSection(Section):
     """Solver, and its options."""
 
     name: Literal["ipm", "sqp", "ipopt"] = optional("name of the solver")
-    time_limit: Positive = optional(
-        "longest time of the solver, after which its best iterate is kept [s]", "time_limit_s"
-    )
+    time_limit: Positive = optional("longest time; then the best iterate is kept [s]", "time_limit_s")
     ipopt: IpoptOptions = optional("IPOPT's own options by name")
     ipm: IPM = optional("")
     sqp: SQP = optional("")
@@ -209,14 +207,12 @@ class ProblemSection(Section):
 
     name: str = optional("what reports call the problem")
     robot: Preset = optional("see `impactopt robots`; or there is a section [robot]")
-    striker: str = required("name of the robot's striker that hits")
-    point: Vector = required(
-        "where the striking point meets the target: x forward, y left, z up from the ground [m]", "point_m"
-    )
+    striker: str = required("the robot's striker")
+    point: Vector = required("hit point: x forward, y left, z up from the ground [m]", "point_m")
     normal: UnitVector = required("direction in which the target is pushed")
     start: Posture = Field(
         default=ImpactProblem.start,
-        description="posture to start from, at rest: its name, or a configuration, as Pinocchio has them",
+        description="start posture: its name, or a configuration of Pinocchio",
     )
 
     @classmethod
@@ -228,40 +224,38 @@ class SecondSection(Section):
     """Another striker that hits the same target at the same time."""
 
     kind = SecondStriker
-    striker: str = required("name of the robot's other striker")
+    striker: str = required("the robot's other striker")
     point: Vector = required("where its striking point meets the target [m]", "point_m")
 
 
 class StanceSection(Section):
-    """The soles that are held, and the hands that hold on."""
+    """Soles that are fixed, and hands that hold on."""
 
     soles: str = Field(
         default="both",
-        description='"both", or the name of the sole that is held; "none": the robot floats freely, in '
-        "`impactopt collide` and sweeps of collisions",
+        description='"both", or one; "none" (`impactopt collide`, sweeps of collisions): it floats freely',
     )
     hands: HandNames = Field(
         default=[],
-        description="strikers that hold on, each to where it is in the start posture; see [terms.grip]",
+        description="strikers that hold on, each where it is at the start; see [terms.grip]",
     )
 
 
 class StancePhaseSection(Section):
-    """A phase of the motion in which the same soles stand; between two, soles lift off or touch down."""
+    """A phase in which the same soles stand."""
 
     soles: list[str] = required("names of the soles that stand")
     duration: Duration = optional(
-        "one number, or [shortest, longest] [s]; left out of the phase with the blow, whose times are those "
-        "of [swing] and [follow]",
+        "duration [s]; left out of the phase with the blow, which has the times of [swing] and [follow]",
         "duration_s",
     )
-    intervals: int = optional("number of the spline's intervals, at least 6, by default 12")
+    intervals: int = optional("intervals of the spline, at least 6, by default 12")
     grading: AtLeastOne = optional(
         "longest over shortest interval, the short ones at the contact, by default 3"
     )
     steps: dict[str, list[float]] = optional(
-        "by sole that touches down as the phase begins: forward and to the left [m] from where it stood "
-        "before, such as { left = [0.3, 0.0] }; without one it comes down where it was",
+        "by sole that touches down as the phase begins: forward and to the left [m], such as "
+        "{ left = [0.3, 0.0] }; without one it comes down where it was",
         "steps_m",
     )
 
@@ -280,12 +274,8 @@ class PhaseSection(Section):
     """A phase of the motion: its duration and its spline."""
 
     kind = Phase
-    duration: Duration = required(
-        "one number, or [shortest, longest] for the solver to choose [s]", "duration_s"
-    )
-    intervals: int = optional(
-        "number of the spline's intervals, at least 6; more make the motion freer and the solve longer"
-    )
+    duration: Duration = required("duration; the solver chooses from a range [s]", "duration_s")
+    intervals: int = optional("intervals of the spline, at least 6; more: a freer motion, a longer solve")
     grading: AtLeastOne = optional("longest over shortest interval, the short ones at the contact")
 
 
@@ -306,11 +296,9 @@ class CollisionSection(Section):
         "model",
     )
     freezes: Freezes = optional('of the model "sdc", during contact')
-    auto_impulse_pct: Positive = optional('of "auto": by how much full dynamics may change the impulse [%]')
-    auto_zmp_mm: Positive = optional('of "auto": by how much they may change the ZMP [mm]')
-    coefficient_of_restitution: Restitution = optional(
-        'speed of separation over speed of approach, of the model "rigid"'
-    )
+    auto_impulse_pct: Positive = optional('of "auto": largest change of the impulse by full dynamics [%]')
+    auto_zmp_mm: Positive = optional('of "auto": largest change of the ZMP [mm]')
+    coefficient_of_restitution: Restitution = optional('of "rigid": speed of separation over approach')
     contact_duration: ContactDuration = optional(
         "[shortest, longest] time of compression and of restitution [s]; 0: no shortest time",
         "duration_s",
@@ -335,11 +323,10 @@ class ObjectiveSection(Section):
     """The motion's style, and small prices that make the optimum unique."""
 
     style: Literal["natural", "strongest"] = optional(
-        '"natural": prices on jerk, on the travel of joints and on ending away from the start posture; '
-        '"strongest": none'
+        '"natural": prices on jerk, travel of joints and the end posture; "strongest": none'
     )
-    motion_price: NotNegative = optional("largest share of the objective that the style's prices may take")
-    price_scale: NotNegative = optional("factor on the style's prices, as a plan has reduced them")
+    motion_price: NotNegative = optional("largest share of these prices in the objective")
+    price_scale: NotNegative = optional("factor on these prices")
     smoothness: NotNegative = optional("price of accelerations [N s per (rad/s^2)^2 s]")
     wrench_price: NotNegative = optional("price of the soles' wrenches")
     return_price: NotNegative = optional("price of ending away from the start posture [N s per rad^2]")

@@ -154,7 +154,7 @@ def unit_vector(value: list[float]) -> list[float]:
 
 
 def per_joint(value: Any) -> Any:
-    """A number >= 0, or a table by joint."""
+    """A number >= 0, or a table."""
     numbers = value.values() if isinstance(value, dict) else [value]
     if not all(_is_number(x) and 0 <= x < np.inf for x in numbers):
         raise ValueError(f"{value}; give a number >= 0, or a table of such numbers by joint")

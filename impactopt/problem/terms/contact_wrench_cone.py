@@ -30,7 +30,7 @@ class ContactWrenchCone(Term):
     collision_margin: float | None = field(
         default=0.02,
         metadata=about(
-            'the same in contact; "anywhere": no constraint on the wrenches in contact, to compare with',
+            'the same in contact; "anywhere": no constraint',
             unit="m",
             least=0,
             none="anywhere",

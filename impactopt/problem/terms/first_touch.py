@@ -47,7 +47,7 @@ class FirstTouch(Term):
     )
     assumed: bool = field(
         default=False,
-        metadata=about("true: of links without a known shape, too, by the boxes of their inertia"),
+        metadata=about("true: of links of unknown shape, too, as boxes of inertia"),
     )
     enabled: bool = field(default=True, metadata=about("false: other parts of the link may touch first"))
 

@@ -40,7 +40,7 @@ class GearLoad(Term):
     limit: float | Mapping[str, float] | None = field(
         default=None,
         metadata=about(
-            "largest load over the torque limit: one for all joints, or by joint; left out: the gear's "
+            "largest load over the torque limit, of all or by joint; left out: the gear's "
             "momentary peak where `[[robot.actuators]]` has it, else 2",
             above=0,
             by_joint=True,

@@ -30,9 +30,7 @@ class JointAcceleration(Term):
     unit: ClassVar[str] = "of limit"
     whole_motion: ClassVar[bool] = True
     limit: float | Mapping[str, float] = field(
-        metadata=about(
-            "largest acceleration: one for all joints, or by joint", unit="rad/s^2", above=0, by_joint=True
-        )
+        metadata=about("largest acceleration, of all or by joint", unit="rad/s^2", above=0, by_joint=True)
     )
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:

@@ -38,7 +38,7 @@ class PowerLimit(Term):
     limit: float | Mapping[str, float] | None = field(
         default=None,
         metadata=about(
-            "largest power: one for all joints, or by joint; left out: that of `[[robot.actuators]]`",
+            "largest power, of all or by joint; left out: that of `[[robot.actuators]]`",
             unit="W",
             above=0,
             by_joint=True,

@@ -26,7 +26,7 @@ class TorqueRate(Term):
     whole_motion: ClassVar[bool] = True
     needs_torques: ClassVar[bool] = True
     limit: float | Mapping[str, float] = field(
-        metadata=about("largest rate: one for all joints, or by joint", unit="N m/s", above=0, by_joint=True)
+        metadata=about("largest rate, of all or by joint", unit="N m/s", above=0, by_joint=True)
     )
 
     def add_rows(self, program: Any) -> None:

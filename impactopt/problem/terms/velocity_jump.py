@@ -29,7 +29,7 @@ class VelocityJump(Term):
     name: ClassVar[str] = "velocity jump"
     unit: ClassVar[str] = "rad/s"
     limit: float | Mapping[str, float] = field(
-        metadata=about("largest jump: one for all joints, or by joint", unit="rad/s", above=0, by_joint=True)
+        metadata=about("largest jump, of all or by joint", unit="rad/s", above=0, by_joint=True)
     )
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:

@@ -43,16 +43,16 @@ class ControllerSettings(Described):
     impact: str = field(
         default="planned",
         metadata=about(
-            "feedback about the impact: as always (none), impact-invariant projection (project), reference "
-            "spreading (spread), both, or both with the plan's servos in contact (planned)",
+            "feedback about the impact: as always (none), impact-invariant projection, reference spreading, "
+            "both, or both with the plan's servos in contact (planned)",
             choices=IMPACTS,
         ),
     )
     follow: str = field(
         default="recover",
         metadata=about(
-            "after the impact: the plan's follow-through (plan), or the same, slower and with the centre of "
-            "mass farther inside the soles (recover)",
+            "after the impact: the plan's follow-through, or the same, slower and with the centre of mass "
+            "farther inside the soles (recover)",
             choices=FOLLOWS,
         ),
     )
@@ -65,7 +65,7 @@ class ControllerSettings(Described):
     recovery_margin: float = field(
         default=0.1,
         metadata=about(
-            "distance of the centre of mass to the soles' edges after it, or the most that they have",
+            "distance of the centre of mass to the soles' edges after it, if they have as much",
             unit="m",
             least=0,
             most=1,
@@ -74,7 +74,7 @@ class ControllerSettings(Described):
     draw_back: float = field(
         default=0.03,
         metadata=about(
-            "how far a hand with a tool in a soft grip draws back after the impact",
+            "how far a hand with a soft grip draws back after the impact",
             unit="m",
             least=0,
             most=1,
@@ -113,7 +113,7 @@ class ControllerSettings(Described):
         metadata=about("bandwidth of the same in the recovery", unit="rad/s", least=0, most=1000),
     )
     friction: float = field(
-        default=0.6, metadata=about("friction coefficient of the floor that it counts on", above=0, most=10)
+        default=0.6, metadata=about("friction coefficient that it counts on", above=0, most=10)
     )
     cop_margin: float = field(
         default=0.003,

@@ -178,6 +178,9 @@ static void drifts(const double *q, const double *normal, Frozen *F) {
   double push[C1] = {0};
   memset(F->bias_root, 0, sizeof F->bias_root);
   FOR(i, V) F->drift[i] = (vec){0};
+#if SLIDES
+  memset(F->e_point, 0, sizeof F->e_point);
+#endif
 #if BIAS || JDOT
   double bias[NV], of_hand = 0.0, of_held[C1];
   const double *in[] = {q, F->drift_velocity, normal};
@@ -192,9 +195,6 @@ static void drifts(const double *q, const double *normal, Frozen *F) {
 #endif
 #endif
   };
-#if SLIDES
-  memset(F->e_point, 0, sizeof F->e_point);
-#endif
   drift(in, out, 0, 0, 0);
 #if BIAS
   vec x[VF] = {0}, pushed[VC] = {0}, sum_of[V] = {0};

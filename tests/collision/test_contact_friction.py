@@ -135,6 +135,17 @@ def test_frozen_models_have_derivatives_with_friction() -> None:
         assert float(jacobian[f"jac_impulse_{name}"]) == pytest.approx(slope, rel=1e-4)
 
 
+def test_gradients_with_freezes_are_those_of_differences_too() -> None:
+    model, (q, v, torque) = oblique(contact_friction=GENTLE, freezes=1, accuracy=None)
+    value, by_q, by_v = (np.array(x) for x in model.gradient_function()(q, v, torque))
+    jacobian = model.function(("impulse",)).jacobian()(q, v, torque, value)
+    np.testing.assert_allclose(by_v.T, jacobian[1], rtol=1e-6, atol=1e-7)
+    way = np.random.default_rng(1).normal(size=model.robot.nv)
+    ends = [model.collide(pin.integrate(model.robot.model, q, h * way), v, torque) for h in (1e-6, -1e-6)]
+    slope = (ends[0].impulse - ends[1].impulse) / 2e-6
+    assert by_q[:, 0] @ way == pytest.approx(slope, rel=1e-4)
+
+
 def test_many_frozen_collisions_have_friction_of_their_own() -> None:
     model, (q, v, torque) = oblique(contact_friction=GENTLE, freezes=1)
     coefficients = np.array([0.1, 0.6, 1.2])

@@ -146,6 +146,19 @@ def test_gradients_with_freezes_are_those_of_differences_too() -> None:
     assert by_q[:, 0] @ way == pytest.approx(slope, rel=1e-4)
 
 
+def test_steps_too_long_for_a_point_that_sticks_are_refused() -> None:
+    """They are stable at a small force, not at that of the blow: friction swings from stage to stage."""
+    sticky = ContactFriction(coefficient=0.6, slip_speed=1e-3)
+    model, (q, _, torque) = oblique(contact_friction=sticky, accuracy=None, step=6e-5)
+    v = striking_velocity(model.robot, q, "fist", OBLIQUE, 1.0)
+    assert model.step_length < model.stable_step(q)
+    with pytest.raises(InputError, match=r"step \[s\]: 6e-05 is too long to follow this contact"):
+        model.collide(q, v, torque)
+    assert np.isnan(model.batch([q], [v], torque)["impulse"]).all()
+    shorter = dataclasses.replace(model, step=1e-5)
+    assert shorter.batch([q], [v], torque)["step_error"][0] < 1e-4
+
+
 def test_many_frozen_collisions_have_friction_of_their_own() -> None:
     model, (q, v, torque) = oblique(contact_friction=GENTLE, freezes=1)
     coefficients = np.array([0.1, 0.6, 1.2])

@@ -77,7 +77,9 @@ def native_gradient(collision: SteppedModel, output: str) -> NativeCode | ca.Fun
 
     def graph() -> Any:
         if collision.stepping == "implicit" or collision.n_freezes:
-            raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4'"))
+            raise InputError(
+                _NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4' and no freezes")
+            )
         return _guarded(collision, gradient_graph(collision, output))
 
     if collision.contact_friction is not None and not collision.n_freezes:

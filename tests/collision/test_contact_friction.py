@@ -288,8 +288,13 @@ def test_bad_input_and_models_without_friction_are_refused() -> None:
     with pytest.raises(InputError, match=r"friction_coefficient: has -1; all must be > 0"):
         model, at = oblique(contact_friction=GENTLE)
         model.collide(*at, friction_coefficient=-1.0)
+    with pytest.raises(InputError, match=r"unstable here, .* or the friction at the hit more slip_speed"):
+        model.collide(*at, friction_slip_speed=1e-6)
     with pytest.raises(InputError, match=r"must be a ContactFriction, not 0\.6"):
         dataclasses.replace(arm_problem(), friction=0.6)
+    for kind in (SDC, FullDynamics):
+        with pytest.raises(InputError, match=r"contact_friction must be a ContactFriction, not 0\.6"):
+            oblique(kind, contact_friction=0.6)
 
 
 def test_a_file_has_it_and_other_problems_keep_their_hash() -> None:

@@ -208,7 +208,9 @@ def describe(
     """Description of `SteppedModel.function` for these outputs; see `SteppedModel.describe`."""
     robot, held_by, settings = collision.robot, collision.held_by, collision.settings
     by = f"{max(held_by.compliance):g} per kg" if any(held_by.compliance) else "exactly"
-    effects = [name for name in _EFFECTS if getattr(collision.effects, name)] if collision.n_servos else []
+    effects = [name for name in _EFFECTS if getattr(collision.effects, name)]
+    effects = ["damping", *effects] if collision.n_servos else []
+    effects += ["friction at the hit"] if collision.contact_friction is not None else []
     contents: dict[str, Any] = {
         "robot": robot.name,
         "joints": robot.n,
@@ -216,7 +218,7 @@ def describe(
         "striker": collision.striker,
         "held": list(held_by.constraint_frames(robot)),
         "held_how": by if held_by.constraint_frames(robot) else "fixed base",
-        "effects": (["damping", *effects] if collision.n_servos else []),
+        "effects": effects,
         "law": type(collision.law).__name__,
         "target": type(collision.target).__name__,
         "outputs": list(outputs),
@@ -238,8 +240,8 @@ def instructions(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str,
     much, or six times where law or target bend.
     """
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
-    whole = ("L_tau", "L_f", "L_0", "drift_velocity") if collision.n_freezes else ()
-    names = tuple(dict.fromkeys((*model.frozen, *frozen_for(outputs, slides=model.slides), *whole)))
+    wanted = (*outputs, "velocity") if collision.n_freezes else outputs
+    names = tuple(dict.fromkeys((*model.frozen, *frozen_for(wanted, slides=model.slides))))
     freeze = frozen_dynamics(collision).function("frozen", names)
     step = rk4_step(model, collision.step_of_graph)
     return {"freeze": int(freeze.expand().n_instructions()), "step": int(step.expand().n_instructions())}
@@ -295,6 +297,8 @@ def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, st
         out["second integrals"] = "no configuration asked for, nothing frozen again"
     if not wanted & {"configuration", "velocity"}:
         out["motion of the whole robot"] = "not asked for"
+    if collision.contact_friction is None:
+        out["friction at the hit"] = "not given (contact_friction)"
     out["derivatives"] = "in `gradient_function`, and in `graph`"
     if independent := independent_joints(collision):
         out["nothing yet"] = (

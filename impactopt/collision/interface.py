@@ -157,9 +157,11 @@ class CollisionModel(ABC):
     def check_step(self, step: float, longest: float, where: str = "here") -> None:
         """InputError for a step [s] that is not below the longest stable one."""
         if step >= longest:
+            slides = getattr(self, "contact_friction", None) is not None
+            more = ", or the friction at the hit more slip_speed" if slides else ""
             raise InputError(
                 f"step [s]: {step:g} is unstable {where}, where the fastest mode allows {longest:.2g}: give "
-                f"{type(self).__name__} a step below that, or the joints less kd or more armature"
+                f"{type(self).__name__} a step below that, or the joints less kd or more armature{more}"
             )
 
     @staticmethod

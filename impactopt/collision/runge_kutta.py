@@ -61,7 +61,8 @@ def _running(model: JointSpaceModel) -> Any:
 
 
 # of |f_2 - f_3| h, of the force at both of a step's middles, summed over steps, what is left out of the
-# impulse: where the force changes by x of itself within a step, half of x^2, as kinks cost
+# impulse: where the force changes by x of itself within a step, half of x^2, as kinks cost. Friction counts
+# too: where it swings from stage to stage, as it does where steps are too long for a point that sticks
 LEFT_OUT_BY_RK4 = 2.0
 
 
@@ -88,7 +89,9 @@ def rk4_step(model: JointSpaceModel, length: float) -> Any:
         largest = ca.fmax(Y[peak], ca.if_else(h > 0, model.part(k1, "impulse"), 0.0))
         y_next = ca.vertcat(y_next[: peak.start], largest, y_next[peak.stop :])
     if model.error:
-        more = LEFT_OUT_BY_RK4 * ca.fabs(model.part(k2, "impulse") - model.part(k3, "impulse")) * h
+        names = ("impulse", *(("sliding",) if model.slides else ()))
+        apart = ca.vertcat(*[model.part(k2, name) - model.part(k3, name) for name in names])
+        more = LEFT_OUT_BY_RK4 * ca.norm_1(apart) * h
         y_next += ca.vertcat(
             *[more if i == model.layout["left_out"].start else 0.0 for i in range(model.n_states)]
         )

@@ -17,6 +17,7 @@ from impactopt.collision.interface import CollisionModel
 from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS
 from impactopt.collision.settings import Effects, JointFriction, Settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
+from impactopt.contact.friction import check_friction
 from impactopt.errors import InputError, check_array, did_you_mean
 
 __all__ = ["SteppedModel", "contact_functions", "law_is_linear", "number_of_steps", "target_is_linear"]
@@ -176,6 +177,7 @@ class SteppedModel(CollisionModel):
             raise InputError(
                 f"method {self.method!r}{did_you_mean(self.method, STEPS)}; there are {', '.join(STEPS)}"
             )
+        check_friction("contact_friction", self.contact_friction)
         if self.contact_friction is not None and self.method == "implicit":
             raise InputError("method 'implicit': its steps have no contact_friction; give 'rk4', or none")
         if not 1e-14 <= check_array("tolerance", self.tolerance, ()) <= 1e-2:

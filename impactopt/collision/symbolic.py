@@ -81,10 +81,9 @@ class SymbolicModel(SteppedModel):
         differences. The code for this is compiled when it is first evaluated. A single scalar output has an
         adjoint. Scalars and histories have tangents with respect to q, v and feedforward. All other
         derivatives are differences of two collisions with tight steps for each number of the input: those
-        with respect to settings; those of models with freezes on the way, or with "rk4", as of all with
-        friction at the striking point; and those of configuration, velocity and the target's results. The
-        quaternion in q is normalized, so derivatives
-        along its length are zero.
+        with respect to settings; those of models with freezes on the way or with "rk4", which is the method
+        of all with friction at the striking point; and those of configuration, velocity and the target's
+        results. The quaternion in q is normalized, so derivatives along its length are zero.
 
         Parameters
         ----------

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.contact.fields import Described, about, check_numbers
+from impactopt.errors import InputError
 
-__all__ = ["ContactFriction", "pushed_way"]
+__all__ = ["ContactFriction", "check_friction", "pushed_way"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +46,12 @@ class ContactFriction(Described):
         normal (3,), and along the slide.
         """
         return np.asarray(pushed_way(normal, speed, *self.parameters))
+
+
+def check_friction(name: str, given: Any) -> None:
+    """InputError for what is neither a ContactFriction nor None."""
+    if given is not None and not isinstance(given, ContactFriction):
+        raise InputError(f"{name} must be a ContactFriction, not {given!r}")
 
 
 def pushed_way(normal: Any, speed: Any, coefficient: Any, slip_speed: Any) -> Any:

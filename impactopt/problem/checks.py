@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.world import Ground, Obstacle, TargetBody
-from impactopt.contact.friction import ContactFriction
+from impactopt.contact.friction import check_friction
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened
@@ -215,8 +215,7 @@ def check_collision(problem: Any) -> None:
             'collision="virtual-mass" has a closed form for the law SpringDamper only, not '
             f"{type(problem.law).__name__}"
         )
-    if problem.friction is not None and not isinstance(problem.friction, ContactFriction):
-        raise InputError(f"friction must be a ContactFriction, not {problem.friction!r}")
+    check_friction("friction", problem.friction)
     if problem.friction is not None and problem.collision != "full":
         raise InputError(
             f'friction: the model {problem.collision!r} of the collision has none: take collision="full", or '

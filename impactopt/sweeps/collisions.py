@@ -344,9 +344,10 @@ def collide_many(
     Parameters
     ----------
     problem : a problem file, its path, or its name.
-    columns : by key path (N) values: numbers of the problem file's [target], [contact], [friction] and servo
+    columns : by key path (N) values: numbers of the problem file's [target], [contact] and servo
         (robot.kp, robot.kd, robot.torque_limit, of all joints or of one), of [at_contact], and problem.point;
-        names and numbers that make another robot or model are in few combinations. Of one value: for all.
+        names and numbers that make another robot or model, as those of [friction] do, are in few
+        combinations. Of one value: for all.
     outputs : names of columns; see docs/sweeps.md. Only what they need is computed: where a million rows are
         asked for, leave out freeze_error_pct, which takes some six times as long as the impulse.
     at_contact : the keys of [at_contact] that no column gives; see docs/sweeps.md.

@@ -1,7 +1,8 @@
 """The C of collisions under the compiler's sanitizers, in every branch for vectors of another width.
 
 Each function is a program of its own: in Python's process sanitizers do not get on with CasADi's plugins. Its
-arrays have exactly the sizes that it asks for, so that a step beyond them is seen.
+arrays have exactly the sizes that it asks for, so that a step beyond them is seen; its room is full of no
+numbers, so that what is read before it is set is seen.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import pytest
 from support.native_cases import ROBOTS, robot_named, situation
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC
+from impactopt.collision import SDC, Effects
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
 from impactopt.contact import Board, ContactFriction, FreeMass, HuntCrossley, Nail, SpringDamper
 
@@ -34,6 +35,7 @@ int main(void) {
   Int sizes[4];
   OF_NAME(work)(sizes, sizes + 1, sizes + 2, sizes + 3);
   double *w = malloc(sizes[3] * sizeof *w);
+  memset(w, 0xff, sizes[3] * sizeof *w);
   FOR(k, N_IN) {
     Int size = SHAPES_IN[k][0] * SHAPES_IN[k][1];
     double *x = malloc(size * sizeof *x);
@@ -81,9 +83,13 @@ PROGRAMS: dict[str, tuple[dict[str, Any], Callable[[SDC], Any]]] = {
         {"law": HUNT, "method": "rk4"},
         lambda one: native_collision(one, ("impulse", "force", "step_error")),
     ),
-    "friction at the hit": (
-        {"contact_friction": ContactFriction(coefficient=0.5), "freezes": 1},
-        lambda one: native_collision(one, ("impulse", "velocity", "peak_force")),
+    "friction at the hit, freezes": (
+        {"contact_friction": ContactFriction(coefficient=0.6), "freezes": 2},
+        lambda one: native_collision(one, ("impulse", "force", "velocity")),
+    ),
+    "friction at the hit, no drifts": (
+        {"contact_friction": ContactFriction(coefficient=0.6), "effects": Effects.none()},
+        lambda one: native_collision(one, ("impulse", "force", "velocity")),
     ),
     "gradient": ({}, lambda one: native_gradient(one, "impulse")),
     "gradient, bent law": ({"law": HUNT, "kd": GAINS}, lambda one: native_gradient(one, "impulse")),

@@ -148,6 +148,30 @@ def test_frozen_models_have_derivatives_with_friction() -> None:
         assert float(jacobian[f"jac_impulse_{name}"]) == pytest.approx(slope, rel=1e-4)
 
 
+def test_gradients_with_freezes_are_those_of_differences_too() -> None:
+    model, (q, v, torque) = oblique(contact_friction=GENTLE, freezes=1, accuracy=None)
+    value, by_q, by_v = (np.array(x) for x in model.gradient_function()(q, v, torque))
+    jacobian = model.function(("impulse",)).jacobian()(q, v, torque, value)
+    np.testing.assert_allclose(by_v.T, jacobian[1], rtol=1e-6, atol=1e-7)
+    way = np.random.default_rng(1).normal(size=model.robot.nv)
+    ends = [model.collide(pin.integrate(model.robot.model, q, h * way), v, torque) for h in (1e-6, -1e-6)]
+    slope = (ends[0].impulse - ends[1].impulse) / 2e-6
+    assert by_q[:, 0] @ way == pytest.approx(slope, rel=1e-4)
+
+
+def test_steps_too_long_for_a_point_that_sticks_are_refused() -> None:
+    """They are stable at a small force, not at that of the blow: friction swings from stage to stage."""
+    sticky = ContactFriction(coefficient=0.6, slip_speed=1e-3)
+    model, (q, _, torque) = oblique(contact_friction=sticky, accuracy=None, step=6e-5)
+    v = striking_velocity(model.robot, q, "fist", OBLIQUE, 1.0)
+    assert model.step_length < model.stable_step(q)
+    with pytest.raises(InputError, match=r"step \[s\]: 6e-05 is too long to follow this contact"):
+        model.collide(q, v, torque)
+    assert np.isnan(model.batch([q], [v], torque)["impulse"]).all()
+    shorter = dataclasses.replace(model, step=1e-5)
+    assert shorter.batch([q], [v], torque)["step_error"][0] < 1e-4
+
+
 def test_many_frozen_collisions_have_friction_of_their_own() -> None:
     model, (q, v, torque) = oblique(contact_friction=GENTLE, freezes=1)
     coefficients = np.array([0.1, 0.6, 1.2])
@@ -277,8 +301,13 @@ def test_bad_input_and_models_without_friction_are_refused() -> None:
     with pytest.raises(InputError, match=r"friction_coefficient: has -1; all must be > 0"):
         model, at = oblique(contact_friction=GENTLE)
         model.collide(*at, friction_coefficient=-1.0)
+    with pytest.raises(InputError, match=r"unstable here, .* or the friction at the hit more slip_speed"):
+        model.collide(*at, friction_slip_speed=1e-6)
     with pytest.raises(InputError, match=r"must be a ContactFriction, not 0\.6"):
         dataclasses.replace(arm_problem(), friction=0.6)
+    for kind in (SDC, FullDynamics):
+        with pytest.raises(InputError, match=r"contact_friction must be a ContactFriction, not 0\.6"):
+            oblique(kind, contact_friction=0.6)
 
 
 def test_a_file_has_it_and_other_problems_keep_their_hash() -> None:

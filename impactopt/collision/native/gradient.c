@@ -27,7 +27,6 @@ static double final_value(const Data *d, const Course *c, State *y_) {
 #if FREEZES
 /* By differences of collisions, of whose steps the tolerance is far below: a segment's length, and where it is frozen,
    depend on the one before. */
-#define DIFFERENCE 1e-4
 static double value_at(const double **arg, const double *q, const double *v, Work *w) {
   const double *in[N_IN];
   Course c;

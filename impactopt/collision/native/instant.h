@@ -192,7 +192,7 @@ static int closing(const Data *d, const State *y, const Instant *now) {
   const double gained = (call(target_velocity, then, d->target, 0) - now->target_speed) / 1e-9;
 #if SLIDES
   double friction[3];
-  friction_on_target(d, d->point_velocity, force, friction);
+  friction_at(d, y, force, friction);
 #else
   const double *friction = 0;
 #endif

@@ -66,6 +66,9 @@ INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
 #endif
 #if STEP_ERROR
   y->left_out += LEFT_OUT_BY_RK4 * fabs(k2.impulse - k3.impulse) * h;
+#if SLIDES
+  FOR(i, 3) y->left_out += LEFT_OUT_BY_RK4 * fabs(k2.sliding[i] - k3.sliding[i]) * h;
+#endif
 #endif
   k1.penetration = MEAN(penetration);
   k1.impulse = MEAN(impulse);

@@ -77,12 +77,12 @@ def native_gradient(collision: SteppedModel, output: str) -> NativeCode | ca.Fun
 
     def graph() -> Any:
         if collision.stepping == "implicit" or collision.n_freezes:
-            raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4'"))
+            raise InputError(
+                _NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4' and no freezes")
+            )
         return _guarded(collision, gradient_graph(collision, output))
 
-    if collision.contact_friction is not None:
-        if collision.n_freezes:
-            raise InputError("gradient_function: with contact_friction only of a model without freezes")
+    if collision.contact_friction is not None and not collision.n_freezes:
         return graph()
     return NativeCode(
         name="collision_gradient",
@@ -162,7 +162,7 @@ def _code(
     if differs or (gradient and collision.n_freezes):
         # differences are of collisions with steps that do not count beside them
         collision = replace(collision, tolerance=min(collision.tolerance, _OF_DIFFERENCES))
-    of_differences: list[str] = []
+    of_differences = [f"#define DIFFERENCE {_DIFFERENCE[collision.stepping]}"]
     if gradient:
         of_tree = [*of_tree, *backwards(of_tree), tangent_back(frozen)]
         scalars += backwards(scalars)
@@ -178,8 +178,8 @@ def _code(
     if differs:
         entries = [rows * columns for rows, columns in shapes.values()]
         inputs = shapes_in(collision)
-        of_differences = [
-            f"#define DIFFERENCE {_DIFFERENCE[collision.stepping]}\n#define N_BY {len(by)}",
+        of_differences += [
+            f"#define N_BY {len(by)}",
             f"#define ENTRIES {sum(entries) + 1}",
             f"#define LONGEST {max(rows * columns for rows, columns in inputs.values())}",
             f"static const int SIZES[] = {{{', '.join(map(str, entries))}}};",

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.collision.settings import Effects, JointFriction, Settings, no_bend, servo_settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
+from impactopt.contact.friction import check_friction
 from impactopt.errors import InputError, check_array
 from impactopt.robots.robot import Robot
 
@@ -165,6 +166,7 @@ class ReferenceModel(CollisionModel):
         super().__post_init__()
         _positive("step [s]", self.step)
         _positive("tolerance", self.tolerance)
+        check_friction("contact_friction", self.contact_friction)
         self._settings(self.kp, self.kd)
 
     @abstractmethod

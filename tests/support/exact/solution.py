@@ -118,7 +118,7 @@ class ExactCollision:
             joints = joints if self.model.n else ca.DM.zeros(collision.robot.n)
             wrench = data["L_tau"] @ joints - data["L_f"] * impulse + data["L_0"] * weight
             at = (data["q"], data["drift_velocity"], data["normal"])
-            return frozen.velocity_change(*at, joints, impulse, wrench, weight)
+            return frozen.velocity_change(*at, joints, impulse, np.zeros(3), wrench, weight)
 
         way = data["v"] * path.time[-1] + change(second=True)
         segment = Segment(

@@ -56,11 +56,11 @@ class TargetBody(Described):
 
     shape: str | None = field(
         default=None,
-        metadata=about("shape; left out: the one that belongs to the target's kind", choices=TARGET_SHAPES),
+        metadata=about("left out: the one of the target's kind", choices=TARGET_SHAPES),
     )
     size: tuple[float, ...] | None = field(
         default=None,
-        metadata=about("size: of a box [across, up, deep], of a ball [diameter]", unit="m", above=0),
+        metadata=about("of a box [across, up, deep], of a ball [diameter]", unit="m", above=0),
     )
 
     def __post_init__(self) -> None:
@@ -91,9 +91,7 @@ class Obstacle(Described):
 
     name: str = field(metadata=about("what reports call it"))
     size: Vector | None = field(default=None, metadata=about("sides of a box", unit="m"))
-    position: Vector = field(
-        default=(0.0, 0.0, 0.0), metadata=about("middle of the box, in the world frame", unit="m")
-    )
+    position: Vector = field(default=(0.0, 0.0, 0.0), metadata=about("middle of the box", unit="m"))
     rpy: Vector = field(default=(0.0, 0.0, 0.0), metadata=about("roll, pitch and yaw of the box", unit="rad"))
     start: Vector | None = field(
         default=None, metadata=about("start of a capsule's axis, in the world frame", unit="m")
@@ -163,9 +161,7 @@ class Ground(Described):
     Left out: there is none. A robot on soles stands on the ground z = 0.
     """
 
-    height: float = field(
-        default=0.0, metadata=about("height of the floor, in the frame of the robot's root link", unit="m")
-    )
+    height: float = field(default=0.0, metadata=about("height in the root link's frame", unit="m"))
 
     def __post_init__(self) -> None:
         height = check_array("Ground.height [m]", self.height, (), most=FARTHEST)

@@ -17,14 +17,14 @@ class SolverOptions:
 
     Attributes
     ----------
-    violation_tolerance : largest violation of a constraint or bound at a solution.
+    violation_tolerance : largest violation at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
-    acceptable_tolerance : tolerance in place of kkt_tolerance for the status ACCEPTABLE, if no step helps.
+    acceptable_tolerance : kkt_tolerance of the status ACCEPTABLE, if no step helps.
     max_iterations : most iterations.
     time_limit : [s]; then the best iterate is returned.
     price : first price of violations; it rises by itself.
-    price_max : largest price of violations; if it is too low, the end may be infeasible.
-    second_order_correction : whether a refused step is corrected for the constraints' curvature.
+    price_max : largest price of violations.
+    second_order_correction : corrects refused steps for the constraints' curvature.
     """
 
     violation_tolerance: float = 1e-6
@@ -66,7 +66,6 @@ class IPMOptions(SolverOptions):
     Attributes
     ----------
     complementarity_tolerance : largest product of a multiplier and the distance to its bound at a solution.
-        The objective's error is at most this times the number of active bounds.
     barrier : first barrier parameter of an initial guess without multipliers.
     barrier_warm : the same of one with multipliers; below 5e-3 it falls at once near a solution.
     push : how far the initial guess is moved inside its bounds; one with multipliers no farther than its
@@ -85,8 +84,8 @@ class SQPOptions(SolverOptions):
 
     Attributes
     ----------
-    qp_solver : name in `QP_SOLVERS` of what solves every QP to its end.
-    hessian : "exact" (made convex) or "bfgs" (damped; dense, for some hundred free variables at most).
+    qp_solver : name in `QP_SOLVERS`.
+    hessian : "exact" (made convex) or "bfgs" (damped; for some hundred free variables at most).
     radius : largest radius of the trust region |d|_inf <= radius.
     """
 

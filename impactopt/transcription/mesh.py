@@ -95,7 +95,8 @@ def _middles_outside(plan: Plan, way: Trajectory, piece: Piece) -> list[float]:
     outside |= (np.abs(way.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
     lower, upper = inside(p.robot, _SHARE * p.term(PositionLimit).margin)
     angles = p.robot.joint_positions(way.q[at])
-    outside |= ((angles < lower) | (angles > upper))[:, c.dependent].any(axis=1)
+    legs = c.dependent[~p.robot.hinges[c.dependent]]  # hinges keep a quarter of their range at the nodes
+    outside |= ((angles < lower) | (angles > upper))[:, legs].any(axis=1)
     outside |= gear_share(p, way.torque[at], way.a[at, joints]) > 1.0 + GEAR
     outside |= _soles_outside(p, piece.number, way.sole_wrench[at])
     time = (way.time[at[outside]] - piece.start) / duration

@@ -108,11 +108,11 @@ impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit ma
 ```
 
 `--set` takes a key path and a value as in TOML. An entry of a list has its index from 0
-(`--set problem.point.1=-0.2`); one of several sections has its index or its name
+(`--set problem.point.1=-0.2`), one of several sections its index or its name
 (`--set scenarios.missing.abort_after=0.03`).
 
 In Python `impactopt.load_problem("my.toml")` reads a file, and `impactopt.write_problem(problem)` writes one
-without defaults. What is made in Python, of functions or models, cannot be written to a file.
+without defaults, unless the problem has functions or models made in Python.
 
 ## Limits
 
@@ -247,7 +247,7 @@ def _allowed(info: FieldInfo, defaulted: bool = False) -> str:
 
 
 def _sentence(text: str) -> str:
-    words = text.split("\n")[0].rstrip(".")
+    words = text.split("\n")[0].rstrip(".").removeprefix("A ")
     return words[0].lower() + words[1:]
 
 

@@ -81,7 +81,7 @@ class StrikerSection(Section):
 
 
 class GripSection(Section):
-    """A hand that holds a tool by a spring and a damper about one axis; left out: it holds it firmly."""
+    """A hand that holds a tool by a spring and a damper about one axis."""
 
     kind = SoftGrip
     axis: Vector = required("unit vector, in the frame")
@@ -151,7 +151,7 @@ class RobotSection(Section):
     mjcf: str = optional("the robot's MJCF, in place of a preset")
     srdf: str = optional("named postures and rotors of the URDF")
     name: str = optional("what reports call it")
-    floating: bool = optional("true: the base is free; false: the root link is fixed to the ground")
+    floating: bool = optional("false: the root link is fixed to the ground")
     locked: dict[str, float] = optional("joints to remove, and their angles [rad]", "locked_rad")
     inertias: Literal["given", "repaired"] = optional(
         '"repaired": impossible ones are changed; `check` lists them'

@@ -292,7 +292,7 @@ class CollisionSection(Section):
 
     collision: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full", "auto"] = optional(
         '"full": the whole equation of motion; "sdc": frozen at contact; "sdc-paper": so, by the paper; '
-        '"auto": the cheapest that is good enough; "virtual-mass", "rigid": no duration, to compare with',
+        '"auto": the cheapest that is good enough; "virtual-mass", "rigid": no duration',
         "model",
     )
     freezes: Freezes = optional('of the model "sdc", during contact')
@@ -300,12 +300,12 @@ class CollisionSection(Section):
     auto_zmp_mm: Positive = optional('of "auto": largest change of the ZMP [mm]')
     coefficient_of_restitution: Restitution = optional('of "rigid": speed of separation over approach')
     contact_duration: ContactDuration = optional(
-        "[shortest, longest] time of compression and of restitution [s]; 0: no shortest time",
+        "time of compression and of restitution [s]",
         "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    compression: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
-    restitution: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
+    compression: Fractions = optional("lengths of its collocation elements")
+    restitution: Fractions = optional("lengths of its collocation elements")
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:

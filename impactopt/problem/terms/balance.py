@@ -21,7 +21,7 @@ class Balance(Term):
     capture_margin: float | None = field(
         default=0.02,
         metadata=about(
-            'distance from the capture point to the support polygon\'s edges; "anywhere": no constraint',
+            'margin of the capture point in the support polygon; "anywhere": no constraint',
             unit="m",
             least=0,
             none="anywhere",
@@ -34,7 +34,7 @@ class Balance(Term):
     angular_momentum: float = field(
         default=10.0,
         metadata=about(
-            "largest angular momentum about each axis through the centre of mass; inf: any",
+            "largest angular momentum about each axis; inf: any",
             unit="N m s",
             least=0,
             endless=True,

@@ -33,9 +33,7 @@ class Gaze(Term):
     axis: Vector = field(metadata=about("direction of view, in the frame", direction=True))
     angle: float = field(
         default=0.5,
-        metadata=about(
-            "largest angle between the axis and the direction to the hit point", unit="rad", above=0
-        ),
+        metadata=about("largest angle of the hit point to the axis", unit="rad", above=0),
     )
     since: float = field(default=0.5, metadata=about("share of the swing after which it holds", least=0))
 

@@ -41,7 +41,7 @@ class GearLoad(Term):
         default=None,
         metadata=about(
             "largest load over the torque limit, of all or by joint; left out: the gear's "
-            "momentary peak where `[[robot.actuators]]` has it, else 2",
+            "momentary peak, or 2",
             above=0,
             by_joint=True,
         ),

@@ -26,15 +26,15 @@ class GroundForce(Term):
     unit: ClassVar[str] = "of weight"
     least: float = field(
         default=0.5,
-        metadata=about("least normal force of all soles, as a share of the weight", least=0, most=0.9),
+        metadata=about("least normal force of all soles over the weight", least=0, most=0.9),
     )
     most: float = field(
         default=1.7,
-        metadata=about("largest normal force of all soles, as a share of the weight", least=1.1),
+        metadata=about("largest normal force of all soles over the weight", least=1.1),
     )
     sole: float = field(
         default=0.2,
-        metadata=about("least normal force of each sole, as a share of the weight", least=0, most=0.45),
+        metadata=about("least normal force of each sole over the weight", least=0, most=0.45),
     )
 
     enabled: bool = field(default=True, metadata=about("false: soles may be unloaded, and land hard"))

@@ -28,13 +28,11 @@ class HandOrientation(Term):
     direction: Vector | None = field(
         default=None,
         metadata=about(
-            "where the axis points at contact, in the world frame; left out: the normal",
+            "its direction at contact, in the world frame; left out: the normal",
             direction=True,
         ),
     )
-    angle: float = field(
-        default=0.2, metadata=about("largest angle between the axis and that direction", unit="rad", above=0)
-    )
+    angle: float = field(default=0.2, metadata=about("largest angle between the two", unit="rad", above=0))
 
     def __post_init__(self) -> None:
         self.check_angle()

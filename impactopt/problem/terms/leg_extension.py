@@ -24,7 +24,7 @@ class LegExtension(Term):
     minimum: float = field(
         default=0.35,
         metadata=about(
-            "least determinant of the leg's Jacobian over that of the start posture; 0: a straight knee",
+            "least determinant of the leg's Jacobian over that at the start",
             least=0,
             most=1,
         ),

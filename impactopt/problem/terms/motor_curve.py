@@ -32,9 +32,7 @@ class MotorCurve(Term):
     unit: ClassVar[str] = "of the line"
     needs_torques: ClassVar[bool] = True
     of_drives: ClassVar[bool] = True
-    fraction: float = field(
-        default=1.0, metadata=about("share of the line that may be used", above=0, most=1)
-    )
+    fraction: float = field(default=1.0, metadata=about("share of the line", above=0, most=1))
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"motor_speed": BlockRecipe(lambda: motor_speed(coordinates))}

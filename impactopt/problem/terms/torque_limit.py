@@ -17,8 +17,6 @@ class TorqueLimit(Term):
     unit: ClassVar[str] = "of limit"
     fraction: float = field(
         default=0.85,
-        metadata=about("share of the limit that may be used in swing and follow-through", above=0, most=1),
+        metadata=about("share of the limit in swing and follow-through", above=0, most=1),
     )
-    collision: float = field(
-        default=0.85, metadata=about("share of the limit that may be used in contact", above=0, most=1)
-    )
+    collision: float = field(default=0.85, metadata=about("share of the limit in contact", above=0, most=1))

@@ -18,6 +18,4 @@ class VelocityLimit(Term):
 
     name: ClassVar[str] = "velocity limit"
     unit: ClassVar[str] = "of limit"
-    fraction: float = field(
-        default=0.95, metadata=about("share of the limit that may be used", above=0, most=1)
-    )
+    fraction: float = field(default=0.95, metadata=about("share of the limit", above=0, most=1))

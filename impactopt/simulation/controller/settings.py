@@ -65,7 +65,7 @@ class ControllerSettings(Described):
     recovery_margin: float = field(
         default=0.1,
         metadata=about(
-            "distance of the centre of mass to the soles' edges after it, if they have as much",
+            "margin of the centre of mass in the soles after it, if they have as much",
             unit="m",
             least=0,
             most=1,
@@ -90,9 +90,7 @@ class ControllerSettings(Described):
     )
     sole_bandwidth: float = field(
         default=25.0,
-        metadata=about(
-            "bandwidth of the feedback that keeps the soles flat", unit="rad/s", least=0, most=1000
-        ),
+        metadata=about("bandwidth of keeping the soles flat", unit="rad/s", least=0, most=1000),
     )
     blow: float = field(default=1000.0, metadata=_weight("torques in contact, against the plan's servos"))
     capture_gain: float = field(

@@ -102,7 +102,7 @@ defaults. In parentheses below: what is permitted, and the default.
 
 ```sh
 impactopt new                                 # lists the problems that come with the package
-impactopt new punch > my.toml                 # copies one, with a comment to each key, and the other keys
+impactopt new punch > my.toml                 # copies one, with all keys and comments
 impactopt check my.toml                       # names all mistakes
 impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit may be left out
 ```

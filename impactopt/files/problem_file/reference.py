@@ -102,7 +102,7 @@ defaults. In parentheses below: what is permitted, and the default.
 
 ```sh
 impactopt new                                 # lists the problems that come with the package
-impactopt new punch > my.toml                 # copies one, with a comment to each key, and the other keys
+impactopt new punch > my.toml                 # copies one, with all keys and comments
 impactopt check my.toml                       # names all mistakes
 impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit may be left out
 ```
@@ -116,10 +116,8 @@ without defaults, unless the problem has functions or models made in Python.
 
 ## Limits
 
-Larger values are refused before work starts.
+Larger values are refused before work starts:
 
-| | at most |
-|---|---|
 {limits}
 
 This page is made by `impactopt new --reference`.
@@ -146,7 +144,7 @@ _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "tex
 
 def reference() -> str:
     """The page, in Markdown."""
-    limits = "\n".join(f"| {' | '.join(row)} |" for row in _LIMITS)
+    limits = "\n".join(f"* {what}: {most}" for what, most in _LIMITS)
     parts = [_INTRODUCTION.replace("{limits}", limits)]
     seen: dict[tuple[str, ...], str] = {}
     several: dict[str, Mapping[str, type[Section]]] = {"target": TARGETS, "contact": LAWS}
@@ -229,7 +227,7 @@ def _allowed(info: FieldInfo, defaulted: bool = False) -> str:
         return ", ".join(f"`{_show(choice)}`" for choice in get_args(info.annotation))
     if info.annotation in _TYPES:
         limits = range_of(info).removesuffix(f" and <= {MOST:g}")
-        if defaulted and not info.is_required() and not limits and info.annotation is not int:
+        if defaulted and not info.is_required() and not limits:
             return ""
         limits = re.sub(r"^>= (\S+) and <= (\S+)$", r"\1 to \2", limits)
         return (
@@ -247,7 +245,7 @@ def _allowed(info: FieldInfo, defaulted: bool = False) -> str:
 
 
 def _sentence(text: str) -> str:
-    words = text.split("\n")[0].rstrip(".").removeprefix("A ")
+    words = text.split("\n")[0].rstrip(".").removeprefix("A ").replace("number >", ">")
     return words[0].lower() + words[1:]
 
 

@@ -206,7 +206,7 @@ class ProblemSection(Section):
     """The robot, its striker, and where it hits."""
 
     name: str = optional("what reports call the problem")
-    robot: Preset = optional("see `impactopt robots`; or there is a section [robot]")
+    robot: Preset = optional("see `impactopt robots`; else a section [robot]")
     striker: str = required("the robot's striker")
     point: Vector = required("hit point: x forward, y left, z up from the ground [m]", "point_m")
     normal: UnitVector = required("direction in which the target is pushed")

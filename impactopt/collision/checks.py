@@ -119,7 +119,7 @@ def spoiled(frozen: dict[str, Array]) -> Any:
     bad = ~(frozen["pivots"] > LEAST_PIVOT).all(axis=1)
     bad |= ~(frozen["freedom"][:, 0] > LEAST_PIVOT) & (frozen["m"][:, 0] != 0)
     for name in {*frozen} - {"pivots", "freedom"}:
-        bad |= ~np.isfinite(frozen[name]).reshape(len(bad), -1).all(axis=1)
+        bad |= ~np.isfinite(frozen[name]).all(axis=1)
     return bad
 
 
@@ -315,11 +315,11 @@ class Stability:
         inputs = (given["q"], np.zeros((1, collision.robot.nv)), given["normal"], np.zeros((1, 2)))
         columns = [np.broadcast_to(x, (count, x.shape[1])).T for x in inputs]
         found = self._freeze.map(count).call([ca.DM(x) for x in columns])
-        frozen = {
-            name: np.array(x).reshape(x.shape[0], count, x.shape[1] // count).swapaxes(0, 1)
-            for name, x in zip(self._freeze.name_out(), found, strict=True)
-        }
-        frozen = {name: x[..., 0] if x.shape[2] == 1 else x for name, x in frozen.items()}
+        frozen: dict[str, Array] = {}
+        for name, x in zip(self._freeze.name_out(), found, strict=True):
+            rows, columns = x.shape[0], x.shape[1] // count
+            each = np.array(x).reshape(rows, count, columns).swapaxes(0, 1)
+            frozen[name] = each.reshape(count, rows * columns)
         data: dict[str, Any] = frozen | {name: given[name] for name in collision.settings}
         own = {name: x for name, x in data.items() if name in self._model.data}
         own |= {name: np.zeros((1, *shape)) for name, shape in self._model.data.items() if name not in own}

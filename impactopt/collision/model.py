@@ -228,7 +228,7 @@ class JointSpaceModel:
         force = self.law.force(self.part(y, "penetration"), 0.0, self.law_numbers(data))
         hand = -data["m"] * force
         if self.slides:
-            friction = self.friction_on_target(data["point_velocity"], force, data)
+            friction = self.friction_on_target(self.point_velocity(y, data), force, data)
             hand -= ca.mtimes(ca.mtimes(data["normal"].T, data["m_point"]), friction)
         if self.n:
             tau = self.saturate(self.with_feedforward(self.servo(y, u, data), data), data)

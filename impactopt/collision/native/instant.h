@@ -133,25 +133,21 @@ INLINE void torques(const Data *d, Instant *now) {
 #endif
 }
 
-#if SLIDES
-/* friction on the target (3) of a striking point with a velocity (3), under a contact force: see contact/friction.py */
-INLINE void friction_on_target(const Data *d, const double *velocity, double force, double *out) {
-  double along = 0.0, square = d->slip_speed * d->slip_speed, slide[3];
-  FOR(k, 3) along += d->normal[k] * velocity[k];
-  FOR(k, 3) slide[k] = velocity[k] - d->normal[k] * along, square += slide[k] * slide[k];
-  const double scale = force * d->coefficient / sqrt(square);
-  FOR(k, 3) out[k] = scale * slide[k];
-}
+/* friction on the target (3) at a state, under a contact force: see contact/friction.py; without, nothing is set */
 INLINE void friction_at(const Data *d, const State *y, double force, double *out) {
+#if SLIDES
   const Frozen *F = d->frozen;
-  double velocity[3];
+  double velocity[3], along = 0.0, square = d->slip_speed * d->slip_speed, slide[3];
   FOR(k, 3) {
     velocity[k] = d->point_velocity[k] + F->e_point[k] * y->time + dot(F->of_point[k], y->torque, V);
     FOR(l, 3) velocity[k] -= F->m_point[k][l] * (d->normal[l] * y->impulse + y->sliding[l]);
   }
-  friction_on_target(d, velocity, force, out);
-}
+  FOR(k, 3) along += d->normal[k] * velocity[k];
+  FOR(k, 3) slide[k] = velocity[k] - d->normal[k] * along, square += slide[k] * slide[k];
+  const double scale = force * d->coefficient / sqrt(square);
+  FOR(k, 3) out[k] = scale * slide[k];
 #endif
+}
 
 /* velocities, rate of penetration and servo at a state */
 INLINE void look(const Data *d, const State *y, Instant *now) {
@@ -190,12 +186,8 @@ static int closing(const Data *d, const State *y, const Instant *now) {
   target_rates(in, out, 0, 0, 0);
   FOR(i, NZ) then[i] = y->target[i] + 1e-9 * rates[i];
   const double gained = (call(target_velocity, then, d->target, 0) - now->target_speed) / 1e-9;
-#if SLIDES
   double friction[3];
   friction_at(d, y, force, friction);
-#else
-  const double *friction = 0;
-#endif
   return velocity(d, now->net, force, friction, 1.0, u) > gained;
 }
 

@@ -65,12 +65,8 @@ static void write_column(const Data *d, const State *y, const Instant *now, cons
 #endif
 #if HELD_HISTORY
   vec held[VC];
-#if SLIDES
   double friction[3];
   friction_at(d, y, force, friction);
-#else
-  const double *friction = 0;
-#endif
   wrench_of(d->frozen, (const double *)now->net, force, friction, 1.0, held);
   const double *w = (const double *)held;
 #ifdef OUT_sole_wrench

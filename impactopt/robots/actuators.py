@@ -90,7 +90,7 @@ class Actuator(Described):
     bandwidth: float | None = field(
         default=None,
         metadata=about(
-            "bandwidth of the motor's torque, a lag of first order",
+            "bandwidth of the motor's torque, a lag of first order; left out: no lag",
             unit="Hz",
             above=0,
             most=FASTEST,

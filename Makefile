@@ -51,7 +51,7 @@ $(STAMP): pyproject.toml $(LEAN)
 
 demo: $(LEAN) ## plan a TALOS punch, replay it in full dynamics, put pictures and numbers in results/punch
 	@echo "== planning a punch (the first run compiles the robot's functions)"
-	@$(BIN)/impactopt solve problems/punch.toml --out results/punch --baseline $(ARGS)
+	@$(BIN)/impactopt solve problems/punch.toml --out results/punch --baseline --workers 2 $(ARGS)
 
 # Only tests open pages in a browser.
 $(BROWSER): $(STAMP)

@@ -48,10 +48,6 @@ from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
     from impactopt.files.output import Record
-    from impactopt.files.problem_file import ProblemFile
-    from impactopt.planning.solution import Solution
-    from impactopt.problem.problem import ImpactProblem
-    from impactopt.report.console import SolveConsole
 
 __all__ = ["app", "main"]
 
@@ -134,13 +130,13 @@ def solve(
     """
     said = "interrupted before there was a plan to keep"
     with plain_errors(said, verbose=verbose, keeps=True) as console:
+        from impactopt.cli.replays import compared_record
         from impactopt.errors import printable
         from impactopt.files.output import keep_record, make_directory, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.solution_library import SolvedFolder
         from impactopt.planning.solve import solve as plan
         from impactopt.report.console import SolveConsole
-        from impactopt.solvers.program import Status
 
         check_time_limit(time_limit)
         check_loudness(quiet, verbose)
@@ -151,8 +147,9 @@ def solve(
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
             progress.say("building the program (compiles for some ten seconds the first time)")
-            chosen |= {"start": start.value, "starts": starts, "workers": workers, "seed": seed}
-            chosen |= {"report": progress.say, "callback": progress.iteration if workers == 1 else None}
+            processes = workers if starts > 1 else 1
+            chosen |= {"start": start.value, "starts": starts, "workers": processes, "seed": seed}
+            chosen |= {"report": progress.say, "callback": progress.iteration if processes == 1 else None}
             if store is None:
                 solution = plan(problem, **chosen)
             else:
@@ -163,11 +160,10 @@ def solve(
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
             if solution.caution:
                 progress.say(solution.caution)
-            record = _record(solution, read, validate, progress)
+            record = compared_record(
+                solution, read, progress, validate=validate, baseline=baseline, workers=workers
+            )
             record.summary.update(command=command_line(context), ok=solution.status.usable)
-            if baseline and solution.status is not Status.INTERRUPTED:
-                progress.say("looking for the hardest minimum-jerk reach")
-                record.summary["baseline"] = _baseline(problem, progress)
             written = [*keep_record(record, directory)]
         _show(record, as_json, solution.status.usable)
         from impactopt.report.pictures import save_pictures  # matplotlib only now
@@ -246,57 +242,6 @@ app.command(epilog=examples("impactopt problems --json"))(problems)
 app.command(epilog=examples("impactopt robots --json"))(robots)
 for _registered in app.registered_commands:
     _registered.cls = PlainCommand
-
-
-def _record(solution: Solution, read: ProblemFile, validate: bool, progress: SolveConsole) -> Record:
-    """The solution as numbers, with its re-simulations where there is something to simulate."""
-    from impactopt.errors import InputError
-    from impactopt.files.output import record_of
-    from impactopt.files.replay import has_mujoco
-    from impactopt.planning.budget import VIOLATED
-    from impactopt.solvers.program import Status
-
-    done, violation = {}, solution.result.max_violation
-    engines = {
-        "pinocchio": "in full dynamics",
-        "mujoco": "on free soles" if solution.problem.soles else "in MuJoCo",
-    }
-    if validate and solution.status is Status.INTERRUPTED:
-        progress.say("no replay of what was interrupted; `impactopt validate` does it")
-    elif validate and not violation <= VIOLATED:
-        progress.say(f"no replay: what meets its constraints only to {violation:.2g} is no plan")
-    elif validate:
-        for engine, how in engines.items():
-            if engine == "mujoco" and not has_mujoco():
-                continue
-            progress.say(f"replaying the plan {how}")
-            try:
-                done[engine] = solution.validate(engine=engine)
-            except KeyboardInterrupt:
-                progress.say("the replay was interrupted; the plan is kept without it")
-                break
-            except InputError as error:
-                progress.say(f"the plan is kept without a replay {how}: {error}")
-    return record_of(
-        solution,
-        simulation=done.get("pinocchio"),
-        replay=done.get("mujoco"),
-        problem=read.text,
-        problem_path=read.path,
-    )
-
-
-def _baseline(problem: ImpactProblem, progress: SolveConsole) -> dict[str, object]:
-    from impactopt.errors import InputError
-    from impactopt.planning.minimum_jerk import minimum_jerk_baseline
-
-    try:
-        return minimum_jerk_baseline(problem).describe()
-    except InputError as error:
-        return {"method": "minimum jerk", "error": str(error)}
-    except KeyboardInterrupt:
-        progress.say("interrupted; the plan is kept without a baseline")
-        return {"method": "minimum jerk", "error": "interrupted"}
 
 
 def _show(record: Record, as_json: bool, ok: bool) -> None:

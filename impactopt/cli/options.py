@@ -119,7 +119,7 @@ Starts = Annotated[
     int, typer.Option(min=1, help="Multistart: number of starts, all but the first drawn; the best is kept.")
 ]
 Workers = Annotated[
-    int, typer.Option(min=1, help="Processes that solve the starts side by side; progress is told by start.")
+    int, typer.Option(min=1, help="Processes for what can be done side by side: starts, replays, a baseline.")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the starts that are drawn.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")]

@@ -81,7 +81,7 @@ def planner(monkeypatch: pytest.MonkeyPatch, problem: ImpactProblem) -> Planner:
     """No solver and no big robot: files are read, but the problem is a small one."""
     planner = Planner()
     monkeypatch.setattr("impactopt.planning.solve.solve", planner)
-    monkeypatch.setattr("impactopt.files.replay.has_mujoco", lambda: True)
+    monkeypatch.setattr("impactopt.cli.replays.has_mujoco", lambda: True)
     monkeypatch.setattr(ProblemFile, "build", lambda self: problem)
     return planner
 
@@ -182,7 +182,7 @@ def test_free_soles_have_a_column_where_mujoco_is_installed(
     assert "free soles" in out and "yes" in row
     summary = json.loads((tmp_path / "with" / "summary.json").read_text())
     assert summary["replayed"]["engine"] == "mujoco" and summary["simulated"]["engine"] == "pinocchio"
-    monkeypatch.setattr("impactopt.files.replay.has_mujoco", lambda: False)
+    monkeypatch.setattr("impactopt.cli.replays.has_mujoco", lambda: False)
     out, err = run("solve", file, "--out", tmp_path / "without")
     assert "free soles" not in out and "mujoco" not in (out + err).lower()
     assert "replayed" not in json.loads((tmp_path / "without" / "summary.json").read_text())
@@ -195,7 +195,7 @@ def test_the_baseline_is_reported_beside_the_plan(
         def describe(self) -> dict[str, object]:
             return {"method": "minimum jerk", "impulse_Ns": 1.5, "hand_speed_m_s": 0.4}
 
-    monkeypatch.setattr("impactopt.planning.minimum_jerk.minimum_jerk_baseline", lambda problem: Reach())
+    monkeypatch.setattr("impactopt.cli.replays.minimum_jerk_baseline", lambda problem: Reach())
     out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
     assert "hardest minimum-jerk reach: 1.50 N s at 0.40 m/s" in out
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["baseline"]["impulse_Ns"] == 1.5
@@ -203,9 +203,18 @@ def test_the_baseline_is_reported_beside_the_plan(
     def nothing(problem: ImpactProblem) -> Reach:
         raise impactopt.InputError("no reach keeps the limits")
 
-    monkeypatch.setattr("impactopt.planning.minimum_jerk.minimum_jerk_baseline", nothing)
+    monkeypatch.setattr("impactopt.cli.replays.minimum_jerk_baseline", nothing)
     out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
     assert "no reach keeps the limits" in out
+
+
+def test_replays_side_by_side_are_those_of_one_process(planner: Planner, file: Path, tmp_path: Path) -> None:
+    summaries = []
+    for workers in (1, 2):
+        run("solve", file, "--out", tmp_path / "out", "--workers", str(workers))
+        summaries.append(json.loads((tmp_path / "out" / "summary.json").read_text()))
+    for part in ("simulated", "replayed"):
+        assert summaries[0][part] == summaries[1][part]
 
 
 def test_the_files_solver_settings_reach_the_solver(planner: Planner, file: Path, tmp_path: Path) -> None:
@@ -328,9 +337,9 @@ def test_what_was_interrupted_gets_no_baseline_and_an_interrupted_baseline_keeps
     def reach(problem: ImpactProblem) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("impactopt.planning.minimum_jerk.minimum_jerk_baseline", reach)
+    monkeypatch.setattr("impactopt.cli.replays.minimum_jerk_baseline", reach)
     _, err = run("solve", file, "--out", tmp_path / "out", "--baseline")
-    assert "kept without a baseline" in err and load_record(tmp_path / "out").completed
+    assert "interrupted while looking for" in err and load_record(tmp_path / "out").completed
     planner.solution = {"status": Status.INTERRUPTED}
     _, err = run("solve", file, "--out", tmp_path / "cut", "--baseline", code=1)
     assert "baseline" not in err

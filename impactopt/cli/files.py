@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 class Motion(str, enum.Enum):
     punch = "punch"
     kick = "kick"
+    chop = "chop"
+    nail = "nail"
 
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -31,7 +31,8 @@ DRAWN, REFUSED = 600, 6000  # postures in which blows are estimated, and that ar
 TRIED = 8  # postures at the point of a problem
 NEARBY = 0.4  # [m] from a problem's point
 AHEAD = 0.25  # of the reach: a target stands so far ahead of the base at least
-NORMALS = tuple(np.array(n) for n in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)))
+DOWN = np.array([0.0, 0.0, -1.0])
+NORMALS = (*map(np.array, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0))), DOWN)
 PRESSED = 1e-3  # [m] at which a law's stiffness is read
 
 

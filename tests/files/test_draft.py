@@ -14,8 +14,9 @@ import pytest
 from support import urdfs
 from typer.testing import CliRunner
 
-from impactopt import Robot, Tool, optimize_strike, solve
+from impactopt import Board, Nail, Robot, Tool, optimize_strike, solve
 from impactopt.cli.app import app
+from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
@@ -63,10 +64,29 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
         (urdfs.arm(), "kick", "does not stand on legs"),
         (urdfs.biped(arms=False), "punch", "no limb beside the legs"),
         (urdfs.biped(legs=5, arms=False), None, "would swing on its hinge"),
-        (urdfs.arm(), "slap", "give punch or kick"),
+        (urdfs.biped(arms=False), "nail", "no limb beside the legs to nail with"),
+        (urdfs.arm(), "slap", "give punch, kick, chop or nail"),
     ):
         with pytest.raises(InputError, match=why):
             _drafted(tmp_path, text, motion=motion)
+
+
+@pytest.mark.parametrize("text", [urdfs.arm(), urdfs.biped()], ids=["arm", "biped"])
+@pytest.mark.parametrize(("motion", "kind"), [("chop", Board), ("nail", Nail)])
+def test_boards_and_nails_are_hit_from_above(
+    tmp_path: Path, text: str, motion: str, kind: type[Target]
+) -> None:
+    """From a start above them, and a biped with the side of its hand that is below then."""
+    problem = _problem(tmp_path, text, motion=motion)
+    robot, q = problem.robot, problem.start_posture
+    assert isinstance(problem.target, kind) and not hopeless(problem)
+    assert problem.normal.tolist() == [0.0, 0.0, -1.0]
+    data, frame = robot.model.createData(), robot.model.getFrameId(f"striker:{problem.striker}")
+    pin.framesForwardKinematics(robot.model, data, q)
+    assert data.oMf[frame].translation[2] > problem.point[2] + 0.05
+    if robot.soles:
+        assert problem.striker == "right_edge"
+    assert optimize_strike(problem).status.usable
 
 
 @pytest.mark.parametrize("behind", [False, True], ids=["ahead", "behind"])

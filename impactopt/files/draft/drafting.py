@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,16 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.contact.laws import SpringDamper
-from impactopt.contact.targets import FreeMass
+from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.default_drives import DOUBT
-from impactopt.files.draft.limbs import renumbered
+from impactopt.files.draft.hits import Hit, hits
+from impactopt.files.draft.limbs import Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
-from impactopt.files.draft.strikers import find_striker
-from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest
+from impactopt.files.draft.strikers import find_edge, find_striker
+from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest, touches
 from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
@@ -31,9 +32,11 @@ from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.files.problem_file.writing import sole_data, striker_data
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
+from impactopt.planning.strike import optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import far_shapes
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.strength import DOWN
 from impactopt.robots.attachments import Sole, Striker
 from impactopt.robots.build import default_kd, default_kp
 from impactopt.robots.checks import REPAIRED
@@ -44,11 +47,15 @@ __all__ = ["Draft", "draft_problem"]
 
 Array = NDArray[np.float64]
 TRIED = 8  # targets
-STIFFNESS, DAMPING = 1e4, 300.0  # [N/m], [N s/m] of a drafted contact
 SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # [s] of fast robots
 SHIFT = (0.6, 1.2)  # [s] from two feet to one, and back
 START = "ready"
-MOTIONS = ("punch", "kick")
+FROM_ABOVE = ("chop", "nail")
+MOTIONS = ("punch", "kick", *FROM_ABOVE)
+EDGEWISE = (
+    "no strike with the striking link's face to the target is found: [terms.first_touch] is off, so another "
+    "part of the link may touch first"
+)
 TOE = 0.02  # [m] of the point of a toe above the sole
 BALL = 0.22  # [m]
 KICKS = (0.3, 0.2, 0.4)  # of the hip's height: how far ahead the ball lies
@@ -75,7 +82,8 @@ def draft_problem(
     """The text of a problem file for the robot of a URDF, or an MJCF.
 
     folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.  motion :
-    "punch" or "kick"; None: a robot on legs kicks where it has no arm to strike with.  planned : the whole
+    "punch", "kick", "chop" (a board, from above) or "nail" (with the fist, from above); None: a robot on
+    legs kicks where it has no arm to strike with, others punch.  planned : the whole
     motion to a bolted arm's blow is solved, too, and the next blow taken where there is none.
     report : is told what is done.
 
@@ -85,7 +93,7 @@ def draft_problem(
         posture or no target is found; an unknown motion, or a kick of a robot without legs.
     """
     if motion not in (None, *MOTIONS):
-        raise InputError(f"motion: {motion!r}; give {' or '.join(MOTIONS)}")
+        raise InputError(f"motion: {motion!r}; give {', '.join(MOTIONS[:-1])} or {MOTIONS[-1]}")
     say = report or (lambda text: None)
     say("reading the robot and the shapes of its links")
     drafted = draft_robot(path, mjcf=mjcf, bolted=bolted)
@@ -96,10 +104,13 @@ def draft_problem(
     if motion == "kick" and not soles:
         raise InputError(f"{path}: it does not stand on legs, so it cannot kick")
     arms, strikers = _arms(drafted)
-    if motion == "punch" and not arms:
-        raise InputError(f"{path}: there is no limb beside the legs to punch with; let it kick")
+    if motion not in (None, "kick") and not arms:
+        raise InputError(f"{path}: there is no limb beside the legs to {motion} with; let it kick")
     if soles and (motion == "kick" or not arms):
         return _kick(drafted, soles, strikers, forward, folder)
+    if soles and motion in FROM_ABOVE:
+        say(f"{drafted.robot.name}: {drafted.robot.n} joints, on two legs; looking for a blow from above")
+        return _stroke(drafted, soles, strikers, arms[0], forward, motion, folder, say)
     robot = drafted.made(soles=soles, strikers=strikers)
     legs = tuple(renumbered(leg, model, robot.model) for leg in drafted.legs)
     arms = [replace(arm, limb=renumbered(arm.limb, model, robot.model)) for arm in arms]
@@ -111,36 +122,31 @@ def draft_problem(
     else:
         say(f"{robot.name}: {robot.n} joints, on a fixed base; trying blows (compiles the first time)")
         q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
-        strong = _strong(robot, arms[0], q)
-    edgewise = not strong and not soles
-    if edgewise:  # an arm of few joints cannot turn the link's face to where it moves
-        strong = _strong(robot, arms[0], q, with_face=False)
+        # last edgewise: an arm of few joints cannot turn the link's face to where it moves
+        for edgewise, hit in product((False, True), hits(motion, robot)):
+            strong = strongest(robot, arms[0], q, hit, with_face=not edgewise)
+            if strong:
+                break
     if strong:
-        tries = [_struck(drafted, robot, strikers, arms[0], blow, edgewise, folder) for blow in strong]
+        tries = [_struck(drafted, robot, strikers, arms[0], blow, hit, edgewise, folder) for blow in strong]
         taken = _planned(tries, folder, say) if planned else 0
         data = tries[taken or 0]
         said.append(_strike_message(strong[taken or 0], found=taken is not None, tried=planned))
         if edgewise:
-            said.append(
-                "no strike with the striking link's face to the target is found: [terms.first_touch] is off, "
-                "so another part of the link may touch first"
-            )
+            said.append(EDGEWISE)
     else:
+        bolted_ways = [tuple(DOWN)] if motion in FROM_ABOVE else WAYS
         try:
-            q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
+            q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else bolted_ways)
         except InputError:
             if not soles or motion == "punch":
                 raise
             return _kick(drafted, soles, strikers, forward, folder)
-        data = _data(drafted, robot, soles, strikers, q, folder)
+        if not soles:
+            said.append("none of the strikes tried is solved: move the target, or give an easier one")
+        data = {**_data(drafted, robot, soles, strikers, q, folder), **hits(motion, robot)[-1].data}
         data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
     return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
-
-
-def _strong(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True) -> list[Strong]:
-    """The hardest blows that are found for an arm on a fixed base."""
-    law, target = SpringDamper(stiffness=STIFFNESS, damping=DAMPING), FreeMass(mass=_target_mass(robot))
-    return strongest(robot, arm, q, with_face=with_face, law=law, target=target)
 
 
 def _struck(
@@ -149,17 +155,77 @@ def _struck(
     strikers: list[Striker],
     arm: Arm,
     strong: Strong,
+    hit: Hit,
     edgewise: bool,
     folder: Path,
 ) -> dict[str, Any]:
     """The data of a blow of a bolted arm."""
-    data = _data(drafted, robot, [], strikers, strong.start, folder)
+    data = {**_data(drafted, robot, [], strikers, strong.start, folder), **hit.data}
     way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
     for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
         data[phase]["duration_s"] = duration(robot, way, usual)
-    if edgewise:
-        data["terms"] = {"first_touch": {"enabled": False}}
+    data = _edgewise(data) if edgewise else data
     return _aimed(data, arm.name, iter([strong.point]), strong.normal, folder)
+
+
+def _stroke(
+    drafted: Drafted,
+    soles: list[Sole],
+    strikers: list[Striker],
+    arm: Arm,
+    forward: Array,
+    motion: str,
+    folder: Path,
+    say: Callable[[str], None],
+) -> Draft:
+    """A draft of a blow from above by a robot on its legs, with the side of the hand that is below.
+
+    Raises
+    ------
+    InputError : the hand has no shape; no posture or no target is found.
+    """
+
+    def found(robot: Robot) -> tuple[Limb, Array]:
+        legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
+        return renumbered(arm.limb, drafted.robot.model, robot.model), half_sitting(
+            robot, legs, soles, forward
+        )
+
+    robot = drafted.made(soles=soles, strikers=strikers)
+    limb, q = found(robot)
+    q, _ = ready(robot, [replace(arm, limb=limb)], q, ways=WAYS[:1])
+    name = arm.name.removesuffix("hand") + "edge"
+    edge, below = find_edge(robot.model, limb, name, bodies_of(robot).of_joint, arm.axis, q)
+    strikers = [*strikers, edge]
+    robot = drafted.made(soles=soles, strikers=strikers)
+    limb, q = found(robot)
+    arm = Arm(limb=limb, name=name, axis=below)
+    q, way = ready(robot, [arm], q, ways=[tuple(DOWN)])
+    data: dict[str, Any] = {}
+    said: list[str] = []
+    for k, (hit, edgewise) in enumerate(product(hits(motion, robot), (False, True)), start=1):
+        say(f"trying blow {k}")
+        if not edgewise:
+            data = {**_data(drafted, robot, soles, strikers, q, folder), **hit.data}
+            data = _aimed(data, name, aims(robot, arm, q, way), way, folder)
+        tried = _edgewise(data) if edgewise else data
+        if _strikes(tried, folder):
+            data, said = tried, [EDGEWISE] if edgewise else []
+            break
+    return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
+
+
+def _edgewise(data: dict[str, Any]) -> dict[str, Any]:
+    """The data where any part of the striking link may touch first."""
+    return {**data, "terms": {**data.get("terms", {}), "first_touch": {"enabled": False}}}
+
+
+def _strikes(data: dict[str, Any], folder: Path) -> bool:
+    """True if the strike of drafted data is solved."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the draft is only tried
+        options = {"max_iterations": ITERATIONS}
+        return optimize_strike(_built(data, folder), options=options, time_limit=SECONDS).status.usable
 
 
 def _kick(
@@ -200,7 +266,7 @@ def _kick(
     both = {"soles": [sole.name for sole in soles], "duration_s": list(SHIFT), "intervals": 8, "grading": 1.0}
     data["stances"] = [both, {"soles": [stands.name]}, both]
     data["target"] = {"mass_kg": mass, "body": {"shape": "ball", "size_m": [size]}}
-    data["contact"] = {"stiffness_N_m": 2 * STIFFNESS, "damping_N_s_m": 20.0}
+    data["contact"] = {"stiffness_N_m": 2e4, "damping_N_s_m": 20.0}
     points = (np.round([part * length, at[1], size / 2], 3) + 0.0 for part in KICKS)
     data = _aimed(data, toe.name, points, np.array(WAYS[0]), folder)
     return Draft(text=_text(data, drafted, robot), said=tuple(_said(data, drafted, robot)))
@@ -229,13 +295,8 @@ def _strike_message(strong: Strong, *, tried: bool, found: bool) -> str:
     none = "; no whole motion to it, or to another one, was found" if not found else ""
     return (
         f"the drafted blow, along [{normal}], is the hardest of the strikes tried{ends}: "
-        f"{strong.impulse:.3g} N s{none}"
+        f"{strong.objective:.3g} {strong.unit}{none}"
     )
-
-
-def _target_mass(robot: Robot) -> float:
-    mass = sum(float(body.mass) for body in robot.model.inertias)
-    return float(f"{np.clip(0.06 * mass, 0.5, 5.0):.1g}")
 
 
 def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
@@ -280,8 +341,7 @@ def _data(
     data: dict[str, Any] = {
         "problem": {"name": f"first strike of {robot.name}", "start": START},
         "robot": keys,
-        "target": {"mass_kg": _target_mass(robot)},
-        "contact": {"stiffness_N_m": STIFFNESS, "damping_N_s_m": DAMPING},
+        **hits(None, robot)[0].data,
         "swing": {"duration_s": list(SWING), "intervals": 16 if soles else 12},
         "follow": {"duration_s": list(FOLLOW), "intervals": 14 if soles else 10},
     }
@@ -316,7 +376,10 @@ def _aimed(
         problem = {"striker": striker, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
         aimed = {**data, "problem": {"name": data["problem"]["name"], **problem, "start": START}}
         try:
-            wrong = hopeless(_built(aimed, folder))
+            built = _built(aimed, folder)
+            wrong = hopeless(built)
+            if not wrong and touches(built, built.start_posture):
+                wrong = ["bodies touch at the start"]
         except InputError as error:
             wrong = [str(error)]
         if not wrong:

@@ -10,10 +10,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece, inertia_box, is_far
+from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb
 from impactopt.robots.attachments import Striker
 
-__all__ = ["find_striker", "first_link"]
+__all__ = ["find_edge", "find_striker", "first_link"]
 
 Array = NDArray[np.float64]
 # the conventions of ROS-Industrial (tool0), of makers and of MuJoCo's menagerie (sites), the surest first
@@ -28,6 +29,7 @@ _TOOLS = tuple(
 )
 APART = 0.01  # [m] two places are apart, and a shape's middle is ahead of its joint
 SHORT = 0.06  # [m] a link so short at most, as a flange is, never folds back over the link before it
+EDGE = 5e-3  # [m] above its lowest point: what of a hand is its edge
 LONG = 0.12  # [m] a hand sticks out so far from a tool's frame at least
 ROLLS = np.cos(np.radians(25))  # least cosine between a joint's axis and what turns about it
 STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
@@ -64,6 +66,33 @@ def find_striker(
     everything = np.concatenate([*points, np.array(frames).reshape(-1, 3)])
     point = axis * max(float((everything @ axis).max()), 0.0)
     return Striker(name=name, frame=parent, point=np.round(above.actInv(point), 4) + 0.0), axis
+
+
+def find_edge(
+    model: pin.Model, limb: Limb, name: str, pieces: Mapping[int, tuple[Piece, ...]], axis: Array, q: Array
+) -> tuple[Striker, Array]:
+    """The side of a limb's last link that is below in a configuration (nq,), and its direction (3,), in the
+    joint's frame.
+
+    axis (3,) : in which the link points; the direction is square to it.
+
+    Raises
+    ------
+    InputError : the link has no shape.
+    """
+    points = [p.vertices for p in pieces.get(limb.tip, ())]
+    if not points:
+        raise InputError(f"the link of {model.names[limb.tip]} has no shape, so no edge to strike with")
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    below = -np.array(data.oMi[limb.tip].rotation)[2]
+    below = _straightened(below - (below @ axis) * axis)
+    vertices = np.concatenate(points)
+    deep = vertices @ below
+    edge = vertices[deep > deep.max() - EDGE].mean(axis=0)
+    edge += (deep.max() - edge @ below) * below
+    parent, above = first_link(model, limb.tip)
+    return Striker(name=name, frame=parent, point=np.round(above.actInv(edge), 4) + 0.0), below
 
 
 def first_link(model: pin.Model, joint: int) -> tuple[str, pin.SE3]:
@@ -107,6 +136,12 @@ def _axis(
     backwards = float(axis @ away) < -STRAIGHT
     if backwards and (size < SHORT or abs(float(axis @ turns)) > ROLLS):
         axis = -axis  # the link ends at its joint, and its shapes are behind that
+    return _straightened(axis)
+
+
+def _straightened(axis: Array) -> Array:
+    """The unit vector (3,) along an axis of the frame, where that is near."""
+    axis = axis / np.linalg.norm(axis)
     k = int(np.argmax(np.abs(axis)))
     return np.eye(3)[k] * np.sign(axis[k]) if abs(axis[k]) > STRAIGHT else np.asarray(axis)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Places
 from impactopt.errors import InputError
+from impactopt.files.draft.hits import Hit
 from impactopt.files.draft.target_placement import LOWEST, Arm
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.kinematics.stance import FixedBase
@@ -23,7 +24,7 @@ from impactopt.problem.strength import Blow, Strength, drawn_blows
 from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 
-__all__ = ["ITERATIONS", "SECONDS", "Strong", "duration", "strongest"]
+__all__ = ["ITERATIONS", "SECONDS", "Strong", "duration", "strongest", "touches"]
 
 Array = NDArray[np.float64]
 STRIKES, LOOKED_AT = 4, 60  # blows that are solved as strikes; estimated ones that are looked at for them
@@ -39,28 +40,30 @@ ITERATIONS, SECONDS = 150, 30.0  # of a strike, or a plan, that is tried: most a
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Strong:
-    """A drafted blow: configurations (nq,) to start from and at contact, point (3,) [m], normal (3,), and the
-    impulse of its strike [N s].
+    """A drafted blow: configurations (nq,) to start from and at contact, point (3,) [m], normal (3,), and
+    what its strike maximizes, with its unit.
     """
 
     start: Array
     contact: Array
     point: Array
     normal: Array
-    impulse: float
+    objective: float
+    unit: str
 
 
-def strongest(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True, **given: Any) -> list[Strong]:
+def strongest(robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = True) -> list[Strong]:
     """Strikes of the blows that are estimated best, the hardest first; none: check finds a fault with all of
     them, or none of the strikes is solved.
 
     q (nq,) : what does not strike stays as in it.  with_face : the link's face meets the target; else any
-    part of it may touch first.  given : law and target, as of `ImpactProblem`.
+    part of it may touch first.
     """
-    given["terms"] = () if with_face else (FirstTouch(enabled=False),)
-    strength = Strength(robot=robot, striker=arm.name, law=given["law"], target=given["target"])
+    given = {**hit.given, "terms": () if with_face else (FirstTouch(enabled=False),)}
+    strength = Strength(robot=robot, striker=arm.name, law=hit.law, target=hit.target)
     found = []
-    for problem, blow in _sound(robot, arm, drawn_blows(strength, q, with_face=with_face), given):
+    blows = drawn_blows(strength, q, hit.normals, with_face=with_face)
+    for problem, blow in _sound(robot, arm, blows, given):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
             solved = optimize_strike(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
@@ -71,10 +74,11 @@ def strongest(robot: Robot, arm: Arm, q: Array, *, with_face: bool = True, **giv
                     contact=blow.q,
                     point=problem.point,
                     normal=problem.normal,
-                    impulse=solved.impulse,
+                    objective=sum(solved.objectives.values()),
+                    unit=problem.objectives[0].unit,
                 )
             )
-    return sorted(found, key=lambda strong: -strong.impulse)
+    return sorted(found, key=lambda strong: -strong.objective)
 
 
 def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:
@@ -134,15 +138,15 @@ def _problem(
                 start=start,
                 **given,
             )
-            touches = _touches(problem, start, blow.q)
+            clear = not touches(problem, start, blow.q)
         except InputError:
             continue
-        if not touches and not hopeless(problem):
+        if clear and not hopeless(problem):
             return problem
     return None
 
 
-def _touches(problem: ImpactProblem, *postures: Array) -> bool:
+def touches(problem: ImpactProblem, *postures: Array) -> bool:
     """True if bodies touch in one of these configurations (nq,), before contact."""
     none: Array = np.zeros(len(postures))
     at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))

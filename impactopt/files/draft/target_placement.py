@@ -15,14 +15,18 @@ from impactopt.files.draft.postures import arm_length, bend_arm, shoulder
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.robots.robot import Robot
 
-__all__ = ["Arm", "aims", "ready"]
+__all__ = ["AHEAD", "WAYS", "Arm", "aims", "ready"]
 
 Array = NDArray[np.float64]
 WAYS = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))
 # of the arm's length, from the shoulder: where its end waits (ahead, below), and where it may hit (ahead)
 WAITS = ((0.4, 0.3), (0.45, 0.0), (0.35, 0.5), (0.5, -0.3))
+RAISED = ((0.45, 0.0), (0.4, -0.2), (0.5, 0.2))  # the same before a blow from above
 BENCH = 0.6  # [m] a shoulder as low as that belongs to an arm on the ground, whose end waits level with it
 HITS = (0.75, 0.65, 0.85, 0.55)
+FALLS = (0.45, 0.35, 0.55)  # of the arm's length, below the shoulder: where it may hit from above
+FARTHER = 0.2  # of the arm's length, at most, than where it waits
+AHEAD = np.array(WAYS[0])
 LOWEST = 0.25  # [m] above the ground
 NEAR = 0.03  # [m] off its place, as bent postures are preferred
 
@@ -34,6 +38,11 @@ class Arm:
     limb: Limb
     name: str
     axis: Array
+
+
+def _level(way: Array) -> Array:
+    """The way (3,) itself, or ahead where it is down."""
+    return AHEAD if way[2] else way
 
 
 def ready(
@@ -52,9 +61,10 @@ def ready(
         length = arm_length(robot, arm.limb, arm.name)
         root = shoulder(robot, arm.limb, q)
         best, off = q, np.inf
-        waits = WAITS if root[2] > BENCH else WAITS[1:]
-        for to, (ahead, below) in product(ways if k == 0 else [way], waits):
-            place = root + length * (ahead * np.array(to) - [0.0, 0.0, below])
+        low = WAITS if root[2] > BENCH else WAITS[1:]
+        tries = ways if k == 0 else [_level(way)]
+        for to, ahead, below in ((one, *wait) for one in tries for wait in (RAISED if one[2] else low)):
+            place = root + length * (ahead * _level(np.array(to)) - [0.0, 0.0, below])
             place[2] = max(place[2], LOWEST)
             tried, gap = bend_arm(robot, arm.limb, arm.name, arm.axis, q, place, np.array(to))
             if gap < off - NEAR:
@@ -76,9 +86,12 @@ def aims(robot: Robot, arm: Arm, q: Array, way: Array) -> Iterator[Array]:
     """Points (3,) [m] that the arm can hit from a configuration (nq,), the likeliest first."""
     start = striking_point(robot, arm.name, q)
     root, length = shoulder(robot, arm.limb, q), arm_length(robot, arm.limb, arm.name)
-    for height, hit in product((0.0, 0.5, 1.0), HITS):
+    for other, hit in product((0.0, 0.5, 1.0), FALLS if way[2] else HITS):
         point = start + way * ((root - start) @ way + hit * length)
-        point[2] += height * (max(root[2], LOWEST) - start[2])
+        if way[2]:
+            point += FARTHER * other * length * AHEAD
+        else:
+            point[2] += other * (max(root[2], LOWEST) - start[2])
         gap = bend_arm(robot, arm.limb, arm.name, arm.axis, q, point, way)[1]
         if gap < NEAR and (point - start) @ way > 0.1 * length:
             yield np.round(point, 3) + 0.0

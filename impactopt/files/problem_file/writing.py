@@ -12,6 +12,8 @@ import numpy as np
 
 from impactopt.bodies.world import TargetBody
 from impactopt.contact.fields import abouts
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_sections import RobotSection
@@ -47,7 +49,15 @@ from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.checks import GIVEN
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
-__all__ = ["problem_data", "robot_data", "sole_data", "striker_data", "write_problem"]
+__all__ = [
+    "law_data",
+    "problem_data",
+    "robot_data",
+    "sole_data",
+    "striker_data",
+    "target_data",
+    "write_problem",
+]
 
 BY_JOINT = {
     "armature": "armature_kg_m2",
@@ -266,8 +276,8 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
             **_different(ProblemSection, {"start": start}),
         },
         **({} if named else {"robot": robot}),
-        "target": _of_kind("target", problem.target, TARGETS, "kind"),
-        "contact": _of_kind("law", problem.law, LAWS, "law"),
+        "target": target_data(problem.target),
+        "contact": law_data(problem.law),
     }
     stance = problem.stance
     hands = {"hands": [hand.name for hand in held]} if (held := stance.held_hands(problem.robot)) else {}
@@ -321,6 +331,16 @@ def _parts(section: type[Section], things: Any) -> dict[str, Any]:
         name, part = kinds[type(thing)]
         out[name] = _section(part, thing)
     return {name: out[name] for name in section.model_fields if name in out}
+
+
+def target_data(target: Target) -> dict[str, Any]:
+    """A target as a problem file's section, without what is a default."""
+    return _of_kind("target", target, TARGETS, "kind")
+
+
+def law_data(law: ContactLaw) -> dict[str, Any]:
+    """A contact law as a problem file's section, without what is a default."""
+    return _of_kind("law", law, LAWS, "law")
 
 
 def _of_kind(what: str, thing: Any, kinds: Mapping[str, type[Section]], key: str) -> dict[str, Any]:

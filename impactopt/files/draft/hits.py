@@ -1,0 +1,86 @@
+"""Targets and contact laws of drafted blows with an arm: a free mass, a board, a nail."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.contact.fields import snake_case
+from impactopt.contact.laws import ContactLaw, KelvinVoigt, SpringDamper
+from impactopt.contact.targets import Board, FreeMass, Nail, Target
+from impactopt.files.problem_file.writing import law_data, target_data
+from impactopt.problem.objectives import Objective, PeakForce, TargetEnergy
+from impactopt.problem.strength import DOWN, NORMALS
+from impactopt.robots.robot import Robot
+
+__all__ = ["Hit", "hits"]
+
+Array = NDArray[np.float64]
+PART = 0.06  # of the robot's mass: a punched one
+FORCE = 30.0  # [N] for each kg of the robot's mass: what boards break at, and wood resists a nail with
+LEAST, MOST = 5.0, 600.0  # [N] of it
+SOFTER = (1.0, 0.5, 0.25)  # of it, where nothing is found for more
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hit:
+    """A target with its contact law; the normals (3,) along which it is hit; what is maximized, and the
+    bounds [s] of the contact's duration, where these are not the defaults.
+    """
+
+    law: ContactLaw
+    target: Target
+    normals: Sequence[Array]
+    objectives: tuple[Objective, ...] = ()
+    duration: tuple[float, float] | None = None
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Arguments of `ImpactProblem`."""
+        more: dict[str, Any] = {} if self.duration is None else {"contact_duration": self.duration}
+        more |= {"objectives": self.objectives} if self.objectives else {}
+        return {"law": self.law, "target": self.target, **more}
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """The same as sections of a problem file."""
+        out: dict[str, Any] = {"target": target_data(self.target), "contact": law_data(self.law)}
+        if self.duration is not None:
+            out["collision"] = {"duration_s": [*self.duration]}
+        if self.objectives:
+            out["objectives"] = {snake_case(type(one).__name__): {} for one in self.objectives}
+        return out
+
+
+def hits(motion: str | None, robot: Robot) -> list[Hit]:
+    """Hits of a robot in "chop", "nail", or else a punch: the hardest first."""
+    mass = sum(float(body.mass) for body in robot.model.inertias)
+    forces = [float(f"{part * np.clip(FORCE * mass, LEAST, MOST):.2g}") for part in SOFTER]
+    if motion == "chop":
+        return [
+            Hit(
+                law=KelvinVoigt(stiffness=5e4, damping=50.0),
+                target=Board(mass=0.1, stiffness=5e4, breaking_force=force, damping=20.0),
+                normals=(DOWN,),
+                objectives=(PeakForce(),),
+                duration=(0.001, 0.03),
+            )
+            for force in forces
+        ]
+    if motion == "nail":
+        return [
+            Hit(
+                law=KelvinVoigt(stiffness=5e5, damping=100.0),
+                target=Nail(mass=0.05, resistance=force, hardening=1e4),
+                normals=(DOWN,),
+                objectives=(TargetEnergy(),),
+                duration=(0.0, 0.015),
+            )
+            for force in forces
+        ]
+    target = FreeMass(mass=float(f"{np.clip(PART * mass, 0.5, 5.0):.1g}"))
+    return [Hit(law=SpringDamper(stiffness=1e4, damping=300.0), target=target, normals=NORMALS)]

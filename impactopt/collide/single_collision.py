@@ -18,7 +18,7 @@ from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.sdc import frozen_model
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, did_you_mean
-from impactopt.files.output import Record, load_record, plain
+from impactopt.files.output import Record, load_record, plain, replay_name
 from impactopt.files.problem_file import ProblemFile, parse_problem_file
 from impactopt.files.problem_file.diagnostics import mistakes_of, report_mistakes
 from impactopt.files.problem_file.sections import File
@@ -296,9 +296,6 @@ def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
         planned["sole_force_N"] = float(a["collision_sole_wrench"][:, 2 : 6 * soles : 6].min())
     out = {"planned": planned}
     names = {"torque_ratio": "torque_ratio_by_phase", "zmp_margin_m": "zmp_margin_by_phase_m"}
-    free = (
-        "free soles" if told.get("sole_cop_margin_mm") else "MuJoCo"
-    )  # nothing holds soles, if there are any
     for name, by_phase in (("simulated", {key: key for key in names}), ("replayed", names)):
         report = told.get(name) or {}
         numbers = {key: report[key] for key in keys if key in report}
@@ -306,7 +303,7 @@ def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
             found = report.get(source) or {}
             numbers |= {key: found["collision"]} if "collision" in found else {}
         if numbers:
-            out["simulated" if name == "simulated" else free] = numbers
+            out["simulated" if name == "simulated" else replay_name(told)] = numbers
     return out
 
 

@@ -128,7 +128,7 @@ def _expressions(
         loop=(_implicit if implicit else _explicit)(collision, model, record),
         horizon=collision.horizon,
         freezes=collision.n_freezes,
-        wanted=frozen_for(outputs, slides=model.slides),
+        names=_frozen_names(collision, model, outputs),
     )
     gives_way = target_start(model.target, model.target_numbers(inputs))
     segments = course.run(inputs, gives_way)
@@ -233,6 +233,14 @@ def describe(
     return Description(contents=contents, left_out=_left_out(collision, outputs))
 
 
+def _frozen_names(
+    collision: SteppedModel, model: JointSpaceModel, outputs: tuple[str, ...]
+) -> tuple[str, ...]:
+    """Attributes of FrozenDynamics that a collision with these outputs needs."""
+    wanted = (*outputs, "velocity") if collision.n_freezes else outputs
+    return tuple(dict.fromkeys((*model.frozen, *frozen_for(wanted, slides=model.slides))))
+
+
 def instructions(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, int]:
     """Scalar instructions of one freeze and one Runge-Kutta step of the graph, as CasADi counts them.
 
@@ -240,9 +248,7 @@ def instructions(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str,
     much, or six times where law or target bend.
     """
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
-    wanted = (*outputs, "velocity") if collision.n_freezes else outputs
-    names = tuple(dict.fromkeys((*model.frozen, *frozen_for(wanted, slides=model.slides))))
-    freeze = frozen_dynamics(collision).function("frozen", names)
+    freeze = frozen_dynamics(collision).function("frozen", _frozen_names(collision, model, outputs))
     step = rk4_step(model, collision.step_of_graph)
     return {"freeze": int(freeze.expand().n_instructions()), "step": int(step.expand().n_instructions())}
 

@@ -154,16 +154,6 @@ class CollisionModel(ABC):
         return usual_stance(self.robot) if self.stance is None else self.stance
 
     # ------------------------------------------------------------ what all of them refuse
-    def check_step(self, step: float, longest: float, where: str = "here") -> None:
-        """InputError for a step [s] that is not below the longest stable one."""
-        if step >= longest:
-            slides = getattr(self, "contact_friction", None) is not None
-            more = ", or the friction at the hit more slip_speed" if slides else ""
-            raise InputError(
-                f"step [s]: {step:g} is unstable {where}, where the fastest mode allows {longest:.2g}: give "
-                f"{type(self).__name__} a step below that, or the joints less kd or more armature{more}"
-            )
-
     @staticmethod
     def check_separation(result: Collision) -> None:
         """InputError for a contact that has not ended."""

@@ -350,7 +350,7 @@ class Course:
     loop : the time loop.
     horizon : [s] at which everything ends.
     freezes : on the way, besides the one at contact.
-    wanted : outputs of FrozenDynamics that are wanted besides what the model needs.
+    names : attributes of FrozenDynamics that are needed.
     """
 
     def __init__(
@@ -361,14 +361,11 @@ class Course:
         loop: Loop,
         horizon: float,
         freezes: int,
-        wanted: tuple[str, ...],
+        names: tuple[str, ...],
     ) -> None:
         self.model, self.frozen, self.loop = model, frozen, loop
         self.horizon, self.freezes = horizon, freezes
-        of_point = ("L_point",) if model.slides else ()
-        whole = ("L_tau", "L_f", "L_0", "drift_velocity", *of_point) if freezes else ()
-        self._names = tuple(dict.fromkeys((*model.frozen, *wanted, *whole)))
-        self._freeze = frozen.function("frozen", self._names)
+        self._names, self._freeze = names, frozen.function("frozen", names)
 
     def run(self, inputs: dict[str, Any], target_start: Any) -> list[Segment]:
         """The segments, in order; `inputs` are q, v, feedforward and settings by name."""

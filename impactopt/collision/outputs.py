@@ -75,7 +75,10 @@ def check_jacobian(names: tuple[str, ...], method: str, freezes: int) -> None:
 
 
 def frozen_for(names: tuple[str, ...], *, slides: bool = False) -> tuple[str, ...]:
-    """Attributes of FrozenDynamics that these outputs need besides what the model does; slides: as of it."""
+    """Attributes of FrozenDynamics that these outputs need besides what the model does; slides: as of it.
+
+    With freezes on the way a collision needs those of "velocity".
+    """
     motion = {"velocity", "configuration"} & {*names}
     wrench = {*OF_SOLES, "hand_wrench"} & {*names}
     whole = {"ground_wrench", "zmp"} & {*names}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -90,12 +90,14 @@ class JointFriction:
 Array = NDArray[np.float64]
 
 # name: whether it has to be positive, or may be zero too
-_SIGN = {"kp": ">= 0", "kd": ">= 0", "torque_limit": "> 0", "viscous": ">= 0", "coulomb": ">= 0"}
-_SIGN |= {"reference_until": "> 0"}
-
-
-_SIGN |= {"friction_coefficient": "> 0", "friction_slip_speed": "> 0"}
-_OF_FRICTION = ("friction_coefficient", "friction_slip_speed")
+_SIGN = {
+    "kp": ">= 0",
+    "kd": ">= 0",
+    "torque_limit": "> 0",
+    "viscous": ">= 0",
+    "coulomb": ">= 0",
+    "reference_until": "> 0",
+}
 
 
 _FOR_EVER = 1e6  # [s]
@@ -129,12 +131,15 @@ class Settings(Mapping[str, Array]):
         servo: Mapping[str, ArrayLike],
         friction: ContactFriction | None = None,
     ) -> None:
-        self._law, self._target = law, target
-        values: dict[str, Any] = {"normal": normal}
-        values |= {f"contact_{name}": number for name, number in law.parameters.items()}
-        values |= {f"target_{name}": number for name, number in target.parameters.items()}
+        self._owners: dict[str, tuple[type, dict[str, float]]] = {
+            "contact_": (type(law), law.parameters),
+            "target_": (type(target), target.parameters),
+        }
         if friction is not None:
-            values |= dict(zip(_OF_FRICTION, friction.parameters, strict=True))
+            self._owners["friction_"] = ContactFriction, asdict(friction)
+        values: dict[str, Any] = {"normal": normal}
+        for prefix, (_, numbers) in self._owners.items():
+            values |= {prefix + key: number for key, number in numbers.items()}
         values |= servo
         self._values = {name: np.asarray(value, dtype=float) for name, value in values.items()}
         self._values = {name: self._check(name, value) for name, value in self._values.items()}
@@ -175,10 +180,10 @@ class Settings(Mapping[str, Array]):
         sign = _SIGN.get(name, "")
         if (sign and (array < 0).any()) or (sign == "> 0" and (array == 0).any()):
             raise InputError(f"{name}: has {array.min():g}; all must be {sign}")
-        for prefix, owner in (("contact_", self._law), ("target_", self._target)):
+        for prefix, (owner, numbers) in self._owners.items():
             if name.startswith(prefix):
                 # the class knows the ranges of its own numbers
-                type(owner)(**{**owner.parameters, name.removeprefix(prefix): float(array)})
+                owner(**{**numbers, name.removeprefix(prefix): float(array)})
         return array
 
     def __getitem__(self, name: str) -> Array:

@@ -235,6 +235,16 @@ class SteppedModel(CollisionModel):
     def _servo_settings(self) -> dict[str, ArrayLike]:
         return {}
 
+    def check_step(self, longest: float, where: str = "here") -> None:
+        """InputError for a step that is not below the longest stable one [s]."""
+        if self.step_length >= longest:
+            more = ", or the friction at the hit more slip_speed" if self.contact_friction else ""
+            raise InputError(
+                f"step [s]: {self.step_length:g} is unstable {where}, where the fastest mode allows "
+                f"{longest:.2g}: give {type(self).__name__} a step below that, or the joints less kd or more "
+                f"armature{more}"
+            )
+
     @cached_property
     def available(self) -> tuple[str, ...]:
         """Names of the outputs that this model has, out of `impactopt.collision.OUTPUTS`."""

@@ -345,7 +345,7 @@ class SymbolicModel(SteppedModel):
     def _by_steps(self, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> Collision:
         frozen = self._stability.frozen(arguments[0], values)
         if self.stepping != "implicit":
-            self.check_step(self.step_length, self._stability.longest(frozen, values))
+            self.check_step(self._stability.longest(frozen, values))
         names = self.available
         found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
         outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}

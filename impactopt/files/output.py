@@ -53,6 +53,7 @@ __all__ = [
     "record_of_strike",
     "remove_file",
     "replay_arrays",
+    "replay_name",
     "save_record",
     "set_aside",
     "summary_of",
@@ -122,6 +123,11 @@ class Record:
     def replayed(self) -> bool:
         """True if a replay on free soles is part of the record."""
         return "replayed_time" in self.arrays
+
+
+def replay_name(summary: Mapping[str, Any]) -> str:
+    """Heading of MuJoCo's replay: nothing holds the soles of a robot that has some."""
+    return "free soles" if summary.get("sole_cop_margin_mm") else "MuJoCo"
 
 
 def record_of(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.files.output import Record
+from impactopt.files.output import Record, replay_name
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import (
     BUCKETS,
@@ -19,7 +19,6 @@ from impactopt.report.histories import (
     thinned,
     zmp_margins,
 )
-from impactopt.report.result_rows import replay_name
 from impactopt.report.tracks import planned_hand_speed
 from impactopt.simulation.result import centre_of_pressure
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.files.output import replay_name
 from impactopt.robots.loads import SHARE, least_kept
 from impactopt.solvers.program import MINOR
 
@@ -48,11 +49,6 @@ class Row:
 
     label: str
     cells: tuple[Cell, ...]
-
-
-def replay_name(summary: Mapping[str, Any]) -> str:
-    """Heading of MuJoCo's replay: nothing holds the soles of a robot that has some."""
-    return "free soles" if summary.get("sole_cop_margin_mm") else "MuJoCo"
 
 
 def result_columns(summary: Mapping[str, Any]) -> Columns:

@@ -10,10 +10,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.files.output import Record
+from impactopt.files.output import Record, replay_name
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.report.result_rows import replay_name
 from impactopt.simulation.result import centre_of_pressure, travelled
 from impactopt.transcription.plan import Trajectory
 

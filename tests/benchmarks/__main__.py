@@ -316,6 +316,9 @@ def _robots(
         int,
         typer.Option(min=0, metavar="N", help="Compare an arm's strike with the best on N random targets."),
     ] = 0,
+    motion: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Motion that is drafted, as of `impactopt new`.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Resume from results/bench/robots.jsonl.")] = False,
     seed: Seed = 0,
 ) -> None:

@@ -87,6 +87,7 @@ def run(
     *,
     names: list[str] | None = None,
     targets: int = 0,
+    motion: str | None = None,
     seed: int = 0,
     resume: bool = False,
     rows: Path = ROWS,
@@ -95,7 +96,8 @@ def run(
     """One row a robot.
 
     names : of `ROBOTS`, all by default.  targets : random targets whose best strike a bolted arm's is
-    compared with; 0: none are.  seed : of them.  resume : do not repeat rows that `rows` has.
+    compared with; 0: none are.  motion : that is drafted; None: the usual one.  seed : of the targets.
+    resume : do not repeat rows that `rows` has.
     drafts : folder of the drafted files.
 
     Raises
@@ -107,21 +109,22 @@ def run(
         if name not in ROBOTS:
             raise InputError(f"there is no robot {name!r} in this bench: there are {', '.join(ROBOTS)}")
     folder = example_robots("this bench")
-    kept = Kept(rows, ("robot",), resume=resume)
+    kept = Kept(rows, ("robot", "motion"), resume=resume)
     drafts.mkdir(parents=True, exist_ok=True)
     found = []
     for name in chosen:
-        if (name,) not in kept.found:
+        if (name, motion) not in kept.found:
             file = folder / ROBOTS[name]
-            kept.add(_row(name, file, drafts, np.random.default_rng(seed), targets))
-        found.append(kept.found[(name,)])
+            row = _row(name, file, drafts, np.random.default_rng(seed), targets, motion)
+            kept.add({"motion": motion, **row})
+        found.append(kept.found[(name, motion)])
         row = found[-1]
         say(", ".join(f"{key} {row[key]}" for _, key, _ in COLUMNS if row.get(key) is not None))
         if row.get("reason"):
             say(f"  {row['reason']}")
     true = [row for row in found if _true(row)]
     title = f"{len(found)} robots, no line edited: {len(true)} from file to a true plan"
-    numbers = {"rows": found, "true": len(true), "targets": targets, "seed": seed}
+    numbers = {"rows": found, "true": len(true), "targets": targets, "motion": motion, "seed": seed}
     return Report(name="robots", numbers=numbers, tables=(columns_table(title, COLUMNS, found),))
 
 
@@ -132,11 +135,13 @@ def _true(row: Mapping[str, Any]) -> bool:
     return abs(row["held_pct"]) < 1.0 and abs(row["free_pct"]) < 2.0
 
 
-def _row(name: str, file: Path, drafts: Path, rng: np.random.Generator, targets: int) -> dict[str, Any]:
+def _row(
+    name: str, file: Path, drafts: Path, rng: np.random.Generator, targets: int, motion: str | None
+) -> dict[str, Any]:
     out: dict[str, Any] = {"robot": name}
     began = time.perf_counter()
     try:
-        draft = draft_problem(file, folder=drafts)
+        draft = draft_problem(file, folder=drafts, motion=motion)
         place = drafts / f"{re.sub('[^a-z0-9]+', '_', name.lower())}.toml"
         place.write_text(draft.text, encoding="utf-8")
         out["draft_seconds"] = time.perf_counter() - began

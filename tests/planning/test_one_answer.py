@@ -228,7 +228,7 @@ def test_references_that_cannot_be() -> None:
 
 # ---------------------------------------------------------------- results of the problems that come with us
 # What plan and full dynamics may differ by is what the plan has between its collocation points, of which
-# docs/benchmarks.md (truth) has the largest: 0.36 % of impulse. A motion's ZMP and torque are told on
+# docs/benchmarks.md (truth) has the largest. A motion's ZMP and torque are told on
 # elements half as long. A strike's are told at its points alone: torques may be largest between two of them,
 # and are compared there.
 OF_PLAN = {"impulse_Ns": 5e-3, "zmp_margin_m": 2e-3, "sole_force_N": 0.02}

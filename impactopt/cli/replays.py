@@ -55,6 +55,8 @@ def compared_record(
                 done[job] = {"method": METHOD, "error": found}
             else:
                 progress.say(f"{told[job]}: {found}")
+    except InputError as error:  # processes that do not start
+        progress.say(f"the plan is kept without replays: {error}")
     except KeyboardInterrupt:
         left = [job for job in jobs if job not in done]
         progress.say(f"interrupted while {' and '.join(told[job] for job in left)}; the plan is kept")

@@ -52,6 +52,7 @@ SHIFT = (0.6, 1.2)  # [s] from two feet to one, and back
 START = "ready"
 FROM_ABOVE = ("chop", "nail")
 MOTIONS = ("punch", "kick", *FROM_ABOVE)
+UNSOLVED = "none of the strikes tried is solved: move the target, or give an easier one"
 EDGEWISE = (
     "no strike with the striking link's face to the target is found: [terms.first_touch] is off, so another "
     "part of the link may touch first"
@@ -82,10 +83,9 @@ def draft_problem(
     """The text of a problem file for the robot of a URDF, or an MJCF.
 
     folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.  motion :
-    "punch", "kick", "chop" (a board, from above) or "nail" (with the fist, from above); None: a robot on
-    legs kicks where it has no arm to strike with, others punch.  planned : the whole
-    motion to a bolted arm's blow is solved, too, and the next blow taken where there is none.
-    report : is told what is done.
+    "punch", "kick", "chop" (a board, from above) or "nail" (with the hand, from above); None: a robot on legs
+    kicks where it has no arm to strike with, others punch.  planned : the whole motion to a bolted arm's blow
+    is solved, too, and the next blow taken where there is none.  report : is told what is done.
 
     Raises
     ------
@@ -111,41 +111,90 @@ def draft_problem(
     if soles and motion in FROM_ABOVE:
         say(f"{drafted.robot.name}: {drafted.robot.n} joints, on two legs; looking for a blow from above")
         return _stroke(drafted, soles, strikers, arms[0], forward, motion, folder, say)
+    if not soles:
+        return _bolted(drafted, strikers, arms, motion, folder, say, planned=planned)
+    say(f"{drafted.robot.name}: {drafted.robot.n} joints, on two legs; looking for a posture and a target")
+    try:
+        return _punch(drafted, soles, strikers, arms, forward, folder)
+    except InputError:
+        if motion == "punch":
+            raise
+        return _kick(drafted, soles, strikers, forward, folder)
+
+
+def _standing(
+    drafted: Drafted, soles: list[Sole], strikers: list[Striker], forward: Array
+) -> tuple[Robot, tuple[Limb, ...], Array]:
+    """The robot on its soles with these strikers, its legs, and the configuration (nq,) that half sits."""
     robot = drafted.made(soles=soles, strikers=strikers)
-    legs = tuple(renumbered(leg, model, robot.model) for leg in drafted.legs)
-    arms = [replace(arm, limb=renumbered(arm.limb, model, robot.model)) for arm in arms]
-    said: list[str] = []
-    strong: list[Strong] = []
-    if soles:
-        say(f"{robot.name}: {robot.n} joints, on two legs; looking for a posture and a target")
-        q = half_sitting(robot, legs, soles, forward)
-    else:
-        say(f"{robot.name}: {robot.n} joints, on a fixed base; trying blows (compiles the first time)")
-        q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
-        # last edgewise: an arm of few joints cannot turn the link's face to where it moves
-        for edgewise, hit in product((False, True), hits(motion, robot)):
-            strong = strongest(robot, arms[0], q, hit, with_face=not edgewise)
-            if strong:
-                break
+    legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
+    return robot, legs, half_sitting(robot, legs, soles, forward)
+
+
+def _renumbered(arms: Sequence[Arm], drafted: Drafted, robot: Robot) -> list[Arm]:
+    """The arms by the joints of a robot that has more frames."""
+    return [replace(arm, limb=renumbered(arm.limb, drafted.robot.model, robot.model)) for arm in arms]
+
+
+def _punch(
+    drafted: Drafted,
+    soles: list[Sole],
+    strikers: list[Striker],
+    arms: list[Arm],
+    forward: Array,
+    folder: Path,
+) -> Draft:
+    """A draft of a punch ahead by a robot on its legs.
+
+    Raises
+    ------
+    InputError : no posture or no target is found.
+    """
+    robot, _, q = _standing(drafted, soles, strikers, forward)
+    arms = _renumbered(arms, drafted, robot)
+    q, way = ready(robot, arms, q, ways=WAYS[:1])
+    data = _data(drafted, robot, soles, strikers, q, folder)
+    data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
+    return Draft(text=_text(data, drafted, robot), said=tuple(_said(data, drafted, robot)))
+
+
+def _bolted(
+    drafted: Drafted,
+    strikers: list[Striker],
+    arms: list[Arm],
+    motion: str | None,
+    folder: Path,
+    say: Callable[[str], None],
+    *,
+    planned: bool,
+) -> Draft:
+    """A draft for a robot on a fixed base: the hardest of the strikes that are solved, else a target within
+    its reach.
+
+    Raises
+    ------
+    InputError : no posture or no target is found.
+    """
+    robot = drafted.made(soles=[], strikers=strikers)
+    arms = _renumbered(arms, drafted, robot)
+    say(f"{robot.name}: {robot.n} joints, on a fixed base; trying blows (compiles the first time)")
+    q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
+    # last edgewise: an arm of few joints cannot turn the link's face to where it moves
+    for edgewise, hit in product((False, True), hits(motion, robot)):
+        strong = strongest(robot, arms[0], q, hit, with_face=not edgewise)
+        if strong:
+            break
     if strong:
         tries = [_struck(drafted, robot, strikers, arms[0], blow, hit, edgewise, folder) for blow in strong]
         taken = _planned(tries, folder, say) if planned else 0
         data = tries[taken or 0]
-        said.append(_strike_message(strong[taken or 0], found=taken is not None, tried=planned))
-        if edgewise:
-            said.append(EDGEWISE)
+        told = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
+        said = [told, EDGEWISE] if edgewise else [told]
     else:
-        bolted_ways = [tuple(DOWN)] if motion in FROM_ABOVE else WAYS
-        try:
-            q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else bolted_ways)
-        except InputError:
-            if not soles or motion == "punch":
-                raise
-            return _kick(drafted, soles, strikers, forward, folder)
-        if not soles:
-            said.append("none of the strikes tried is solved: move the target, or give an easier one")
-        data = {**_data(drafted, robot, soles, strikers, q, folder), **hits(motion, robot)[-1].data}
+        q, way = ready(robot, arms, q, ways=[tuple(DOWN)] if motion in FROM_ABOVE else WAYS)
+        data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
         data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
+        said = [UNSOLVED]
     return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
 
 
@@ -184,30 +233,22 @@ def _stroke(
     ------
     InputError : the hand has no shape; no posture or no target is found.
     """
-
-    def found(robot: Robot) -> tuple[Limb, Array]:
-        legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
-        return renumbered(arm.limb, drafted.robot.model, robot.model), half_sitting(
-            robot, legs, soles, forward
-        )
-
-    robot = drafted.made(soles=soles, strikers=strikers)
-    limb, q = found(robot)
-    q, _ = ready(robot, [replace(arm, limb=limb)], q, ways=WAYS[:1])
+    robot, _, q = _standing(drafted, soles, strikers, forward)
+    (hand,) = _renumbered([arm], drafted, robot)
+    q, _ = ready(robot, [hand], q, ways=WAYS[:1])
     name = arm.name.removesuffix("hand") + "edge"
-    edge, below = find_edge(robot.model, limb, name, bodies_of(robot).of_joint, arm.axis, q)
+    edge, below = find_edge(robot.model, hand.limb, name, bodies_of(robot).of_joint, arm.axis, q)
     strikers = [*strikers, edge]
-    robot = drafted.made(soles=soles, strikers=strikers)
-    limb, q = found(robot)
-    arm = Arm(limb=limb, name=name, axis=below)
-    q, way = ready(robot, [arm], q, ways=[tuple(DOWN)])
+    robot, _, q = _standing(drafted, soles, strikers, forward)
+    (hand,) = _renumbered([Arm(limb=arm.limb, name=name, axis=below)], drafted, robot)
+    q, way = ready(robot, [hand], q, ways=[tuple(DOWN)])
     data: dict[str, Any] = {}
-    said: list[str] = []
+    said = [UNSOLVED]
     for k, (hit, edgewise) in enumerate(product(hits(motion, robot), (False, True)), start=1):
         say(f"trying blow {k}")
         if not edgewise:
             data = {**_data(drafted, robot, soles, strikers, q, folder), **hit.data}
-            data = _aimed(data, name, aims(robot, arm, q, way), way, folder)
+            data = _aimed(data, name, aims(robot, hand, q, way), way, folder)
         tried = _edgewise(data) if edgewise else data
         if _strikes(tried, folder):
             data, said = tried, [EDGEWISE] if edgewise else []
@@ -253,9 +294,7 @@ def _kick(
     assert foot.parent is not None  # it is drafted
     toe = Striker(name=f"{foot.name}_toe", frame=foot.parent, point=np.round(point, 4) + 0.0)
     strikers = [*strikers, toe]
-    robot = drafted.made(soles=soles, strikers=strikers)
-    legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
-    q = half_sitting(robot, legs, soles, forward)
+    robot, legs, q = _standing(drafted, soles, strikers, forward)
     at = striking_point(robot, toe.name, q)
     hip = robot.model.createData()
     pin.forwardKinematics(robot.model, hip, q)

@@ -84,7 +84,7 @@ class Strength:
         out = []
         for n in normals:
             inverse = float(n @ mobility @ n)
-            if inverse < 1e-9 * np.trace(mobility):
+            if inverse <= 1e-9 * np.trace(mobility):  # it cannot move along the normal
                 continue
             best = max(
                 (self._speed(way, n, jac, inertia, weight, room), k, way)

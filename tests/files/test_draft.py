@@ -71,6 +71,18 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
             _drafted(tmp_path, text, motion=motion)
 
 
+@pytest.mark.parametrize("motion", ["punch", "nail"])
+@pytest.mark.parametrize("moves", ["turn", "elbow"])
+def test_a_robot_of_one_joint_is_told_that_it_reaches_no_target(
+    tmp_path: Path, moves: str, motion: str
+) -> None:
+    text = urdfs.arm()
+    for name in {"turn", "shoulder", "elbow", "wrist"} - {moves}:
+        text = text.replace(f'<joint name="{name}" type="revolute">', f'<joint name="{name}" type="fixed">')
+    with pytest.raises(InputError, match="no posture is found with 'hand' in front"):
+        _drafted(tmp_path, text, motion=motion)
+
+
 @pytest.mark.parametrize(
     ("text", "motion", "kind"),
     [(urdfs.arm(), "nail", Nail), (urdfs.biped(), "chop", Board)],

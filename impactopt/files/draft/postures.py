@@ -105,7 +105,8 @@ def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
     pin.computeJointJacobians(model, data, q)
     pin.centerOfMass(model, data, q)
     joint, column = data.oMi[first], model.joints[first].idx_v
-    axis = np.array(pin.getJointJacobian(model, data, first, pin.LOCAL_WORLD_ALIGNED))[3:, column]
+    jacobian = np.reshape(pin.getJointJacobian(model, data, first, pin.LOCAL_WORLD_ALIGNED), (6, model.nv))
+    axis = jacobian[3:, column]
     middle = joint.act(np.array(data.com[first])) - joint.translation
     along = float(axis @ middle)
     if abs(along) > ACROSS * np.linalg.norm(middle):

@@ -149,5 +149,6 @@ def _straightened(axis: Array) -> Array:
 def _turning_axis(model: pin.Model, joint: int) -> Array:
     """(3,) of a joint that turns, in its frame; zero of one that slides."""
     data = model.createData()
-    jac = pin.computeJointJacobian(model, data, pin.neutral(model), joint)
+    # of a model with one joint Pinocchio gives (6,)
+    jac = np.reshape(pin.computeJointJacobian(model, data, pin.neutral(model), joint), (6, model.nv))
     return np.array(jac[3:, model.joints[joint].idx_v]).reshape(3)

@@ -36,32 +36,32 @@ def compared_record(
 
     workers : processes that do these side by side; 1: one after the other, here.
 
-    Ctrl-C keeps the plan with what is done.
+    Ctrl-C, and processes that do not start, keep the plan with what is done.
     """
     jobs = [*(_engines(solution, progress) if validate else ()), *([BASELINE] if baseline else ())]
     if solution.status is Status.INTERRUPTED:
         jobs = []
     told = {
-        "pinocchio": "replaying the plan in full dynamics",
-        "mujoco": f"replaying the plan {'on free soles' if solution.problem.soles else 'in MuJoCo'}",
-        BASELINE: "looking for the hardest minimum-jerk reach",
+        "pinocchio": "replay in full dynamics",
+        "mujoco": f"replay {'on free soles' if solution.problem.soles else 'in MuJoCo'}",
+        BASELINE: "search for the hardest minimum-jerk reach",
     }
-    done = dict[str, Any]()
+    done, failed = dict[str, Any](), dict[str, str]()
+    why = ""
     try:
         for job, found in _side_by_side(solution, jobs, told, min(workers, len(jobs)), progress):
-            if not isinstance(found, str):
-                done[job] = found
-            elif job == BASELINE:
-                done[job] = {"method": METHOD, "error": found}
+            if isinstance(found, str):
+                failed[job] = found
+                progress.say(f"no result of the {told[job]}: {found}")
             else:
-                progress.say(f"{told[job]}: {found}")
-    except InputError as error:  # processes that do not start
-        progress.say(f"the plan is kept without replays: {error}")
+                done[job] = found
     except KeyboardInterrupt:
-        left = [job for job in jobs if job not in done]
-        progress.say(f"interrupted while {' and '.join(told[job] for job in left)}; the plan is kept")
-        if BASELINE in left:
-            done[BASELINE] = {"method": METHOD, "error": "interrupted"}
+        why = "interrupted"
+    except InputError as error:  # the processes do not start
+        why = str(error)
+    if left := [job for job in jobs if job not in done and job not in failed]:
+        progress.say(f"{why}; the plan is kept without results of: {', '.join(told[job] for job in left)}")
+        failed |= dict.fromkeys(left, why)
     record = record_of(
         solution,
         simulation=done.get("pinocchio"),
@@ -69,8 +69,8 @@ def compared_record(
         problem=read.text,
         problem_path=read.path,
     )
-    if BASELINE in done:
-        record.summary[BASELINE] = done[BASELINE]
+    if BASELINE in jobs:
+        record.summary[BASELINE] = done.get(BASELINE) or {"method": METHOD, "error": failed[BASELINE]}
     return record
 
 
@@ -89,7 +89,14 @@ def _engines(solution: Solution, progress: SolveConsole) -> list[str]:
 def _side_by_side(
     solution: Solution, jobs: list[str], told: dict[str, str], workers: int, progress: SolveConsole
 ) -> Iterator[tuple[str, Any]]:
-    """Each job's name with its result, or with the reason why there is none."""
+    """Each job's name with its result, or with the reason why there is none.
+
+    told : what each job is, for the user.
+
+    Raises
+    ------
+    InputError : the processes do not start.
+    """
     if workers < 2:
         for job in jobs:
             progress.say(told[job])

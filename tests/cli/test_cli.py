@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from impactopt.files.problem_file import ProblemFile
 from impactopt.planning.refinement import Attempt
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures import PICTURES
+from impactopt.simulation.workers import Died
 from impactopt.solvers.program import IterationRecord, Status, Violation
 
 GOOD = f"""\
@@ -217,6 +219,43 @@ def test_replays_side_by_side_are_those_of_one_process(planner: Planner, file: P
         assert summaries[0][part] == summaries[1][part]
 
 
+@pytest.mark.parametrize(
+    ("ends", "told"),
+    [
+        (Died(code=-9, tries=1), "its process has died (exit code -9)"),
+        (impactopt.InputError("the worker processes do not start"), "the worker processes do not start"),
+        (KeyboardInterrupt(), "interrupted"),
+    ],
+    ids=["died", "not started", "interrupted"],
+)
+def test_a_plan_outlives_the_processes_that_replay_it(
+    planner: Planner,
+    file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    ends: Died | BaseException,
+    told: str,
+) -> None:
+    """The first replay is done, and stays; the other one and the baseline come to nothing."""
+
+    def each(
+        function: Callable[..., Any], shared: Any, inputs: Iterable[tuple[int, Any]], **options: Any
+    ) -> Iterator[tuple[int, Any]]:
+        (first, given), *rest = inputs
+        yield first, function(shared, given)
+        for k, _ in rest:
+            if isinstance(ends, BaseException):
+                raise ends
+            yield k, ends
+
+    monkeypatch.setattr("impactopt.cli.replays.each_on_workers", each)
+    _, err = run("solve", file, "--out", tmp_path / "out", "--workers", "2", "--baseline")
+    assert told in err and "replay on free soles" in err
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["simulated"]["engine"] == "pinocchio" and "replayed" not in summary
+    assert summary["baseline"] == {"method": "minimum jerk", "error": told}
+
+
 def test_the_files_solver_settings_reach_the_solver(planner: Planner, file: Path, tmp_path: Path) -> None:
     run("solve", file, "--out", tmp_path / "out")
     assert (planner.options["solver"], planner.options["time_limit"]) == ("ipopt", 40)
@@ -339,7 +378,7 @@ def test_what_was_interrupted_gets_no_baseline_and_an_interrupted_baseline_keeps
 
     monkeypatch.setattr("impactopt.cli.replays.minimum_jerk_baseline", reach)
     _, err = run("solve", file, "--out", tmp_path / "out", "--baseline")
-    assert "interrupted while looking for" in err and load_record(tmp_path / "out").completed
+    assert "without results of: search for" in err and load_record(tmp_path / "out").completed
     planner.solution = {"status": Status.INTERRUPTED}
     _, err = run("solve", file, "--out", tmp_path / "cut", "--baseline", code=1)
     assert "baseline" not in err

@@ -169,7 +169,10 @@ def find_mesh(name: str, urdf: Path) -> Path:
     ------
     FileNotFoundError : there is none.
     """
-    path = Path(name.removeprefix("package://").removeprefix("file://"))
+    if name.startswith("package://"):  # some files have a slash too many
+        path = Path(name.removeprefix("package://").lstrip("/"))
+    else:
+        path = Path(name.removeprefix("file://"))
     above = [*urdf.resolve().parents]
     places = [folder / path for folder in above]
     if name.startswith("package://"):  # the folder may be called otherwise than the package

@@ -298,9 +298,10 @@ def test_bad_input_and_models_without_friction_are_refused() -> None:
         dataclasses.replace(arm_problem(), friction=GENTLE, collision="sdc")
     with pytest.raises(InputError, match=r"method 'implicit': its steps have no contact_friction"):
         oblique(contact_friction=GENTLE, method="implicit")
-    with pytest.raises(InputError, match=r"friction_coefficient: has -1; all must be > 0"):
-        model, at = oblique(contact_friction=GENTLE)
-        model.collide(*at, friction_coefficient=-1.0)
+    model, at = oblique(contact_friction=GENTLE)
+    for coefficient in (-1.0, 11.0):
+        with pytest.raises(InputError, match=rf"coefficient: {coefficient:g}; give a number > 0 and <= 10"):
+            model.collide(*at, friction_coefficient=coefficient)
     with pytest.raises(InputError, match=r"unstable here, .* or the friction at the hit more slip_speed"):
         model.collide(*at, friction_slip_speed=1e-6)
     with pytest.raises(InputError, match=r"must be a ContactFriction, not 0\.6"):

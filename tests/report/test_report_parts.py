@@ -163,6 +163,12 @@ def test_locked_and_floating_joints_keep_shapes_in_place(lamp: Path) -> None:
         find_mesh("package://lamp_description/meshes/gone.stl", lamp)
 
 
+def test_a_mesh_is_found_where_its_file_has_a_slash_too_many(lamp: Path) -> None:
+    """As TALOS's in example-robot-data."""
+    found = find_mesh("package:///lamp_description/meshes/tip.stl", lamp)
+    assert found == find_mesh("package://lamp_description/meshes/tip.stl", lamp)
+
+
 def test_what_has_lost_its_meshes_is_a_box_and_bones(
     lamp: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,7 +52,7 @@ SHIFT = (0.6, 1.2)  # [s] from two feet to one, and back
 START = "ready"
 FROM_ABOVE = ("chop", "nail")
 MOTIONS = ("punch", "kick", *FROM_ABOVE)
-UNSOLVED = "none of the strikes tried is solved: move the target, or give an easier one"
+UNSOLVED = "none of the strikes tried is solved: if `solve` finds no motion, move the target or ease it"
 EDGEWISE = (
     "no strike with the striking link's face to the target is found: [terms.first_touch] is off, so another "
     "part of the link may touch first"

@@ -223,8 +223,8 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """Problem with the lazy constraints that the record's plan needed, its chosen gains, and its style's
-    prices.
+    """Problem with the lazy constraints and the touches that the record's plan needed, its chosen gains, and
+    its style's prices.
 
     given : the file was, and is not the record's own text.
     """
@@ -234,6 +234,8 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
         problem = with_chosen(problem, [each["factor"] for each in told])
         if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
             problem = replace(problem, price_scale=scale)
+        if problem.touches is None and (touches := record.summary.get("touches")) is not None:
+            problem = replace(problem, touches=touches)
         return with_rows(problem, record.summary.get("rows_on_demand", ()))
     except InputError as error:
         if given:

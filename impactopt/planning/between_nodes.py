@@ -89,7 +89,7 @@ class BetweenNodes:
         missed = error is not None and error.missed
         if violated is None and nodes == t.nodes and elements is None:
             replay = outcome.at.replay if self._refined < _MESH_ROUNDS else None
-            if replay is None or replay.off <= ASKED or replay.partings:
+            if replay is None or replay.off <= ASKED or replay.unforeseen:
                 return None
             missed, elements = missed or replay.off > REFUTED, all_halved(t.hit.elements)
             if elements is None:

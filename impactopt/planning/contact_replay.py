@@ -73,7 +73,7 @@ class ContactReplay:
     planned, impulse [N s] : to the target, as planned and as it is.  peak [N] : largest force.  outcome : of
     the target, by name and unit.  contact [s] : from the first touch to the end of the last.  events [s] :
     since contact, when the target has switched, such as a board that breaks.  partings : how often striker
-    and target part and meet again.
+    and target part and meet again.  planned_partings : how often they are planned to.
     guards : names of the target's events, in their order.  known [%] : what of `impulse_pct` is reported as
     the error of the model of the collision.
     """
@@ -86,7 +86,13 @@ class ContactReplay:
     events: tuple[float, ...]
     partings: int
     guards: tuple[str, ...]
+    planned_partings: int = 0
     known: float = 0.0
+
+    @property
+    def unforeseen(self) -> bool:
+        """True if they part more often, or less often, than is planned."""
+        return self.partings != self.planned_partings
 
     @property
     def impulse_pct(self) -> float:
@@ -103,11 +109,12 @@ class ContactReplay:
     def __str__(self) -> str:
         """Message: how the replayed contact differs from the planned one."""
         off = f"its impulse is {self.impulse:.4g} N s, {self.planned:.4g} N s as planned"
-        if self.partings:
+        if self.unforeseen:
             times = "once" if self.partings == 1 else f"{self.partings} times"
+            contacts = f"{self.planned_partings + 1} touches" if self.planned_partings else "one contact"
             return (
-                f"striker and target part and meet again {times} within the blow, which is planned as one "
-                f"contact: {off}, and the largest force is {self.peak:.0f} N, whatever is planned"
+                f"striker and target part and meet again {times} within the blow, which is planned as "
+                f"{contacts}: {off}, and the largest force is {self.peak:.0f} N, whatever is planned"
             )
         names = [self.guards[k % len(self.guards)] for k in range(len(self.events))] if self.guards else []
         told = [f"{name} at {1e3 * t:.3g} ms" for name, t in zip(names, self.events, strict=False)]
@@ -148,7 +155,7 @@ class PlannedContact:
                 problem.robot,
                 self.reference,
                 scene_of(problem),
-                step=min(_STEP, duration / _STEPS),
+                step=min(_STEP, duration / (_STEPS * (problem.touches or 1) ** 2)),
                 # a strike has no motion that takes the striker away
                 until=duration * (_LONGER if isinstance(planned, Plan) else 1.0),
                 longest=_LONGEST * duration,
@@ -172,6 +179,7 @@ def _told(
         contact=found.touches[-1][1] - found.touches[0][0] if found.touches else 0.0,
         events=found.events,
         partings=sum(gap > _REPORTED_GAP * duration for gap in gaps),
+        planned_partings=(problem.touches or 1) - 1,
         guards=problem.target.guards,
         known=known,
     )

@@ -13,6 +13,7 @@ from impactopt.errors import InputError
 from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.causes import Cause
 from impactopt.planning.solution import Solution
+from impactopt.problem.checks import met_once
 from impactopt.problem.feasibility import too_weak
 from impactopt.robots.loads import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
@@ -103,19 +104,22 @@ def with_soles_kept(solution: Solution) -> Solution:
 def _too_stiff(t: ContactProgram) -> str:
     """The target's last event does not happen in one contact, however fast the robot is."""
     p = t.problem
-    if not isinstance(t.expected, Collision) or not p.target.guards:
+    if not isinstance(t.expected, Collision) or not p.target.guards or (p.touches or 1) > 1:
         return ""
     limit = fastest(t.coordinates, p.striker, p.normal, p.contact_posture, t.builder.limits.rate_limit)
     found = parting(p.law, p.target, t.hit.mass, limit)
-    return "" if found is None else _told(found, limit)
+    return "" if found is None else _told(found, limit, fixed=bool(met_once(p)))
 
 
-def _told(found: Parting, limit: float) -> str:
+def _told(found: Parting, limit: float, *, fixed: bool) -> str:
+    """fixed : whether a plan can have one touch only."""
     words = (
         f"one contact is not enough: even at {limit:.2g} m/s, the most that the joints allow, point masses "
         f"as heavy as striker and target separate {1e3 * found.time:.2g} ms after they touch, before the "
         f"target's {found.event!r}"
     )
+    if found.touches is not None and not fixed:
+        words += f"; `[collision] touches = {found.touches}` plans them"
     if found.needed is not None:
         words += f"; {found.needed:.2g} m/s would be enough"
     if found.stiffness is not None:

@@ -136,19 +136,19 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
     for hit in t.hit.collisions:
         if not isinstance(hit, Collision):
             continue
-        for phase, group in zip(t.problem.target.phases, hit.T, strict=True):
+        for phase, group in zip(t.problem.contact_phases, hit.T, strict=True):
             j = group.offset
             if result.x[j] * group.scale[0] >= (1 - _AT) * longest:
                 # multiplier: slope of the objective by the bound; a window twice as long moves it by itself
                 price += max(float(result.bound_multipliers[j]), 0.0) * float(result.x[j])
-                named.append(phase)
+                named.append(phase.name)
     if not named or objective <= 0 or price < _COSTLY * objective:
         return ""
     share = 100 * min(price / objective, 9.99)
     return (
         f"The contact's {' and '.join(dict.fromkeys(named))} takes all the time that [collision] duration_s "
         f"leaves it, {1e3 * longest:.3g} ms, and that bound is costly: twice as long gains {share:.0f} % of "
-        "the objective, to first order. The contact is softer than that: give it longer."
+        "the objective, to first order. Give it longer, unless this is to be a blow and not a push."
     )
 
 

@@ -20,12 +20,14 @@ from impactopt.planning.budget import Budget
 from impactopt.planning.contact_replay import ModelError, collision_error
 from impactopt.planning.gain_selection import with_factors_of
 from impactopt.planning.lazy_constraints import rows_on_demand
+from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import carried
 from impactopt.planning.solution import Solved
+from impactopt.problem.checks import met_once
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import VelocityLimit
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.contact_guess import fastest
+from impactopt.transcription.contact_guess import fastest, mass_at_contact, touches_needed
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.initial_guess import strike_rates
 
@@ -50,6 +52,25 @@ def carried_start(
     new = t.with_apart(rows)
     found = carried(new, old().with_apart(start.apart), start.result)
     return with_factors_of(new, start.problem.robot, found) if now[-1] else found
+
+
+def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactProblem:
+    """The same with as many touches as point masses need, where it leaves their number open."""
+    if problem.touches is not None or problem.scenarios or met_once(problem):
+        return problem
+    mass, most = mass_at_contact(problem), _fastest(problem)
+    needed = touches_needed(problem.law, problem.target, mass, most) if np.isfinite(most) else None
+    if needed in (None, 1):
+        return problem
+    event = problem.target.guards[-1]
+    say(f"point masses part before the target's {event!r}: planned with {needed} touches")
+    return changed(problem, touches=needed)
+
+
+def _fastest(problem: ImpactProblem) -> float:
+    """Greatest speed [m/s] of the striker along the normal in the posture of the initial guess."""
+    limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit
+    return fastest(problem.coordinates, problem.striker, problem.normal, problem.contact_posture, limit)
 
 
 def climbed(
@@ -95,8 +116,7 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
     """
     first, c = replace(problem, collision=_MODELS[0]), problem.coordinates
     y, legs = c.split(problem.contact_posture)
-    limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit
-    most = fastest(c, problem.striker, problem.normal, problem.contact_posture, limit)
+    most = _fastest(problem)
     speed = _SHARE * most if np.isfinite(most) else _GUESSED
     try:
         legs = c.solve_legs(y, legs)

@@ -86,7 +86,7 @@ class Solved:
     def caution(self) -> str:
         """Warning about effects that the planned contact leaves out; empty if the replay agrees with it."""
         replay = self.contact_replay
-        return str(replay) if replay is not None and (replay.partings or replay.off > AGREED) else ""
+        return str(replay) if replay is not None and (replay.unforeseen or replay.off > AGREED) else ""
 
     @property
     def status(self) -> Status:
@@ -108,6 +108,7 @@ class Solved:
             "starts": [attempt.summary() for attempt in self.attempts],
             "collision_model": self.problem.collision,
             "freezes": self.problem.freezes,
+            **({"touches": self.problem.touches} if self.problem.touches is not None else {}),
             "rows_on_demand": list(rows_on_demand(self.problem)),
             "style": self.problem.style,
             "price_scale": self.problem.price_scale,

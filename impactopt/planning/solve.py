@@ -23,7 +23,7 @@ from impactopt.planning.clearance_constraints import Margins, same_bodies, solve
 from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
 from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, window_caution, with_rows
-from impactopt.planning.models import carried_start
+from impactopt.planning.models import carried_start, with_touches
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
@@ -186,6 +186,7 @@ def _program(
 ) -> tuple[Transcription, str | Array | SolverResult]:
     """A problem's nonlinear program, on the mesh of a given solution, and the given start on it."""
     if not isinstance(start, Solution):
+        problem = with_touches(problem, budget.say)
         t = program_on(roomy(problem), NO_MORE, (), (), budget.report)
         if isinstance(start, str):
             return with_first_scale(t), start
@@ -194,6 +195,8 @@ def _program(
     problem = with_rows(problem, rows_on_demand(start.problem))
     if problem.style == start.problem.style:
         problem = replace(problem, price_scale=start.problem.price_scale)
+    if problem.touches is None:
+        problem = replace(problem, touches=start.problem.touches)
     t = program_on(roomy(problem), start.nodes, start.elements, start.shares, budget.report)
     apart = start.apart if same_bodies(problem, start.problem) else {}
     given = carried_start(t, partial(program_of, start), start, apart)

@@ -20,6 +20,7 @@ from impactopt.kinematics.operational_space import Held
 from impactopt.kinematics.stance import Free
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.motion_style import STYLES
+from impactopt.problem.objectives import Penetration
 from impactopt.problem.terms import Grip, Term
 from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.gains import GainFactor, scaled_gains
@@ -38,6 +39,7 @@ __all__ = [
     "check_names",
     "check_prices",
     "check_stance",
+    "check_touches",
     "check_world",
 ]
 
@@ -47,6 +49,7 @@ COLLISIONS = (*INSTANT, "sdc-paper", "sdc", "full", "auto")
 MOST_FREEZES = 64
 LONGEST_CONTACT = 100.0  # [s]
 MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
+MOST_TOUCHES = 4
 MANY = 100  # scenarios or obstacles
 STUCK = 1e-12  # mobility along the normal over the largest in any direction, that is none
 
@@ -236,6 +239,32 @@ def check_collision(problem: Any) -> None:
                 f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
                 "approach and part several times in a blow"
             )
+
+
+def check_touches(problem: Any) -> None:
+    """InputError for touches that a plan cannot have."""
+    if problem.touches is None:
+        return
+    touches = check_whole("touches", problem.touches, least=1, most=MOST_TOUCHES)
+    object.__setattr__(problem, "touches", touches)
+    if touches > 1 and (why := met_once(problem)):
+        raise InputError(f"touches is {touches}, but {why}: leave it out")
+
+
+def met_once(problem: Any) -> str:
+    """Reason why a striker meets the target only once in a plan; "" if it may meet it again."""
+    law, target = problem.law, problem.target
+    if not target.met_again:
+        return f"a {type(target).__name__} is met once in a plan"
+    if law.formula()[0] != law.formula()[1]:
+        return f"the law {type(law).__name__} is not the same in compression and restitution"
+    if problem.collision != "full":
+        return f"the model {problem.collision!r} of the collision has one contact"
+    if problem.second is not None:
+        return "two strikers meet it"
+    if any(isinstance(objective, Penetration) for objective in problem.objectives):
+        return "the objective Penetration is for one touch"
+    return ""
 
 
 def check_elements(problem: Any) -> None:

@@ -25,6 +25,7 @@ from impactopt.bodies.world import (
 from impactopt.collision.settings import Effects
 from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
+from impactopt.contact.phases import ContactPhase, contact_phases
 from impactopt.contact.targets import Target
 from impactopt.errors import (
     FARTHEST,
@@ -50,6 +51,7 @@ from impactopt.problem.checks import (
     check_names,
     check_prices,
     check_stance,
+    check_touches,
     check_world,
 )
 from impactopt.problem.hashing import problem_hash
@@ -114,6 +116,8 @@ class ImpactProblem:
         fractions that sum to 1. With a `Nail` or a `Board` those of compression are used before and after the
         event, and every element is cut in two halves.
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
+    touches : how many times the striker meets the target in the blow: more than once a `Board` that breaks in
+        the last touch. None: as many times as point masses in place of robot and target do.
     collision : the model of the impact. "full": the whole equation of motion while the contact lasts. "sdc":
         H, J and bias are frozen at contact, and ``freezes`` times during it, as in :class:`impactopt.SDC`.
         "sdc-paper": likewise, with the effects of `SDC.paper`. "auto": "sdc" where it is good enough, else
@@ -160,6 +164,7 @@ class ImpactProblem:
     contact_duration: tuple[float, float] = (0.0, 0.2)
     collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.8), (1.0,))
     collision_stages: int = 3
+    touches: int | None = None
     collision: str = "full"
     freezes: int = 0
     auto_impulse_pct: float = 0.5
@@ -195,7 +200,7 @@ class ImpactProblem:
         aimed = found.attempt(self._check_aim)
         stands = found.attempt(partial(check_stances, self)) and found.attempt(partial(check_stance, self))
         stands = stands and found.attempt(self._check_start)
-        for check in (check_elements, check_prices, check_collision):
+        for check in (check_elements, check_prices, check_collision, check_touches):
             found.attempt(partial(check, self))
         if found.attempt(self._check_scenarios):
             for scenario in self.scenarios:
@@ -269,6 +274,11 @@ class ImpactProblem:
         strikers = [self.robot.striker(name).model_frame for name in self.strikers]
         held = [*(leg.frame for leg in self.coordinates.legs), *(sole.frame for sole in self.soles)]
         return idle_joints(self.robot, [*strikers, *held])
+
+    @property
+    def contact_phases(self) -> tuple[ContactPhase, ...]:
+        """Phases of the contact in a plan."""
+        return contact_phases(self.target, self.touches or 1)
 
     @property
     def lasts(self) -> bool:

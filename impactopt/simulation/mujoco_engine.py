@@ -407,7 +407,7 @@ def simulate_mujoco(
             replay.place_target()
             impulses += step * push.forces
             left = replay.target if force > 0 else left
-            kept = k % record == 0 or force > 0
+            kept = k % record == 0 or touches.touched
             state = replay.state() if kept else None
             corners = replay.corner_places() if kept else None
             mujoco.mj_step2(model, data)

@@ -326,7 +326,7 @@ def simulate_pinocchio(
             touches.add(t, push.force, step, push.since)
         peak = max(peak, float(first.forces.sum()) if push is None else push.peak)
         gears.look(first.torque, first.a)
-        if touches.touching or k % record == 0:
+        if touches.touched or k % record == 0:
             motion = (state.q, state.v, float(first.forces.sum()), first.vt, first.hand_speed)
             rows.append(
                 (

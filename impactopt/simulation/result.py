@@ -20,6 +20,7 @@ from impactopt.simulation.collision_geometry import Solids, Touched
 from impactopt.simulation.motors import MotorCut
 
 Array = NDArray[np.float64]
+ONE_BLOW = 5e-3  # [s] apart: touches of one blow
 PHASES = ("swing", "collision", "follow")
 PHASES_OF_MISS = ("swing", "missed")  # up to the planned contact, and from there on
 REPORT = (
@@ -379,11 +380,17 @@ class FollowedReference:
 
 
 class Touches:
-    """Intervals of contact, told step by step. A graze before or after the blow is an interval of its own."""
+    """Intervals of contact, told step by step.
+
+    A graze before or after the blow is one of its own, and so is each touch of a blow in which bodies part
+    and meet again.
+
+    touched : whether there was contact in the step that was told last, or in the one before it.
+    """
 
     def __init__(self) -> None:
         self.intervals: list[list[float]] = []  # start [s], end [s], impulse [N s]
-        self.touching = False
+        self.touching = self.touched = False
 
     def add(self, t: float, force: float, step: float, since: float = 0.0) -> None:
         """The contact's mean force [N] in the step that begins at time t [s]; since [s]: when in it there was
@@ -392,15 +399,20 @@ class Touches:
             if not self.touching:
                 self.intervals.append([t + since, t + since, 0.0])
             self.intervals[-1][2] += force * step
-        if self.touching or force > 0:
+        self.touched = self.touching or force > 0
+        if self.touched:
             self.intervals[-1][1] = max(t, self.intervals[-1][0])
         self.touching = force > 0
 
     def blow(self) -> tuple[float, float]:
-        """Start and end [s] of the contact with the largest impulse; nan if there was none."""
-        if not self.intervals:
-            return np.nan, np.nan
-        start, end, _ = max(self.intervals, key=lambda interval: interval[2])
+        """Start and end [s] of the blow with the largest impulse; nan if there was none."""
+        blows = list[list[float]]()
+        for start, end, impulse in self.intervals:
+            if blows and start - blows[-1][1] < ONE_BLOW:
+                blows[-1][1:] = end, blows[-1][2] + impulse
+            else:
+                blows.append([start, end, impulse])
+        start, end, _ = max(blows, key=lambda blow: blow[2], default=[np.nan] * 3)
         return start, end
 
 

@@ -14,13 +14,14 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.contact.laws import ContactLaw
+from impactopt.contact.phases import SEPARATION, TOUCH, TURN
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.contact_blocks import FORCE_SCALE, typical_state
+from impactopt.transcription.contact_blocks import DEPTH_SCALE, FORCE_SCALE, typical_state
 from impactopt.transcription.contact_guess import blow, coasted, effective_mass
 from impactopt.transcription.contact_state import (
     Contact,
@@ -156,8 +157,8 @@ class Collocated:
     Attributes
     ----------
     stages : collocation points of the phases.  end : the last one of each phase.  T : durations [s] of them.
-    u, d : rates and travel of the robot.  xt : travel of the target.  joined, joined_x : those of two phases
-        of three as one.  suffix : of places' names.
+    u, d : rates and travel of the robot.  xt : travel of the target.  joined, joined_x : those of the first
+        two phases as one, of the first three, and so on to all but the last.  suffix : of places' names.
     legs : at the stages.  contact : what it starts from.  torques : over limit at the stages, as variables.
     """
 
@@ -187,26 +188,25 @@ class Collocated:
         """Integral over the phases before one, divided by their time."""
         if phase == 0:
             return Affine.zeros(integral.size)
-        return integral[self.end[0]] if phase == 1 else joined[0]
+        return integral[self.end[0]] if phase == 1 else joined[phase - 2]
 
     def _time(self, phase: int, place: float) -> Affine:
         """[s] since contact."""
         return self._before(phase)[0] + self.T[phase][0] * place
 
     def _integrals(self) -> list[tuple[Group, Group]]:
-        """Integrals over the phase so far, each with its group of the first two phases of three as one."""
+        """Integrals over the phase so far, each with its group of the first phases as one."""
         return [(self.d, self.joined), (self.xt, self.joined_x)]
 
     def _join(self) -> list[list[Affine]]:
-        """Slots of the block ``join``: integrals in the first two phases of three as one."""
-        first, second = self.end[:2]
-        times = self.T[0][0], self.T[1][0]
-        parts = [(integral[first], integral[second], joined[0]) for integral, joined in self._integrals()]
-        return [
-            [*times, *(integral[k : k + 1] for integral in integrals)]
-            for integrals in parts
-            for k in range(integrals[0].size)
-        ]
+        """Slots of the block ``join``: integrals in the first phases as one, phase by phase."""
+        out = []
+        for phase in range(1, len(self.end) - 1):
+            times = self._before(phase)[0], self.T[phase][0]
+            for integral, joined in self._integrals():
+                parts = self._so_far(integral, joined, phase), integral[self.end[phase]], joined[phase - 1]
+                out += [[*times, *(part[k : k + 1] for part in parts)] for k in range(integral.size)]
+        return out
 
     def _slots(self, group: Group, i: int, start: Affine, *, anew: bool = False) -> tuple[Affine, Affine]:
         """Value and d/ds of a collocated group at stage i; ``start``: at contact; ``anew``: of each phase."""
@@ -301,7 +301,7 @@ class Collision(ContactNumbers, Collocated):
 
     contact : what all start from.  stages : collocation points of its phases.
     number : of the program's collisions; 0 that with the expected target.
-    mass : of the robot at its striker [kg].
+    mass : of the robot at its striker [kg].  forceless : mask of the stages at which its force is zero.
     guarded : whether its force may not pull within a phase, whatever the law.
     scenario : None: the expected target.  after : what the variables of the position after contact have
     (labels, bounds); None: there are none, a follow-through starts there.
@@ -323,8 +323,11 @@ class Collision(ContactNumbers, Collocated):
         self.number, self.scenario, self.torques = number, scenario, []
         self._each = ["", "second "][: len(b.problem.strikers)]  # of the strikers, before names of outputs
         p, c, limits = b.problem, b.coordinates, b.limits
-        phases = range(len(p.target.phases))
-        self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in phases]
+        self.phases = p.contact_phases
+        self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in range(len(self.phases))]
+        # where bodies are apart, and where they part, there is no force
+        self.forceless = np.array([self.phases[s.phase].apart for s in stages])
+        self.forceless[[i for i, f in zip(self.end, self.phases, strict=True) if f.end == SEPARATION]] = True
         self._named = named = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
         self.mass = mass
@@ -338,29 +341,29 @@ class Collision(ContactNumbers, Collocated):
 
         longest = p.contact_duration[1]
         self.T = [
-            b.duration(f"{named}{name} duration", (least, longest), 0.01)
-            for name, least in zip(p.target.phases, self.shortest, strict=True)
+            b.duration(f"{named}{phase.name} duration", (least, longest), 0.01)
+            for phase, least in zip(self.phases, self.shortest, strict=True)
         ]
         self._add_reference(n)
         self.u = add("collision rate", b.ny, labels=c.labels)
         self.d = add("collision travel", b.ny, labels=c.labels)
         self.legs = add("collision legs", b.nl, **limits.of_legs)
-        # it ends with contact; where law or target might make it pull, it has to be kept from that
-        last = (np.arange(n) == n - 1)[:, None]
-        least = 0.0 if p.target.guards or pulls_apart(p.law) or guarded else np.where(last, 0.0, -np.inf)
+        # where law or target might make it pull, it has to be kept from that
+        none = self.forceless[:, None]
+        least = 0.0 if p.target.guards or pulls_apart(p.law) or guarded else np.where(none, 0.0, -np.inf)
         # what is driven and rattles is held on to meanwhile, and the check of plans says what that leaves
         # out; of no use where forces are wanted
         self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
         if self.holds:
             driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
             least = np.where(driven, -np.inf, 0.0)[:, None]
-        most = np.where(last, 0.0, np.inf)
+        most = np.where(none, 0.0, np.inf)
         self.f = add("contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
         self.xt = add("target travel", 1, labels=["target"])
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
-        joined = int(bool(p.target.guards))
+        joined = len(self.phases) - 2
         self.joined = b.layout.add(f"{named}travel in compression", joined, b.ny, labels=c.labels)
         self.joined_x = b.layout.add(f"{named}target travel in compression", joined, 1)
         wanted = int(after is not None)
@@ -462,8 +465,8 @@ class Collision(ContactNumbers, Collocated):
     def determined(self) -> list[Determined]:
         """Variables that each stage's constraints determine, leg by leg, and those of each element.
 
-        An element's travel comes first, by linear constraints; last, if there are three phases, the integrals
-        of the first two as one.
+        An element's travel comes first, by linear constraints; last, if there are three phases or more, the
+        integrals of the first ones as one.
         """
         out: list[Determined] = []
         for i in range(len(self.stages)):
@@ -471,16 +474,16 @@ class Collision(ContactNumbers, Collocated):
             out += [determined(Turn.STAGE_LEGS, leg, k) for k, leg in enumerate(legs)]
         integrals, states = zip(*self.integrated(), strict=True)
         groups = (*states, self.w, self.f, *self.states())
-        last = self.end[-1]
         step = 0
         for members in sorted({s.members for s in self.stages}):
-            # the last force is given
-            part = [g.index(i) for i in members for g in groups if g is not self.f or i != last]
+            # where there is none, the force is given
+            part = [g.index(i) for i in members for g in groups if g is not self.f or not self.forceless[i]]
             out += [determined(Turn.ELEMENT, one.index(i), step) for i in members for one in integrals]
             out.append(determined(Turn.ELEMENT, np.concatenate(part), step + 1))
             step += 2
         if self.joined.count:
-            whole = np.concatenate([joined.index(0) for _, joined in self._integrals()])
+            joined = [group for _, group in self._integrals()]
+            whole = np.concatenate([group.index(k) for k in range(self.joined.count) for group in joined])
             out.append(determined(Turn.ELEMENT, whole, step))
         if self.scenario is not None:
             out.append(determined(Turn.AFTER, self.after.index(0)))
@@ -498,18 +501,21 @@ class Collision(ContactNumbers, Collocated):
         (start, size), order = at["force"], percent("off")
         part, where, target = self._b.parts("force"), self.suffix.lstrip(", "), self._b.problem.target
         if target.guards:  # first, as they determine variables of their own
-            names = [label for one, _ in self._integrals() for label in one.labels]
+            names = [label for one, _ in self._integrals() for label in one.labels] * self.joined.count
             outputs = at["join"][0] + np.arange(len(names))
             self._b.equal("travel in compression", where, names, outputs, along(names, "off"))
-        ends = [(name, "target", k, "event", order) for k, name in enumerate(target.guards)]
-        if target.turns:
-            still = Measure("m/s", 1.0, "left")
-            ends.append(("end of compression", "approach speed", len(ends), "rate", still))
-        ends.append(("separation", "force", len(ends), "separation", Measure("N", FORCE_SCALE, "left")))
-        for term, component, k, name, measure in ends:
-            for one in self._each if name in ("rate", "separation") else self._each[:1]:
-                outputs = start + self.end[k] * size + part[one + name]
-                self._b.equal(term, where, [one + component], outputs, measure)
+        ends = {
+            TURN: ("approach speed", "rate", Measure("m/s", 1.0, "left")),
+            SEPARATION: ("force", "separation", Measure("N", FORCE_SCALE, "left")),
+            TOUCH: ("penetration", "penetration", Measure("mm", 1e3 * DEPTH_SCALE, "left")),
+        }
+        for last, phase in zip(self.end, self.phases, strict=True):
+            component, name, measure = ends.get(phase.end, ("target", "event", order))
+            for one in self._each if phase.end in ends else self._each[:1]:
+                outputs = start + last * size + part[one + name]
+                self._b.equal(phase.end, where, [one + component], outputs, measure)
+            if phase.end == TOUCH:  # they approach then
+                self._rate_row(last, start + last * size, back=False)
 
     def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
         b, c, joints = self._b, self._b.coordinates, self._b.robot.joint_names
@@ -531,9 +537,9 @@ class Collision(ContactNumbers, Collocated):
         self._target_rows(i, place, first["force"])
 
     def _target_rows(self, i: int, place: Place, first: int) -> None:
-        b, target = self._b, self._b.problem.target
+        b, target, phase = self._b, self._b.problem.target, self.phases[self.stages[i].phase]
         part, fast = b.parts("force"), Measure("m/s", 1.0, "off")
-        if i != self.end[-1]:  # there the force is zero by its bounds
+        if not self.forceless[i]:  # there the force is zero by its bounds
             force = Measure("N", FORCE_SCALE, "off")
             for one in self._each:
                 b.equal("contact law", place, [f"{one}force"], first + part[f"{one}law"], force)
@@ -542,11 +548,12 @@ class Collision(ContactNumbers, Collocated):
         b.equal("target's motion", place, states, first + part["target"], of_size)
         b.equal("target's motion", place, ["travel"], first + part["travel"], fast)
         b.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
-        k, still = self.stages[i].phase, [0.0] * target.n_states
-        if i in self.end:
-            if target.reserve(still, 0.0, k):
+        k, still = phase.mode, [0.0] * target.n_states
+        ends, once = phase.end in target.guards, len(self.phases) == len(target.phases)
+        if i in self.end and (ends or once):
+            if ends and target.reserve(still, 0.0, k):
                 b.rows.add(
-                    term=target.guards[k],
+                    term=phase.end,
                     place=place,
                     components=["reserve"],
                     outputs=first + part["reserve"],
@@ -555,25 +562,28 @@ class Collision(ContactNumbers, Collocated):
                 )
             return
         if self._switches and target.guards:
-            back = self._restitution(i)
-            b.rows.add(
-                term="approach speed",
-                place=place,
-                components=["striker and target"],
-                outputs=first + part["rate"],
-                lower=-np.inf if back else 0.0,
-                upper=0.0 if back else np.inf,
-                measure=Measure("m/s", 1.0, "the other way"),
-            )
+            self._rate_row(i, first, back=self._restitution(i))
         if target.invariant(still, 0.0, k):
             b.rows.add(
                 term=target.guards[min(k, len(target.guards) - 1)],
                 place=place,
                 components=["target"],
                 outputs=first + part["invariant"],
-                lower=target.margin(k, self.stages[i].place),
+                lower=target.margin(k, self.stages[i].place if ends or once else 0.0),
                 measure=percent("out of turn"),
             )
+
+    def _rate_row(self, i: int, first: int, *, back: bool) -> None:
+        """Striker and target approach at a stage, or go ``back``; first : its first output of ``force``."""
+        self._b.rows.add(
+            term="approach speed",
+            place=self._place(self.stages[i]),
+            components=["striker and target"],
+            outputs=first + self._b.parts("force")["rate"],
+            lower=-np.inf if back else 0.0,
+            upper=0.0 if back else np.inf,
+            measure=Measure("m/s", 1.0, "the other way"),
+        )
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
         """Slots of the block ``link``: this state after contact to a ``start`` (y, d y/ds, duration [s])."""
@@ -600,7 +610,7 @@ class Collision(ContactNumbers, Collocated):
         place = np.array([s.place for s in self.stages])
         phase = np.array([s.phase for s in self.stages])
         mass, speed = effective_mass(c, p.strikers, p.normal, y, legs, rates)
-        found = blow(*self.alone(), mass, speed, phase, place)
+        found = blow(*self.alone(), mass, speed, phase, place, p.touches or 1)
         times = np.clip(found.durations, *np.transpose([layout.bounds(group) for group in self.T]))
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)
@@ -611,12 +621,11 @@ class Collision(ContactNumbers, Collocated):
         self.d.write(x, d)
         self.state.write(x, found.state)
         self.xt.write(x, found.travel[:, None] * per_time)
-        self.f.write(x, np.where(np.arange(len(place)) == self.end[-1], 0.0, found.force)[:, None])
+        self.f.write(x, np.where(self.forceless, 0.0, found.force)[:, None])
         self.p.write(x, len(p.strikers) * found.impulse[:, None])
-        if p.target.guards:
-            share = times[:2, None] / before[2]
-            self.joined.write(x, (share * d[self.end[:2]]).sum(axis=0))
-            self.joined_x.write(x, (share * self.xt.read(x)[self.end[:2]]).sum(axis=0))
+        for joined, each in ((self.joined, d[self.end]), (self.joined_x, self.xt.read(x)[self.end])):
+            ways = np.cumsum(times[:, None] * each, axis=0) / before[1:, None]
+            joined.write(x, ways[1:-1])
         self.after.write(x, y + float(found.moved[self.end].sum()) * rates)
         self.guess_model(x, y, rates, legs)
         if c.legs:

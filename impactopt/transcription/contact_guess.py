@@ -9,6 +9,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -17,10 +18,12 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linprog
 
 from impactopt.contact.laws import ContactLaw
+from impactopt.contact.phases import contact_phases
 from impactopt.contact.targets import FreeMass, Nail, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import Held
+from impactopt.problem.checks import MOST_TOUCHES
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription.layout import Array
 
@@ -29,6 +32,7 @@ AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as 
 # the blow is made harder until a board breaks, or a nail moves; and softer, where contact is so stiff that
 # a harder one has hammer and nail part before the nail stands
 FASTER, TRIES = 1.3, 12
+FINER = 6  # times as many speeds are tried where the blow has several touches: few have as many as are asked
 CLOSING = 0.5  # [m/s] at which what moves away is met, at least
 FASTEST = 10.0  # [m/s] beyond a start's speed none is looked for
 SLOW = 0.1  # [m/s] that a striker has at least, either way
@@ -118,14 +122,38 @@ def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, l
 class Parting:
     """Point masses that part before the last of a target's events, ``event``: when [s].
 
+    touches : how often they have to meet for it, at a speed that they may have.
     needed : speed [m/s] at which they do not; stiffness: the nearest, by factors of 10, with which they do
         not at the speed that they have. None where none is known.
     """
 
     event: str
     time: float
+    touches: int | None
     needed: float | None
     stiffness: float | None
+
+
+def touches_needed(law: ContactLaw, target: Target, mass: float, fastest: float) -> int | None:
+    """How often a point mass [kg] meets a target until all its events have happened, at a speed up to the
+    fastest; None where they do not in as many touches as a plan may have.
+    """
+    if _in_one_touch(law, target, mass, fastest):
+        return 1
+    least: int | None = None
+    for k in range(2 * TRIES * FINER):
+        found = _histories(law, target, mass, fastest * FASTER ** (1 - k / FINER), least or MOST_TOUCHES)
+        if _phases(found, target) is not None:
+            least = min(found.touches, least or MOST_TOUCHES)
+        if least == 2:
+            break
+    return least
+
+
+def _in_one_touch(law: ContactLaw, target: Target, mass: float, fastest: float) -> bool:
+    """True if all events of a target happen in one touch at some speed up to the fastest."""
+    speeds = (fastest * FASTER ** (1 - k) for k in range(2 * TRIES))
+    return any(_phases(_histories(law, target, mass, v), target) is not None for v in speeds)
 
 
 def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
@@ -136,11 +164,11 @@ def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Par
     """
 
     def whole(law: ContactLaw, speed: float) -> bool:
-        return _phases(*_histories(law, target, mass, speed), target) is not None
+        return _phases(_histories(law, target, mass, speed), target) is not None
 
-    if not np.isfinite(fastest) or any(whole(law, fastest * FASTER ** (1 - k)) for k in range(2 * TRIES)):
+    if not np.isfinite(fastest) or _in_one_touch(law, target, mass, fastest):
         return None
-    time, _ = _histories(law, target, mass, fastest)
+    time = _histories(law, target, mass, fastest).time
     if time[-1] >= LONGEST:
         return None
     faster = (fastest * FASTER**k for k in range(2, 2 * TRIES))
@@ -150,29 +178,39 @@ def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Par
     return Parting(
         event=target.guards[-1],
         time=float(time[-1]),
+        touches=touches_needed(law, target, mass, fastest) if target.met_again else None,
         needed=next((v for v in faster if whole(law, v)), None),
         stiffness=next((k for k in other if whole(type(law)(**{**numbers, "stiffness": k}), fastest)), None),
     )
 
 
 def blow(
-    law: ContactLaw, target: Target, mass: float, speed: float, phase: NDArray[np.intp], place: Array
+    law: ContactLaw,
+    target: Target,
+    mass: float,
+    speed: float,
+    phase: NDArray[np.intp],
+    place: Array,
+    touches: int,
 ) -> Blow:
     """A point mass [kg] that meets the target at a speed [m/s], at points ``place`` in [0, 1] of phases.
 
-    A target with events is met as fast, or as slowly, as it takes for all of them to happen, and one that
-    moves away no slower than it goes.
+    A target with events is met as fast, or as slowly, as it takes for all of them to happen in so many
+    touches, and one that moves away no slower than it goes.
     """
     speed = max(speed, float(target.speed_before()) + CLOSING)
-    for k in range(2 * TRIES if target.guards else 1):
+    finer = 1 if touches == 1 else FINER
+    for k in range(2 * TRIES * finer if target.guards else 1):
         # nearest speeds first, slower and faster in turn
-        at = speed * FASTER ** ((k + 1) // 2 * (1 if k % 2 else -1))
-        time, rows = _histories(law, target, mass, at)
-        ends = _phases(time, rows, target)
+        at = speed * FASTER ** ((k + 1) // 2 / finer * (1 if k % 2 else -1))
+        found = _histories(law, target, mass, at, touches)
+        ends = _phases(found, target) if found.touches == touches else None
         if ends is not None:
             break
+    time, rows, _ = found
     if ends is None:  # somewhere, where the solver has to fix it
-        ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.guards else [0.0, 0.5, 1.0])
+        ends = np.array([0.0, 0.4, 0.5, 1.0] if target.guards else [0.0, 0.5, 1.0])
+        ends = time[-1] * (ends if touches == 1 else np.linspace(0.0, 1.0, 2 * touches + 1))
     times = ends[phase] + place * np.diff(ends)[phase]
 
     def sample(values: Array) -> Array:
@@ -205,7 +243,7 @@ def speed_that_leaves(
     """
 
     def left(speed: float) -> float:
-        rows = _histories(law, target, mass, speed)[1]
+        rows = _histories(law, target, mass, speed).rows
         return float(target.velocity(rows[3:-1, -1], target.parameters))
 
     after = left(speed)
@@ -220,21 +258,22 @@ def speed_that_leaves(
     return float(brentq(lambda v: left(v) - wanted, low, high, xtol=1e-2)) if low < high else speed
 
 
-def natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:
+def natural_durations(law: ContactLaw, target: Target, mass: float, touches: int) -> Array:
     """Duration [s] of each phase of a point mass [kg] that hits at 1 m/s.
 
     It is known from the last programs, which mostly are of the same blow.
     """
     try:
-        return _natural_durations(law, target, mass)
+        return _natural_durations(law, target, mass, touches)
     except TypeError:  # a law or a target of one's own that has no hash
-        return _natural_durations.__wrapped__(law, target, mass)
+        return _natural_durations.__wrapped__(law, target, mass, touches)
 
 
 @lru_cache(maxsize=64)
-def _natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:
-    phases = len(target.phases)
-    return blow(law, target, mass, 1.0, np.arange(phases, dtype=np.intp), np.ones(phases)).durations
+def _natural_durations(law: ContactLaw, target: Target, mass: float, touches: int) -> Array:
+    phases = len(contact_phases(target, touches))
+    at = np.arange(phases, dtype=np.intp)
+    return blow(law, target, mass, 1.0, at, np.ones(phases), touches).durations
 
 
 def push(target: FreeMass, phase: NDArray[np.intp], place: Array) -> Blow:
@@ -260,8 +299,25 @@ def push(target: FreeMass, phase: NDArray[np.intp], place: Array) -> Blow:
     )
 
 
-def _histories(law: ContactLaw, target: Target, mass: float, speed: float) -> tuple[Array, Array]:
-    """Instants (k,) [s], and rows of the mass's position and speed, the target's travel and state, force."""
+class _History(NamedTuple):
+    """Instants (k,) [s], and rows of the mass's position and speed, the target's travel and state, force.
+
+    met : instants [s] at which they part and meet again, in turn, before they part for the last time.
+    """
+
+    time: Array
+    rows: Array
+    met: list[float]
+
+    @property
+    def touches(self) -> int:
+        return len(self.met) // 2 + 1
+
+
+def _histories(law: ContactLaw, target: Target, mass: float, speed: float, touches: int = 1) -> _History:
+    """The blow of a point mass that meets a target until its first event has happened, so many times at
+    most.
+    """
 
     of_law, of_target = law.parameters, target.parameters
 
@@ -279,16 +335,40 @@ def _histories(law: ContactLaw, target: Target, mass: float, speed: float) -> tu
         rate = float(y[1] - moves(y))
         return 1.0 if rate > 0 else float(law.separation(float(y[0] - y[2]), rate, of_law))
 
+    def meet(_: float, y: Array) -> float:
+        return float(y[0] - y[2])
+
     apart.terminal, apart.direction = True, -1.0  # type: ignore[attr-defined]
-    start = [0.0, speed, 0.0, *np.zeros(target.n_states)]
+    meet.terminal, meet.direction = True, 1.0  # type: ignore[attr-defined]
+    start = np.array([0.0, speed, 0.0, *np.zeros(target.n_states)])
     # explicit: what switches, as a nail does, makes stiff solvers stall
-    span, options = (0.0, LONGEST), {"method": "RK23", "rtol": 1e-4, "atol": 1e-8}
-    found = solve_ivp(flow, span, start, events=apart, max_step=LONGEST / 400, **options)
-    return found.t, np.vstack([found.y, [force(y) for y in found.y.T]])
+    options = {"method": "RK23", "rtol": 1e-4, "atol": 1e-8, "max_step": LONGEST / 400}
+    times, columns, met = list[Array](), list[Array](), list[float]()
+    for k in range(2 * touches - 1):
+        span = (met[-1] if met else 0.0, LONGEST)
+        found = solve_ivp(flow, span, start, events=meet if k % 2 else apart, **options)
+        times.append(found.t)
+        columns.append(found.y)
+        if found.status != 1:
+            break
+        start = found.y[:, -1]
+        if k % 2 == 0 and (k == 2 * touches - 2 or target.guard(start[3:], 0.0, found.t[-1], 0) >= 0):
+            break
+        met.append(float(found.t[-1]))
+    y = np.hstack(columns)
+    return _History(np.concatenate(times), np.vstack([y, [force(each) for each in y.T]]), met)
 
 
-def _phases(time: Array, rows: Array, target: Target) -> Array | None:
+def _phases(found: _History, target: Target) -> Array | None:
     """Start and ends of the phases [s]; None if the target's events have not happened in their order."""
+    time, rows, met = found
+    if met:
+        broken = [
+            k for k in range(len(time)) if float(target.guard(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0
+        ]
+        if len(met) % 2 or not broken or not met[-1] < time[broken[0]] < time[-1]:
+            return None
+        return np.array([0.0, *met, time[broken[0]], time[-1]])
     deepest = int(np.argmax(rows[0] - rows[2]))
     ends = [0.0, time[deepest], time[-1]]
     if isinstance(target, Nail):

@@ -163,7 +163,8 @@ class _Again:
             assert isinstance(new, Collision) and isinstance(old, Collision)
             carry_contact(new, old, z, x)
             held += [new.after.index(0)] if new.after.count else []
-        ends = {*self._builder.problem.target.guards, "end of compression", "separation"}
+            held += [new.f.index(int(i)) for i in np.flatnonzero(new.forceless[:-1])]
+        ends = {phase.end for phase in self._builder.problem.contact_phases}
         equal = program.g_lower == program.g_upper
         events = np.array([o.term in ends for o in program.origins])
 

@@ -59,7 +59,7 @@ class ContactNumbers:
             return
         self._known = numbers
         # how long the last phase [s] is of a point mass's blow: the unit of what is too short
-        self.natural = float(natural_durations(*self.alone(), self.mass)[-1])
+        self.natural = float(natural_durations(*self.alone(), self.mass, p.touches or 1)[-1])
         self.shortest = shortest_phases(p, self.natural)
 
     def alone(self) -> tuple[Any, Any]:
@@ -77,7 +77,8 @@ class ContactNumbers:
     def force_numbers(self) -> list[list[float]]:
         """Parameters of the block ``force``, of each stage."""
         p = self._b.problem
-        phases = np.column_stack([np.eye(len(self.end)), self.shortest])
+        modes = np.eye(len(p.target.phases))[[phase.mode for phase in p.contact_phases]]
+        phases = np.column_stack([modes, self.shortest])
         within = phases if p.target.guards else phases[:, :0]
         numbers = [*self.law.values(), *self.target.values()]
         numbers += [] if p.second is None else [*p.second.point]
@@ -92,7 +93,7 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     target, (shortest, longest) = problem.target, problem.contact_duration
     if not shortest:  # no bound: far below what a blow takes, as constraints are over these times
         shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
-    shares = [SHARE if target.guards else 1.0] * (len(target.phases) - 1) + [1.0]
+    shares = [SHARE if target.guards else 1.0] * (len(problem.contact_phases) - 1) + [1.0]
     if target.at_once:
         shares[0] = AT_ONCE
     return [share * shortest for share in shares]

@@ -150,7 +150,7 @@ class CollocationPoint:
 
 
 def collision_mesh(
-    elements: Sequence[tuple[float, ...]], radau: Radau, names: tuple[str, ...] = Target.phases
+    elements: Sequence[tuple[float, ...]], radau: Radau, names: Sequence[str] = Target.phases
 ) -> list[CollocationPoint]:
     """Stages of the contact's phases; ``elements``: their lengths, as fractions of a phase."""
     inverse = np.linalg.inv(radau.a)
@@ -186,6 +186,9 @@ def lagrange(places: Sequence[float], at: float) -> Array:
     return np.asarray(np.prod(ahead / gaps, axis=1))
 
 
+APART = (0.5, 0.5)  # elements of a phase without force
+
+
 def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
     """Elements of each phase of a problem's contact; halved if its target has events.
 
@@ -195,7 +198,7 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
     target, (first, last) = problem.target, problem.collision_elements
     if target.guards:
         first, last = halved((first, last))
-    before = [first] * (len(target.phases) - 1)
+    before = [APART if phase.apart else first for phase in problem.contact_phases[:-1]]
     if target.at_once:
         before[0] = (1.0,)
     own = (*before, last)
@@ -211,7 +214,7 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
 
 def guessed_shares(problem: ImpactProblem) -> Shares:
     """Fraction of the contact's time that each phase lasts, as a point mass meets the target."""
-    durations = natural_durations(problem.law, problem.target, mass_at_contact(problem))
+    durations = natural_durations(problem.law, problem.target, mass_at_contact(problem), 1)
     return tuple(float(share) for share in durations / durations.sum())
 
 
@@ -244,7 +247,8 @@ def halved(elements: Elements) -> Elements:
 def contact_mesh(problem: ImpactProblem, elements: Elements | None = None) -> list[CollocationPoint]:
     """Stages of the contact of a problem; ``elements``: if not those that it asks for."""
     radau = Radau.of_stages(problem.collision_stages)
-    return collision_mesh(elements or contact_elements(problem), radau, problem.target.phases)
+    names = [phase.name for phase in problem.contact_phases]
+    return collision_mesh(elements or contact_elements(problem), radau, names)
 
 
 def percentage(s: float, more: Collection[float]) -> str:

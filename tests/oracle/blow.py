@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,37 @@ def stages_of(elements: Sequence[Sequence[float]], stages: int) -> list[Stage]:
     return out
 
 
+class Spell(NamedTuple):
+    """A phase: its name, the target's phase in it, what ends it, and whether striker and target are apart."""
+
+    name: str
+    mode: int
+    end: str
+    apart: bool
+
+
+def spells_of(problem: ImpactProblem) -> list[Spell]:
+    """All phases: the target's; or each touch and each gap, the last touch with the target's events."""
+    target, more = problem.target, (problem.touches or 1) - 1
+    guards = list(target.guards)
+    if not more:
+        turn = ["end of compression"] if len(target.phases) > len(guards) + 1 else []
+        ends = [*guards, *turn, "separation"]
+        return [Spell(name, k, ends[k], False) for k, name in enumerate(target.phases)]
+    out = []
+    for k in range(more):
+        out += [
+            Spell(f"touch {k + 1}", 0, "separation", False),
+            Spell(f"apart after touch {k + 1}", 0, "touch", True),
+        ]
+    out.append(Spell(f"touch {more + 1}", 0, guards[0], False))
+    for k, guard in enumerate(guards):
+        out.append(
+            Spell(f"touch {more + 1}, after the {guard}", k + 1, [*guards, "separation"][k + 1], False)
+        )
+    return out
+
+
 class Blow:
     """Rows and bounds of the contact with the expected target, or with a scenario's.
 
@@ -87,10 +118,15 @@ class Blow:
             self.law, self.target = scenario.numbers(law, target)
             self.fraction, self.margin, self.least = scenario.torque, scenario.cone_margin, 0.0
         self.points = [point for _, point in problem.contacts]
-        self.phases = len(target.phases)
+        self.spells = spells_of(problem)
+        self.phases = len(self.spells)
         self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in range(self.phases)]
         self.typical = np.array(target.typical or (1.0,) * target.n_states)
-        self.durations = [f"{self.prefix}{name} duration" for name in target.phases]
+        self.durations = [f"{self.prefix}{spell.name} duration" for spell in self.spells]
+        self.free = [  # of force
+            self.spells[s.phase].apart or (i in self.end and self.spells[s.phase].end == "separation")
+            for i, s in enumerate(self.stages)
+        ]
 
     @property
     def _each(self) -> list[str]:
@@ -110,12 +146,12 @@ class Blow:
     def bounds(self, guarded: bool) -> dict[str, tuple[Array, Array]]:
         """Physical (count, size), of groups that have them; guarded : no force may pull, whatever the law."""
         p, target, n = self.problem, self.problem.target, len(self.stages)
-        last = np.arange(n) == n - 1
+        free = np.array(self.free)
         pulls = float(type(p.law)(**self.problem.law.parameters).branch(1e-6, -10.0, False)) < 0
-        least = np.zeros(n) if target.guards or pulls or guarded else np.where(last, 0.0, -np.inf)
+        least = np.zeros(n) if target.guards or pulls or guarded else np.where(free, 0.0, -np.inf)
         if not target.turns and not any(isinstance(o, PeakForce) for o in p.objectives):
             least = np.where([0 < s.phase < self.phases - 1 for s in self.stages], -np.inf, 0.0)
-        most = np.where(last, 0.0, np.inf)
+        most = np.where(free, 0.0, np.inf)
         longest = p.contact_duration[1]
         most_torque = np.array([self.fraction])
         torques = {self.torque(i) for i in range(n)} & self.lifted
@@ -129,7 +165,7 @@ class Blow:
 
     def place(self, i: int) -> str:
         s = self.stages[i]
-        return f"{self.problem.target.phases[s.phase]}, {100 * s.place:.3g} %{self.suffix}"
+        return f"{self.spells[s.phase].name}, {100 * s.place:.3g} %{self.suffix}"
 
     def get(self, v: Variables, name: str, i: int = 0) -> Array:
         return v.get(self.prefix + name, i)
@@ -151,8 +187,8 @@ class Blow:
         if phase == 1:
             at = self.end[0]
             return time, self.get(v, "collision travel", at), float(self.get(v, "target travel", at)[0])
-        joined = self.get(v, "travel in compression")
-        return time, joined, float(self.get(v, "target travel in compression")[0])
+        joined = self.get(v, "travel in compression", phase - 2)
+        return time, joined, float(self.get(v, "target travel in compression", phase - 2)[0])
 
     def moved(self, v: Variables, i: int, y0: Array) -> tuple[Array, float, float, float]:
         """At stage i: coordinates, time [s] since contact, duration [s] of its phase, target's travel [m]."""
@@ -262,17 +298,24 @@ class Blow:
         return way - gone, float(normal @ fast) - speed, f, T, state
 
     def _smooth(self, i: int, state: Array, f: float) -> tuple[Any, Array]:
-        phase = self.stages[i].phase if self.problem.target.guards else 0
-        speed, rates = self.problem.target.smooth(state, f, phase, self.target)
+        mode = self.spells[self.stages[i].phase].mode if self.problem.target.guards else 0
+        speed, rates = self.problem.target.smooth(state, f, mode, self.target)
         return speed, np.array([float(rate) for rate in rates]).reshape(self.problem.target.n_states)
 
     def _of_target(self, i: int) -> list[Piece]:
-        target, law, place, phase = self.problem.target, self.problem.law, self.place(i), self.stages[i].phase
-        inner, n = i not in self.end, target.n_states
-        guarded = inner and bool(target.invariant([0.0] * n, 0.0, phase))
-        reserved = not inner and bool(target.reserve([0.0] * n, 0.0, phase))
+        target, law, place, number = (
+            self.problem.target,
+            self.problem.law,
+            self.place(i),
+            self.stages[i].phase,
+        )
+        spell, n = self.spells[number], target.n_states
+        phase, inner, one = spell.mode, i not in self.end, not (self.problem.touches or 1) > 1
+        to_event = spell.end in target.guards
+        guarded = (inner or not (one or to_event)) and bool(target.invariant([0.0] * n, 0.0, phase))
+        reserved = not inner and to_event and bool(target.reserve([0.0] * n, 0.0, phase))
         signed = inner and bool(target.guards) and _switches(law)
-        releases = phase == self.phases - 1
+        releases = number == self.phases - 1
 
         def value(v: Variables) -> Array:
             _, rate, f, T, now = self.contact(v, i)
@@ -281,7 +324,7 @@ class Blow:
             travel = self.slope(v, "target travel", i, np.zeros(1), anew=True) - float(speed)
             given = self.slope(v, "impulse so far", i, np.zeros(1)) - T * f
             parts = [slopes / self.typical, travel, given]
-            own = self.get(v, "contact force", i) if i != self.end[-1] else ()
+            own = () if self.free[i] else self.get(v, "contact force", i)
             for k, force in enumerate(own):
                 deep, fast, *_ = self.contact(v, i, k)
                 parts.append(
@@ -300,58 +343,58 @@ class Blow:
             ("target's motion", place, [*states, "travel"], 0.0, 0.0),
             ("impulse", place, ["target"], 0.0, 0.0),
         ]
-        if i != self.end[-1]:
+        if not self.free[i]:
             rows.append(("contact law", place, [f"{one}force" for one in self._each], 0.0, 0.0))
         if signed:
             way = (-np.inf, 0.0) if releases else (0.0, np.inf)
             rows.append(("approach speed", place, ["striker and target"], *way))
         if guarded:
             name = target.guards[min(phase, len(target.guards) - 1)]
-            least = target.margin(phase, self.stages[i].place)
+            least = target.margin(phase, self.stages[i].place if one or to_event else 0.0)
             rows.append((name, place, ["target"], least, np.inf))
         if reserved:
-            rows.append((target.guards[phase], place, ["reserve"], 0.0, np.inf))
+            rows.append((spell.end, place, ["reserve"], 0.0, np.inf))
         return [Piece.of(value, rows)]
 
     def _ends(self) -> list[Piece]:
         target, law, where = self.problem.target, self.problem.law, self.suffix.lstrip(", ")
         out = []
-        for k, name in enumerate(target.guards):
+        for number, (spell, i) in enumerate(zip(self.spells, self.end, strict=True)):
 
-            def event(v: Variables, k: int = k) -> Array:
-                _, _, f, T, now = self.contact(v, self.end[k])
-                late = T - self.shortest[k]
-                return np.array([float(target.guard(now, f, late, k, self.target))])
+            def ended(v: Variables, number: int = number, spell: Spell = spell, i: int = i) -> Array:
+                if spell.end in target.guards:
+                    _, _, f, T, now = self.contact(v, i)
+                    late = T - self.shortest[number]
+                    return np.array([float(target.guard(now, f, late, spell.mode, self.target))])
+                found = [self.contact(v, i, k)[:2] for k in range(len(self.points))]
+                if spell.end == "separation":
+                    return np.array([float(law.separation(*each, self.law)) / FORCE for each in found])
+                if spell.end == "touch":
+                    return np.array([deep / DEPTH for deep, _ in found])
+                return np.array([rate for _, rate in found])
 
-            out.append(Piece.of(event, [(name, where, ["target"], 0.0, 0.0)]))
-        if target.turns:
-            turn = self.end[len(target.guards)]
+            each = {"separation": "force", "touch": "penetration", "end of compression": "approach speed"}
+            names = [f"{one}{each[spell.end]}" for one in self._each] if spell.end in each else ["target"]
+            out.append(Piece.of(ended, [(spell.end, where, names, 0.0, 0.0)]))
+            if spell.apart:
 
-            def turned(v: Variables) -> Array:
-                return np.array([self.contact(v, turn, k)[1] for k in range(len(self.points))])
+                def comes(v: Variables, i: int = i) -> Array:
+                    return np.array([self.contact(v, i)[1]])
 
-            names = [f"{one}approach speed" for one in self._each]
-            out.append(Piece.of(turned, [("end of compression", where, names, 0.0, 0.0)]))
+                row = ("approach speed", self.place(i), ["striker and target"], 0.0, np.inf)
+                out.append(Piece.of(comes, [row]))
+        return [*out, *(self._joined(where, k) for k in range(1, self.phases - 1))]
 
-        def parted(v: Variables) -> Array:
-            last = (self.contact(v, self.end[-1], k)[:2] for k in range(len(self.points)))
-            return np.array([float(law.separation(*found, self.law)) / FORCE for found in last])
+    def _joined(self, where: str, k: int) -> Piece:
+        """Travel in all phases to a number k is that in those before it and in k itself."""
 
-        names = [f"{one}force" for one in self._each]
-        out.append(Piece.of(parted, [("separation", where, names, 0.0, 0.0)]))
-        if target.guards:
-            out.append(self._joined(where))
-        return out
-
-    def _joined(self, where: str) -> Piece:
         def value(v: Variables) -> Array:
-            one, two = (v.one(name) for name in self.durations[:2])
-            parts = []
-            for travel, joined in (("collision travel", ""), ("target travel", "target ")):
-                first, second = (self.get(v, travel, self.end[k]) for k in (0, 1))
-                whole = self.get(v, f"{joined}travel in compression")
-                parts.append(one * first + two * second - (one + two) * whole)
-            return np.concatenate(parts)
+            time, y, x = self.before(v, k)
+            own, (together, whole, gone) = v.one(self.durations[k]), self.before(v, k + 1)
+            at = self.end[k]
+            moved = time * y + own * self.get(v, "collision travel", at) - together * whole
+            travel = time * x + own * float(self.get(v, "target travel", at)[0]) - together * gone
+            return np.concatenate([moved, [travel]])
 
         names = [*self.robot.labels, "target"]
         return Piece.of(value, [("travel in compression", where, names, 0.0, 0.0)])

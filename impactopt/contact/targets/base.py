@@ -38,6 +38,7 @@ class Target(Described, ABC):
     at_once : whether the first guard may be met at the first touch, so that the phase before it has no
         length.
     stays : whether the target stays where the blow leaves it. The striker must then keep off it afterwards.
+    met_again : whether a plan may have the striker part from it and meet it again before its first guard.
     """
 
     word: ClassVar[str] = ""
@@ -48,6 +49,7 @@ class Target(Described, ABC):
     phases: ClassVar[tuple[str, ...]] = ("compression", "restitution")
     at_once: ClassVar[bool] = False
     stays: ClassVar[bool] = False
+    met_again: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_numbers(self)

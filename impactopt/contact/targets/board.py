@@ -44,6 +44,7 @@ class Board(Target):
     typical: ClassVar[tuple[float, ...]] = (1.0, 0.01)
     guards: ClassVar[tuple[str, ...]] = ("break",)
     phases: ClassVar[tuple[str, ...]] = ("compression", "compression after the break", "restitution")
+    met_again: ClassVar[bool] = True
 
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
         p = self.parameters if parameters is None else parameters

@@ -155,7 +155,7 @@ class PlannedContact:
                 problem.robot,
                 self.reference,
                 scene_of(problem),
-                step=min(_STEP, duration / (_STEPS * (problem.touches or 1) ** 2)),
+                step=min(_STEP, duration / _STEPS),
                 # a strike has no motion that takes the striker away
                 until=duration * (_LONGER if isinstance(planned, Plan) else 1.0),
                 longest=_LONGEST * duration,

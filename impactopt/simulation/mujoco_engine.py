@@ -185,7 +185,7 @@ class _Replay(MujocoRobot):
                 self.kept = self.kept + struck.depths(self.places(), self.travel) - depths
         else:
             state = struck.moved(self.target, 0.0, step)
-            travel = self.travel + step * struck.speed(state)
+            travel = self.travel + step / 2 * (struck.speed(self.target) + struck.speed(state))
             push = Push(forces=none, halves=none, peaks=none, state=state, travel=travel, depths=depths)
         self.before = (speeds, push.forces)
         self.target, self.travel = push.state, push.travel

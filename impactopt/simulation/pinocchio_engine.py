@@ -193,11 +193,12 @@ class _World:
             drive=self.motors.after(s.drive, first.cut, h / 2),
         )
         middle = self.rates(t + h / 2, half, forces=0.0 * first.forces if push is None else push.forces)
+        target = self.struck.moved(s.target, 0.0, h) if push is None else push.state
         after = _State(
             q=pin.integrate(self.model, s.q, h * middle.v),
             v=s.v + h * middle.a,
-            x=s.x + h * first.vt,
-            target=self.struck.moved(s.target, 0.0, h) if push is None else push.state,
+            x=s.x + h / 2 * (first.vt + self.struck.speed(target)),
+            target=target,
             impulses=s.impulses + h * middle.forces,
             drive=self.motors.after(s.drive, middle.cut, h),
         )

@@ -21,6 +21,7 @@ from impactopt.transcription.mesh import CollocationPoint
 # of the shortest compression that each of the two may last which an event makes of it, and the first of them
 # where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
 SHARE, AT_ONCE = 0.1, 0.05
+SEVERAL = 0.01  # the same of each phase where striker and target part and meet again
 # of a phase without a shortest time: share of the natural one, [s] at most, and share of the longest time
 OF_NATURAL, LEAST, HALF = 0.15, 2e-3, 0.5
 ALIKE = 3.0  # factor between numbers that are
@@ -94,6 +95,8 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     if not shortest:  # no bound: far below what a blow takes, as constraints are over these times
         shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
     shares = [SHARE if target.guards else 1.0] * (len(problem.contact_phases) - 1) + [1.0]
+    if (problem.touches or 1) > 1:
+        shares = [SEVERAL] * len(shares)
     if target.at_once:
         shares[0] = AT_ONCE
     return [share * shortest for share in shares]

@@ -190,13 +190,16 @@ APART = (0.5, 0.5)  # elements of a phase without force
 
 
 def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
-    """Elements of each phase of a problem's contact; halved if its target has events.
+    """Elements of each phase of a problem's contact; halved if its target has events, and once more where it
+    is met several times, as force rises and falls in one phase then.
 
     Where an event may come at once, the phase before it is one element. Where something is frozen on the
     way, segments begin with elements; ``shares`` : if the phases' are not those of a point mass.
     """
     target, (first, last) = problem.target, problem.collision_elements
     if target.guards:
+        first, last = halved((first, last))
+    if (problem.touches or 1) > 1:
         first, last = halved((first, last))
     before = [APART if phase.apart else first for phase in problem.contact_phases[:-1]]
     if target.at_once:

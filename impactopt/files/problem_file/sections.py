@@ -304,7 +304,7 @@ class CollisionSection(Section):
         "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    touches: Literal[1, 2, 3, 4] | None = optional(
+    touches: Literal[1, 2, 3, 4] = optional(
         "times that a board is met, the last of which breaks it; left out: as often as point masses meet it"
     )
     compression: Fractions = optional("lengths of its collocation elements")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.small_plans import Planned, arm_problem, biped_problem, changed, transcribed
 
-from impactopt.contact import FreeMass
+from impactopt.contact import Board, FreeMass, KelvinVoigt
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.clearance_constraints import Margins, Watch
 from impactopt.problem.objectives import Effort
@@ -110,6 +110,13 @@ def test_of_a_ball_that_comes_and_is_caught() -> None:
     still = TargetSpeed(least=-0.1, most=0.2)
     ball = FreeMass(mass=0.5, initial_velocity=-3.0)
     check_rows(transcribed(dataclasses.replace(p, target=ball, terms=(*p.terms, still))))
+
+
+@pytest.mark.parametrize("touches", [2, 3])
+def test_of_a_board_that_is_met_several_times(touches: int) -> None:
+    board = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
+    law = KelvinVoigt(stiffness=1e6, damping=50.0)
+    check_rows(transcribed(dataclasses.replace(arm_problem(), target=board, law=law, touches=touches)))
 
 
 def test_of_a_slide_that_is_bounded() -> None:

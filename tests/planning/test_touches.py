@@ -1,0 +1,216 @@
+"""Boards that are met more than once: touches of a plan are those of its replays, and each is a phase."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impactopt import Solution, optimize_strike, solve
+from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, SpringDamper
+from impactopt.contact.phases import SEPARATION, TOUCH, contact_phases
+from impactopt.errors import InputError, NotSolvedWarning
+from impactopt.files.output import record_of, save_record
+from impactopt.files.problem_file import load_problem
+from impactopt.files.replay import load_planned
+from impactopt.problem.objectives import Penetration
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import GearLoad
+from impactopt.simulation.engines import scene_of
+from impactopt.simulation.pinocchio_engine import follow_contact
+from impactopt.solvers.program import Status
+from impactopt.transcription.contact_guess import natural_durations, parting, touches_needed
+
+BOARD = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
+
+
+def stiff(stiffness: float = 1e6, **changes: Any) -> ImpactProblem:
+    """A hammer that bounces off its board before the board has bent far enough."""
+    law = KelvinVoigt(stiffness=stiffness, damping=50.0)
+    terms = (*load_problem("chop_arm").terms, GearLoad(enabled=False))
+    return dataclasses.replace(load_problem("chop_arm"), **{"law": law, "terms": terms, **changes})
+
+
+@pytest.fixture(scope="module", params=[1e6, 1e7])
+def chopped(request: pytest.FixtureRequest) -> Solution:
+    return solve(stiff(request.param))
+
+
+# ---- plans
+
+
+def test_it_is_solved_with_the_touches_that_point_masses_need(chopped: Solution) -> None:
+    assert chopped.status is Status.SOLVED
+    assert chopped.problem.touches == 2
+    assert chopped.plan.collision.outcome == {"broken": 1.0}
+    assert "caution" not in chopped.summary()
+
+
+def test_it_is_replayed_as_planned(chopped: Solution) -> None:
+    replay = chopped.validate()
+    assert replay.impulse == pytest.approx(chopped.impulse, rel=2e-3)
+    assert replay.peak_force == pytest.approx(chopped.plan.collision.force.max(), rel=0.02)
+    duration = chopped.plan.compression + chopped.plan.restitution
+    assert replay.contact_end - replay.contact_start == pytest.approx(duration, rel=0.03)
+    assert len([touch for touch in replay.touches if touch[2] > 1e-3 * replay.impulse]) == 2
+    followed = chopped.contact_replay
+    assert followed is not None
+    assert (followed.partings, followed.unforeseen) == (1, False)
+    assert followed.outcome == {"broken": 1.0}
+
+
+def test_mujoco_says_so_too(chopped: Solution) -> None:
+    """Of the softer one: the other needs steps that take a minute."""
+    if chopped.problem.law.parameters["stiffness"] == 1e6:
+        replay = chopped.validate(engine="mujoco")
+        assert replay.impulse == pytest.approx(chopped.impulse, rel=1e-2)
+        assert replay.peak_force == pytest.approx(chopped.plan.collision.force.max(), rel=0.02)
+
+
+def test_force_is_zero_between_the_touches_and_only_there(chopped: Solution) -> None:
+    hit = chopped.plan.collision
+    inside = hit.force[1:-1]
+    gap = np.flatnonzero(inside == 0.0)
+    assert (np.diff(gap) == 1).all()
+    assert gap[0] > 0
+    assert gap[-1] < len(inside) - 1
+    assert (np.delete(inside, gap) > 0).all()
+
+
+def test_impulse_is_what_the_board_has_and_what_its_spring_took(chopped: Solution) -> None:
+    """m v, and the spring's and the damper's force over time, up to the break."""
+    p, hit = chopped.problem, chopped.plan.collision
+    broken = chopped.contact_replay
+    assert broken is not None
+    until = hit.time <= broken.events[0]
+    way = np.concatenate(
+        [[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)]
+    )
+    bent = (BOARD.stiffness * way + BOARD.damping * hit.target_speed)[until]
+    taken = float(np.trapezoid(bent, hit.time[until]))
+    given = p.target.parameters["mass"] * hit.target_speed[-1] + taken
+    assert given == pytest.approx(chopped.impulse, rel=2e-2)
+
+
+def test_steps_of_replays_do_not_move_the_second_touch(chopped: Solution) -> None:
+    """The board swings freely between them: its way in a step is not its first speed times the step."""
+    p, duration = chopped.problem, chopped.plan.compression + chopped.plan.restitution
+    coarse, fine = (
+        follow_contact(
+            p.robot,
+            chopped.plan.reference,
+            scene_of(p),
+            step=duration / n,
+            until=duration,
+            longest=4 * duration,
+        )
+        for n in (60, 480)
+    )
+    assert coarse.impulse == pytest.approx(fine.impulse, rel=5e-4)
+    assert coarse.touches[1][0] == pytest.approx(fine.touches[1][0], rel=5e-4)
+
+
+def test_a_strike_is_planned_so_too() -> None:
+    strike = optimize_strike(stiff())
+    assert strike.status is Status.SOLVED
+    assert strike.problem.touches == 2
+    followed = strike.contact_replay
+    assert followed is not None
+    assert not followed.unforeseen
+    assert abs(followed.impulse_pct) < 0.5
+
+
+def test_one_touch_has_no_plan_and_the_number_that_has_one_is_named() -> None:
+    with pytest.warns(NotSolvedWarning, match="one contact is not enough"):
+        strike = optimize_strike(stiff(touches=1))
+    assert strike.status is Status.INFEASIBLE
+    assert "`[collision] touches = 2` plans them" in strike.result.message
+
+
+def test_a_plan_starts_from_a_neighbour(chopped: Solution) -> None:
+    again = solve(stiff(1.05 * chopped.problem.law.parameters["stiffness"]), start=chopped)
+    assert again.status is Status.SOLVED
+    assert again.problem.touches == 2
+
+
+def test_what_is_saved_is_read_with_its_touches(chopped: Solution, tmp_path: Path) -> None:
+    """Its problem does not say how many: the plan does."""
+    k = chopped.problem.law.parameters["stiffness"]
+    text = (Path(__file__).resolve().parents[2] / "problems" / "chop_arm.toml").read_text("utf-8")
+    text = text.replace("stiffness_N_m = 1e5\ndamping_N_s_m = 50", f"stiffness_N_m = {k}\ndamping_N_s_m = 50")
+    text += "\n[terms.gear_load]\nenabled = false\n"
+    save_record(record_of(chopped, problem=text, problem_path=tmp_path / "chop.toml"), tmp_path)
+    planned = load_planned(tmp_path)
+    assert planned.problem.touches == 2
+    assert planned.problem.law == chopped.problem.law
+
+
+def test_a_board_with_a_weaker_one_as_a_scenario() -> None:
+    """All targets are met as often; point masses are not asked then."""
+    others = (Scenario(name="heavier", mass=1.2),)
+    solution = solve(stiff(scenarios=others, touches=2))
+    assert solution.status is Status.SOLVED
+    heavier = solution.plan.scenarios[0]
+    assert heavier.collision.outcome == {"broken": 1.0}
+    assert heavier.impulse != solution.impulse
+
+
+# ---- phases and their number
+
+
+@pytest.mark.parametrize("target", [BOARD, FreeMass(mass=1.0), Nail(mass=0.05, resistance=600.0)])
+def test_phases_of_one_touch_are_the_targets(target: Any) -> None:
+    phases = contact_phases(target)
+    assert tuple(phase.name for phase in phases) == target.phases
+    assert [phase.mode for phase in phases] == list(range(len(phases)))
+    assert phases[-1].end == SEPARATION
+    assert tuple(phase.end for phase in phases[: len(target.guards)]) == target.guards
+
+
+@pytest.mark.parametrize("touches", [2, 3, 4])
+def test_phases_of_several_touches(touches: int) -> None:
+    phases = contact_phases(BOARD, touches)
+    assert len(phases) == 2 * touches
+    assert [phase.end for phase in phases[:-2]] == [SEPARATION, TOUCH] * (touches - 1)
+    assert [phase.end for phase in phases[-2:]] == ["break", SEPARATION]
+    assert [phase.apart for phase in phases[:-2]] == [False, True] * (touches - 1)
+    assert [phase.mode for phase in phases] == [0] * (2 * touches - 1) + [1]
+    assert len({phase.name for phase in phases}) == len(phases)
+
+
+def test_touches_of_point_masses() -> None:
+    """Without damping they part after half a period of the spring between them."""
+    soft, hard = (KelvinVoigt(stiffness=k, damping=50.0) for k in (1e5, 1e7))
+    assert touches_needed(soft, BOARD, 0.9, 8.0) == 1
+    assert touches_needed(hard, BOARD, 0.9, 8.0) == 2
+    found = parting(hard, BOARD, 0.9, 8.0)
+    assert found is not None
+    assert found.touches == 2
+    undamped = KelvinVoigt(stiffness=1e7, damping=0.0)
+    first = natural_durations(undamped, BOARD, 2.5, 2)[0]
+    reduced = 1 / (1 / 2.5 + 1 / BOARD.mass)
+    assert first == pytest.approx(np.pi * np.sqrt(reduced / 1e7), rel=0.02)
+
+
+# ---- refusals
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"touches": 0}, "touches"),
+        ({"touches": 5}, "touches"),
+        ({"touches": 1.5}, "touches"),
+        ({"touches": 2, "target": FreeMass(mass=1.0)}, "a FreeMass is met once"),
+        ({"touches": 2, "law": SpringDamper(stiffness=1e6, damping=50.0)}, "SpringDamper is not the same"),
+        ({"touches": 2, "collision": "sdc"}, "'sdc' of the collision has one contact"),
+        ({"touches": 2, "objectives": (Penetration(),)}, "Penetration is for one touch"),
+    ],
+)
+def test_touches_that_no_plan_has_are_refused(changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        stiff(**changes)

@@ -61,7 +61,7 @@ $(BROWSER): $(STAMP)
 
 test: $(STAMP) $(BROWSER) ## run the tests (ARGS='-k robot' for some of them)
 	@echo "== running the tests (the first run compiles functions)"
-	@$(BIN)/python -m pytest -n auto --dist loadgroup $(ARGS)
+	@$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
 lint: $(STAMP) ## check style with ruff
 	@echo "== ruff"

@@ -15,19 +15,6 @@ from impactopt.transcription.transcription import Transcription
 os.environ.setdefault("IMPACTOPT_COMPILE", "quick")  # `as_shipped` takes it away
 
 
-@pytest.hookimpl(tryfirst=True)  # xdist reads the groups in the same hook
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Workers of `-n auto --dist loadgroup` take whole files, so that no plan is made twice; those tests that
-    need the demo's plan go to one of them.
-    """
-    if not config.pluginmanager.hasplugin("xdist"):
-        return
-    for item in items:
-        own = hasattr(getattr(item, "module", None), "punch")  # another plan, by the same name
-        demo = "punch" in getattr(item, "fixturenames", ()) and not own
-        item.add_marker(pytest.mark.xdist_group("demo" if demo else str(item.path)))
-
-
 @pytest.fixture
 def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
     """Collisions compiled as users have them."""

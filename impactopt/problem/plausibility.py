@@ -11,7 +11,7 @@ from impactopt.bodies.convex_hulls import distance_to_link, is_far, pieces_of, s
 from impactopt.robots.gains import HEAVIEST_ROTOR, LIGHTEST_ROTOR
 from impactopt.robots.robot import Robot
 
-__all__ = ["doubts", "far_shapes", "giant_soles"]
+__all__ = ["doubts", "giant_soles", "shape_doubts"]
 
 GIANT = 3.0  # of a leg's length: no sole is so long
 ALIKE = 0.2  # of a sole's length or width, by which left and right may differ
@@ -19,7 +19,7 @@ ALIKE = 0.2  # of a sole's length or width, by which left and right may differ
 
 def doubts(robot: Robot) -> list[str]:
     """Numbers of a robot that a plan depends on and that are missing, or hard to believe."""
-    return [*_without_armature(robot), *_armatures(robot), *_sides(robot), *far_shapes(robot)]
+    return [*_without_armature(robot), *_armatures(robot), *_sides(robot), *shape_doubts(robot)]
 
 
 def giant_soles(robot: Robot) -> Iterator[str]:
@@ -89,9 +89,16 @@ def _sides(robot: Robot) -> Iterator[str]:
         yield (f"soles {left.name!r} and {right.name!r} are not alike: {_times(size)} and {_times(same)}")
 
 
-def far_shapes(robot: Robot) -> Iterator[str]:
-    """Shapes far from the link that has them."""
+def shape_doubts(robot: Robot) -> Iterator[str]:
+    """Shapes far from the link that has them, and striking links without any."""
     pieces = pieces_of(robot)[0]
+    shown = {piece.joint for piece in pieces}
+    for striker in robot.strikers.values():
+        if _parent(robot, striker.frame) not in shown:
+            yield (
+                f"the link of striker {striker.name!r} has no shapes: nothing keeps it off other bodies, and "
+                "what of it touches first is not known; give it a <collision>"
+            )
     for piece in pieces:
         beside = [other for other in pieces if other.joint == piece.joint]
         if is_far(robot.model, piece, beside):

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support import urdfs
 from support.small_plans import biped_problem
 from support.small_robots import biped
 from typer.testing import CliRunner
 
-from impactopt import Robot, arm7, load_problem, planar_arm
+from impactopt import Robot, Striker, arm7, load_problem, planar_arm
 from impactopt.cli.app import app
 from impactopt.files.problem_file import write_problem
 from impactopt.problem.feasibility import hopeless
@@ -74,3 +76,17 @@ def _checked(file: Path, text: str, *settings: str) -> str:
     done = CliRunner().invoke(app, ["check", str(file), "--json", *words])
     assert done.exit_code == 0, done.output
     return done.stdout
+
+
+def test_a_striking_link_without_shapes_is_doubted(tmp_path: Path) -> None:
+    whole = urdfs.arm()
+    before, _, hand = whole.partition('<link name="wrist_link">')
+    bare = before + '<link name="wrist_link">' + re.sub(r"<collision>.*?</collision>", "", hand)
+    told = []
+    for text in (whole, bare):
+        (tmp_path / "robot.urdf").write_text(text, "utf-8")
+        hand_of = Striker(name="hand", frame="wrist_link", point=[0.0, 0.0, 0.1])
+        robot = Robot.from_urdf(tmp_path / "robot.urdf", floating=False, strikers=[hand_of])
+        told.append([line for line in doubts(robot) if "has no shapes" in line])
+    assert told[0] == []
+    assert len(told[1]) == 1 and "striker 'hand'" in told[1][0] and "give it a <collision>" in told[1][0]

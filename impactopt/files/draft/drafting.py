@@ -34,7 +34,7 @@ from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.feasibility import hopeless
-from impactopt.problem.plausibility import far_shapes
+from impactopt.problem.plausibility import shape_doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import DOWN
 from impactopt.robots.attachments import Sole, Striker
@@ -512,7 +512,7 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
                 f"five joints hold sole {sole.name!r}: the foot may turn on it about {sole.hinge}, by "
                 f"{sole.hinge_range:g} rad, and it bears no moment about that axis"
             )
-    yield from far_shapes(robot)
+    yield from shape_doubts(robot)
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"
     yield from robot.source.notes if robot.source is not None else ()

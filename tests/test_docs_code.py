@@ -64,7 +64,10 @@ def test_python_that_fails_is_found_out(tmp_path: Path, monkeypatch: pytest.Monk
         "import impactopt\nimpactopt.solve(None, sover=1)",
     ],
 )
-def test_a_block_that_cannot_run_is_checked_all_the_same(block: str, tmp_path: Path) -> None:
+def test_a_block_that_cannot_run_is_checked_all_the_same(
+    block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     page = tmp_path / "page.md"
     page.write_text(f"<!-- needs SLURM -->\n```python\n{block}\n```\n", encoding="utf-8")
     with pytest.raises((AttributeError, AssertionError)):

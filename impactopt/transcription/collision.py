@@ -624,8 +624,8 @@ class Collision(ContactNumbers, Collocated):
         self.f.write(x, np.where(self.forceless, 0.0, found.force)[:, None])
         self.p.write(x, len(p.strikers) * found.impulse[:, None])
         for joined, each in ((self.joined, d[self.end]), (self.joined_x, self.xt.read(x)[self.end])):
-            ways = np.cumsum(times[:, None] * each, axis=0) / before[1:, None]
-            joined.write(x, ways[1:-1])
+            ways = [(times[:k, None] / before[k] * each[:k]).sum(axis=0) for k in range(2, len(times))]
+            joined.write(x, np.reshape(ways, (joined.count, joined.size)))
         self.after.write(x, y + float(found.moved[self.end].sum()) * rates)
         self.guess_model(x, y, rates, legs)
         if c.legs:

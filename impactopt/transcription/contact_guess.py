@@ -135,8 +135,8 @@ class Parting:
 
 
 def touches_needed(law: ContactLaw, target: Target, mass: float, fastest: float) -> int | None:
-    """How often a point mass [kg] meets a target until all its events have happened, at a speed up to the
-    fastest; None where they do not in as many touches as a plan may have.
+    """Touches in which a point mass [kg] brings about all events of a target, at a speed up to the fastest;
+    None where as many as a plan may have do not.
     """
     if _in_one_touch(law, target, mass, fastest):
         return 1

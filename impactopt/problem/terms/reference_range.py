@@ -41,17 +41,15 @@ class ReferenceRange(Term):
         return robot.lower + less, robot.upper - less
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
-        return {"coasted": BlockRecipe(lambda: coasted(coordinates))}
+        phases = len(problem.contact_phases)
+        return {"coasted": BlockRecipe(lambda: coasted(coordinates, phases), key=(phases,))}
 
     def add_rows(self, program: Any) -> None:
         if not program.problem.lasts:
             return
         c, hit = program.coordinates, program.expected
         lower, upper = self.limits(program.robot)
-        time = hit.T[0][0]
-        for duration in hit.T[1:]:
-            time = time + duration[0]
-        z = [program.contact_state[0], program.u0[0], time]
+        z = [program.contact_state[0], program.u0[0], *(duration[0] for duration in hit.T)]
         at = program.add_block("coasted", [z], np.zeros(0))
         bounds = {
             "term": self.name,
@@ -75,7 +73,7 @@ class ReferenceRange(Term):
             )
 
 
-def coasted(c: StanceCoordinates) -> BlockExpression:
-    """z = y, ydot at contact, duration [s] of the contact;  out = joints at its end [rad]."""
-    y, rate, time = ca.SX.sym("y", c.ny), ca.SX.sym("rate", c.ny), ca.SX.sym("T")
-    return make_block([y, rate, time], [], {"joints": (y + rate * time)[c.base :]}, lanes=1)
+def coasted(c: StanceCoordinates, phases: int) -> BlockExpression:
+    """z = y, ydot at contact, duration [s] of each phase of the contact;  out = joints at its end [rad]."""
+    y, rate, times = ca.SX.sym("y", c.ny), ca.SX.sym("rate", c.ny), ca.SX.sym("T", phases)
+    return make_block([y, rate, times], [], {"joints": (y + rate * ca.sum1(times))[c.base :]}, lanes=1)

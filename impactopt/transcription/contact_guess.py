@@ -145,7 +145,7 @@ def touches_needed(law: ContactLaw, target: Target, mass: float, fastest: float)
         found = _histories(law, target, mass, fastest * FASTER ** (1 - k / FINER), least or MOST_TOUCHES)
         if _phases(found, target) is not None:
             least = min(found.touches, least or MOST_TOUCHES)
-        if least == 2:
+        if least == 2 or _first_event(found, target) is None:  # slower, there is none either
             break
     return least
 
@@ -363,12 +363,10 @@ def _phases(found: _History, target: Target) -> Array | None:
     """Start and ends of the phases [s]; None if the target's events have not happened in their order."""
     time, rows, met = found
     if met:
-        broken = [
-            k for k in range(len(time)) if float(target.guard(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0
-        ]
-        if len(met) % 2 or not broken or not met[-1] < time[broken[0]] < time[-1]:
+        first = _first_event(found, target)
+        if len(met) % 2 or first is None or not met[-1] < time[first] < time[-1]:
             return None
-        return np.array([0.0, *met, time[broken[0]], time[-1]])
+        return np.array([0.0, *met, time[first], time[-1]])
     deepest = int(np.argmax(rows[0] - rows[2]))
     ends = [0.0, time[deepest], time[-1]]
     if isinstance(target, Nail):
@@ -377,10 +375,17 @@ def _phases(found: _History, target: Target) -> Array | None:
             return None
         ends = [0.0, max(time[moves[0] - 1], AT_ONCE), time[moves[-1]], time[-1]]
     elif target.guards:
-        after = [
-            k for k in range(deepest) if float(target.guard(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0
-        ]
-        if not after:
+        first = _first_event(found, target)
+        if first is None or first >= deepest:
             return None
-        ends.insert(1, time[after[0]])
+        ends.insert(1, time[first])
     return np.array(ends) if min(np.diff(ends)) > 0 else None
+
+
+def _first_event(found: _History, target: Target) -> int | None:
+    """Index of the instant at which a target's first event has happened; None: it does not happen."""
+    time, rows, _ = found
+    return next(
+        (k for k in range(len(time)) if float(target.guard(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0),
+        None,
+    )

@@ -138,22 +138,19 @@ def touches_needed(law: ContactLaw, target: Target, mass: float, fastest: float)
     """Touches in which a point mass [kg] brings about all events of a target, at a speed up to the fastest;
     None where as many as a plan may have do not.
     """
-    if _in_one_touch(law, target, mass, fastest):
+    speeds = (fastest * FASTER ** (1 - k) for k in range(2 * TRIES))
+    if any(_phases(_histories(law, target, mass, v), target) is not None for v in speeds):
         return 1
+    if not target.met_again:
+        return None
     least: int | None = None
     for k in range(2 * TRIES * FINER):
         found = _histories(law, target, mass, fastest * FASTER ** (1 - k / FINER), least or MOST_TOUCHES)
         if _phases(found, target) is not None:
             least = min(found.touches, least or MOST_TOUCHES)
-        if least == 2 or _first_event(found, target) is None:  # slower, there is none either
+        if least in (1, 2) or _first_event(found, target) is None:  # slower, there is none either
             break
     return least
-
-
-def _in_one_touch(law: ContactLaw, target: Target, mass: float, fastest: float) -> bool:
-    """True if all events of a target happen in one touch at some speed up to the fastest."""
-    speeds = (fastest * FASTER ** (1 - k) for k in range(2 * TRIES))
-    return any(_phases(_histories(law, target, mass, v), target) is not None for v in speeds)
 
 
 def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
@@ -166,7 +163,10 @@ def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Par
     def whole(law: ContactLaw, speed: float) -> bool:
         return _phases(_histories(law, target, mass, speed), target) is not None
 
-    if not np.isfinite(fastest) or _in_one_touch(law, target, mass, fastest):
+    if not np.isfinite(fastest):
+        return None
+    touches = touches_needed(law, target, mass, fastest)
+    if touches == 1:
         return None
     time = _histories(law, target, mass, fastest).time
     if time[-1] >= LONGEST:
@@ -178,7 +178,7 @@ def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Par
     return Parting(
         event=target.guards[-1],
         time=float(time[-1]),
-        touches=touches_needed(law, target, mass, fastest) if target.met_again else None,
+        touches=touches,
         needed=next((v for v in faster if whole(law, v)), None),
         stiffness=next((k for k in other if whole(type(law)(**{**numbers, "stiffness": k}), fastest)), None),
     )

@@ -67,6 +67,24 @@ def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactPr
     return changed(problem, touches=needed)
 
 
+def with_touches_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
+    """The same with the touches of a solution that it starts from.
+
+    Raises
+    ------
+    InputError : it has others.
+    """
+    if problem.touches is None and not met_once(problem):
+        return replace(problem, touches=start.problem.touches)
+    own, its = problem.touches or 1, start.problem.touches or 1
+    if own != its:
+        raise InputError(
+            f"start: the solution meets its target {its} times in the blow, and this problem's is met {own} "
+            "times: leave start out"
+        )
+    return problem
+
+
 def _fastest(problem: ImpactProblem) -> float:
     """Greatest speed [m/s] of the striker along the normal in the posture of the initial guess."""
     limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit

@@ -23,7 +23,7 @@ from impactopt.planning.clearance_constraints import Margins, same_bodies, solve
 from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
 from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, window_caution, with_rows
-from impactopt.planning.models import carried_start, with_touches
+from impactopt.planning.models import carried_start, with_touches, with_touches_of
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
@@ -195,8 +195,7 @@ def _program(
     problem = with_rows(problem, rows_on_demand(start.problem))
     if problem.style == start.problem.style:
         problem = replace(problem, price_scale=start.problem.price_scale)
-    if problem.touches is None:
-        problem = replace(problem, touches=start.problem.touches)
+    problem = with_touches_of(start, problem)
     t = program_on(roomy(problem), start.nodes, start.elements, start.shares, budget.report)
     apart = start.apart if same_bodies(problem, start.problem) else {}
     given = carried_start(t, partial(program_of, start), start, apart)

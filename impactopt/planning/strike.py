@@ -17,7 +17,7 @@ from impactopt.planning.clearance_constraints import Margins, deepest_penetratio
 from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
 from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, rows_on_demand, with_rows
-from impactopt.planning.models import carried_start, with_touches
+from impactopt.planning.models import carried_start, with_touches, with_touches_of
 from impactopt.planning.multistart import (
     Guesses,
     best_of,
@@ -133,8 +133,7 @@ def _optimized(
     began, problem = time.perf_counter(), roomy(problem)
     if isinstance(start, StrikeSolution):
         problem = with_rows(problem, rows_on_demand(start.problem))
-        if problem.touches is None:
-            problem = replace(problem, touches=start.problem.touches)
+        problem = with_touches_of(start, problem)
     else:
         problem = with_touches(problem, budget.say)
     mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()

@@ -254,9 +254,9 @@ def check_touches(problem: Any) -> None:
 def met_once(problem: Any) -> str:
     """Reason why a striker meets the target only once in a plan; "" if it may meet it again."""
     law, target = problem.law, problem.target
-    if not target.met_again:
+    if not getattr(target, "met_again", False):  # what is no target is refused elsewhere
         return f"a {type(target).__name__} is met once in a plan"
-    if law.formula()[0] != law.formula()[1]:
+    if not isinstance(law, ContactLaw) or law.formula()[0] != law.formula()[1]:
         return f"the law {type(law).__name__} is not the same in compression and restitution"
     if problem.collision != "full":
         return f"the model {problem.collision!r} of the collision has one contact"

@@ -137,6 +137,13 @@ def test_a_plan_starts_from_a_neighbour(chopped: Solution) -> None:
     assert again.problem.touches == 2
 
 
+def test_a_start_with_other_touches_is_refused(chopped: Solution) -> None:
+    ball = stiff(target=FreeMass(mass=1.0))
+    for problem in (stiff(touches=1), stiff(touches=3), ball):
+        with pytest.raises(InputError, match="start: the solution meets its target 2 times"):
+            solve(problem, start=chopped)
+
+
 def test_what_is_saved_is_read_with_its_touches(chopped: Solution, tmp_path: Path) -> None:
     """Its problem does not say how many: the plan does."""
     k = chopped.problem.law.parameters["stiffness"]
@@ -206,6 +213,8 @@ def test_touches_of_point_masses() -> None:
         ({"touches": 5}, "touches"),
         ({"touches": 1.5}, "touches"),
         ({"touches": 2, "target": FreeMass(mass=1.0)}, "a FreeMass is met once"),
+        ({"touches": 2, "target": 7}, "target must be a Target"),
+        ({"touches": 2, "law": "stiff"}, "law must be a ContactLaw"),
         ({"touches": 2, "law": SpringDamper(stiffness=1e6, damping=50.0)}, "SpringDamper is not the same"),
         ({"touches": 2, "collision": "sdc"}, "'sdc' of the collision has one contact"),
         ({"touches": 2, "objectives": (Penetration(),)}, "Penetration is for one touch"),

@@ -131,6 +131,13 @@ def test_one_touch_has_no_plan_and_the_number_that_has_one_is_named() -> None:
     assert "`[collision] touches = 2` plans them" in strike.result.message
 
 
+def test_touches_that_do_not_come_are_named() -> None:
+    with pytest.warns(
+        NotSolvedWarning, match="`\\[collision\\] touches` is 2, and point masses need 1 to 'break'"
+    ):
+        optimize_strike(stiff(1e5, touches=2), options={"max_iterations": 200})
+
+
 def test_a_plan_starts_from_a_neighbour(chopped: Solution) -> None:
     again = solve(stiff(1.05 * chopped.problem.law.parameters["stiffness"]), start=chopped)
     assert again.status is Status.SOLVED

@@ -179,7 +179,7 @@ def _told(
         contact=found.touches[-1][1] - found.touches[0][0] if found.touches else 0.0,
         events=found.events,
         partings=sum(gap > _REPORTED_GAP * duration for gap in gaps),
-        planned_partings=(problem.touches or 1) - 1,
+        planned_partings=problem.planned_touches - 1,
         guards=problem.target.guards,
         known=known,
     )

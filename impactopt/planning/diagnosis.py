@@ -18,7 +18,7 @@ from impactopt.problem.feasibility import too_weak
 from impactopt.robots.loads import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.contact_guess import Parting, fastest, parting, touches_needed
+from impactopt.transcription.contact_guess import Parting, fastest_at_contact, parting, touches_needed
 from impactopt.transcription.contact_program import ContactProgram
 
 Array = NDArray[np.float64]
@@ -106,8 +106,8 @@ def _too_stiff(t: ContactProgram) -> str:
     p = t.problem
     if not isinstance(t.expected, Collision) or not p.target.guards:
         return ""
-    limit = fastest(t.coordinates, p.striker, p.normal, p.contact_posture, t.builder.limits.rate_limit)
-    if (p.touches or 1) > 1:
+    limit = fastest_at_contact(p)
+    if p.planned_touches > 1:
         needed = touches_needed(p.law, p.target, t.hit.mass, limit)
         if needed in (None, p.touches):
             return ""

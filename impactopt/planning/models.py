@@ -25,9 +25,8 @@ from impactopt.planning.refinement import carried
 from impactopt.planning.solution import Solved
 from impactopt.problem.checks import met_once
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import VelocityLimit
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.contact_guess import fastest, mass_at_contact, touches_needed
+from impactopt.transcription.contact_guess import fastest_at_contact, mass_at_contact, touches_needed
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.initial_guess import strike_rates
 
@@ -58,7 +57,7 @@ def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactPr
     """The same with as many touches as point masses need, where it leaves their number open."""
     if problem.touches is not None or problem.scenarios or met_once(problem):
         return problem
-    mass, most = mass_at_contact(problem), _fastest(problem)
+    mass, most = mass_at_contact(problem), fastest_at_contact(problem)
     needed = touches_needed(problem.law, problem.target, mass, most) if np.isfinite(most) else None
     if needed in (None, 1):
         return problem
@@ -74,21 +73,15 @@ def with_touches_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
     ------
     InputError : it has others.
     """
+    own, its = problem.planned_touches, start.problem.planned_touches
+    if own == its:
+        return problem
     if problem.touches is None and not met_once(problem):
-        return replace(problem, touches=start.problem.touches)
-    own, its = problem.touches or 1, start.problem.touches or 1
-    if own != its:
-        raise InputError(
-            f"start: the solution meets its target {its} times in the blow, and this problem's is met {own} "
-            "times: leave start out"
-        )
-    return problem
-
-
-def _fastest(problem: ImpactProblem) -> float:
-    """Greatest speed [m/s] of the striker along the normal in the posture of the initial guess."""
-    limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit
-    return fastest(problem.coordinates, problem.striker, problem.normal, problem.contact_posture, limit)
+        return changed(problem, touches=its)
+    raise InputError(
+        f"start: the solution meets its target {its} times in the blow, and this problem's is met {own} "
+        "times: leave start out"
+    )
 
 
 def climbed(
@@ -134,7 +127,7 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
     """
     first, c = replace(problem, collision=_MODELS[0]), problem.coordinates
     y, legs = c.split(problem.contact_posture)
-    most = _fastest(problem)
+    most = fastest_at_contact(problem)
     speed = _SHARE * most if np.isfinite(most) else _GUESSED
     try:
         legs = c.solve_legs(y, legs)

@@ -276,9 +276,14 @@ class ImpactProblem:
         return idle_joints(self.robot, [*strikers, *held])
 
     @property
+    def planned_touches(self) -> int:
+        """Touches of the target in a plan: one where their number is open."""
+        return self.touches or 1
+
+    @property
     def contact_phases(self) -> tuple[ContactPhase, ...]:
         """Phases of the contact in a plan."""
-        return contact_phases(self.target, self.touches or 1)
+        return contact_phases(self.target, self.planned_touches)
 
     @property
     def lasts(self) -> bool:

@@ -184,8 +184,7 @@ class _Replay(MujocoRobot):
             if self.links is not None:  # as those of points in a plane
                 self.kept = self.kept + struck.depths(self.places(), self.travel) - depths
         else:
-            state = struck.moved(self.target, 0.0, step)
-            travel = self.travel + step / 2 * (struck.speed(self.target) + struck.speed(state))
+            state, travel = struck.untouched_step(self.target, self.travel, step)
             push = Push(forces=none, halves=none, peaks=none, state=state, travel=travel, depths=depths)
         self.before = (speeds, push.forces)
         self.target, self.travel = push.state, push.travel

@@ -193,11 +193,14 @@ class _World:
             drive=self.motors.after(s.drive, first.cut, h / 2),
         )
         middle = self.rates(t + h / 2, half, forces=0.0 * first.forces if push is None else push.forces)
-        target = self.struck.moved(s.target, 0.0, h) if push is None else push.state
+        if push is None:
+            target, travel = self.struck.untouched_step(s.target, s.x, h)
+        else:
+            target, travel = push.state, push.travel
         after = _State(
             q=pin.integrate(self.model, s.q, h * middle.v),
             v=s.v + h * middle.a,
-            x=s.x + h / 2 * (first.vt + self.struck.speed(target)),
+            x=travel,
             target=target,
             impulses=s.impulses + h * middle.forces,
             drive=self.motors.after(s.drive, middle.cut, h),
@@ -208,7 +211,7 @@ class _World:
         self.body.look(after.q, after.v)
         gone = self.depths(replace(after, x=0.0)) - push.depths
         known = gone[np.isfinite(gone)]
-        return replace(after, x=float(known.mean()) if known.size else push.travel)
+        return replace(after, x=float(known.mean())) if known.size else after
 
 
 @dataclass(frozen=True, kw_only=True)

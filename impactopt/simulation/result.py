@@ -117,7 +117,8 @@ class Simulation:
     their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, as
     of :func:`impactopt.robots.loads.cop_margin`; slip, lift (k, soles) [m]: how far the corner of a
     sole that moved most went along the ground, and rose.
-    contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
+    contact_start, contact_end [s]: of the blow, whose touches are less than 5 ms apart; nan if the target
+    was not hit.  impulse [N s]: the contact force's
     integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.
     outcome: the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
     ``broken``).  saturated [s]: how long the demand of some joint was above its torque limit.  fall: why the

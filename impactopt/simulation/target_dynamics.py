@@ -165,6 +165,11 @@ class Struck:
             last=float(total[-1]),
         )
 
+    def untouched_step(self, state: Array, travel: float, step: float) -> tuple[Array, float]:
+        """State and travel [m] after a step [s] without a force, the travel by the trapezoidal rule."""
+        after = self.moved(state, 0.0, step)
+        return after, travel + step / 2 * (self.speed(state) + self.speed(after))
+
     def rates(self, state: Array, force: float) -> Array:
         """d(state)/dt (n_states,)."""
         return np.array([float(rate) for rate in self.target.derivative(state, force, self._target)])

@@ -404,7 +404,7 @@ class Collision(ContactNumbers, Collocated):
             "force": (force, self.force_numbers()),
             **self._reference(),
         }
-        if p.target.guards:
+        if self.joined.count:
             join = self._join()
             out["join"] = join, [np.zeros(0)] * len(join)
         return out
@@ -499,8 +499,8 @@ class Collision(ContactNumbers, Collocated):
             first = {name: start + i * size for name, (start, size) in at.items()}
             self._dynamics_rows(i, place, first)
         (start, size), order = at["force"], percent("off")
-        part, where, target = self._b.parts("force"), self.suffix.lstrip(", "), self._b.problem.target
-        if target.guards:  # first, as they determine variables of their own
+        part, where = self._b.parts("force"), self.suffix.lstrip(", ")
+        if self.joined.count:  # first, as they determine variables of their own
             names = [label for one, _ in self._integrals() for label in one.labels] * self.joined.count
             outputs = at["join"][0] + np.arange(len(names))
             self._b.equal("travel in compression", where, names, outputs, along(names, "off"))
@@ -549,7 +549,7 @@ class Collision(ContactNumbers, Collocated):
         b.equal("target's motion", place, ["travel"], first + part["travel"], fast)
         b.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
         k, still = phase.mode, [0.0] * target.n_states
-        ends, once = phase.end in target.guards, len(self.phases) == len(target.phases)
+        ends, once = phase.end in target.guards, self._b.problem.planned_touches == 1
         if i in self.end and (ends or once):
             if ends and target.reserve(still, 0.0, k):
                 b.rows.add(
@@ -610,7 +610,7 @@ class Collision(ContactNumbers, Collocated):
         place = np.array([s.place for s in self.stages])
         phase = np.array([s.phase for s in self.stages])
         mass, speed = effective_mass(c, p.strikers, p.normal, y, legs, rates)
-        found = blow(*self.alone(), mass, speed, phase, place, p.touches or 1)
+        found = blow(*self.alone(), mass, speed, phase, place, p.planned_touches)
         times = np.clip(found.durations, *np.transpose([layout.bounds(group) for group in self.T]))
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)

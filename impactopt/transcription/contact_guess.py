@@ -25,6 +25,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import Held
 from impactopt.problem.checks import MOST_TOUCHES
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import VelocityLimit
 from impactopt.transcription.layout import Array
 
 LONGEST = 0.2  # [s] a contact that has not ended by then is cut off
@@ -116,6 +117,14 @@ def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, l
     bounds = np.concatenate([limit, limit])
     found = linprog(-row, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))
     return float(-found.fun) if found.status == 0 else np.inf
+
+
+def fastest_at_contact(problem: ImpactProblem) -> float:
+    """Greatest speed [m/s] of the striker along the normal that the joints' limits allow, where inverse
+    kinematics reaches the target.
+    """
+    limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit
+    return fastest(problem.coordinates, problem.striker, problem.normal, problem.contact_posture, limit)
 
 
 @dataclass(frozen=True)

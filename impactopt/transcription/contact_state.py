@@ -60,7 +60,7 @@ class ContactNumbers:
             return
         self._known = numbers
         # how long the last phase [s] is of a point mass's blow: the unit of what is too short
-        self.natural = float(natural_durations(*self.alone(), self.mass, p.touches or 1)[-1])
+        self.natural = float(natural_durations(*self.alone(), self.mass, p.planned_touches)[-1])
         self.shortest = shortest_phases(p, self.natural)
 
     def alone(self) -> tuple[Any, Any]:
@@ -95,7 +95,7 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     if not shortest:  # no bound: far below what a blow takes, as constraints are over these times
         shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
     shares = [SHARE if target.guards else 1.0] * (len(problem.contact_phases) - 1) + [1.0]
-    if (problem.touches or 1) > 1:
+    if problem.planned_touches > 1:
         shares = [SEVERAL] * len(shares)
     if target.at_once:
         shares[0] = AT_ONCE

@@ -199,7 +199,7 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
     target, (first, last) = problem.target, problem.collision_elements
     if target.guards:
         first, last = halved((first, last))
-    if (problem.touches or 1) > 1:
+    if problem.planned_touches > 1:
         first, last = halved((first, last))
     before = [APART if phase.apart else first for phase in problem.contact_phases[:-1]]
     if target.at_once:

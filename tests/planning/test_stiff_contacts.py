@@ -91,6 +91,18 @@ def test_a_time_far_too_short_for_its_contact_is_named() -> None:
     assert "for 5e-05 s ([collision] duration_s)" in solution.result.message
 
 
+def test_a_board_that_takes_more_than_one_contact_is_named() -> None:
+    """The hammer is off again long before the board has bent as far as it takes to break."""
+    once = dataclasses.replace(with_stiffness("chop_arm", 1e7, ratio=False), touches=1)
+    with pytest.warns(NotSolvedWarning, match="a stiff contact"):
+        solution = solve(once)
+    assert solution.status is Status.INFEASIBLE
+    assert solution.result.message.startswith("Infeasible: a stiff contact. stiffness of the contact: ")
+    assert "one contact is not enough" in solution.result.message
+    assert "'break'" in solution.result.message
+    assert "contact stiffness of 1e+05 would do" in solution.result.message
+
+
 def test_a_strike_tells_it_too() -> None:
     strike = optimize_strike(with_stiffness("arm_planar", 1e8, ratio=False))
     assert strike.status is Status.SOLVED

@@ -64,11 +64,9 @@ def test_it_is_replayed_as_planned(chopped: Solution) -> None:
 
 
 def test_mujoco_says_so_too(chopped: Solution) -> None:
-    """Of the softer one: the other needs steps that take a minute."""
-    if chopped.problem.law.parameters["stiffness"] == 1e6:
-        replay = chopped.validate(engine="mujoco")
-        assert replay.impulse == pytest.approx(chopped.impulse, rel=1e-2)
-        assert replay.peak_force == pytest.approx(chopped.plan.collision.force.max(), rel=0.02)
+    replay = chopped.validate(engine="mujoco")
+    assert replay.impulse == pytest.approx(chopped.impulse, rel=1e-2)
+    assert replay.peak_force == pytest.approx(chopped.plan.collision.force.max(), rel=0.02)
 
 
 def test_force_is_zero_between_the_touches_and_only_there(chopped: Solution) -> None:
@@ -163,7 +161,7 @@ def test_what_is_saved_is_read_with_its_touches(chopped: Solution, tmp_path: Pat
     assert planned.problem.law == chopped.problem.law
 
 
-def test_a_board_with_a_weaker_one_as_a_scenario() -> None:
+def test_a_board_with_a_heavier_one_as_a_scenario() -> None:
     """All targets are met as often; point masses are not asked then."""
     others = (Scenario(name="heavier", mass=1.2),)
     solution = solve(stiff(scenarios=others, touches=2))

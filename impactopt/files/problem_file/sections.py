@@ -39,6 +39,7 @@ from impactopt.files.problem_file.values import (
     Preset,
     Restitution,
     Section,
+    Touches,
     UnitVector,
     Vector,
     attribute_docs,
@@ -304,7 +305,7 @@ class CollisionSection(Section):
         "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    touches: Literal[1, 2, 3, 4] = optional(
+    touches: Touches = optional(
         "times that a board is met, the last of which breaks it; left out: as often as point masses meet it"
     )
     compression: Fractions = optional("lengths of its collocation elements")

@@ -28,7 +28,7 @@ from pydantic import (
 
 from impactopt.contact.fields import About, abouts
 from impactopt.errors import did_you_mean, shortened
-from impactopt.problem.checks import MOST_FREEZES
+from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
 from impactopt.robots.presets import robot_names
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS
 
@@ -249,6 +249,7 @@ def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
 
 Positive = Annotated[float, Field(gt=0)]
 Freezes = Annotated[int, Field(ge=0, le=MOST_FREEZES)]
+Touches = Annotated[int, Field(ge=1, le=MOST_TOUCHES)]
 NotNegative = Annotated[float, Field(ge=0)]
 AtLeastOne = Annotated[float, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, le=1)]

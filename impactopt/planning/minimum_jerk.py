@@ -163,7 +163,7 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
         joints, rates = q[:, -r.n :], v[:, -r.n :]
         if (joints < lower).any() or (joints > upper).any():
             return False
-        if (np.abs(rates) > problem.term(VelocityLimit).fraction * r.velocity_limit).any():
+        if (np.abs(rates) > problem.term(VelocityLimit).most(r)).any():
             return False
         if not all(_wrenches_exist(problem, q[k], v[k], a[k]) for k in range(len(y))):
             return False

@@ -99,32 +99,22 @@ def coasted(
         yield legs, (v[c.base + c.dependent], a[c.base + c.dependent])
 
 
-def _motions(c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array) -> tuple[Array, Array]:
-    """Rates of all joints (nv, ny), and the striker's speed (ny,) along the normal, for rates ydot of 1."""
-    model, data = c.model, c.model.createData()
-    still = np.zeros(c.ny)
-    motions = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
-    pin.computeJointJacobians(model, data, c.join(y, legs))
-    frame = model.getFrameId(f"striker:{striker}")
-    jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
-    return motions, normal @ jacobian @ motions
-
-
-def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, limit: Array) -> float:
-    """Greatest speed [m/s] of the striker along the normal in a posture (nq,); ``limit`` (n,) [rad/s]."""
-    motions, row = _motions(c, striker, normal, *c.split(posture))
-    joints = motions[c.base :]
-    bounds = np.concatenate([limit, limit])
-    found = linprog(-row, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))
-    return float(-found.fun) if found.status == 0 else np.inf
-
-
 def fastest_at_contact(problem: ImpactProblem) -> float:
     """Greatest speed [m/s] of the striker along the normal that the joints' limits allow, where inverse
     kinematics reaches the target.
     """
-    limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit
-    return fastest(problem.coordinates, problem.striker, problem.normal, problem.contact_posture, limit)
+    c, limit = problem.coordinates, problem.term(VelocityLimit).most(problem.robot)
+    y, legs = c.split(problem.contact_posture)
+    model, data, still = c.model, c.model.createData(), np.zeros(c.ny)
+    # rates of all joints (nv, ny), and the striker's speed (ny,), for rates ydot of 1
+    motions = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
+    pin.computeJointJacobians(model, data, c.join(y, legs))
+    frame = model.getFrameId(f"striker:{problem.striker}")
+    jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
+    row, joints = problem.normal @ jacobian @ motions, motions[c.base :]
+    bounds = np.concatenate([limit, limit])
+    found = linprog(-row, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))
+    return float(-found.fun) if found.status == 0 else np.inf
 
 
 @dataclass(frozen=True)

@@ -404,7 +404,7 @@ class Limits:
         self.y_lower = np.concatenate([y0[: c.base] - box, lower[c.independent]])
         self.y_upper = np.concatenate([y0[: c.base] + box, upper[c.independent]])
         self.legs_lower, self.legs_upper = lower[c.dependent], upper[c.dependent]
-        self.rate_limit = self.velocity.fraction * r.velocity_limit
+        self.rate_limit = self.velocity.most(r)
         self.units = np.array([self.weight, LEVER])
         force, moment = Measure("N", self.weight, "off"), Measure("N m", self.weight * LEVER, "off")
         self.unbalanced = [force if name in "xyz" else moment for name in DIRECTIONS[: c.base]]

@@ -67,7 +67,7 @@ class Spell(NamedTuple):
 
 def spells_of(problem: ImpactProblem) -> list[Spell]:
     """All phases: the target's; or each touch and each gap, the last touch with the target's events."""
-    target, more = problem.target, problem.planned_touches - 1
+    target, more = problem.target, (problem.touches or 1) - 1
     guards = list(target.guards)
     if not more:
         turn = ["end of compression"] if len(target.phases) > len(guards) + 1 else []
@@ -306,7 +306,7 @@ class Blow:
         target, law, place = self.problem.target, self.problem.law, self.place(i)
         number = self.stages[i].phase
         spell, n = self.spells[number], target.n_states
-        phase, inner, one = spell.mode, i not in self.end, self.problem.planned_touches == 1
+        phase, inner, one = spell.mode, i not in self.end, not any(each.apart for each in self.spells)
         to_event = spell.end in target.guards
         guarded = (inner or not (one or to_event)) and bool(target.invariant([0.0] * n, 0.0, phase))
         reserved = not inner and to_event and bool(target.reserve([0.0] * n, 0.0, phase))

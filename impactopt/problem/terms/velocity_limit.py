@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from impactopt.contact.fields import about
 from impactopt.problem.terms.base import Term
+from impactopt.robots.robot import Robot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,3 +20,7 @@ class VelocityLimit(Term):
     name: ClassVar[str] = "velocity limit"
     unit: ClassVar[str] = "of limit"
     fraction: float = field(default=0.95, metadata=about("share of the limit", above=0, most=1))
+
+    def most(self, robot: Robot) -> Any:
+        """The largest magnitude (n,) of each joint's velocity [rad/s] or [m/s]."""
+        return self.fraction * robot.velocity_limit

@@ -16,6 +16,7 @@ from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance
 from impactopt.bodies.separation import THIN, Placed, Shapes
 from impactopt.bodies.world import BEHIND, WorldBody
 from impactopt.errors import InputError
+from impactopt.robots.checks import parent_body
 from impactopt.robots.robot import Robot
 
 __all__ = ["SLACK", "Bodies", "Places", "Survey", "Touch"]
@@ -131,7 +132,7 @@ class Bodies:
         self.world_pairs: list[Pair] = []
         for w, body in enumerate(world):
             for j in self.links.joints:
-                rooted = j in standing or (not robot.floating and robot.model.parents[j] == 0)
+                rooted = j in standing or (not robot.floating and parent_body(robot.model, j) == 0)
                 on_ground = body.ground and rooted
                 mine = j in striking
                 core = mine and not self._strikes_from_inside(j)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from impactopt.bodies.convex_hulls import Piece, pieces_of
+from impactopt.robots.checks import parent_body
 from impactopt.robots.robot import Robot
 
 __all__ = ["Pair", "RobotBodies", "StrikerFace", "bodies_of", "distance", "striker_face", "transform"]
@@ -47,8 +48,8 @@ class RobotBodies:
     @cached_property
     def connected(self) -> tuple[Pair, ...]:
         """Each joint that moves something, with its parent if that does too: their bodies always touch."""
-        parents = self.robot.model.parents
-        return tuple((j, int(parents[j])) for j in self.joints if int(parents[j]) in self.joints)
+        parents = ((j, parent_body(self.robot.model, j)) for j in self.joints)
+        return tuple((j, parent) for j, parent in parents if parent in self.joints)
 
     @cached_property
     def balls(self) -> dict[int, tuple[Array, float]]:

@@ -25,6 +25,7 @@ __all__ = [
     "check_frame",
     "check_inertias",
     "check_legs",
+    "parent_body",
     "reduced",
     "repair_inertias",
     "tell_apart",
@@ -338,12 +339,31 @@ DENSITY = 2000.0  # [kg/m3] of the ball that takes the place of a point: motors,
 _MEND = f'correct its <inertial>, with moments about the centre of mass, or take inertias="{REPAIRED}"'
 
 
+def parent_body(model: pin.Model, joint: int) -> int:
+    """Joint that moves the body on which the body of a joint hangs; 0 for the ground.
+
+    It is not always the joint before: several joints may move the same body.
+    """
+    above = int(model.parents[joint])
+    while above and not model.inertias[above].mass:
+        above = int(model.parents[above])
+    return above
+
+
+def _is_between_joints(model: pin.Model, i: int) -> bool:
+    """True if joint i moves no body of its own, but the joint after it: both move the same body."""
+    if model.inertias[i].mass or np.any(np.array(model.inertias[i].inertia)) or model.joints[i].nv != 1:
+        return False
+    own = any(f.parentJoint == i and f.type != pin.FrameType.JOINT for f in model.frames)
+    return not own and list(model.parents)[1:].count(i) == 1
+
+
 def check_inertias(model: pin.Model) -> None:
     """InputError with all moving bodies whose mass or inertia cannot be those of matter."""
     found = Mistakes()
     for i in range(1, model.njoints):
-        for text in _wrong(model, i):
-            found.found.append(text)
+        if not _is_between_joints(model, i):
+            found.found += _wrong(model, i)
     found.raise_if_any(f"the robot {model.name!r}")
 
 

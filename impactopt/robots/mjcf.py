@@ -150,12 +150,6 @@ def _of_joints(c: Compiled) -> Iterator[Tie]:
         if bent.any() and not c.off("damper", "passive"):
             text = f"joint {name!r} has damping that is not linear in its speed, which no plan has"
             yield Tie(text=text, joints=(name,), free=0, fix=_OUT)
-    for b in c.body:
-        first, count = int(mj.body_jntadr[b]), int(mj.body_jntnum[b])
-        names = [c.name("joint", j) for j in range(first, first + count) if j in c.joint]
-        if len(names) > 1:
-            text = f"joints {', '.join(map(repr, names))} move the same body, with no mass between them"
-            yield Tie(text=text, joints=tuple(names), fix="put bodies with mass between them")
 
 
 def _equalities(c: Compiled) -> Iterator[Tie]:

@@ -213,32 +213,49 @@ def _robot_bodies(
 
 
 def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
-    """The robot's links and joints, without anything that touches; one body a joint of the model, in its
-    order, the world first. Names are ``body <joint>`` and the joints' own."""
+    """The robot's links and joints, without anything that touches; the body of each joint of the model, in
+    its order, the world first. Names are ``body <joint>`` and the joints' own.
+
+    MuJoCo has no moving body without mass: joints that move nothing of their own move the next one's body.
+    """
     model = robot.model
-    bodies = [spec.worldbody]
+    bodies = [spec.worldbody] * model.njoints
+    between: dict[int, list[int]] = {}  # a joint that moves nothing of its own, with those before it
     for j in range(1, model.njoints):
-        placement = model.jointPlacements[j]
-        body = bodies[model.parents[j]].add_body(
+        joints, inertia = [*between.pop(model.parents[j], ()), j], model.inertias[j]
+        if not inertia.mass:
+            between[j] = joints
+            continue
+        placement, places = pin.SE3.Identity(), list[Any]()
+        for i in joints:
+            placement = placement * model.jointPlacements[i]
+            places.append(placement)
+        body = bodies[model.parents[joints[0]]].add_body(
             name=f"body {model.names[j]}", pos=placement.translation, quat=quaternion(placement.rotation)
         )
-        bodies.append(body)
-        inertia = model.inertias[j]
+        bodies[j] = body
         _inertial(body, inertia.mass, inertia.lever, inertia.inertia)
         if model.joints[j].nv == 6:
             body.add_freejoint(name=model.names[j])
             continue
-        data = model.joints[j].createData()
-        model.joints[j].calc(data, pin.neutral(model))
-        subspace = np.asarray(data.S).reshape(6)
-        turns = bool(np.any(subspace[3:]))
-        body.add_joint(
-            name=model.names[j],
-            type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
-            axis=subspace[3:] if turns else subspace[:3],
-            armature=float(model.armature[model.joints[j].idx_v]),
-        )
+        for i, place in zip(joints, places, strict=True):
+            _add_joint(mujoco, body, model, i, placement.actInv(place))
     return bodies
+
+
+def _add_joint(mujoco: Any, body: Any, model: Any, j: int, at: Any) -> None:
+    """Joint j of the model, which is there in the body's frame."""
+    data = model.joints[j].createData()
+    model.joints[j].calc(data, pin.neutral(model))
+    subspace = np.asarray(data.S).reshape(6)
+    turns = bool(np.any(subspace[3:]))
+    body.add_joint(
+        name=model.names[j],
+        type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=at.rotation @ (subspace[3:] if turns else subspace[:3]),
+        pos=at.translation,
+        armature=float(model.armature[model.joints[j].idx_v]),
+    )
 
 
 def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[str], step: float) -> None:

@@ -24,7 +24,7 @@ import os
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,10 +63,11 @@ from impactopt.errors import NoCompilerWarning
 __all__ = ["FunctionGroup", "cached", "cached_groups", "canonical", "library_path", "model_hash"]
 
 
-def model_hash(model: pin.Model) -> str:
+def model_hash(model: pin.Model, springs: Mapping[str, tuple[float, float]] | None = None) -> str:
     """Hexadecimal hash of all in a `pin.Model` that shapes its dynamics, the same in every process.
 
     Covers joints (name, type, axis, parent, placement), inertias, armature, gravity and frames; not limits.
+    springs : of its joints, as of `Robot.springs`.
     """
     digest = hashlib.sha256()
 
@@ -87,6 +88,8 @@ def model_hash(model: pin.Model) -> str:
     add(np.array(model.armature))
     for frame in model.frames:
         add(str(frame.name), int(frame.parentJoint), str(frame.type), np.array(frame.placement.homogeneous))
+    for joint_name, spring in (springs or {}).items():
+        add(joint_name, *spring)
     return digest.hexdigest()
 
 

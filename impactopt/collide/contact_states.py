@@ -54,7 +54,7 @@ def striking_functions(robot: Robot, *, striker: str, stance: Stance) -> dict[st
         tree = _StrikingGraphs(robot, held, frame)
         return [tree.least_energy(), tree.least_rates(), tree.holding()]
 
-    recipe = (model_hash(robot.model), frame, held, robot.velocity_limit)
+    recipe = (model_hash(robot.model, robot.springs), frame, held, robot.velocity_limit)
     return cached("striking", recipe, build)
 
 
@@ -62,7 +62,8 @@ class _StrikingGraphs:
     """Quantities that depend on the robot's tree in SX, dense algebra in MX, as in `FrozenDynamics`."""
 
     def __init__(self, robot: Robot, held: tuple[str, ...], frame: str) -> None:
-        self.rb, self.n, self.base = RigidBody(robot.model), robot.n, robot.nv - robot.n
+        self.rb = RigidBody(robot.model, springs=robot.springs)
+        self.n, self.base = robot.n, robot.nv - robot.n
         self.nq, self.nv, self.held, self.frame = robot.nq, robot.nv, held, frame
         # the base's speeds are those that the legs leave it: they cost next to nothing
         self.ease = np.concatenate([np.full(self.base, _BASE), robot.velocity_limit])

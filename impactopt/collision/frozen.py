@@ -279,7 +279,7 @@ class _TreeQuantities:
 
     def __init__(self, robot: Robot, held: tuple[str, ...], soles: tuple[str, ...], frame: str) -> None:
         self.robot, self.held, self.soles, self.frame = robot, held, soles, frame
-        self.rb = RigidBody(robot.model)
+        self.rb = RigidBody(robot.model, springs=robot.springs)
         self.normal = ca.SX.sym("normal", 3)
         self.base = robot.nv - robot.n
 

@@ -271,7 +271,8 @@ class SteppedModel(CollisionModel):
         frame = self.robot.striker(self.striker).model_frame
         steps = (self.stepping, self.step_length, self.tolerance, self.step_of_graph)
         course = (*steps, self.horizon, self.n_freezes, self.contact_friction is not None)
-        return (model_hash(self.robot.model), self.n_servos, frame, *held_by, *kinds, shapes, *course)
+        dynamics = model_hash(self.robot.model, self.robot.springs)
+        return (dynamics, self.n_servos, frame, *held_by, *kinds, shapes, *course)
 
 
 def number_of_steps(collision: SteppedModel, fraction: float = 1.0) -> int:

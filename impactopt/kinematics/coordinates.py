@@ -337,7 +337,7 @@ class StanceCoordinates:
         base_labels = ["base x", "base y", "base z", "base roll", "base pitch", "base yaw"][: self.base]
         self.labels = (*base_labels, *(robot.joint_names[j] for j in self.independent))
         self.leg_labels = tuple(robot.joint_names[j] for j in self.dependent)
-        self.rb = RigidBody(self.model, base="rpy")
+        self.rb = RigidBody(self.model, base="rpy", springs=robot.springs)
         self._build_symbolic_pieces()
         legs = ca.SX.sym("legs", self.nl)
         self.start, self.start_legs = self.split(posture)

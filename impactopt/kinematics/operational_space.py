@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import MOST, InputError, check_array
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, usual_stance
+from impactopt.robots.dynamics import generalized_gravity, nonlinear_effects
 from impactopt.robots.robot import Robot
 
 __all__ = ["Held", "across", "holding_torque", "static_wrenches", "striking_point", "striking_velocity"]
@@ -40,9 +41,8 @@ def static_wrenches(c: StanceCoordinates, y: Array, legs: Array) -> Array:
     """Sole wrenches (6 a sole) of least norm that carry the robot at rest. Hands and hinges bear nothing."""
     if not c.legs:
         return np.zeros(0)
-    model, data = c.model, c.model.createData()
     q = c.join(y, legs)
-    tau = np.array(pin.computeGeneralizedGravity(model, data, q))
+    tau = generalized_gravity(c.robot, c.model.createData(), q)
     jac = c.sole_jacobians(q)[0][: 6 * len(c.soles), c.undriven]
     lever = np.array([1, 1, 1, 10, 10, 10] * len(c.soles))  # moments cost more: keep the CoP in the sole
     found = np.linalg.lstsq(jac.T / lever, tau[c.undriven], rcond=None)[0] / lever
@@ -141,7 +141,7 @@ def holding_torque(
     q = robot.check_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.check_velocity(v)
     held_by = usual_stance(robot) if stance is None else stance
-    bias = pin.nonLinearEffects(robot.model, robot.model.createData(), q, v)
+    bias = nonlinear_effects(robot, robot.model.createData(), q, v)
     if not np.all(np.isfinite(bias)):
         raise InputError("q, v: the forces of this motion are no finite numbers; give smaller ones")
     held = _jacobians(robot.model, q, held_by.constraint_frames(robot))

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
@@ -25,6 +24,7 @@ from impactopt.kinematics.splines import quintic
 from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
+from impactopt.robots.dynamics import inverse_dynamics
 from impactopt.robots.tools import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.transcription.initial_guess import strike_rates
@@ -175,7 +175,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     program).
     """
     c, r = problem.coordinates, problem.robot
-    tau = np.array(pin.rnea(c.model, c.data, q, v, a))
+    tau = inverse_dynamics(r, c.data, q, v, a)
     limit = problem.term(TorqueLimit).fraction * np.where(r.hinges, 0.0, r.torque_limit)
     if not c.legs:
         return bool(np.all(np.abs(tau) <= limit))

@@ -56,7 +56,7 @@ def _robot(robot: Robot, striker: str) -> dict[str, Any]:
     numbers = ("kp", "kd", "torque_limit", "velocity_limit", "lower", "upper")
     hits = robot.striker(striker)
     return {
-        "model": model_hash(robot.model),
+        "model": model_hash(robot.model, robot.springs),
         **{name: getattr(robot, name) for name in numbers},
         "soles": [(sole.name, sole.frame, sole.polygon) for sole in robot.soles],
         "striker": (hits.frame, hits.point),

@@ -12,20 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.contact.fields import Described, about, abouts
-from impactopt.errors import InputError, check_number, did_you_mean
+from impactopt.errors import FARTHEST, InputError, check_number, did_you_mean
 from impactopt.robots.checks import HEAVIEST, STRONGEST
 
 __all__ = ["MOMENTARY_PEAK", "Actuator", "fitting", "known", "numbers_of", "with_classes"]
 
 # of a gear over the joint's torque limit, where nothing better is known: see docs/howto/gears.md
 MOMENTARY_PEAK = 2.0
-_FRICTION = ("viscous_friction", "coulomb_friction")
+# what a robot's file may say of a joint, whose motor is not known: nothing is 0
+_OF_JOINT = ("viscous_friction", "coulomb_friction", "spring_stiffness", "spring_rest")
 FASTEST, LATEST = 1e6, 1.0  # [Hz], [s] of a motor: beyond, it is none, or in other units
 
 
 @dataclass(frozen=True, kw_only=True)
 class Actuator(Described):
-    """A joint's motor and gear. All is as the joint feels it, after the gear; None is not known."""
+    """A joint's motor and gear, and a spring beside them. All is as the joint feels it, after the gear; None
+    is not known.
+    """
 
     armature: float | None = field(
         default=None,
@@ -53,6 +56,19 @@ class Actuator(Described):
             least=0,
             most=STRONGEST,
         ),
+    )
+    spring_stiffness: float | None = field(
+        default=None,
+        metadata=about(
+            "stiffness of a spring between the joint's links, beside the motor",
+            unit="N m/rad",
+            least=0,
+            most=STRONGEST,
+        ),
+    )
+    spring_rest: float | None = field(
+        default=None,
+        metadata=about("angle at which this spring is relaxed", unit="rad", least=-FARTHEST, most=FARTHEST),
     )
     continuous_torque: float | None = field(
         default=None,
@@ -142,7 +158,7 @@ def with_classes(
         if not isinstance(actuator, Actuator):
             raise InputError(f"actuators: of {pattern!r} is {actuator!r}; give an Actuator")
         for k in fitting(pattern, joints, "actuators"):
-            own = {name: getattr(out[k], name) for name in _FRICTION if getattr(actuator, name) is None}
+            own = {name: getattr(out[k], name) for name in _OF_JOINT if getattr(actuator, name) is None}
             out[k] = replace(actuator, armature=None, **own)
             if actuator.armature is not None:
                 model.armature[base + k] = actuator.armature
@@ -150,9 +166,9 @@ def with_classes(
 
 
 def known(actuators: Iterable[Actuator]) -> tuple[Actuator, ...]:
-    """The actuators of a robot: without friction where nothing is said of it."""
+    """The actuators of a robot: without friction and springs where nothing is said of them."""
     return tuple(
-        replace(actuator, **{name: 0.0 for name in _FRICTION if getattr(actuator, name) is None})
+        replace(actuator, **{name: 0.0 for name in _OF_JOINT if getattr(actuator, name) is None})
         for actuator in actuators
     )
 

@@ -148,6 +148,16 @@ def check_actuators(joints: Sequence[str], actuators: Sequence[Any]) -> None:
             )
 
 
+def check_springs(model: pin.Model, springs: Iterable[str]) -> None:
+    """InputError if a joint, by name, has a spring and no end of its turns."""
+    for name in springs:
+        if model.joints[model.getJointId(name)].nq > 1:
+            raise InputError(
+                f"joint {name!r} has a spring and turns without end, so that its angle is not known; give it "
+                "position limits in its file, or take the spring out"
+            )
+
+
 def check_gains(
     model: pin.Model, joints: Sequence[str], kp: Array, kd: Array, configurations: Iterable[Array]
 ) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.errors import Mistakes
+from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source, Striker
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.checks import REPAIRED, check_choice, repair_inertias
@@ -52,6 +53,7 @@ class Description:
     model : with its armature, friction, limits and gravity, and named configurations; a frame of type BODY
         for each link or body, and an OP_FRAME for each site, by their names.
     kp, kd, torque : by joint, what its actuators say.
+    springs : stiffness [N m/rad] and angle at rest [rad] by joint.
     sites : names of those on links that move.
     ties : what no plan has, unless joints are locked.
     notes : what was left out or taken otherwise than the file says, in words.
@@ -62,6 +64,7 @@ class Description:
     kp: dict[str, float] = field(default_factory=dict)
     kd: dict[str, float] = field(default_factory=dict)
     torque: dict[str, float] = field(default_factory=dict)
+    springs: dict[str, tuple[float, float]] = field(default_factory=dict)
     sites: list[str] = field(default_factory=list)
     ties: list[Tie] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -81,6 +84,13 @@ class Description:
             own = {joint: value for joint, value in numbers.items() if joint in joints}
             if own and isinstance(given.get(key, {}), Mapping):
                 out[key] = {**own, **given.get(key, {})}
+        springs = {
+            joint: Actuator(spring_stiffness=stiffness, spring_rest=rest)
+            for joint, (stiffness, rest) in self.springs.items()
+            if joint in joints
+        }
+        if springs:
+            out["actuators"] = {**springs, **given.get("actuators", {})}
         named = {striker.name for striker in given.get("strikers", ())}
         sites = [Striker(name=s, frame=s, point=np.zeros(3)) for s in self.sites if s not in named]
         return {**out, "strikers": [*sites, *given.get("strikers", ())]}

@@ -134,18 +134,10 @@ def _of_joints(c: Compiled) -> Iterator[Tie]:
     mj = c.mj
     for j in c.joint:
         name = c.name("joint", j)
-        spring = max(
-            np.max(np.abs(c.numbers(key)[j]), initial=0.0)
-            for key in ("jnt_stiffness", "jnt_stiffnesspoly")
-            if c.numbers(key).size
-        )
-        if spring and not c.off("spring", "passive"):
-            yield Tie(
-                text=f"joint {name!r} has a spring, stiffness {spring:g}, which no plan has",
-                joints=(name,),
-                free=0,
-                fix=_OUT,
-            )
+        bent = any(c.numbers(f"jnt_{key}")[j : j + 1].any() for key in ("stiffnesspoly", "springyield"))
+        if bent and not c.off("spring", "passive"):
+            text = f"joint {name!r} has a spring whose torque is not linear in its angle, which no plan has"
+            yield Tie(text=text, joints=(name,), free=0, fix=_OUT)
         bent = c.numbers("dof_dampingpoly")[int(mj.jnt_dofadr[j]) :][:1]
         if bent.any() and not c.off("damper", "passive"):
             text = f"joint {name!r} has damping that is not linear in its speed, which no plan has"
@@ -392,6 +384,9 @@ class _Reader(Compiled):
             viscous=0.0 if self.off("damper", "passive") else _first(mj.dof_damping[lasting]),
             dry=0.0 if self.off("frictionloss", "constraint") else mj.dof_frictionloss[lasting],
         )
+        stiffness = _first(mj.jnt_stiffness[j])
+        if stiffness and not self.off("spring", "passive"):
+            self.out.springs[name] = stiffness, float(mj.qpos_spring[mj.jnt_qposadr[j]])
         return added, int(model.addJointFrame(added, above))
 
     def _add_to_joint(self, j: int, *, armature: float = 0.0, viscous: float = 0.0, dry: float = 0.0) -> None:

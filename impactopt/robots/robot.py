@@ -94,6 +94,7 @@ class Robot:
         found.raise_if_any(f"robot {self.name!r}")
         object.__setattr__(self, "actuators", known(self.actuators or (Actuator(),) * self.n))
         checks.check_actuators(self.joint_names, self.actuators)
+        checks.check_springs(self.model, self.springs)
         for sole in self.soles:
             check_sole(self.model, sole)
         for striker in self.strikers.values():
@@ -134,7 +135,7 @@ class Robot:
 
         Raises
         ------
-        InputError : no such file; Gazebo's springs and loops and <mimic>, unless their joints are locked.
+        InputError : no such file; Gazebo's loops and <mimic>, unless their joints are locked.
         """
         read = _urdf.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, "inertias": inertias}
@@ -166,7 +167,7 @@ class Robot:
 
         Raises
         ------
-        InputError : no MuJoCo; no robot; ball joints; springs, tendons, loops and followers that move.
+        InputError : no MuJoCo; no robot; ball joints; tendons, loops and followers that move.
         """
         read = _mjcf.read_mjcf(path, floating=floating)
         given = {"name": name, "floating": floating, "locked": locked, "inertias": inertias}
@@ -292,6 +293,23 @@ class Robot:
         known = numbers_of(self.actuators, "momentary_torque") / self.torque_limit
         limit = np.where(np.isnan(known), MOMENTARY_PEAK, known)
         return read_only(np.where(self.passive, np.inf, limit))
+
+    @cached_property
+    def springs(self) -> dict[str, tuple[float, float]]:
+        """Stiffness [N m/rad] and angle at rest [rad] of springs beside the motors, by joint."""
+        return {
+            joint: (float(actuator.spring_stiffness), float(actuator.spring_rest or 0.0))
+            for joint, actuator in zip(self.joint_names, self.actuators, strict=True)
+            if actuator.spring_stiffness
+        }
+
+    def spring_torque(self, q: Array) -> Array:
+        """(n,) [N m] with which motors bend the springs at q (nq,): stiffness times the angle from rest."""
+        out = np.zeros(self.n)
+        for joint, (stiffness, rest) in self.springs.items():
+            at = self.model.joints[self.model.getJointId(joint)]
+            out[at.idx_v - self.nv + self.n] = stiffness * (q[at.idx_q] - rest)
+        return out
 
     def joint_index(self, name: str) -> int:
         """Index of a joint in arrays of length n."""

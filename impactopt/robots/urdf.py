@@ -64,6 +64,7 @@ def read_urdf(
             raise InputError(f"SRDF {file}: {error}") from error
     out = Description(kind="URDF", model=model)
     out.ties += [*_mimics(root, model), *_of_gazebo(root, model)]
+    out.springs |= _springs(root, model)
     out.notes += [*_weightless(root), *_rotors(root)]
     return out
 
@@ -94,13 +95,20 @@ def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:
                 )
 
 
-def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
-    """Springs on joints and closed loops, which Gazebo has and URDF has not."""
+def _springs(root: Any, model: pin.Model) -> dict[str, tuple[float, float]]:
+    """Gazebo's springs on joints: stiffness and angle at rest."""
+    out = {}
     for gazebo in _children(root, "gazebo"):
         name = gazebo.getAttribute("reference")
-        if model.existJointName(name) and any(_numbers(gazebo, "springStiffness")):
-            text = f"joint {name!r} has a spring, Gazebo's <springStiffness>, which no plan has"
-            yield Tie(text=text, joints=(name,), free=0, fix="take it out")
+        stiffness, rest = (list(_numbers(gazebo, f"spring{key}")) for key in ("Stiffness", "Reference"))
+        if model.existJointName(name) and any(stiffness):
+            out[name] = stiffness[0], (rest or [0.0])[0]
+    return out
+
+
+def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
+    """Closed loops, which Gazebo has and URDF has not."""
+    for gazebo in _children(root, "gazebo"):
         for loop in _children(gazebo, "joint"):
             ends = [_text(end) for tag in ("parent", "child") for end in _children(loop, tag)]
             frames = [

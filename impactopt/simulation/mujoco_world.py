@@ -239,22 +239,26 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
             body.add_freejoint(name=model.names[j])
             continue
         for i, place in zip(joints, places, strict=True):
-            _add_joint(mujoco, body, model, i, placement.actInv(place))
+            _add_joint(mujoco, body, robot, i, placement.actInv(place))
     return bodies
 
 
-def _add_joint(mujoco: Any, body: Any, model: Any, j: int, at: Any) -> None:
+def _add_joint(mujoco: Any, body: Any, robot: Robot, j: int, at: Any) -> None:
     """Joint j of the model, which is there in the body's frame."""
+    model = robot.model
     data = model.joints[j].createData()
     model.joints[j].calc(data, pin.neutral(model))
     subspace = np.asarray(data.S).reshape(6)
     turns = bool(np.any(subspace[3:]))
+    stiffness, rest = robot.springs.get(str(model.names[j]), (0.0, 0.0))
+    spring = {"stiffness": stiffness, "springref": rest} if stiffness else {}
     body.add_joint(
         name=model.names[j],
         type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=at.rotation @ (subspace[3:] if turns else subspace[:3]),
         pos=at.translation,
         armature=float(model.armature[model.joints[j].idx_v]),
+        **spring,
     )
 
 

@@ -45,7 +45,8 @@ class Body(ABC):
         normal: Array,
         friction: ContactFriction | None = None,
     ) -> None:
-        self.model, self.n, self.nv = robot.model, robot.n, robot.nv
+        self.robot, self.model, self.n, self.nv = robot, robot.model, robot.n, robot.nv
+        self._springs = np.zeros(self.n)
         self.data: Any = robot.model.createData()
         self.frames = [self.model.getFrameId(frame) for frame in frames]
         self.compliance, self.normal = np.tile(compliance, len(frames)), normal
@@ -90,10 +91,12 @@ class Body(ABC):
         J = pin.getFrameJacobian(self.model, self.data, frame, _AXES)
         return np.reshape(J, (6, self.nv))  # a single column comes without its second dimension
 
-    def _meet(self, v: Array) -> None:
+    def _meet(self, q: Array, v: Array) -> None:
         """Sets rows and pushes (hands, nv), once all Jacobians are known: the striking points' speeds along
-        the normal, and what a unit of the contact's normal force does, friction included.
+        the normal, and what a unit of the contact's normal force does, friction included; and the springs.
         """
+        if self.robot.springs:
+            self._springs = self.robot.spring_torque(q)
         jacobians = [self._jacobian(hand)[:3] for hand in self.hands]
         self.rows = self.pushes = np.array([self.normal @ J for J in jacobians])
         if self.friction is not None:
@@ -101,7 +104,7 @@ class Body(ABC):
 
     def _push(self, torque: Array, force: float | Array) -> Array:
         push = -np.atleast_1d(force) @ self.pushes
-        push[-self.n :] += torque
+        push[-self.n :] += torque - self._springs
         return push
 
 
@@ -130,7 +133,7 @@ class DenseBody(Body):
             self._matrix[rows, :nv] = J
             self._matrix[:nv, rows] = -J.T
             self._right[rows] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
-        self._meet(v)
+        self._meet(q, v)
         self._matrix[:nv, :nv] = pin.crba(model, data, q)
         self._bias = pin.nonLinearEffects(model, data, q, v)
         return float(self.rows[0] @ v)
@@ -193,7 +196,7 @@ class PinocchioBody(Body):
         self._at = q, v
         pin.forwardKinematics(self.model, self.data, q, v)
         pin.computeJointJacobians(self.model, self.data)
-        self._meet(v)
+        self._meet(q, v)
         return float(self.rows[0] @ v)
 
     def accelerate(self, torque: Array, force: float | Array) -> Array:

@@ -115,7 +115,7 @@ def block_functions(
 def _coordinates_recipe(c: StanceCoordinates) -> tuple[Any, ...]:
     """Recipe of a block beside its formula: the model, and what its legs hold how."""
     return (
-        model_hash(c.robot.model),
+        model_hash(c.robot.model, c.robot.springs),
         tuple((leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12))) for leg in c.legs),
         tuple(np.round(c.start, 12)) if any(leg.before.size for leg in c.legs) else (),
         tuple(tuple(o.tolist()) for leg in c.legs for o in leg.order),

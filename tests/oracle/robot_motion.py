@@ -184,6 +184,11 @@ class RobotMotion:
         """
         model, data = self.model, self.data
         tau: Array = np.array(pin.rnea(model, data, q, v, a))
+        drives = self.robot.actuators
+        for name, drive in zip(list(model.names)[-len(drives) :], drives, strict=True):
+            if drive.spring_stiffness:
+                joint = model.joints[model.getJointId(name)]
+                tau[joint.idx_v] += drive.spring_stiffness * (q[joint.idx_q] - drive.spring_rest)
         if self.soles:
             self.relieve(tau, q, wrenches)
         for hand, force in zip(self.hands, forces, strict=False):

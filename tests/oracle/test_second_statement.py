@@ -27,6 +27,7 @@ from impactopt.problem.terms import (
     Slide,
     TargetSpeed,
 )
+from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Trajectory
@@ -103,6 +104,12 @@ def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> No
 def test_with_scenarios() -> None:
     others = (Scenario(name="soft", stiffness=0.5, torque=0.9), Scenario(name="heavy", mass=2.0))
     check_rows(transcribed(dataclasses.replace(arm_problem(), scenarios=others)))
+
+
+def test_of_joints_with_springs() -> None:
+    p = arm_problem()
+    springs = {"elbow": Actuator(spring_stiffness=40.0, spring_rest=0.8)}
+    check_rows(transcribed(dataclasses.replace(p, robot=p.robot.with_actuators(springs))))
 
 
 def test_of_a_ball_that_comes_and_is_caught() -> None:

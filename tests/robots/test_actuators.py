@@ -105,6 +105,18 @@ def test_friction_is_the_files_until_an_actuator_has_its_own(tmp_path: Path) -> 
         Robot.from_urdf(path, **more)
 
 
+def test_springs_are_the_files_until_an_actuator_has_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    spring = "<springStiffness>90</springStiffness><springReference>0.3</springReference>"
+    path.write_text(urdfs.arm().replace("</robot>", f'<gazebo reference="elbow">{spring}</gazebo></robot>'))
+    robot = Robot.from_urdf(path, floating=False, armature=0.1, actuators={"*": Actuator(bandwidth=50.0)})
+    assert robot.springs == {"elbow": (90.0, 0.3)}
+    assert robot.with_actuators({"elbow": Actuator(spring_stiffness=20.0)}).springs == {"elbow": (20.0, 0.3)}
+    assert not robot.with_actuators({"*": Actuator(spring_stiffness=0.0)}).springs
+    with pytest.raises(InputError, match="joint 'turn' has a spring and turns without end"):
+        arm().with_actuators({"turn": Actuator(spring_stiffness=9.0)})
+
+
 def test_files_name_classes_of_joints(tmp_path: Path) -> None:
     problem = from_text(
         tmp_path,

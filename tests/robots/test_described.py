@@ -19,6 +19,7 @@ from support import urdfs
 from impactopt import Robot
 from impactopt.codegen.cache import model_hash
 from impactopt.errors import InputError
+from impactopt.robots.dynamics import nonlinear_effects
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -91,15 +92,29 @@ def _urdf(tree: list[Drawn]) -> str:
 
 
 def _mjcf(tree: list[Drawn], gravcomp: float, gravity: str, borne: bool) -> str:
+    compensated = ' actuatorgravcomp="true"' if borne else ""
+
+    def another(k: int) -> str:
+        """A second joint of some bodies, which nothing is between."""
+        d = tree[k]
+        return (
+            f'<joint name="more{k}" axis="1 {d.numbers[1]} 0" pos="{d.vector(3)}" range="-3 3" '
+            f'armature="{d.positive(3)}" stiffness="{d.positive(6)}" actuatorfrcrange="-9 9"'
+            f"{compensated}/>"
+            if d.numbers[8] > 0
+            else ""
+        )
+
     def body(k: int) -> str:
         d = tree[k]
         inertia = "{} {} {}".format(*sorted(_moments(d)))
-        compensated = ' actuatorgravcomp="true"' if borne else ""
         return (
             f'<body name="link{k}" pos="{d.vector(1)}" euler="{d.vector(4)}" gravcomp="{gravcomp}">'
             f'<joint name="{_name(k, d)}" type="{"slide" if d.slides else "hinge"}" pos="{d.vector(2)}" '
             f'axis="{" ".join(map(repr, d.axis().tolist()))}" ref="{d.numbers[5]}" range="-3 3"{compensated} '
-            f'armature="{d.positive(3)}" damping="{d.positive(16)}" frictionloss="{d.positive(17)}"/>'
+            f'armature="{d.positive(3)}" damping="{d.positive(16)}" frictionloss="{d.positive(17)}" '
+            f'stiffness="{10 * abs(d.numbers[6])}" springref="{d.numbers[7]}"/>'
+            f"{another(k)}"
             f'<inertial pos="{d.vector(3)}" euler="{d.vector(2)}" mass="{d.positive(15)}" '
             f'diaginertia="{inertia}"/>'
             + "".join(body(i) for i, other in enumerate(tree) if other.parent == k)
@@ -145,7 +160,7 @@ def _same_as_mujoco(robot: Robot, mj: Any, seed: int, held: dict[str, float]) ->
         assert np.abs(own - mass[np.ix_(dofs, dofs)]).max() <= EQUAL * np.abs(own).max()
         # what no motor gives: Coriolis, centrifugal and gravity forces, damping, compensated weight
         other = (there.qfrc_bias - there.qfrc_passive)[dofs]
-        mine = pin.nonLinearEffects(robot.model, here, q, rates) + viscous * rates
+        mine = nonlinear_effects(robot, here, q, rates) + viscous * rates
         assert np.abs(mine - other).max() <= EQUAL * max(1.0, np.abs(other).max())
     dry = [actuator.coulomb_friction for actuator in robot.actuators]
     assert dry == pytest.approx(mj.dof_frictionloss[dofs], rel=EQUAL)
@@ -239,7 +254,7 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`<springStiffness>`": (
         [_before("</robot>", '<gazebo reference="j1"><springStiffness>9</springStiffness></gazebo>')],
-        "'j1' has a spring",
+        "",
     ),
     "`<joint>` in `<gazebo>`": (
         [
@@ -285,7 +300,8 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
         [('<body name="two"', '<body gravcomp="1" name="two"')],
         "'two' have a gravcomp.*lock",
     ),
-    "`stiffness`": ([(J2, f'stiffness="9" springref=".5" {J2}')], "'j2' has a spring, stiffness 9"),
+    "`stiffness`, ": ([(J2, f'stiffness="9" springref=".5" {J2}')], ""),
+    "`stiffness` that": ([(J2, f'stiffness="9 1" {J2}')], "'j2' has a spring whose torque is not linear"),
     "`damping` that": ([(J2, f'damping="2 1" {J2}')], "'j2' has damping that is not linear"),
     "`<tendon>`": (
         [
@@ -315,8 +331,14 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
         "'j2' is a ball",
     ),
     "several joints": (
-        [('<joint name="j2"', '<joint name="j0" axis="1 0 0"/><joint name="j2"')],
-        "joints 'j0', 'j2' move the same body",
+        [
+            (
+                f"<joint {J2}",
+                f'<joint name="j0" axis="1 0 0" range="-1 1" armature=".1" actuatorfrcrange="-9 9"/>'
+                f"<joint {J2}",
+            )
+        ],
+        "",
     ),
     "`<option>` with `density`": (
         [("<option/>", '<option density="1000" wind="1 0 0"/>')],

@@ -134,6 +134,16 @@ def test_a_lag_is_of_first_order(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_a_spring_swings_about_its_rest(engine: str) -> None:
+    """It is no motor: it has no torque limit, and no part in the torque that is recorded."""
+    stiffness, rest = 400.0, 0.7
+    found = replay(engine, lever(spring_stiffness=stiffness, spring_rest=rest), pushed(lambda t: 0.0))
+    wanted = rest * (1 - np.cos(np.sqrt(stiffness / INERTIA) * found.time))
+    np.testing.assert_allclose(found.q[:, 0], wanted, atol=2e-3)
+    assert not found.torque.any()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_a_delay_shifts_what_is_asked_for(engine: str) -> None:
     """Half of it a ramp, so that instants between steps count."""
     late = 4.23e-3

@@ -13,6 +13,7 @@ from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
 from impactopt.robots.checks import LEG
+from impactopt.robots.dynamics import generalized_gravity
 from impactopt.robots.robot import Robot, Sole
 
 __all__ = ["arm_length", "bend_arm", "eased", "half_sitting", "rested", "shoulder"]
@@ -198,13 +199,13 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
     Of several the one in which the fewest links touch.
     """
     own = _rows(robot, [joint for limb in limbs for joint in limb.own])
-    model, data = robot.model, robot.model.createData()
+    data = robot.model.createData()
     low, high = _limits(robot, own)
     rest, rng = robot.joint_positions(q)[own], np.random.default_rng(0)
 
     def errors(angles: Array) -> Array:
-        weight = pin.computeGeneralizedGravity(model, data, _set(robot, q, own, angles))
-        share = np.abs(np.array(weight)[robot.nv - robot.n + own]) / robot.torque_limit[own]
+        weight = generalized_gravity(robot, data, _set(robot, q, own, angles))
+        share = np.abs(weight[robot.nv - robot.n + own]) / robot.torque_limit[own]
         return np.concatenate([np.maximum(share - HELD, 0.0), REST * (angles - rest) / (high - low)])
 
     if not errors(rest)[: len(own)].any():

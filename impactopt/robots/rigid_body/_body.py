@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -42,6 +43,7 @@ class RigidBody:
     base : "quaternion": q is Pinocchio's, (p, quaternion x y z w, joints), a continuous joint being (cos,
         sin); "rpy": one number for each velocity, (p, roll, pitch, yaw, joints), a continuous joint being its
         angle. Without a free-flyer the two differ in continuous joints only.
+    springs : stiffness and position at rest by joint, of joints that are not continuous.
 
     Attributes
     ----------
@@ -62,8 +64,10 @@ class RigidBody:
         or an argument of the wrong shape.
     """
 
-    def __init__(self, model: Any, base: str = "quaternion") -> None:
-        self.model = model
+    def __init__(
+        self, model: Any, base: str = "quaternion", springs: Mapping[str, tuple[float, float]] | None = None
+    ) -> None:
+        self.model, self._springs = model, springs or {}
         self._tree = Tree(model)
         self._coordinates = Coordinates(self._tree, base)
         self._kinematics = Kinematics(self._tree, self._coordinates)
@@ -104,11 +108,16 @@ class RigidBody:
         return pack_symmetric(self.nv, self._crba().entries)
 
     def rnea(self, v: Any, a: Any, gravity: bool = True) -> Any:
-        """H a + C v + g, SX (nv) [N, N m], armature in H (as `pin.rnea`).
+        """H a + C v + g, SX (nv) [N, N m], armature in H (as `pin.rnea`), springs in g.
 
-        None stands for zero v or a: `rnea(None, None)` is gravity's torque alone.
+        None stands for zero v or a: `rnea(None, None)` is gravity's torque alone, and the springs'.
         """
-        return pack_vector(_dynamics.rnea(self._link_accelerations(v, a), gravity=gravity))
+        out = pack_vector(_dynamics.rnea(self._link_accelerations(v, a), gravity=gravity))
+        for name, (stiffness, rest) in self._springs.items() if gravity else ():
+            joint = self.model.joints[self.model.getJointId(name)]
+            at = joint.idx_v if self.base == "rpy" else joint.idx_q
+            out[joint.idx_v] += stiffness * (self.q[at] - rest)
+        return out
 
     def factorize(self, H: Any = None, damping: Any = None) -> Factor:
         """H + diag(damping) = L' D L, sparse and without fill-in.

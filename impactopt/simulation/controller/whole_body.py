@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
+from impactopt.robots.dynamics import nonlinear_effects
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.clearance import MOST, Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
@@ -106,7 +107,7 @@ class HeldDynamics:
         *,
         holding: tuple[str, ...] = (),
     ) -> None:
-        self.model, self.normal = robot.model, normal
+        self._robot, self.model, self.normal = robot, robot.model, normal
         self.data: Any = robot.model.createData()
         self._soles = [self.model.getFrameId(name) for name in soles]
         self._held = [*self._soles, *(self.model.getFrameId(name) for name in holding)]
@@ -132,7 +133,7 @@ class HeldDynamics:
         pin.computeJointJacobians(model, data)
         half = pin.crba(model, data, q) * self._upper
         np.add(half, half.T, out=left[:nv, :nv])
-        right[:nv, n] = -pin.nonLinearEffects(model, data, q, v)
+        right[:nv, n] = -nonlinear_effects(self._robot, data, q, v)
         self.places = []
         for k, i in enumerate(self._held):
             rows = slice(nv + 6 * k, nv + 6 * k + 6)

@@ -21,8 +21,11 @@ from support.rigid_body_cases import (
     reference_derivatives,
     reference_values,
 )
+from support.small_robots import biped
 
 from impactopt.errors import InputError
+from impactopt.robots.actuators import Actuator
+from impactopt.robots.dynamics import generalized_gravity, inverse_dynamics
 from impactopt.robots.rigid_body import RigidBody
 
 VALUES, DERIVATIVES = 1e-12, 1e-10
@@ -134,6 +137,35 @@ def test_first_derivatives_agree_with_pinocchio(name: str, base: str) -> None:
     samples = zip(q, v, a, strict=True)
     worst = errors(ours, [reference_derivatives(s.case, *sample) for sample in samples])
     assert {k: e for k, e in worst.items() if not e <= DERIVATIVES} == {}
+
+
+@pytest.mark.parametrize("base", ["quaternion", "rpy"])
+def test_springs_add_to_gravity(base: str) -> None:
+    springs = {
+        "left knee": Actuator(spring_stiffness=50.0, spring_rest=0.4),
+        "elbow": Actuator(spring_stiffness=7.0),
+    }
+    robot = biped().with_actuators(springs)
+    q, v, a, _ = (rows[0] for rows in configurations(robot.model, 1))
+    knee, elbow = (robot.joint_index(name) for name in springs)
+    angles, expected = robot.joint_positions(q), np.zeros(robot.nv)
+    expected[6 + knee], expected[6 + elbow] = 50.0 * (angles[knee] - 0.4), 7.0 * angles[elbow]
+    data = robot.model.createData()
+    np.testing.assert_allclose(
+        inverse_dynamics(robot, data, q, v, a) - pin.rnea(robot.model, data, q, v, a), expected, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        generalized_gravity(robot, data, q) - pin.computeGeneralizedGravity(robot.model, data, q),
+        expected,
+        atol=1e-9,
+    )
+    rb = RigidBody(robot.model, base, springs=robot.springs)
+    for gravity in (True, False):
+        ours = ca.Function("f", [rb.q, rb.v, rb.a], [rb.rnea(rb.v, rb.a, gravity=gravity)])
+        plain = RigidBody(robot.model, base)
+        other = ca.Function("f", [plain.q, plain.v, plain.a], [plain.rnea(plain.v, plain.a, gravity=gravity)])
+        added = np.ravel(ours(rb.from_pin(q), v, a) - other(rb.from_pin(q), v, a))
+        np.testing.assert_allclose(added, expected * gravity, atol=1e-9)
 
 
 # ---------------------------------------------------------------- factorization

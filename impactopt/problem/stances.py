@@ -107,7 +107,7 @@ def check_stances(problem: Any) -> None:
     if problem.stance.hand_frames(robot):
         raise InputError("stances: a hand that holds on goes with one stance: leave one of them out")
     if robot.sprung.any():
-        raise InputError(f"stances: robot {robot.name!r} has springs, which go with one stance")
+        raise InputError(f"stances: robot {robot.name!r} has soft grips, which go with one stance")
     object.__setattr__(problem, "stance", _stance(robot, of_blow[0].soles))
 
 

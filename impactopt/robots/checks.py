@@ -362,10 +362,8 @@ def parent_body(model: pin.Model, joint: int) -> int:
 
 def _is_between_joints(model: pin.Model, i: int) -> bool:
     """True if joint i moves no body of its own, but the joint after it: both move the same body."""
-    if model.inertias[i].mass or np.any(np.array(model.inertias[i].inertia)) or model.joints[i].nv != 1:
-        return False
-    own = any(f.parentJoint == i and f.type != pin.FrameType.JOINT for f in model.frames)
-    return not own and list(model.parents)[1:].count(i) == 1
+    weightless = not model.inertias[i].mass and not np.any(np.array(model.inertias[i].inertia))
+    return weightless and model.joints[i].nv == 1 and list(model.parents)[1:].count(i) == 1
 
 
 def check_inertias(model: pin.Model) -> None:

@@ -63,7 +63,7 @@ def read_urdf(
         except (ValueError, RuntimeError) as error:
             raise InputError(f"SRDF {file}: {error}") from error
     out = Description(kind="URDF", model=model)
-    out.ties += [*_mimics(root, model), *_of_gazebo(root, model)]
+    out.ties += [*_mimics(root, model), *_of_gazebo(root, model), *_hollow(root, model)]
     out.springs |= _springs(root, model)
     out.notes += [*_weightless(root), *_rotors(root)]
     return out
@@ -93,6 +93,25 @@ def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:
                         _urdf_number(mimic.getAttribute("multiplier") or "1"),
                     ),
                 )
+
+
+def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
+    """Links with shapes and without mass. Those without shapes may be there to join two joints."""
+    shaped = {
+        link.getAttribute("name")
+        for link in _children(root, "link")
+        if _children(link, "visual") or _children(link, "collision")
+    }
+    for frame in model.frames:
+        joint = frame.parentJoint
+        light = model.joints[joint].nv == 1 and not model.inertias[joint].mass
+        if light and frame.type == pin.FrameType.BODY and str(frame.name) in shaped:
+            yield Tie(
+                text=f"the link {frame.name!r} has shapes and mass 0 kg",
+                joints=(str(model.names[joint]),),
+                free=0,
+                fix="give its <inertial> a mass > 0",
+            )
 
 
 def _springs(root: Any, model: pin.Model) -> dict[str, tuple[float, float]]:

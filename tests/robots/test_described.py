@@ -238,12 +238,27 @@ def _before(end: str, more: str) -> Edit:
     return end, f"{more}{end}"
 
 
+def _between(link: str) -> list[Edit]:
+    """Another joint before j2, and nothing but this link between them."""
+    limits = '<axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="9" velocity="4"/>'
+    joint = '<joint name="j0" type="revolute"><parent link="one"/><child link="between"/>'
+    return [
+        ('parent link="one"', 'parent link="between"'),
+        _before("</robot>", f"{link}{joint}{limits}</joint>"),
+    ]
+
+
 # by the beginning of a line's first column: edits of the file above; of what is told, or refused, a part
 URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     "`<inertial>`": ([('<mass value="1.0"/>', '<mass value="3.0"/>')], ""),
     "`<joint>` of type revolute": ([('<axis xyz="0 1 0"/>', '<axis xyz="1 1 0"/>')], ""),
     "`<limit>`": ([('effort="80.0"', 'effort="30.0"')], ""),
     "`<dynamics>`": ([_before("</joint>", '<dynamics damping="3" friction="1.5"/>')], ""),
+    "links without mass and shapes": (_between('<link name="between"/>'), ""),
+    "links with shapes": (
+        _between('<link name="between"><visual><geometry><sphere radius=".1"/></geometry></visual></link>'),
+        "the link 'between' has shapes and mass 0 kg",
+    ),
     "`<mimic>`": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>')],
         "'j2' follows 'j1'",

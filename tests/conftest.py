@@ -17,7 +17,7 @@ os.environ.setdefault("IMPACTOPT_COMPILE", "quick")  # `as_shipped` takes it awa
 
 
 def pytest_collection_finish() -> None:
-    """Leave 5000 collected tests out of every garbage collection: to look at them took a tenth of the time."""
+    """Leave 5000 collected tests out of every garbage collection, which took a tenth of the time."""
     gc.collect()
     gc.freeze()
 

@@ -54,7 +54,7 @@ class Description:
         for each link or body, and an OP_FRAME for each site, by their names.
     kp, kd, torque : by joint, what its actuators say.
     springs : stiffness [N m/rad] and angle at rest [rad] by joint.
-    sites : names of those on links that move.
+    sites : names of those on links that move.  idle : joints that no actuator moves, where some have one.
     ties : what no plan has, unless joints are locked.
     notes : what was left out or taken otherwise than the file says, in words.
     """
@@ -66,6 +66,7 @@ class Description:
     torque: dict[str, float] = field(default_factory=dict)
     springs: dict[str, tuple[float, float]] = field(default_factory=dict)
     sites: list[str] = field(default_factory=list)
+    idle: list[str] = field(default_factory=list)
     ties: list[Tie] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -112,6 +113,8 @@ class Description:
         return model, every, Source(repairs=repairs, notes=notes, **own)
 
     def _approximated(self, joints: tuple[str, ...]) -> Iterator[str]:
+        if idle := [repr(joint) for joint in self.idle if joint in joints]:
+            yield f"no actuator moves {', '.join(idle)}: plans have a motor there all the same"
         for tie in self.ties:
             left = [joint for joint in tie.joints if joint in joints]
             if left and len(left) < len(tie.joints):

@@ -134,8 +134,8 @@ def _of_joints(c: Compiled) -> Iterator[Tie]:
     mj = c.mj
     for j in c.joint:
         name = c.name("joint", j)
-        bent = any(c.numbers(f"jnt_{key}")[j : j + 1].any() for key in ("stiffnesspoly", "springyield"))
-        if bent and not c.off("spring", "passive"):
+        stiffens = any(c.numbers(f"jnt_{key}")[j : j + 1].any() for key in ("stiffnesspoly", "springyield"))
+        if stiffens and not c.off("spring", "passive"):
             text = f"joint {name!r} has a spring whose torque is not linear in its angle, which no plan has"
             yield Tie(text=text, joints=(name,), free=0, fix=_OUT)
         bent = c.numbers("dof_dampingpoly")[int(mj.jnt_dofadr[j]) :][:1]
@@ -339,8 +339,8 @@ class _Reader(Compiled):
             above = model.addJointFrame(joint, 0)
         for j in () if free else range(first, first + count):
             at = pin.SE3(np.eye(3), np.array(mj.jnt_pos[j]))
-            joint, above = self._add_joint(j, joint, place * at, above)
-            place = at.inverse()
+            joint, above, turn = self._add_joint(j, joint, place * at, above)
+            place = (at * turn).inverse()
         body = pin.Inertia(
             float(mj.body_mass[b]),
             np.array(mj.body_ipos[b]),
@@ -356,7 +356,8 @@ class _Reader(Compiled):
         taken = [str(f.name) for f in self.model.frames if f.type != pin.FrameType.JOINT]
         return name if name not in taken else f"{kind} {name}"
 
-    def _add_joint(self, j: int, parent: int, place: Any, above: int) -> tuple[int, int]:
+    def _add_joint(self, j: int, parent: int, place: Any, above: int) -> tuple[int, int, Any]:
+        """The joint and its frame, and how it is turned to have its axis, in a parent's joint at a place."""
         mj, model, name = self.mj, self.model, self.name("joint", j)
         hinge = mj.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_HINGE
         if not hinge and mj.jnt_type[j] != self.mujoco.mjtJoint.mjJNT_SLIDE:
@@ -369,8 +370,8 @@ class _Reader(Compiled):
             pin.SE3(pin.exp3(-zero * axis), np.zeros(3)) if hinge else pin.SE3(np.eye(3), -zero * axis)
         )
         limited, lasting = bool(mj.jnt_limited[j]), int(mj.jnt_dofadr[j])
-        kind = _kind(axis, hinge, limited)
-        added = int(model.addJoint(parent, kind, place, name))
+        kind, turn = _kind(axis, hinge, limited)
+        added = int(model.addJoint(parent, kind, place * turn, name))
         at = model.joints[added]
         low, high = mj.jnt_range[j] if limited else (-np.inf, np.inf)
         if at.nq == 1:
@@ -387,7 +388,7 @@ class _Reader(Compiled):
         stiffness = _first(mj.jnt_stiffness[j])
         if stiffness and not self.off("spring", "passive"):
             self.out.springs[name] = stiffness, float(mj.qpos_spring[mj.jnt_qposadr[j]])
-        return added, int(model.addJointFrame(added, above))
+        return added, int(model.addJointFrame(added, above)), turn
 
     def _add_to_joint(self, j: int, *, armature: float = 0.0, viscous: float = 0.0, dry: float = 0.0) -> None:
         """More armature and friction; a negative one takes off."""
@@ -438,8 +439,11 @@ class _Reader(Compiled):
                     f"actuator {self.name('actuator', a)!r} has dynamics of its own, which are left out: a "
                     "motor gives its torque at once, or with the `bandwidth` and `delay` that you give it"
                 )
+        driven = bool(most)
         for j in self.joint:
             name = self.name("joint", j)
+            if driven and name not in most and not mj.jnt_actfrclimited[j]:
+                self.out.idle.append(name)
             if mj.jnt_actfrclimited[j]:
                 bound = float(np.abs(mj.jnt_actfrcrange[j]).min())
                 most[name] = min(most[name], bound) if name in most else bound
@@ -494,15 +498,18 @@ def _largest(mj: Any, a: int, affine: bool) -> float:
     return out
 
 
-def _kind(axis: Array, hinge: bool, limited: bool) -> Any:
-    """Pinocchio's joint about or along an axis."""
+def _kind(axis: Array, hinge: bool, limited: bool) -> tuple[Any, Any]:
+    """Pinocchio's joint about or along an axis, and the placement in which it is that."""
     along = [k for k in range(3) if axis[k] == 1 and not np.delete(axis, k).any()]
     if along:
-        return ((_HINGES if limited else _TURNS) if hinge else _SLIDES)[along[0]]()
+        return ((_HINGES if limited else _TURNS) if hinge else _SLIDES)[along[0]](), _none()
     if not hinge:
-        return pin.JointModelPrismaticUnaligned(axis)
-    unaligned = pin.JointModelRevoluteUnaligned if limited else pin.JointModelRevoluteUnboundedUnaligned
-    return unaligned(axis)
+        return pin.JointModelPrismaticUnaligned(axis), _none()
+    if limited:
+        return pin.JointModelRevoluteUnaligned(axis), _none()
+    # Python cannot give the axis of an unbounded one
+    to_axis = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
+    return pin.JointModelRUBZ(), pin.SE3(to_axis.matrix(), np.zeros(3))
 
 
 def _placement(position: Any, quaternion: Any) -> Any:

@@ -54,7 +54,7 @@ TREE = """
         <joint name="lift" type="slide" axis="0 .1 1" range="-.1 .2" ref=".05"/>
         <inertial mass="2" pos=".01 .02 .03" fullinertia=".02 .03 .04 .001 .002 -.001"/>
         <body name="top" pos="0 0 .1">
-          <joint name="turn" axis="0 0 1" limited="false"/>
+          <joint name="turn" axis="0 -1 1" limited="false"/>
           <geom type="box" size=".05 .02 .03" pos=".02 0 0"/>
         </body>
       </body>
@@ -191,6 +191,8 @@ def test_drives_are_those_of_actuators_and_joints(tree: Path) -> None:
     assert (robot.armature == 0.03).all()
     assert robot.lower[k["elbow"]] == pytest.approx(-np.pi / 2) and robot.upper[k["lift"]] == 0.2
     assert robot.lower[k["turn"]] == -np.inf
+    assert robot.source is not None
+    assert any(note.startswith("no actuator moves 'turn':") for note in robot.source.notes)
 
 
 def test_sites_that_move_strike_and_keyframes_inside_the_limits_are_postures(tree: Path) -> None:

@@ -31,6 +31,7 @@ __all__ = [
     "inertia_box",
     "is_far",
     "pieces_of",
+    "seen_pieces",
     "size_of",
     "tool_solids",
 ]
@@ -130,6 +131,14 @@ def _from_mjcf(robot: Robot, mjcf: str) -> Iterator[Piece]:
             piece = _hull(geom.link, geom.joint, geom.solid)
             if piece is not None:
                 yield piece
+
+
+def seen_pieces(robot: Robot, joint: int) -> tuple[Piece, ...]:
+    """Hulls of what an MJCF shows of a joint's links and lets touch nothing, as Unitree's of hands."""
+    geoms = geoms_of(robot.model, robot.mjcf) if robot.mjcf is not None else []
+    shown = (geom for geom in geoms if geom.joint == joint and not geom.collides)
+    hulls = (_hull(geom.link, geom.joint, geom.solid) for geom in shown)
+    return tuple(hull for hull in hulls if hull is not None)
 
 
 def _from_inertia(robot: Robot) -> Iterator[Piece]:

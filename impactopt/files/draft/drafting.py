@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.convex_hulls import seen_pieces
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.default_drives import DOUBT
@@ -346,7 +347,8 @@ def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
     names = ["hand"] if len(names) == 1 else names
     arms, strikers = [], []
     for limb, name in zip(limbs, names, strict=True):
-        striker, axis = find_striker(model, limb, name, drafted.pieces)
+        tip = (*drafted.pieces.get(limb.tip, ()), *seen_pieces(drafted.robot, limb.tip))
+        striker, axis = find_striker(model, limb, name, {limb.tip: tip})
         arms.append(Arm(limb=limb, name=name, axis=axis))
         strikers.append(striker)
     arms.sort(key=lambda arm: (not arm.name.startswith("right"), -len(arm.limb.own)))

@@ -28,6 +28,7 @@ VIEWS = (
     ("top", np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])),
 )
 PARTS = {"target": ORANGE, "held": "#b0b0b0", "obstacle": "#cccccc"}
+Shown = tuple[Array, Array, Array]  # triangles (n, 3, 3) [m], their normals and colours (n, 3)
 Drawn = tuple[int, Array, Array, Array]  # joint, triangles (k, 3, 3) [m] in its frame, normals, colour
 
 
@@ -40,16 +41,20 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     track = tracks_of(record, problem)[0]
     chosen = _chosen(track)
     solids, world = _solids(problem), [p for p in surroundings_of(problem.world) if not _hides(p)]
-    scenes = [_scene(track, k, solids, world, problem.normal) for k in chosen]
-    points = np.concatenate([scene[0].reshape(-1, 3) for scene in scenes])
-    ends = np.percentile(points, [0.05, 99.95], axis=0) + np.array([[-0.04], [0.04]])
+    robots = [_joined([_placed(track, k, solid) for solid in solids]) for k in chosen]
+    around = [_around(track, k, world, problem.normal) for k in chosen]
+    points = np.concatenate([robot[0].reshape(-1, 3) for robot in robots])
+    edges = np.percentile(points, [0.05, 99.95], axis=0)  # a stray vertex of a mesh may lie anywhere
+    edges = np.concatenate([edges, *(part[0].reshape(-1, 3) for parts in around for part in parts)])
+    ends = np.array([edges.min(axis=0) - 0.04, edges.max(axis=0) + 0.04])
     ends[0, 2] = min(ends[0, 2], problem.ground_height or 0.0) - 0.02
     sizes = [[np.ptp(ends @ np.abs(direction)) for direction in view[:2]] for _, view in VIEWS]
     heights = [high for _, high in sizes]
     scale = (WIDTH - 0.4) / (len(chosen) * max(wide for wide, _ in sizes))  # [in/m]
     figure = Picture(WIDTH, scale * sum(heights) + 0.9)
     axes = figure.subplots(len(VIEWS), len(chosen), squeeze=False, gridspec_kw={"height_ratios": heights})
-    for column, (k, scene) in enumerate(zip(chosen, scenes, strict=True)):
+    for column, k in enumerate(chosen):
+        scene = _joined([robots[column], *around[column]])
         for row, (name, view) in enumerate(VIEWS):
             ax = axes[row, column]
             _draw(ax, *scene, view)
@@ -72,16 +77,18 @@ def _hides(part: Part) -> bool:
     return part.clear and part.kind != "obstacle"
 
 
-def _scene(
-    track: Track, k: int, solids: list[Drawn], world: list[Part], normal: Array
-) -> tuple[Array, Array, Array]:
-    """Triangles (n, 3, 3) [m], their normals and colours (n, 3) at an instant of a track."""
-    shown = [_placed(track, k, solid) for solid in solids]
+def _around(track: Track, k: int, world: list[Part], normal: Array) -> list[Shown]:
+    """The world at an instant of a track."""
+    shown = []
     for part in world:
         corners = part.placed(float(track.travel[k]), normal)[part.solid.triangles]
         if abs(track.travel[k]) < GONE or not part.moves:
             shown.append((corners, _normals(corners), np.tile(_rgb(PARTS[part.kind]), (len(corners), 1))))
-    triangles, normals, colours = (np.concatenate([s[i] for s in shown]) for i in range(3))
+    return shown
+
+
+def _joined(shown: list[Shown]) -> Shown:
+    triangles, normals, colours = (np.concatenate(parts) for parts in zip(*shown, strict=True))
     return triangles, normals, colours
 
 
@@ -120,7 +127,7 @@ def _normals(corners: Array) -> Array:
     return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
 
 
-def _placed(track: Track, k: int, drawn: Drawn) -> tuple[Array, Array, Array]:
+def _placed(track: Track, k: int, drawn: Drawn) -> Shown:
     joint, corners, normals, colours = drawn
     place = pin.XYZQUATToSE3(track.places[k, joint])
     return corners @ place.rotation.T + place.translation, normals @ place.rotation.T, colours

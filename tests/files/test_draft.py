@@ -457,11 +457,15 @@ def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
         <geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/><body name="lower" pos="0 0 .3">
         <joint name="elbow" axis="0 1 0" range="-140 140"/>
         <geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/>
+        <geom type="sphere" size=".08" pos="0 0 .4" contype="0" conaffinity="0" mass="0"/>
         </body></body></body></worldbody>
         <actuator><motor joint="elbow" ctrlrange="-30 30"/></actuator></mujoco>
     """)
     draft = draft_problem(path, folder=tmp_path, mjcf=True)
+    assert "no actuator moves 'shoulder'" in "".join(draft.said)
     assert set(read_toml(draft.text)["robot"]["torque_limit_N_m"]) == {"shoulder"}
+    (striker,) = read_toml(draft.text)["robot"]["strikers"]
+    assert striker["point_m"] == pytest.approx([0.0, 0.0, 0.48], abs=1e-3)
     (tmp_path / "arm.toml").write_text(draft.text)
     assert load_problem(tmp_path / "arm.toml").robot.torque_limit[1] == 30.0
 

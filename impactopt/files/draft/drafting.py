@@ -117,10 +117,13 @@ def draft_problem(
     say(f"{drafted.robot.name}: {drafted.robot.n} joints, on two legs; looking for a posture and a target")
     try:
         return _punch(drafted, soles, strikers, arms, forward, folder)
-    except InputError:
+    except InputError as no_punch:
         if motion == "punch":
             raise
-        return _kick(drafted, soles, strikers, forward, folder)
+        try:
+            return _kick(drafted, soles, strikers, forward, folder)
+        except InputError:
+            raise no_punch from None
 
 
 def _standing(

@@ -32,6 +32,7 @@ SHORT = 0.06  # [m] a link so short at most, as a flange is, never folds back ov
 EDGE = 5e-3  # [m] above its lowest point: what of a hand is its edge
 LONG = 0.12  # [m] a hand sticks out so far from a tool's frame at least
 ROLLS = np.cos(np.radians(25))  # least cosine between a joint's axis and what turns about it
+ASLANT = np.cos(np.radians(60))  # least cosine for a shape that is behind its joint rather than beside it
 STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
 
 
@@ -133,9 +134,11 @@ def _axis(
         return away
     axis = axis / size
     turns = _turning_axis(model, limb.tip)
-    backwards = float(axis @ away) < -STRAIGHT
-    if backwards and (size < SHORT or abs(float(axis @ turns)) > ROLLS):
+    onwards = float(axis @ away)
+    if onwards < -STRAIGHT and (size < SHORT or abs(float(axis @ turns)) > ROLLS):
         axis = -axis  # the link ends at its joint, and its shapes are behind that
+    elif onwards < -ASLANT and size < SHORT:
+        axis = turns * np.sign(turns @ away) if abs(turns @ away) > ASLANT else away
     return _straightened(axis)
 
 

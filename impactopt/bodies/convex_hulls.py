@@ -28,8 +28,10 @@ __all__ = [
     "bare_joints",
     "convex",
     "distance_to_link",
+    "file_pieces",
     "inertia_box",
     "is_far",
+    "is_too_large",
     "pieces_of",
     "seen_pieces",
     "size_of",
@@ -39,6 +41,7 @@ __all__ = [
 Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
 SIDE = 0.02  # [m] least side of a box of inertia
+LARGE, TIMES = 1.0, 8.0  # a shape is too large from so many metres on, and times the box of its inertia
 NEIGHBOURS = 200  # of a vertex at most: coal counts them in a byte
 THINNED = 1e-4  # [m] vertices nearer to each other become one, twice as far each time, where there are more
 
@@ -84,21 +87,26 @@ def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
     """The pieces of a robot, and in words where they are from.
 
     They are hulls of its URDF's or MJCF's collision shapes, or of the visual ones of a link that has no
-    others. A robot without any, and what has lost its meshes, is rounded boxes of the links' inertia. Tools
-    are rods to their heads.
+    others. A robot without any, what has lost its meshes, and what has shapes that are too large, is rounded
+    boxes of the links' inertia. Tools are rods to their heads.
     """
-    if robot.mjcf is not None:
-        found, source = list(_from_mjcf(robot, robot.mjcf)), "collision shapes of its MJCF"
-    else:
-        found, source = list(_from_urdf(robot)), "collision shapes of its URDF"
+    known = file_pieces(robot)
+    found = [piece for piece in known if not is_too_large(robot.model, piece.joint, piece.vertices)]
+    source = f"collision shapes of its {'URDF' if robot.mjcf is None else 'MJCF'}"
     if not found:
         found, source = list(_from_inertia(robot)), "boxes of its links' inertia"
     else:
-        bare = bare_joints(robot, {piece.joint for piece in found})
+        bare = bare_joints(robot, {piece.joint for piece in known})
+        bare |= {piece.joint for piece in known} - {piece.joint for piece in found}
         found += [piece for piece in _from_inertia(robot) if piece.joint in bare]
-        source += f", and boxes of the inertia of {len(bare)} that have lost their meshes" if bare else ""
+        source += f", and boxes of the inertia of {len(bare)} without usable ones" if bare else ""
     found += [piece for tool in robot.tools for piece in _of_tool(robot, tool)]
     return tuple(found), source
+
+
+def file_pieces(robot: Robot) -> tuple[Piece, ...]:
+    """Hulls of the shapes in a robot's URDF or MJCF, whatever they are."""
+    return tuple(_from_urdf(robot) if robot.mjcf is None else _from_mjcf(robot, robot.mjcf))
 
 
 def bare_joints(robot: Robot, shown: Collection[int]) -> set[int]:
@@ -241,6 +249,24 @@ def is_far(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> bool:
 def size_of(piece: Piece) -> float:
     """Diagonal of a shape's bounds [m]."""
     return float(np.linalg.norm(np.ptp(piece.vertices, axis=0)))
+
+
+def is_too_large(model: pin.Model, joint: int, vertices: Array) -> bool:
+    """True if a shape that a joint moves is larger than the whole robot, and by far than the inertia of its
+    link says, as one in millimetres that is read as metres.
+    """
+    size, inertia = float(np.linalg.norm(np.ptp(vertices, axis=0))), model.inertias[joint]
+    if size < LARGE or not inertia.mass:
+        return False
+    box = float(np.linalg.norm(np.ptp(inertia_box(inertia).vertices, axis=0)))
+    return size > TIMES * box and size > 2 * kinematic_size(model)
+
+
+def kinematic_size(model: pin.Model) -> float:
+    """Diagonal of the bounds of all joints, where they are at zero [m]."""
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+    return float(np.linalg.norm(np.ptp([place.translation for place in data.oMi], axis=0)))
 
 
 def distance_to_link(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> float:

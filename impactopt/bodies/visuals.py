@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from impactopt.bodies.convex_hulls import ROD, bare_joints, inertia_box, tool_solids
+from impactopt.bodies.convex_hulls import ROD, bare_joints, inertia_box, is_too_large, tool_solids
 from impactopt.bodies.file_shapes import geoms_of, numbers, shapes_of, urdf_root
 from impactopt.bodies.solids import Solid, box, cylinder, sphere
 from impactopt.bodies.world import WorldBody
@@ -40,15 +40,17 @@ class Visual:
 def visuals_of(robot: Robot) -> list[Visual]:
     """The robot's visual shapes; tools are rods, with a bar across the end of a hammer.
 
-    What has lost its meshes is drawn by boxes of the links' inertia and bones between the joints, and so is a
-    robot without shapes.
+    What has lost its meshes, or has too large ones, is drawn by boxes of the links' inertia and bones between
+    the joints, and so is a robot without shapes.
     """
     found = [] if robot.urdf is None else _from_urdf(robot, Path(robot.urdf))
     if robot.mjcf is not None:
         found = _from_mjcf(robot, robot.mjcf)
+    known = {visual.joint for visual in found}
+    found = [v for v in found if not is_too_large(robot.model, v.joint, v.solid.vertices)]
     if not found:
         return _from_inertia(robot)
-    bare = bare_joints(robot, {visual.joint for visual in found})
+    bare = bare_joints(robot, known) | (known - {visual.joint for visual in found})
     found += [visual for visual in _from_inertia(robot) if visual.joint in bare] if bare else []
     return [*found, *(visual for tool in robot.tools for visual in _of_tool(robot, tool))]
 

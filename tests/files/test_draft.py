@@ -15,6 +15,8 @@ from support import urdfs
 from typer.testing import CliRunner
 
 from impactopt import Board, Nail, Robot, Tool, optimize_strike, solve
+from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.bodies.visuals import visuals_of
 from impactopt.cli.app import app
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
@@ -382,6 +384,19 @@ def test_of_a_tool_at_the_joint_itself_a_long_hand_strikes(tmp_path: Path) -> No
     striker, axis = find_striker(drafted.robot.model, drafted.arms[0], "hand", drafted.pieces)
     assert striker.frame == "tool0" and striker.point == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
     assert axis == pytest.approx([1.0, 0.0, 0.0])
+
+
+def test_a_shape_larger_than_the_robot_is_told_and_no_body(tmp_path: Path) -> None:
+    """As of a mesh in millimetres; where the robot is plausible nothing is left out."""
+    text = urdfs.arm().replace('<box size="0.08 0.08 0.3"/>', '<box size="80 80 300"/>')
+    problem = _problem(tmp_path, text)
+    told = doubts(problem.robot)
+    assert len(told) == 2 and all("3.2e+02 m large" in line for line in told)
+    bodies = bodies_of(problem.robot)
+    assert {piece.link for piece in bodies.pieces if piece.assumed} == {"shoulder", "elbow"}
+    assert max(np.ptp(piece.vertices, axis=0).max() for piece in bodies.pieces) < 0.5
+    assert max(np.ptp(v.solid.vertices, axis=0).max() for v in visuals_of(problem.robot)) < 0.5
+    assert not any(piece.assumed for piece in bodies_of(_problem(tmp_path, urdfs.arm()).robot).pieces)
 
 
 def test_a_shape_far_from_its_link_is_told_and_does_not_strike(tmp_path: Path) -> None:

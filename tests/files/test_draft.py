@@ -463,6 +463,19 @@ def test_a_drawing_of_lines_has_no_soles(tmp_path: Path) -> None:
         _drafted(tmp_path, text)
 
 
+@pytest.mark.parametrize(("effort", "locked"), [(20.0, True), (2000.0, False)])
+def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: float, locked: bool) -> None:
+    """Makers' files have such limits where nobody looked."""
+    text = urdfs.arm().replace('<parent link="base"/>', '<parent link="lift"/>', 1)
+    lift = urdfs.link("lift", 4.0, (0.1, 0.1, 0.1), (0, 0, 0))
+    rail = urdfs.joint(
+        "rise", "base", "lift", "0 0 1", (0, 0, 0.2), (0, 0.4), kind="prismatic", effort=effort
+    )
+    draft = _drafted(tmp_path, text.replace("</robot>", f"{lift}{rail}</robot>"))
+    assert ("rise cannot lift what it carries" in "".join(draft.said)) == locked
+    assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
+
+
 def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"

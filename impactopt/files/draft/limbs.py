@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece
-from impactopt.robots.build import is_floating
+from impactopt.robots.build import effort_limit, is_floating
 from impactopt.robots.checks import LEG
 
 __all__ = ["Limb", "arms_of", "legs_of", "limbs_of", "renumbered", "to_lock", "toes", "unshared"]
@@ -58,11 +58,15 @@ def limbs_of(model: pin.Model) -> tuple[Limb, ...]:
 
 
 def to_lock(model: pin.Model) -> dict[str, str]:
-    """Joints that no plan should move, and why: fingers, wheels, joints without range or without mass."""
+    """Joints that no plan should move, and why: fingers, wheels, joints without range or without mass, slides
+    that cannot lift what they carry.
+    """
     children, out = _children(model), dict[str, str]()
     first = 2 if is_floating(model) else 1
     mass, total = _beyond(model, children), sum(float(body.mass) for body in model.inertias)
     reach = _reach(model, children)
+    effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
+    rises = np.abs(_rises(model))
     for j in range(model.njoints - 1, first - 1, -1):
         joint, name = model.joints[j], str(model.names[j])
         low, high = (
@@ -80,12 +84,27 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             out[name] = "a finger"
         elif mass[j] <= 0:
             out[name] = "no mass"
+        elif effort[joint.idx_v] < 9.81 * mass[j] * rises[joint.idx_v]:
+            out[name] = f"{name} cannot lift what it carries"
     for j in range(first, model.njoints):  # a hand: several short and light chains beside each other
         small = [c for c in children[j] if mass[c] < LIGHT * total and reach[c] < SHORT]
         if len(small) > 1 and len(small) == len(children[j]):
             out |= {str(model.names[i]): "a finger" for c in small for i in _below(c, children)}
     if len(out) == model.njoints - first:  # a finger that is the whole robot
         out = {name: why for name, why in out.items() if not _FINGERS.search(name)}
+    return out
+
+
+def _rises(model: pin.Model) -> Array:
+    """(nv,) how far [m/m] each slide of the neutral posture lifts what it carries; 0 for other joints."""
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    out = np.zeros(model.nv)
+    for j in range(1, model.njoints):
+        if model.joints[j].nv == 1:
+            jac = np.reshape(pin.getJointJacobian(model, data, j, pin.LOCAL_WORLD_ALIGNED), (6, model.nv))
+            turns = jac[3:, model.joints[j].idx_v].any()
+            out[model.joints[j].idx_v] = 0.0 if turns else jac[2, model.joints[j].idx_v]
     return out
 
 

@@ -97,9 +97,10 @@ def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
         found, source = list(_from_inertia(robot)), "boxes of its links' inertia"
     else:
         bare = bare_joints(robot, {piece.joint for piece in known})
-        bare |= {piece.joint for piece in known} - {piece.joint for piece in found}
-        found += [piece for piece in _from_inertia(robot) if piece.joint in bare]
-        source += f", and boxes of the inertia of {len(bare)} without usable ones" if bare else ""
+        large = {piece.joint for piece in known} - {piece.joint for piece in found}
+        found += [piece for piece in _from_inertia(robot) if piece.joint in bare | large]
+        source += f", and boxes of the inertia of {len(bare)} that have lost their meshes" if bare else ""
+        source += f", and boxes of the inertia of {len(large)} whose shapes are too large" if large else ""
     found += [piece for tool in robot.tools for piece in _of_tool(robot, tool)]
     return tuple(found), source
 

@@ -46,14 +46,16 @@ def reduced(model: pin.Model, locked: Sequence[int], q: NDArray[np.float64], *ge
     """The model without locked joints, held at q (nq,), as of `pin.buildReducedModel`; and a
     pin.GeometryModel where one is given.
 
-    Pinocchio 4.1 looks frames up by joints' names, and fails where a link has the same.
+    Pinocchio 4.1 looks frames up by joints' names, and fails where a link has the same, or a fixed joint has
+    its link's.
     """
     model = model.copy()
-    joints = set(map(str, model.names))
+    joints, count = set(map(str, model.names)), Counter(str(frame.name) for frame in model.frames)
     for frame in model.frames:
+        fixed = frame.type == pin.FrameType.FIXED_JOINT
         if frame.type == pin.FrameType.JOINT:
             frame.name = model.names[frame.parentJoint]
-        elif frame.type != pin.FrameType.FIXED_JOINT and str(frame.name) in joints:
+        elif count[str(frame.name)] > 1 if fixed else str(frame.name) in joints:
             frame.name = f"{frame.name}{_MARK}"
     out = pin.buildReducedModel(model, *geometry, list(locked), q)
     found = out[0] if geometry else out

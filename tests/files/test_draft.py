@@ -386,6 +386,12 @@ def test_of_a_tool_at_the_joint_itself_a_long_hand_strikes(tmp_path: Path) -> No
     assert axis == pytest.approx([1.0, 0.0, 0.0])
 
 
+def test_links_without_mass_are_told(tmp_path: Path) -> None:
+    text = re.sub(r"<inertial>.*?</inertial>", "", urdfs.arm())
+    with pytest.raises(InputError, match=r"its links have no mass.*give each an <inertial>"):
+        _drafted(tmp_path, text)
+
+
 def test_a_shape_larger_than_the_robot_is_told_and_no_body(tmp_path: Path) -> None:
     """As of a mesh in millimetres; where the robot is plausible nothing is left out."""
     text = urdfs.arm().replace('<box size="0.08 0.08 0.3"/>', '<box size="80 80 300"/>')
@@ -501,6 +507,8 @@ def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
 def test_a_joint_may_have_a_links_name(tmp_path: Path) -> None:
     same = urdfs.arm().replace('joint name="elbow"', 'joint name="elbow_link"')
     same = same.replace('joint name="slide_0"', 'joint name="claw_0"')
+    plate = urdfs.joint("plate", "wrist_link", "plate", "0 0 1", (0, 0, 0), (0, 0), kind="fixed")
+    same = same.replace("</robot>", f'<link name="plate"/>{plate}</robot>')
     problem = _problem(tmp_path, same)
     other = _problem(tmp_path, urdfs.arm())
     assert problem.robot.joint_names == ("turn", "shoulder", "elbow_link", "wrist")

@@ -15,7 +15,7 @@ from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.errors import InputError
 from impactopt.files.draft.default_drives import Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, to_lock, toes, unshared
-from impactopt.robots.build import is_floating, joint_names, lock_joints
+from impactopt.robots.build import is_floating, lock_joints
 from impactopt.robots.checks import LEG, REPAIRED, check_inertias
 from impactopt.robots.description import Description, Tie
 from impactopt.robots.mjcf import read_mjcf
@@ -73,7 +73,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     """
     first = _floating(path, mjcf, bolted)
     locked = _locked(first)
-    if set(locked.values()) == {"no mass"} and locked.keys() == set(joint_names(first.model)):
+    if not any(body.mass for body in list(first.model.inertias)[1 + is_floating(first.model) :]):
         raise InputError(
             f"{path}: its links have no mass, so no motion can be planned; give each an <inertial>, with "
             "mass and inertia"

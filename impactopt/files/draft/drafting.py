@@ -30,7 +30,7 @@ from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
-from impactopt.files.problem_file.writing import sole_data, striker_data
+from impactopt.files.problem_file.writing import sole_data, striker_data, tool_data
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import optimize_strike
@@ -38,7 +38,7 @@ from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import shape_doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import DOWN
-from impactopt.robots.attachments import Sole, Striker
+from impactopt.robots.attachments import Sole, Striker, Tool
 from impactopt.robots.build import default_kd, default_kp
 from impactopt.robots.checks import REPAIRED
 from impactopt.robots.gains import USUAL_ROTOR
@@ -57,6 +57,11 @@ UNSOLVED = "none of the strikes tried is solved: if `solve` finds no motion, mov
 EDGEWISE = (
     "no strike with the striking link's face to the target is found: [terms.first_touch] is off, so another "
     "part of the link may touch first"
+)
+PEG, PEG_MASS = 0.05, 0.1  # [m], [kg]
+PEGGED = (
+    f"a peg of {100 * PEG:g} cm is drafted on the striking link, as the links before it would touch the "
+    "target first: mount one, or give your own tool in [[robot.tools]]"
 )
 TOE = 0.02  # [m] of the point of a toe above the sole
 BALL = 0.22  # [m]
@@ -188,18 +193,41 @@ def _bolted(
         strong = strongest(robot, arms[0], q, hit, with_face=not edgewise)
         if strong:
             break
+    pegged = not strong and motion not in FROM_ABOVE
+    if pegged:
+        other, with_peg = robot.with_tool(_peg(robot, arms[0])), replace(arms[0], name="peg")
+        for edgewise, hit in product((False, True), hits(motion, robot)):
+            if strong := strongest(other, with_peg, q, hit, with_face=not edgewise):
+                robot, arms = other, [with_peg, *arms[1:]]
+                break
     if strong:
         tries = [_struck(drafted, robot, strikers, arms[0], blow, hit, edgewise, folder) for blow in strong]
         taken = _planned(tries, folder, say) if planned else 0
         data = tries[taken or 0]
         told = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
-        said = [told, EDGEWISE] if edgewise else [told]
+        said = [told, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
     else:
         q, way = ready(robot, arms, q, ways=[tuple(DOWN)] if motion in FROM_ABOVE else WAYS)
         data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
         data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
         said = [UNSOLVED]
     return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
+
+
+def _peg(robot: Robot, arm: Arm) -> Tool:
+    """A rod ahead of the striking point of an arm, which strikes in its place."""
+    striker = robot.striker(arm.name)
+    frame = robot.model.frames[robot.model.getFrameId(striker.frame)]
+    axis = np.round(frame.placement.rotation.T @ arm.axis, 4) + 0.0
+    across, along = PEG_MASS * PEG**2 / 12, PEG_MASS * 0.01**2 / 2
+    return Tool(
+        name="peg",
+        frame=striker.frame,
+        mass=PEG_MASS,
+        center=np.round(striker.point + PEG / 2 * axis, 4),
+        inertia=np.round(across * np.eye(3) + (along - across) * np.outer(axis, axis), 8),
+        head=np.round(striker.point + PEG * axis, 4),
+    )
 
 
 def _struck(
@@ -288,8 +316,7 @@ def _kick(
     """
     if any(sole.hinge is not None for sole in soles):
         raise InputError(
-            f"{drafted.path}: there is nothing to strike with but the feet, and legs of five joints cannot "
-            "kick: a foot in the air would swing on its hinge"
+            f"{drafted.path}: legs of five joints cannot kick: a foot in the air would swing on its hinge"
         )
     lifted = max(range(len(soles)), key=lambda k: soles[k].name == "right")
     foot, stands = soles[lifted], soles[1 - lifted]
@@ -379,6 +406,7 @@ def _data(
     if soles:
         keys["soles"] = [sole_data(sole) for sole in soles]
     keys["strikers"] = [striker_data(striker) for striker in strikers]
+    keys |= {"tools": [tool_data(tool) for tool in robot.tools]} if robot.tools else {}
     angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
     keys["postures_rad"] = {START: {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}}
     mass = sum(float(body.mass) for body in robot.model.inertias)
@@ -448,6 +476,7 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         "velocity_limit_rad_s": f"{DOUBT}; the file has none",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
         "strikers": "found in the shapes of the last links, where these end; move them to what is to hit",
+        "tools": "a GUESS: a peg that has to be mounted, as the links before it would touch the target first",
         "locked_rad": "; ".join(_reasons(drafted.locked)),
     }
 

@@ -56,6 +56,7 @@ __all__ = [
     "sole_data",
     "striker_data",
     "target_data",
+    "tool_data",
     "write_problem",
 ]
 
@@ -123,7 +124,7 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
     if options.get("strikers") and source.preset is None:
         data["strikers"] = [striker_data(striker) for striker in options["strikers"]]
     if source.tools:
-        data["tools"] = [_tool(tool) for tool in source.tools]
+        data["tools"] = [tool_data(tool) for tool in source.tools]
     grips = {tool.name: _grip(tool.grip) for tool in robot.tools if tool.grip is not None}
     if grips:
         data["grips"] = grips
@@ -205,7 +206,7 @@ def striker_data(striker: Striker) -> dict[str, Any]:
     return {"name": striker.name, "frame": striker.frame, "point_m": striker.point.tolist()}
 
 
-def _tool(tool: Tool) -> dict[str, Any]:
+def tool_data(tool: Tool) -> dict[str, Any]:
     return {
         "name": tool.name,
         "frame": tool.frame,

@@ -386,6 +386,15 @@ def test_of_a_tool_at_the_joint_itself_a_long_hand_strikes(tmp_path: Path) -> No
     assert axis == pytest.approx([1.0, 0.0, 0.0])
 
 
+def test_where_no_plan_is_found_motions_may_last_longer(tmp_path: Path) -> None:
+    """As where one joint is slow: the strike does not need it, the way to its start does."""
+    head, joint, tail = urdfs.arm().partition('<joint name="shoulder"')
+    text = head + joint + tail.replace('velocity="4.0"', 'velocity="0.1"', 1)
+    problem = _problem(tmp_path, text, planned=True)
+    assert problem.swing.duration[1] > 2.0
+    assert solve(problem).status.usable
+
+
 def test_a_flange_that_the_wrist_hides_gets_a_peg(tmp_path: Path) -> None:
     """As of some makers' arms: with nothing mounted the link before would touch the target first."""
     hidden, shown = urdfs.arm(), '<origin xyz="0.0 0.0 0.15"/><geometry><box size="0.08 0.08 0.3"/>'

@@ -203,6 +203,9 @@ def _bolted(
     if strong:
         tries = [_struck(drafted, robot, strikers, arms[0], blow, hit, edgewise, folder) for blow in strong]
         taken = _planned(tries, folder, say) if planned else 0
+        if taken is None:
+            tries = [_slower(data) for data in tries]
+            taken = _planned(tries, folder, say)
         data = tries[taken or 0]
         told = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
         said = [told, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
@@ -212,6 +215,13 @@ def _bolted(
         data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
         said = [UNSOLVED]
     return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
+
+
+def _slower(data: dict[str, Any]) -> dict[str, Any]:
+    """The data with phases that may last twice as long."""
+    phases = {key: data[key] for key in ("swing", "follow")}
+    longer = {key: [phase["duration_s"][0], 2 * phase["duration_s"][1]] for key, phase in phases.items()}
+    return data | {key: phase | {"duration_s": longer[key]} for key, phase in phases.items()}
 
 
 def _peg(robot: Robot, arm: Arm) -> Tool:

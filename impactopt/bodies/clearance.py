@@ -16,7 +16,7 @@ from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance
 from impactopt.bodies.separation import THIN, Placed, Shapes
 from impactopt.bodies.world import BEHIND, WorldBody
 from impactopt.errors import InputError
-from impactopt.robots.checks import parent_body
+from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 
 __all__ = ["SLACK", "Bodies", "Places", "Survey", "Touch"]

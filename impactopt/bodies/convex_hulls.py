@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,10 +13,10 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from impactopt.bodies.file_shapes import geoms_of, lost_meshes, shapes_of, urdf_root
+from impactopt.bodies.file_shapes import Geom, LinkShape, geoms_of, lost_meshes, shapes_of, urdf_root
 from impactopt.bodies.solids import Solid, cylinder, rounded_box
 from impactopt.codegen.files import kept
 from impactopt.robots.robot import Robot, Tool
@@ -83,14 +83,14 @@ def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
     return coal.Convex(points, facets)
 
 
-def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
-    """The pieces of a robot, and in words where they are from.
+def pieces_of(robot: Robot, known: Sequence[Piece] | None = None) -> tuple[tuple[Piece, ...], str]:
+    """The pieces of a robot, and in words where they are from; known : its `file_pieces`, if they are read.
 
     They are hulls of its URDF's or MJCF's collision shapes, or of the visual ones of a link that has no
     others. A robot without any, what has lost its meshes, and what has shapes that are too large, is rounded
     boxes of the links' inertia. Tools are rods to their heads.
     """
-    known = file_pieces(robot)
+    known = file_pieces(robot) if known is None else known
     found = [piece for piece in known if not is_too_large(robot.model, piece.joint, piece.vertices)]
     source = f"collision shapes of its {'URDF' if robot.mjcf is None else 'MJCF'}"
     if not found:
@@ -126,28 +126,27 @@ def _from_urdf(robot: Robot) -> Iterator[Piece]:
         return
     solid = list(shapes_of(robot.model, root, urdf, "collision"))
     seen = shapes_of(robot.model, root, urdf, "visual", without={shape.link for shape in solid})
-    for shape in [*solid, *seen]:
-        piece = _hull(shape.link, shape.joint, shape.solid)
-        if piece is not None:
-            yield piece
+    yield from _hulls([*solid, *seen])
 
 
 def _from_mjcf(robot: Robot, mjcf: str) -> Iterator[Piece]:
     geoms = geoms_of(robot.model, mjcf)
     bodied = {geom.link for geom in geoms if geom.collides}
-    for geom in geoms:
-        if geom.collides or geom.link not in bodied:
-            piece = _hull(geom.link, geom.joint, geom.solid)
-            if piece is not None:
-                yield piece
+    yield from _hulls(geom for geom in geoms if geom.collides or geom.link not in bodied)
 
 
 def seen_pieces(robot: Robot, joint: int) -> tuple[Piece, ...]:
     """Hulls of what an MJCF shows of a joint's links and lets touch nothing, as Unitree's of hands."""
     geoms = geoms_of(robot.model, robot.mjcf) if robot.mjcf is not None else []
-    shown = (geom for geom in geoms if geom.joint == joint and not geom.collides)
-    hulls = (_hull(geom.link, geom.joint, geom.solid) for geom in shown)
-    return tuple(hull for hull in hulls if hull is not None)
+    return tuple(_hulls(geom for geom in geoms if geom.joint == joint and not geom.collides))
+
+
+def _hulls(shapes: Iterable[LinkShape | Geom]) -> Iterator[Piece]:
+    """Hulls of those shapes of a file that have one."""
+    for shape in shapes:
+        piece = _hull(shape.link, shape.joint, shape.solid)
+        if piece is not None:
+            yield piece
 
 
 def _from_inertia(robot: Robot) -> Iterator[Piece]:
@@ -249,25 +248,30 @@ def is_far(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> bool:
 
 def size_of(piece: Piece) -> float:
     """Diagonal of a shape's bounds [m]."""
-    return float(np.linalg.norm(np.ptp(piece.vertices, axis=0)))
+    return _diagonal(piece.vertices)
+
+
+def _diagonal(points: ArrayLike) -> float:
+    """Diagonal of the bounds of points (k, 3) [m]."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def is_too_large(model: pin.Model, joint: int, vertices: Array) -> bool:
     """True if a shape that a joint moves is larger than the whole robot, and by far than the inertia of its
     link says, as one in millimetres that is read as metres.
     """
-    size, inertia = float(np.linalg.norm(np.ptp(vertices, axis=0))), model.inertias[joint]
+    size, inertia = _diagonal(vertices), model.inertias[joint]
     if size < LARGE or not inertia.mass:
         return False
-    box = float(np.linalg.norm(np.ptp(inertia_box(inertia).vertices, axis=0)))
-    return size > TIMES * box and size > 2 * kinematic_size(model)
+    box = _diagonal(inertia_box(inertia).vertices)
+    return size > TIMES * box and size > 2 * _kinematic_size(model)
 
 
-def kinematic_size(model: pin.Model) -> float:
+def _kinematic_size(model: pin.Model) -> float:
     """Diagonal of the bounds of all joints, where they are at zero [m]."""
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
-    return float(np.linalg.norm(np.ptp([place.translation for place in data.oMi], axis=0)))
+    return _diagonal([place.translation for place in data.oMi])
 
 
 def distance_to_link(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> float:

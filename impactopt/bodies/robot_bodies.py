@@ -14,8 +14,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from impactopt.bodies.convex_hulls import Piece, pieces_of
-from impactopt.robots.checks import parent_body
+from impactopt.bodies.convex_hulls import Piece, file_pieces, pieces_of
+from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 
 __all__ = ["Pair", "RobotBodies", "StrikerFace", "bodies_of", "distance", "striker_face", "transform"]
@@ -28,12 +28,14 @@ Pair = tuple[int, int]
 class RobotBodies:
     """Collision geometry of a robot.
 
-    pieces : hulls of links, exact.  source : where they are from, in words.
+    pieces : hulls of links, exact.  source : where they are from, in words.  too_large : shapes of its file
+        that are none of them.
     """
 
     robot: Robot
     pieces: tuple[Piece, ...]
     source: str
+    too_large: tuple[Piece, ...] = ()
 
     @cached_property
     def joints(self) -> tuple[int, ...]:
@@ -112,8 +114,10 @@ _KNOWN: weakref.WeakKeyDictionary[Robot, RobotBodies] = weakref.WeakKeyDictionar
 def bodies_of(robot: Robot) -> RobotBodies:
     """The robot's bodies, made once."""
     if robot not in _KNOWN:
-        pieces, source = pieces_of(robot)
-        _KNOWN[robot] = RobotBodies(robot=robot, pieces=pieces, source=source)
+        known = file_pieces(robot)
+        pieces, source = pieces_of(robot, known)
+        too_large = tuple(piece for piece in known if piece not in pieces)
+        _KNOWN[robot] = RobotBodies(robot=robot, pieces=pieces, source=source, too_large=too_large)
     return _KNOWN[robot]
 
 

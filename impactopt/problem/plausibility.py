@@ -7,14 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 
-from impactopt.bodies.convex_hulls import (
-    distance_to_link,
-    file_pieces,
-    is_far,
-    is_too_large,
-    pieces_of,
-    size_of,
-)
+from impactopt.bodies.convex_hulls import distance_to_link, is_far, size_of
+from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.robots.gains import HEAVIEST_ROTOR, LIGHTEST_ROTOR
 from impactopt.robots.robot import Robot
 
@@ -98,14 +92,13 @@ def _sides(robot: Robot) -> Iterator[str]:
 
 def shape_doubts(robot: Robot) -> Iterator[str]:
     """Shapes far from the link that has them, or too large for it, and striking links without any."""
-    for piece in file_pieces(robot):
-        if is_too_large(robot.model, piece.joint, piece.vertices):
-            yield (
-                f"a shape of link {piece.link!r} is {size_of(piece):.2g} m large, more than the whole robot: "
-                "scale it, as from millimetres; a box of the link's inertia takes its place"
-            )
-    pieces = pieces_of(robot)[0]
-    shown = {piece.joint for piece in pieces}
+    bodies = bodies_of(robot)
+    for piece in bodies.too_large:
+        yield (
+            f"a shape of link {piece.link!r} is {size_of(piece):.2g} m large, more than the whole robot: "
+            "scale it, as from millimetres; a box of the link's inertia takes its place"
+        )
+    pieces, shown = bodies.pieces, bodies.of_joint
     for striker in robot.strikers.values():
         if _parent(robot, striker.frame) not in shown:
             yield (

@@ -58,6 +58,17 @@ def joint_index(names: Sequence[str], name: str, what: str) -> int:
     return list(names).index(name)
 
 
+def parent_body(model: pin.Model, joint: int) -> int:
+    """Joint that moves the body on which the body of a joint hangs; 0 for the ground.
+
+    It is not always the joint before: several joints may move the same body.
+    """
+    above = int(model.parents[joint])
+    while above and not model.inertias[above].mass:
+        above = int(model.parents[above])
+    return above
+
+
 def per_joint(
     what: str, value: float | Mapping[str, float] | ArrayLike | None, joints: Sequence[str], default: Array
 ) -> Array:

@@ -25,7 +25,6 @@ __all__ = [
     "check_frame",
     "check_inertias",
     "check_legs",
-    "parent_body",
     "reduced",
     "repair_inertias",
     "tell_apart",
@@ -52,11 +51,11 @@ def reduced(model: pin.Model, locked: Sequence[int], q: NDArray[np.float64], *ge
     model = model.copy()
     joints, count = set(map(str, model.names)), Counter(str(frame.name) for frame in model.frames)
     for frame in model.frames:
-        fixed = frame.type == pin.FrameType.FIXED_JOINT
+        name, fixed = str(frame.name), frame.type == pin.FrameType.FIXED_JOINT
         if frame.type == pin.FrameType.JOINT:
             frame.name = model.names[frame.parentJoint]
-        elif count[str(frame.name)] > 1 if fixed else str(frame.name) in joints:
-            frame.name = f"{frame.name}{_MARK}"
+        elif (fixed and count[name] > 1) or (not fixed and name in joints):
+            frame.name = f"{name}{_MARK}"
     out = pin.buildReducedModel(model, *geometry, list(locked), q)
     found = out[0] if geometry else out
     for frame in found.frames:
@@ -349,17 +348,6 @@ TRIANGLE = 1e-3  # relative, of the triangle inequality: room for rounded decima
 THIN = 0.01  # [m] of the slab that a repaired body has at least the second moments of
 DENSITY = 2000.0  # [kg/m3] of the ball that takes the place of a point: motors, gears and housing
 _MEND = f'correct its <inertial>, with moments about the centre of mass, or take inertias="{REPAIRED}"'
-
-
-def parent_body(model: pin.Model, joint: int) -> int:
-    """Joint that moves the body on which the body of a joint hangs; 0 for the ground.
-
-    It is not always the joint before: several joints may move the same body.
-    """
-    above = int(model.parents[joint])
-    while above and not model.inertias[above].mass:
-        above = int(model.parents[above])
-    return above
 
 
 def _is_between_joints(model: pin.Model, i: int) -> bool:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import missing_package
+from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
@@ -220,17 +221,15 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
     """
     model = robot.model
     bodies = [spec.worldbody] * model.njoints
-    between: dict[int, list[int]] = {}  # a joint that moves nothing of its own, with those before it
     for j in range(1, model.njoints):
-        joints, inertia = [*between.pop(model.parents[j], ()), j], model.inertias[j]
+        inertia, above, way = model.inertias[j], parent_body(model, j), list(model.supports[j])
         if not inertia.mass:
-            between[j] = joints
             continue
-        placement, places = pin.SE3.Identity(), list[Any]()
+        joints, placement, places = way[way.index(above) + 1 :], pin.SE3.Identity(), list[Any]()
         for i in joints:
             placement = placement * model.jointPlacements[i]
             places.append(placement)
-        body = bodies[model.parents[joints[0]]].add_body(
+        body = bodies[above].add_body(
             name=f"body {model.names[j]}", pos=placement.translation, quat=quaternion(placement.rotation)
         )
         bodies[j] = body

@@ -85,8 +85,10 @@ def tree(tmp_path: Path) -> Path:
 class Both:
     """A robot's model beside MuJoCo's, at states drawn in Pinocchio's coordinates: qvel = S v."""
 
-    def __init__(self, path: Path) -> None:
-        self.mj, self.model = mujoco.MjModel.from_xml_path(str(path)), read_mjcf(path).model
+    def __init__(self, path: Path, *, mj: Any = None, model: Any = None) -> None:
+        """A file's; or these."""
+        self.mj = mujoco.MjModel.from_xml_path(str(path)) if mj is None else mj
+        self.model = read_mjcf(path).model if model is None else model
         self.there, self.data = mujoco.MjData(self.mj), self.model.createData()
 
     def states(self, count: int) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
@@ -154,10 +156,7 @@ def test_several_joints_may_move_the_same_body(tree: Path) -> None:
     spec = mujoco.MjSpec()
     spec.compiler.degree, spec.compiler.balanceinertia = False, False
     robot_bodies(mujoco, spec, robot)
-    both = Both(tree)
-    both.mj, both.model, both.data = spec.compile(), robot.model, robot.model.createData()
-    both.there = mujoco.MjData(both.mj)
-    both.check_dynamics()
+    Both(tree, mj=spec.compile(), model=robot.model).check_dynamics()
     # the bodies beside these joints are connected by them: they may touch
     model = robot.model
     carried = model.getJointId("elbow"), model.getJointId("shoulder")

@@ -188,18 +188,13 @@ def _bolted(
     arms = _renumbered(arms, drafted, robot)
     say(f"{robot.name}: {robot.n} joints, on a fixed base; trying blows (compiles the first time)")
     q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
-    # last edgewise: an arm of few joints cannot turn the link's face to where it moves
-    for edgewise, hit in product((False, True), hits(motion, robot)):
-        strong = strongest(robot, arms[0], q, hit, with_face=not edgewise)
-        if strong:
-            break
+    drawn = hits(motion, robot)
+    strong, hit, edgewise = _hardest(robot, arms[0], q, drawn)
     pegged = not strong and motion not in FROM_ABOVE
     if pegged:
         other, with_peg = robot.with_tool(_peg(robot, arms[0])), replace(arms[0], name="peg")
-        for edgewise, hit in product((False, True), hits(motion, robot)):
-            if strong := strongest(other, with_peg, q, hit, with_face=not edgewise):
-                robot, arms = other, [with_peg, *arms[1:]]
-                break
+        strong, hit, edgewise = _hardest(other, with_peg, q, drawn)
+        robot, arms = (other, [with_peg, *arms[1:]]) if strong else (robot, arms)
     if strong:
         tries = [_struck(drafted, robot, strikers, arms[0], blow, hit, edgewise, folder) for blow in strong]
         taken = _planned(tries, folder, say) if planned else 0
@@ -217,11 +212,23 @@ def _bolted(
     return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
 
 
+def _hardest(robot: Robot, arm: Arm, q: Array, drawn: list[Hit]) -> tuple[list[Strong], Hit, bool]:
+    """The first hit with strikes that are solved, these, and whether they are edgewise; else none, of the
+    last one.
+    """
+    strong: list[Strong] = []
+    # last edgewise: an arm of few joints cannot turn the link's face to where it moves
+    for edgewise, hit in product((False, True), drawn):
+        strong = strongest(robot, arm, q, hit, with_face=not edgewise)
+        if strong:
+            break
+    return strong, hit, edgewise
+
+
 def _slower(data: dict[str, Any]) -> dict[str, Any]:
     """The data with phases that may last twice as long."""
-    phases = {key: data[key] for key in ("swing", "follow")}
-    longer = {key: [phase["duration_s"][0], 2 * phase["duration_s"][1]] for key, phase in phases.items()}
-    return data | {key: phase | {"duration_s": longer[key]} for key, phase in phases.items()}
+    short = {key: data[key]["duration_s"] for key in ("swing", "follow")}
+    return data | {key: data[key] | {"duration_s": [low, 2 * high]} for key, (low, high) in short.items()}
 
 
 def _peg(robot: Robot, arm: Arm) -> Tool:
@@ -486,7 +493,7 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         "velocity_limit_rad_s": f"{DOUBT}; the file has none",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
         "strikers": "found in the shapes of the last links, where these end; move them to what is to hit",
-        "tools": "a GUESS: a peg that has to be mounted, as the links before it would touch the target first",
+        "tools": f"{DOUBT}: a peg to be mounted, as the links before it would touch the target first",
         "locked_rad": "; ".join(_reasons(drafted.locked)),
     }
 

@@ -66,7 +66,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
     mass, total = _beyond(model, children), sum(float(body.mass) for body in model.inertias)
     reach = _reach(model, children)
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
-    rises = np.abs(_rises(model))
+    weight = np.abs(pin.computeGeneralizedGravity(model, model.createData(), pin.neutral(model)))
     for j in range(model.njoints - 1, first - 1, -1):
         joint, name = model.joints[j], str(model.names[j])
         low, high = (
@@ -84,7 +84,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             out[name] = "a finger"
         elif mass[j] <= 0:
             out[name] = "no mass"
-        elif effort[joint.idx_v] < 9.81 * mass[j] * rises[joint.idx_v]:
+        elif "JointModelP" in joint.shortname() and effort[joint.idx_v] < weight[joint.idx_v]:
             out[name] = f"{name} cannot lift what it carries"
     for j in range(first, model.njoints):  # a hand: several short and light chains beside each other
         small = [c for c in children[j] if mass[c] < LIGHT * total and reach[c] < SHORT]
@@ -92,19 +92,6 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             out |= {str(model.names[i]): "a finger" for c in small for i in _below(c, children)}
     if len(out) == model.njoints - first:  # a finger that is the whole robot
         out = {name: why for name, why in out.items() if not _FINGERS.search(name)}
-    return out
-
-
-def _rises(model: pin.Model) -> Array:
-    """(nv,) how far [m/m] each slide of the neutral posture lifts what it carries; 0 for other joints."""
-    data = model.createData()
-    pin.computeJointJacobians(model, data, pin.neutral(model))
-    out = np.zeros(model.nv)
-    for j in range(1, model.njoints):
-        if model.joints[j].nv == 1:
-            jac = np.reshape(pin.getJointJacobian(model, data, j, pin.LOCAL_WORLD_ALIGNED), (6, model.nv))
-            turns = jac[3:, model.joints[j].idx_v].any()
-            out[model.joints[j].idx_v] = 0.0 if turns else jac[2, model.joints[j].idx_v]
     return out
 
 

@@ -83,7 +83,7 @@ def model_hash(model: pin.Model, springs: Mapping[str, tuple[float, float]] | No
         joint, inertia = model.joints[i], model.inertias[i]
         placement = model.jointPlacements[i].homogeneous
         add(str(model.names[i]), joint.shortname(), int(model.parents[i]), joint.idx_q, joint.idx_v)
-        add(_motion_subspace(joint, neutral) if i else None)
+        add(*_motion(joint, neutral) if i else ())
         add(np.array(placement), float(inertia.mass), np.array(inertia.lever), np.array(inertia.inertia))
     add(np.array(model.armature))
     for frame in model.frames:
@@ -93,11 +93,13 @@ def model_hash(model: pin.Model, springs: Mapping[str, tuple[float, float]] | No
     return digest.hexdigest()
 
 
-def _motion_subspace(joint: Any, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axes of a joint, (6, nv): the only way from Python to the axis of an unaligned one."""
+def _motion(joint: Any, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Axes of a joint, (6, nv), and its placement: the only way from Python to the axis of an unaligned one,
+    and with a follower's multiplier and offset.
+    """
     data = joint.createData()
     joint.calc(data, q)
-    return np.array(data.S)
+    return np.array(data.S), np.array(data.M.homogeneous)
 
 
 def canonical(item: Any) -> str:

@@ -261,11 +261,12 @@ def _steps(collision: SteppedModel) -> dict[str, float]:
 
 def independent_joints(collision: SteppedModel) -> list[str]:
     """Joints that the blow cannot move, and that move nothing that is asked for: on a fixed base, those of
-    limbs that share no joint with the striking point's. H has no entries between the two, nor have gains
-    given one a joint. To lock them in the robot changes nothing of the collision."""
+    limbs that share no joint with the striking point's, where no joint follows another. H has no entries
+    between the two, nor have gains given one a joint. To lock them in the robot changes nothing of the
+    collision."""
     robot = collision.robot
     gains = [value for name, value in collision.settings.items() if name in ("kp", "kd")]
-    if robot.floating or any(gain.ndim == 2 for gain in gains):
+    if robot.floating or robot.couplings or any(gain.ndim == 2 for gain in gains):
         return []
     model = robot.model
     frame = model.getFrameId(robot.striker(collision.striker).model_frame)

@@ -207,7 +207,7 @@ def _joint(columns: Mapping[str, Array], robot: Robot, k: int, name: str) -> Arr
 
 
 def _turns(robot: Robot, k: int) -> bool:
-    joint = list(robot.model.joints)[-robot.n :][k]
+    joint = robot.joint_models[k]
     data = joint.createData()
     joint.calc(data, pin.neutral(robot.model))
     return bool(np.any(np.asarray(data.S).reshape(6)[3:]))
@@ -216,7 +216,7 @@ def _turns(robot: Robot, k: int) -> bool:
 def _configurations(robot: Robot, angles: Array) -> Array:
     """(k, nq) of joint positions (k, n): a continuous joint is (cosine, sine) there."""
     out = np.empty((len(angles), robot.nq))
-    for joint, values in zip(list(robot.model.joints)[-robot.n :], angles.T, strict=True):
+    for joint, values in zip(robot.joint_models, angles.T, strict=True):
         if joint.nq == 2:
             out[:, joint.idx_q], out[:, joint.idx_q + 1] = np.cos(values), np.sin(values)
         else:

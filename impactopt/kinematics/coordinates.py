@@ -89,7 +89,7 @@ class Closing:
         none = np.zeros(0, dtype=np.intp)
         self._dependent = np.concatenate([none, *(limb.columns for limb in limbs)])
         self._independent = independent
-        of_column = {joint.idx_v: joint for joint in model.joints}
+        of_column = {joint.idx_v: joint for joint in model.joints if joint.nv}
         joints = [of_column[int(column)] for column in self._dependent]
         turning = all(joint.nq == 1 for joint in joints)  # no joint without limits, which has two numbers
         self._places = np.array([joint.idx_q for joint in joints], dtype=np.intp) if turning else None

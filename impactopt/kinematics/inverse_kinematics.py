@@ -114,7 +114,7 @@ def inverse_kinematics(
     hands = [(model.getFrameId(f"striker:{name}"), point) for name, point in aims]
     lower, upper = inside(robot, margin)
     # a continuous joint takes two numbers of q, and has no limits
-    joints = list(model.joints)[-robot.n :]
+    joints = robot.joint_models
     limited = np.array([k for k, j in enumerate(joints) if j.nq == 1], dtype=np.intp)
     place = np.array([joints[k].idx_q for k in limited], dtype=np.intp)
     rng = np.random.default_rng(0)

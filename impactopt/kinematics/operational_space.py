@@ -18,6 +18,7 @@ from impactopt.errors import MOST, InputError, check_array
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.dynamics import generalized_gravity, nonlinear_effects
+from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
 __all__ = ["Held", "across", "holding_torque", "static_wrenches", "striking_point", "striking_velocity"]
@@ -65,10 +66,9 @@ class Held:
     @classmethod
     def at(cls, model: pin.Model, q: Array, frames: Sequence[str], striker: str) -> Held:
         """Quantities at a configuration (nq,), with frames by their names in the model."""
-        data = model.createData()
-        upper = np.triu(pin.crba(model, data, q))
+        inertia = mass_matrix(model, model.createData(), q)
         rows = _jacobians(model, q, [*frames, striker])
-        return cls(upper + np.triu(upper, 1).T, rows[:-6], rows[-6:-3])
+        return cls(inertia, rows[:-6], rows[-6:-3])
 
     def inverse_mass(self) -> Array:
         """J P J' (3, 3) [1/kg]: P is the inverse inertia of the robot as it is held, its joints free.

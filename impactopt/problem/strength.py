@@ -18,6 +18,7 @@ from impactopt.errors import InputError
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.terms import FirstTouch, TorqueLimit
 from impactopt.robots.dynamics import generalized_gravity
+from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
 if TYPE_CHECKING:
@@ -70,8 +71,7 @@ class Strength:
         robot = self.robot
         model, data = robot.model, robot.model.createData()
         frame = model.getFrameId(robot.striker(self.striker).model_frame)
-        upper = np.triu(pin.crba(model, data, q))
-        inertia = upper + np.triu(upper, 1).T
+        inertia = mass_matrix(model, data, q)
         jac = np.reshape(
             pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED), (6, model.nv)
         )[:3]

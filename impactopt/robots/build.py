@@ -45,9 +45,16 @@ def is_floating(model: pin.Model) -> bool:
     return bool(model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer")
 
 
+def joint_indices(model: pin.Model) -> list[int]:
+    """Indices of the joints in the order of v, without the free-flyer, and without followers, whose
+    coordinates are their leaders'.
+    """
+    return [j for j in range(2 if is_floating(model) else 1, model.njoints) if model.joints[j].nv]
+
+
 def joint_names(model: pin.Model) -> tuple[str, ...]:
-    """Names of the joints in the order of v, without the free-flyer."""
-    return tuple(str(name) for name in list(model.names)[2 if is_floating(model) else 1 :])
+    """Names of these joints."""
+    return tuple(str(model.names[j]) for j in joint_indices(model))
 
 
 def joint_index(names: Sequence[str], name: str, what: str) -> int:
@@ -146,12 +153,20 @@ def velocity_limit(model: pin.Model) -> Array:
     return np.array(model.upperVelocityLimit if hasattr(model, "upperVelocityLimit") else model.velocityLimit)
 
 
+def set_velocity_limit(model: pin.Model, limit: Array) -> None:
+    """The other way round."""
+    if hasattr(model, "upperVelocityLimit"):
+        model.upperVelocityLimit, model.lowerVelocityLimit = limit, -limit
+    else:
+        model.velocityLimit = limit
+
+
 def position_limit(
     model: pin.Model, joints: Sequence[str], value: Mapping[str, tuple[float, float]] | ArrayLike | None
 ) -> tuple[Array, Array]:
     """(n,) lower and upper joint positions [rad]; infinite for continuous joints unless given."""
     limits = np.empty((len(joints), 2))
-    for row, joint in zip(limits, _joints(model), strict=True):
+    for row, joint in zip(limits, moving_joints(model), strict=True):
         # Pinocchio bounds cosine and sine of a continuous joint by +-1.01
         row[:] = (
             (-np.inf, np.inf)
@@ -223,7 +238,7 @@ def joint_positions(model: pin.Model, q: Array) -> Array:
     return np.array(
         [
             q[joint.idx_q] if joint.nq == 1 else np.arctan2(q[joint.idx_q + 1], q[joint.idx_q])
-            for joint in _joints(model)
+            for joint in moving_joints(model)
         ]
     )
 
@@ -231,7 +246,7 @@ def joint_positions(model: pin.Model, q: Array) -> Array:
 def set_joints(model: pin.Model, q: Array, angles: Mapping[str, float], what: str) -> Array:
     """A copy of the configuration with some joint angles set by name."""
     q = np.array(q, dtype=np.float64)
-    names, joints = joint_names(model), _joints(model)
+    names, joints = joint_names(model), moving_joints(model)
     for name, value in angles.items():
         joint = joints[joint_index(names, name, what)]
         angle = float(check_array(f"{what}: joint {name!r}", value, ()))
@@ -293,8 +308,9 @@ def pick(kind: str, name: str, options: Mapping[str, Any], robot: str) -> Any:
     return options[name]
 
 
-def _joints(model: pin.Model) -> list[Any]:
-    return list(model.joints)[2 if is_floating(model) else 1 :]
+def moving_joints(model: pin.Model) -> list[Any]:
+    """Pinocchio's joints of `joint_indices`."""
+    return [joint for joint in list(model.joints)[2 if is_floating(model) else 1 :] if joint.nv]
 
 
 def existing(path: str | PathLike[str], kind: str) -> str:

@@ -11,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, did_you_mean
+from impactopt.robots.mass_matrix import mass_matrix
 
 __all__ = [
     "GIVEN",
@@ -25,6 +26,7 @@ __all__ = [
     "check_frame",
     "check_inertias",
     "check_legs",
+    "columns_above",
     "reduced",
     "repair_inertias",
     "tell_apart",
@@ -76,13 +78,18 @@ STRONGEST = 1e15  # [N m], [rad/s] of a joint: a test may ask for no limit
 
 
 def check_joint_types(model: pin.Model) -> None:
-    """InputError unless all joints but a free-flyer at the root have one degree of freedom."""
+    """InputError unless all joints but a free-flyer at the root have one degree of freedom, or follow one."""
     for i in range(1, model.njoints):
         joint = model.joints[i]
-        if joint.nv != 1 and not (i == 1 and joint.shortname() == "JointModelFreeFlyer"):
+        if joint.nv > 1 and not (i == 1 and joint.shortname() == "JointModelFreeFlyer"):
             raise InputError(
                 f"joint {model.names[i]!r} is a {joint.shortname()} with {joint.nv} degrees of freedom; "
                 "besides a free-flyer at the root, joints have one: split it into such joints, or lock it"
+            )
+        if not joint.nv and any(other.idx_v == joint.idx_v and other.nq == 2 for other in model.joints):
+            raise InputError(
+                f"joint {model.names[i]!r} follows one that turns without end; give both of them position "
+                "limits"
             )
 
 
@@ -174,9 +181,8 @@ def check_gains(
                 raise InputError(f"{option} of joint {name!r} is {gain:g}; give a finite number, 0 or more")
     data = model.createData()
     for q in configurations:
-        upper = np.triu(pin.crba(model, data, q))
         try:
-            mobility = np.diag(np.linalg.inv(upper + np.triu(upper, 1).T))[model.nv - len(joints) :]
+            mobility = np.diag(np.linalg.inv(mass_matrix(model, data, q)))[model.nv - len(joints) :]
         except np.linalg.LinAlgError:
             mobility = np.full(len(joints), np.nan)
         if not np.all(np.isfinite(mobility)):
@@ -229,16 +235,25 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
         return int(model.getFrameId(frame, pin.FrameType.BODY))
 
 
+def columns_above(model: pin.Model, joint: int) -> list[int]:
+    """Columns in v, each once, of the joints that move the body of a joint, from the root on; without a
+    free-flyer's. A follower's is its leader's.
+    """
+    above = (model.joints[j] for j in model.supports[joint] if j)
+    return list(dict.fromkeys(int(each.idx_v) for each in above if each.nv <= 1))
+
+
 def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
     """InputError with all fixed soles, (name, frame) each, that are on no leg of their own: its last six
     joints, which move no other fixed sole.
     """
     found, chains = Mistakes(), []
+    names = {
+        int(joint.idx_v): str(name) for name, joint in zip(model.names, model.joints, strict=True) if joint.nv
+    }
     for name, frame in soles:
         parent = model.frames[check_frame(model, frame, f"sole {name!r}")].parentJoint
-        chains.append(
-            [str(model.names[j]) for j in model.supports[parent] if j > 0 and model.joints[j].nv == 1]
-        )
+        chains.append([names[k] for k in columns_above(model, parent)])
     for k, ((name, frame), joints) in enumerate(zip(soles, chains, strict=True)):
         others = {joint for other in chains[:k] + chains[k + 1 :] for joint in other}
         own = joints[-LEG:]
@@ -353,7 +368,7 @@ _MEND = f'correct its <inertial>, with moments about the centre of mass, or take
 def _is_between_joints(model: pin.Model, i: int) -> bool:
     """True if joint i moves no body of its own, but the joint after it: both move the same body."""
     weightless = not model.inertias[i].mass and not np.any(np.array(model.inertias[i].inertia))
-    return weightless and model.joints[i].nv == 1 and list(model.parents)[1:].count(i) == 1
+    return weightless and model.joints[i].nv <= 1 and list(model.parents)[1:].count(i) == 1
 
 
 def check_inertias(model: pin.Model) -> None:

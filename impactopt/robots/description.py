@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from os import PathLike, fspath
 from typing import Any
@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt.errors import Mistakes
+from impactopt.errors import InputError, Mistakes
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source, Striker
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.checks import REPAIRED, check_choice, repair_inertias
+from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
 
 __all__ = ["Description", "Tie", "between"]
 
@@ -25,8 +26,8 @@ class Tie:
 
     joints : by name.  free : how many of them may move all the same; the others have to be locked.
     text : of a message; begins with the thing and its name.  fix : another one than to lock.
-    follower : the joint that a draft locks, "" if none is meant; follows : a polynomial of the other
-        joint's angle [rad], the lowest coefficient first, which is the follower's.
+    follower : the joint that has no motor, "" if none is meant; follows : a polynomial of the other joint's
+        angle [rad], the lowest coefficient first, which is the follower's.
     """
 
     text: str
@@ -35,6 +36,15 @@ class Tie:
     fix: str = ""
     follower: str = ""
     follows: tuple[float, ...] = (0.0,)
+
+    @property
+    def coupling(self) -> Coupling | None:
+        """Law of the follower, if it is one that plans have."""
+        linear = len(self.follows) > 1 and not any(self.follows[2:])
+        others = [joint for joint in self.joints if joint != self.follower]
+        if not self.follower or not linear or len(others) != len(self.joints) - 1:
+            return None
+        return Coupling(others[0] if others else self.follower, self.follows[1], self.follows[0])
 
     def broken(self, joints: tuple[str, ...]) -> str:
         """The mistake of a robot whose joints these are; "" if there is none."""
@@ -70,6 +80,25 @@ class Description:
     ties: list[Tie] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
+    def moving(self, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
+        """The model without locked joints, whose followers follow.
+
+        Raises
+        ------
+        InputError : a joint that cannot follow another one, or two of them.
+        """
+        model = lock_joints(self.model, locked)
+        joints, couplings = joint_names(model), dict[str, Coupling]()
+        for tie in self.ties:
+            if tie.coupling is not None and set(tie.joints) <= set(joints):
+                if tie.follower in couplings:
+                    raise InputError(
+                        f"{self.kind}: joint {tie.follower!r} follows {couplings[tie.follower].leader!r} and "
+                        f"{tie.coupling.leader!r}; it can follow one: take the other <mimic> or equality out"
+                    )
+                couplings[tie.follower] = tie.coupling
+        return coupled(model, couplings) if couplings else model
+
     def options(self, model: pin.Model, given: Mapping[str, Any]) -> dict[str, Any]:
         """Options of `Robot.from_model` for a model with some of these joints, under those that are given.
 
@@ -87,7 +116,7 @@ class Description:
                 out[key] = {**own, **given.get(key, {})}
         springs = {
             joint: Actuator(spring_stiffness=stiffness, spring_rest=rest)
-            for joint, (stiffness, rest) in self.springs.items()
+            for joint, (stiffness, rest) in with_followers(self.springs, couplings_of(model)).items()
             if joint in joints
         }
         if springs:
@@ -105,17 +134,22 @@ class Description:
         options : of `Robot.from_model`, that were given.
         """
         check_choice(given["inertias"])
-        model, kind = lock_joints(self.model, given["locked"]), self.kind.lower()
+        model, kind = self.moving(given["locked"]), self.kind.lower()
         repairs = tuple(repair_inertias(model)) if given["inertias"] == REPAIRED else ()
         every = {"name": given["name"] or model.name, kind: path, **self.options(model, options)}
-        notes = (*self.notes, *self._approximated(joint_names(model)))
+        notes = (*self.notes, *self._approximated(model))
         own: dict[str, Any] = {kind: fspath(path), "options": {**given, **options}}
         return model, every, Source(repairs=repairs, notes=notes, **own)
 
-    def _approximated(self, joints: tuple[str, ...]) -> Iterator[str]:
+    def _approximated(self, model: pin.Model) -> Iterator[str]:
+        joints, followers = joint_names(model), couplings_of(model)
         if idle := [repr(joint) for joint in self.idle if joint in joints]:
             yield f"no actuator moves {', '.join(idle)}: plans have a motor there all the same"
+        for name in followers.keys() & (self.torque.keys() | self.kp.keys()):
+            yield f"the actuator of {name!r} is left out: the motor of {followers[name].leader!r} moves both"
         for tie in self.ties:
+            if tie.follower in followers:
+                continue
             left = [joint for joint in tie.joints if joint in joints]
             if left and len(left) < len(tie.joints):
                 locked = ", ".join(repr(joint) for joint in tie.joints if joint not in joints)

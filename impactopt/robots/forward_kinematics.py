@@ -9,6 +9,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.robots.couplings import axis_of
+
 __all__ = ["ForwardKinematics"]
 
 Array = NDArray[np.float64]
@@ -19,16 +21,18 @@ class ForwardKinematics:
 
     def __init__(self, model: pin.Model) -> None:
         joints = range(1, model.njoints)
-        fixed = [model.jointPlacements[j] for j in joints]
+        self._free = [j for j in joints if model.joints[j].nv == 6]
+        axes = {j: axis_of(model, j) for j in joints if j not in self._free}
+        fixed = [axes[j].placement if j in axes else model.jointPlacements[j] for j in joints]
         self._rotation = np.array([place.rotation for place in fixed]).reshape(-1, 3, 3)
         self._translation = np.array([place.translation for place in fixed]).reshape(-1, 3)
-        self._free = [j for j in joints if model.joints[j].nv == 6]
         self._q = np.array([model.joints[j].idx_q for j in joints], dtype=np.intp)
         self._unbounded = np.array([model.joints[j].nq == 2 for j in joints], dtype=bool)
         turn, slide = np.zeros((len(joints), 3)), np.zeros((len(joints), 3))
         for k, j in enumerate(joints):
-            if j not in self._free:
-                slide[k], turn[k] = np.split(_subspace(model, j), 2)
+            if j in axes:
+                slide[k], turn[k] = np.split(axes[j].subspace, 2)
+        self._ratio = np.array([axes[j].ratio if j in axes else 1.0 for j in joints])
         self._slide = np.einsum("jab,jb->ja", self._rotation, slide)
         # Rodrigues: R (1 - c) a a' + c 1 + s [a]x, whose three parts are the model's
         along, turned = np.einsum("ja,jb->jab", turn, turn), np.array([pin.skew(a) for a in turn])
@@ -43,13 +47,14 @@ class ForwardKinematics:
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
         """Rotations (k, joints, 3, 3) and translations (k, joints, 3) [m] at configurations q (k, nq)."""
-        angle = np.where(self._turns, q[:, self._q], 0.0)
+        position = self._ratio * q[:, self._q]
+        angle = np.where(self._turns, position, 0.0)
         cosine, sine = np.cos(angle), np.sin(angle)
         cosine[:, self._unbounded] = q[:, self._q[self._unbounded]]
         sine[:, self._unbounded] = q[:, self._q[self._unbounded] + 1]
         along, across, turned = self._parts
         local = along + cosine[:, :, None, None] * across + sine[:, :, None, None] * turned
-        shift = self._translation + self._slide * q[:, self._q, None]
+        shift = self._translation + self._slide * position[:, :, None]
         for j in self._free:
             at = int(self._q[j - 1])
             local[:, j - 1] = self._rotation[j - 1] @ _of_quaternions(q[:, at + 3 : at + 7])
@@ -62,13 +67,6 @@ class ForwardKinematics:
             rotation[:, own] = above @ local[:, own - 1]
             translation[:, own] = translation[:, parents] + (above @ shift[:, own - 1, :, None])[..., 0]
         return rotation, translation
-
-
-def _subspace(model: pin.Model, joint: int) -> Array:
-    """Motion subspace (6,) of a joint with one degree of freedom, in its own frame."""
-    data = model.joints[joint].createData()
-    model.joints[joint].calc(data, pin.neutral(model))
-    return np.asarray(data.S, dtype=float).reshape(6)
 
 
 def _of_quaternions(q: Array) -> Array:

@@ -20,6 +20,7 @@ from impactopt.robots import urdf as _urdf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
 from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, read_only
 from impactopt.robots.checks import GIVEN, REPAIRED, check_inertias, tell_apart
+from impactopt.robots.couplings import Coupling, couplings_of
 from impactopt.robots.forward_kinematics import ForwardKinematics
 from impactopt.robots.tools import check_sole, with_hinges
 
@@ -135,7 +136,8 @@ class Robot:
 
         Raises
         ------
-        InputError : no such file; Gazebo's loops and <mimic>, unless their joints are locked.
+        InputError : no such file; Gazebo's loops, and joints that cannot follow another by <mimic>, unless
+            they are locked.
         """
         read = _urdf.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, "inertias": inertias}
@@ -167,7 +169,8 @@ class Robot:
 
         Raises
         ------
-        InputError : no MuJoCo; no robot; ball joints; tendons, loops and followers that move.
+        InputError : no MuJoCo; no robot; ball joints; tendons and loops that move; joints that follow others
+            otherwise than linearly.
         """
         read = _mjcf.read_mjcf(path, floating=floating)
         given = {"name": name, "floating": floating, "locked": locked, "inertias": inertias}
@@ -282,6 +285,16 @@ class Robot:
     def joint_names(self) -> tuple[str, ...]:
         return build.joint_names(self.model)
 
+    @cached_property
+    def joint_models(self) -> tuple[Any, ...]:
+        """(n,) Pinocchio's models of its joints."""
+        return tuple(build.moving_joints(self.model))
+
+    @cached_property
+    def couplings(self) -> dict[str, Coupling]:
+        """Laws of the joints that follow others and have no motor, by name; `joint_names` has them not."""
+        return couplings_of(self.model)
+
     @property
     def armature(self) -> Array:
         """(n,) reflected rotor inertia [kg m2]; it lives in `model.armature`."""
@@ -318,11 +331,7 @@ class Robot:
     def limb(self, frame: str) -> tuple[int, ...]:
         """Indices (into arrays of length n) of the joints from the root to a frame."""
         parent = self.model.frames[checks.check_frame(self.model, frame, f"robot {self.name!r}")].parentJoint
-        base = self.nv - self.n
-        first = 2 if self.floating else 1
-        return tuple(
-            int(self.model.joints[j].idx_v) - base for j in self.model.supports[parent] if j >= first
-        )
+        return tuple(k - self.nv + self.n for k in checks.columns_above(self.model, parent))
 
     def striker(self, name: str) -> Striker:
         return build.pick("striker", name, self.strikers, self.name)

@@ -1,7 +1,7 @@
 """Reads a `pin.Model` and other data of a robot from a URDF.
 
-Pinocchio reads links and joints. It says nothing of <mimic>, of Gazebo's extensions and of <transmission>:
-what of these changes the dynamics becomes a tie or a note of the `Description`.
+Pinocchio reads links and joints. It says nothing here of <mimic>, of Gazebo's extensions and of
+<transmission>: what of these changes the dynamics becomes a tie or a note of the `Description`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from xml.parsers.expat import ExpatError
 import numpy as np
 import pinocchio as pin
 
-from impactopt.errors import InputError, Mistakes
+from impactopt.errors import InputError, Mistakes, did_you_mean
 from impactopt.robots.build import existing
 from impactopt.robots.checks import HEAVIEST
 from impactopt.robots.description import Description, Tie, between
@@ -79,13 +79,18 @@ def _parsed(urdf: str) -> Any:
 
 def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:
     """Joints that follow others."""
+    every = [joint.getAttribute("name") for joint in _children(root, "joint")]
     for joint in _children(root, "joint"):
         name = joint.getAttribute("name")
         for mimic in _children(joint, "mimic"):
             other = mimic.getAttribute("joint")
-            if model.existJointName(name):
+            text = f"joint {name!r} follows {other!r} by <mimic>"
+            if model.existJointName(name) and other not in every:
+                text += f", and there is no such joint{did_you_mean(other, every)}"
+                yield Tie(text=text, joints=(name,), free=0, fix="correct its name")
+            elif model.existJointName(name):
                 yield Tie(
-                    text=f"joint {name!r} follows {other!r} by <mimic>",
+                    text=text,
                     joints=(name, other),
                     follower=name,
                     follows=(

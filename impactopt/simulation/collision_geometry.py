@@ -164,7 +164,7 @@ class Touched:
 
 
 def _own(joint: Any, moves: Array) -> Array:
-    return moves[joint.idx_v : joint.idx_v + joint.nv]
+    return moves[joint.idx_v : joint.idx_v + max(joint.nv, 1)]  # a follower has its leader's
 
 
 def _placed(place: Any) -> Any:

@@ -32,7 +32,7 @@ class Servo:
         self.n = robot.n
         self.kp, self.kd, self.limit = kp * robot.kp, kd * robot.kd, limit * robot.torque_limit
         self.time = np.asarray(reference.time)
-        joints = list(robot.model.joints)[-robot.n :]
+        joints = robot.joint_models
         self.place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
         # a continuous joint's angle is kept as (cosine, sine)
         self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import missing_package
 from impactopt.robots.build import parent_body
+from impactopt.robots.couplings import axis_of
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
@@ -238,17 +239,14 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
             body.add_freejoint(name=model.names[j])
             continue
         for i, place in zip(joints, places, strict=True):
-            _add_joint(mujoco, body, robot, i, placement.actInv(place))
+            _add_joint(mujoco, spec, body, robot, i, placement.actInv(place))
     return bodies
 
 
-def _add_joint(mujoco: Any, body: Any, robot: Robot, j: int, at: Any) -> None:
-    """Joint j of the model, which is there in the body's frame."""
-    model = robot.model
-    data = model.joints[j].createData()
-    model.joints[j].calc(data, pin.neutral(model))
-    subspace = np.asarray(data.S).reshape(6)
-    turns = bool(np.any(subspace[3:]))
+def _add_joint(mujoco: Any, spec: Any, body: Any, robot: Robot, j: int, at: Any) -> None:
+    """Joint j of the model, which is there in the body's frame; a follower's law is an equality."""
+    model, subspace = robot.model, axis_of(robot.model, j).subspace
+    turns, coupling = bool(np.any(subspace[3:])), robot.couplings.get(str(model.names[j]))
     stiffness, rest = robot.springs.get(str(model.names[j]), (0.0, 0.0))
     spring = {"stiffness": stiffness, "springref": rest} if stiffness else {}
     body.add_joint(
@@ -256,9 +254,20 @@ def _add_joint(mujoco: Any, body: Any, robot: Robot, j: int, at: Any) -> None:
         type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=at.rotation @ (subspace[3:] if turns else subspace[:3]),
         pos=at.translation,
-        armature=float(model.armature[model.joints[j].idx_v]),
+        armature=0.0 if coupling else float(model.armature[model.joints[j].idx_v]),
         **spring,
     )
+    if coupling is not None:
+        law = _hard(spec.add_equality(), spec.option.timestep)
+        law.type, law.name1, law.name2 = mujoco.mjtEq.mjEQ_JOINT, model.names[j], coupling.leader
+        law.data[:5] = [coupling.offset, coupling.ratio, 0.0, 0.0, 0.0]
+
+
+def _hard(equality: Any, step: float) -> Any:
+    """The equality, as hard as MuJoCo lets it be in steps [s] of this length."""
+    equality.solref = [_TIME_CONSTANT * step, 1.0]
+    equality.solimp = [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0]
+    return equality
 
 
 def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[str], step: float) -> None:
@@ -273,11 +282,9 @@ def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[s
             name=name, pos=frame.placement.translation, quat=quaternion(frame.placement.rotation)
         )
         spec.worldbody.add_site(name=f"ground {name}")
-        weld = spec.add_equality()
+        weld = _hard(spec.add_equality(), step)
         weld.type, weld.objtype = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_SITE
         weld.name1, weld.name2 = name, f"ground {name}"
-        weld.solref = [_TIME_CONSTANT * step, 1.0]
-        weld.solimp = [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0]
     if frames:
         spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # their rows are read
 
@@ -325,10 +332,15 @@ class MujocoRobot:
         joints = [world.joint(name) for name in robot.joint_names]
         self.dof = np.array([joint.dofadr[0] for joint in joints])
         self.place = np.array([joint.qposadr[0] for joint in joints])
-        own = list(robot.model.joints)[-robot.n :]
+        own = robot.joint_models
         self._place = np.array([joint.idx_q for joint in own], dtype=np.intp)
         # a continuous joint's angle is (cosine, sine) in Pinocchio
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
+        # of followers: place in qpos and qvel, index of the leader, ratio and offset
+        self._laws = [
+            (int(j.qposadr[0]), int(j.dofadr[0]), robot.joint_index(law.leader), law.ratio, law.offset)
+            for j, law in ((world.joint(name), law) for name, law in robot.couplings.items())
+        ]
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._rows, self.along = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
         self.friction = friction
@@ -340,10 +352,14 @@ class MujocoRobot:
         if self.floating:
             d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
         d.qpos[self.place] = robot.joint_positions(q)
+        for place, _, leader, ratio, offset in self._laws:
+            d.qpos[place] = ratio * d.qpos[self.place[leader]] + offset
         if v is not None:
             if self.floating:
                 d.qvel[:3], d.qvel[3:6] = self.base_rotation() @ v[:3], v[3:6]
             d.qvel[self.dof] = v[-robot.n :]
+            for _, dof, leader, ratio, _ in self._laws:
+                d.qvel[dof] = ratio * v[leader - robot.n]
 
     def state(self) -> tuple[Array, Array]:
         """q (nq), v (nv)."""
@@ -389,7 +405,7 @@ class MujocoRobot:
 
 
 class Welds:
-    """The welds of a compiled world that has no other equalities.
+    """The welds of a compiled world, whose other equalities are the laws of joints that follow others.
 
     frames : as :func:`impactopt.simulation.mujoco_world.add_welds` has added them.
     """
@@ -419,7 +435,8 @@ class Welds:
             return out, places
         rows = np.reshape(d.efc_J, (-1, self.world.nv))
         for k, frame in enumerate(self.frames):
-            its = slice(6 * k, 6 * k + 6)
+            first = 6 * k + self.world.neq - len(self.frames)
+            its = slice(first, first + 6)
             self.mujoco.mj_jacSite(self.world, d, J[:3], J[3:], frame)
             # the rows of a weld are in coordinates of its own
             out[k] = np.linalg.lstsq(J.T, rows[its].T @ d.efc_force[its], rcond=None)[0]

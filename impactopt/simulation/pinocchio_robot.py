@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
+from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
 __all__ = ["FORMS", "Body", "DenseBody", "PinocchioBody"]
@@ -134,7 +135,7 @@ class DenseBody(Body):
             self._matrix[:nv, rows] = -J.T
             self._right[rows] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
         self._meet(q, v)
-        self._matrix[:nv, :nv] = pin.crba(model, data, q)
+        self._matrix[:nv, :nv] = mass_matrix(model, data, q)
         self._bias = pin.nonLinearEffects(model, data, q, v)
         return float(self.rows[0] @ v)
 
@@ -157,7 +158,7 @@ class DenseBody(Body):
 
 class PinocchioBody(Body):
     """Pinocchio's own way along the tree: its constrained dynamics, or the articulated-body algorithm where
-    nothing is held.
+    nothing is held. Neither has joints that follow others (Pinocchio 4.1): such robots take the dense system.
 
     Raises
     ------
@@ -171,7 +172,7 @@ class PinocchioBody(Body):
                 "form 'pinocchio': holds soles exactly only; take form='lagrange' for a virtual base, "
                 "or a stance without base_mass and base_inertia"
             )
-        model = self.model
+        model, self._dense = self.model, DenseBody(*args) if self.robot.couplings else None
         self._constraints = pin.StdVec_RigidConstraintModel()
         self._found = pin.StdVec_RigidConstraintData()
         for i in self.frames:
@@ -188,7 +189,7 @@ class PinocchioBody(Body):
             self._constraints.append(constraint)
             self._found.append(constraint.createData())
         self._dynamics = model.createData()
-        if self.frames:
+        if self.frames and self._dense is None:
             pin.initConstraintDynamics(model, self._dynamics, self._constraints, self._found)
         self._proximal = pin.ProximalSettings(1e-14, 1e-12, 5)
 
@@ -200,6 +201,9 @@ class PinocchioBody(Body):
         return float(self.rows[0] @ v)
 
     def accelerate(self, torque: Array, force: float | Array) -> Array:
+        if self._dense is not None:
+            self._dense.look(*self._at)
+            return self._dense.accelerate(torque, force)
         push, model = self._push(torque, force), self.model
         if not self.frames:
             return np.array(pin.aba(model, self._dynamics, *self._at, push))
@@ -213,12 +217,13 @@ class PinocchioBody(Body):
         last.
         """
         jac = np.vstack([self._jacobian(frame) for frame in self.frames])
-        inertia = np.array(pin.crba(self.model, self._dynamics, self._at[0]))
-        inertia = np.triu(inertia) + np.triu(inertia, 1).T
+        inertia = mass_matrix(self.model, self._dynamics, self._at[0])
         yields = np.linalg.solve(inertia, jac.T)
         return np.asarray(v - yields @ np.linalg.solve(jac @ yields, jac @ v))
 
     def wrenches(self) -> Array:
+        if self._dense is not None:
+            return self._dense.wrenches()
         out = np.empty((len(self.frames), 6))
         for k, placement in enumerate(self.placements()):
             local = self._found[k].contact_force

@@ -20,6 +20,7 @@ from impactopt.bodies.separation import Separations
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
+from impactopt.robots.couplings import Axis, axis_of
 from impactopt.robots.robot import Robot
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
@@ -32,14 +33,15 @@ TOO_NEAR = millimetres("too near")
 class Chain:
     """Kinematic chain between the frames of two bodies, joint by joint.
 
-    columns (n,) : the joints' places among base coordinates and joints (nv), with their ``signs``.
+    columns (n,) : the joints' places among base coordinates and joints (nv), with their ``ratios``:
+    -1 on the way to the root, else 1, times a follower's to its leader.
     turns (n,) : 1 for a joint that turns, 0 for one that slides.  places : n + 1 placements between them
     (pin.SE3).
     base : whether the base's position comes before all that.
     """
 
     columns: tuple[int, ...]
-    signs: tuple[float, ...]
+    ratios: tuple[float, ...]
     turns: tuple[float, ...]
     places: tuple[Any, ...]
     base: bool = False
@@ -65,7 +67,7 @@ class Chain:
         """
         where = _places(c)
         slots = [3 + k for k in range(len(self.columns))]
-        coordinates, factors = [where[k] for k in self.columns], list(self.signs)
+        coordinates, factors = [where[k] for k in self.columns], list(self.ratios)
         if self.base and rotation is not None:
             for i in range(3):
                 slots += [i] * 3
@@ -95,15 +97,16 @@ def chain_between(model: Any, one: int, other: int) -> Chain:
     shared = max(j for j in up_one if j in up_other)
     if other == 0:
         shared = 0
-    place, columns, signs, turns, places = pin.SE3.Identity(), [], [], [], []
+    place, columns, ratios, turns, places = pin.SE3.Identity(), [], [], [], []
     base = False
     for j in reversed([j for j in up_other if j > shared]):
-        turn, axis, revolute = _joint(model, j)
+        joint = axis_of(model, j)
+        axis, revolute = _axis_to_z(joint)
         places.append(place * axis)
-        columns.append(turn)
-        signs.append(-1.0)
+        columns.append(int(model.joints[j].idx_v))
+        ratios.append(-joint.ratio)
         turns.append(revolute)
-        place = axis.inverse() * model.jointPlacements[j].inverse()
+        place = axis.inverse() * joint.placement.inverse()
     for j in [j for j in up_one if j > shared]:
         if model.joints[j].nv == 6:  # position, and angles about z, y and x in turn
             base, place = True, place * model.jointPlacements[j]
@@ -111,17 +114,18 @@ def chain_between(model: Any, one: int, other: int) -> Chain:
                 axis = _turned(np.array(direction, dtype=float))
                 places.append(place * axis)
                 columns.append(column)
-                signs.append(1.0)
+                ratios.append(1.0)
                 turns.append(1.0)
                 place = axis.inverse()
             continue
-        turn, axis, revolute = _joint(model, j)
-        places.append(place * model.jointPlacements[j] * axis)
-        columns.append(turn)
-        signs.append(1.0)
+        joint = axis_of(model, j)
+        axis, revolute = _axis_to_z(joint)
+        places.append(place * joint.placement * axis)
+        columns.append(int(model.joints[j].idx_v))
+        ratios.append(joint.ratio)
         turns.append(revolute)
         place = axis.inverse()
-    return Chain(tuple(columns), tuple(signs), tuple(turns), (*places, place), base)
+    return Chain(tuple(columns), tuple(ratios), tuple(turns), (*places, place), base)
 
 
 _chains: WeakKeyDictionary[Robot, dict[tuple[int, int], Chain]] = WeakKeyDictionary()
@@ -135,13 +139,10 @@ def _chain(robot: Robot, one: int, other: int) -> Chain:
     return known[one, other]
 
 
-def _joint(model: Any, j: int) -> tuple[int, Any, float]:
-    """Column, placement whose z axis is the joint's, and whether it turns."""
-    data = model.joints[j].createData()
-    model.joints[j].calc(data, pin.neutral(model))
-    subspace = np.asarray(data.S).reshape(6)
-    revolute = bool(np.any(subspace[3:]))
-    return int(model.joints[j].idx_v), _turned(subspace[3:] if revolute else subspace[:3]), float(revolute)
+def _axis_to_z(joint: Axis) -> tuple[Any, float]:
+    """Placement whose z axis is the joint's, and whether it turns."""
+    revolute = bool(np.any(joint.subspace[3:]))
+    return _turned(joint.subspace[3:] if revolute else joint.subspace[:3]), float(revolute)
 
 
 def _turned(direction: Array) -> Any:

@@ -19,6 +19,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
+from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, FORCE_SCALE, typical_state
@@ -123,8 +124,7 @@ def jump(
     model = problem.robot.model
     q, v, a = c.complete_motion(y, rates, np.zeros(c.ny), legs)
     data: Any = model.createData()
-    upper = np.triu(pin.crba(model, data, q))
-    inertia = upper + np.triu(upper, 1).T
+    inertia = mass_matrix(model, data, q)
     soles = c.sole_jacobians(q)[0] if c.legs else np.zeros((0, model.nv))
     hands = [model.getFrameId(problem.robot.striker(name).model_frame) for name in problem.strikers]
     pin.computeJointJacobians(model, data, q)

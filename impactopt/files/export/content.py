@@ -220,7 +220,7 @@ class Export:
         )
 
     def _joints(self) -> list[dict[str, Any]]:
-        robot, moves = self.robot, list(self.robot.model.joints)[-self.robot.n :]
+        robot, moves = self.robot, self.robot.joint_models
         rows = []
         for name, k in zip(self.joints, self.order, strict=True):
             prismatic = "JointModelP" in moves[k].shortname()

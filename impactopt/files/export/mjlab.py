@@ -71,7 +71,7 @@ def _state(export: Export, motion: Motion, k: int) -> tuple[Array, Array]:
     """q (nq,) and v (nv,) of Pinocchio at a frame."""
     robot = export.robot
     q, v = pin.neutral(robot.model), np.zeros(robot.nv)
-    own = list(robot.model.joints)[-robot.n :]
+    own = robot.joint_models
     for column, at in enumerate(export.order):
         joint, angle = own[at], motion.position[k, column]
         q[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(angle), np.sin(angle)) if joint.nq == 2 else angle

@@ -166,7 +166,7 @@ def _curves(reference: Trajectory, robot: Robot) -> tuple[Array, Array, Array]:
     The base has seven: position, and quaternion w, x, y, z.
     """
     q, v, a = reference.q, reference.v, reference.a
-    joints = list(robot.model.joints)[-robot.n :]
+    joints = robot.joint_models
     turning = [k for k, joint in enumerate(joints) if joint.nq == 2]
     angle = robot.joint_positions(q)
     angle[:, turning] = np.unwrap(angle[:, turning], axis=0)

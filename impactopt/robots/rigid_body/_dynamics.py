@@ -109,9 +109,10 @@ class Kinematics:
                 columns = [(cross(column(R, 2), arm), column(R, 2))]
             else:
                 columns = [(column(R, 2), zero_vector())]
-            for c, (linear, angular) in enumerate(columns):
-                for r in range(3):
-                    entries[r, joint.v + c], entries[3 + r, joint.v + c] = linear[r], angular[r]
+            for c, parts in enumerate(columns):
+                for r, entry in enumerate(joint.ratio * x for part in parts for x in part):
+                    place = r, joint.v + c
+                    entries[place] = entries[place] + entry if place in entries else entry
         return entries
 
 
@@ -132,7 +133,8 @@ class Velocities:
                     self._angular[j] = self.v[joint.v + 3 : joint.v + 6]
                     continue
                 x, y, z = self.kinematics.down(j, self._angular[joint.parent])
-                self._angular[j] = [x, y, z + self.v[joint.v]] if joint.kind is Kind.REVOLUTE else [x, y, z]
+                turning = joint.kind is Kind.REVOLUTE
+                self._angular[j] = [x, y, z + joint.along(self.v)] if turning else [x, y, z]
         return self._angular[i]
 
     def linear(self, i: int) -> Vector:
@@ -147,7 +149,8 @@ class Velocities:
                     self._linear[joint.parent], cross(self.angular(joint.parent), self.kinematics.offset(j))
                 )
                 x, y, z = self.kinematics.down(j, above)
-                self._linear[j] = [x, y, z + self.v[joint.v]] if joint.kind is Kind.PRISMATIC else [x, y, z]
+                sliding = joint.kind is Kind.PRISMATIC
+                self._linear[j] = [x, y, z + joint.along(self.v)] if sliding else [x, y, z]
         return self._linear[i]
 
     def frame(self, name: str) -> Vector:
@@ -184,8 +187,8 @@ class Accelerations:
                     continue
                 x, y, z = self.kinematics.down(j, self._angular[joint.parent])
                 if joint.kind is Kind.REVOLUTE:
-                    w, rate = self.velocities.angular(j), self.velocities.v[joint.v]
-                    x, y, z = x + w[1] * rate, y - w[0] * rate, z + self.a[joint.v]
+                    w, rate = self.velocities.angular(j), joint.along(self.velocities.v)
+                    x, y, z = x + w[1] * rate, y - w[0] * rate, z + joint.along(self.a)
                 self._angular[j] = [x, y, z]
         return self._angular[i]
 
@@ -219,8 +222,8 @@ class Accelerations:
         at_joint = add(above, times(self.spin(joint.parent), self.kinematics.offset(i)))
         x, y, z = self.kinematics.down(i, at_joint)
         if joint.kind is Kind.PRISMATIC:
-            w, rate = self.velocities.angular(i), v[joint.v]
-            x, y, z = x + 2.0 * (w[1] * rate), y - 2.0 * (w[0] * rate), z + self.a[joint.v]
+            w, rate = self.velocities.angular(i), joint.along(v)
+            x, y, z = x + 2.0 * (w[1] * rate), y - 2.0 * (w[0] * rate), z + joint.along(self.a)
         return [x, y, z]
 
     def frame(self, name: str) -> Vector:
@@ -437,18 +440,30 @@ class MassMatrix:
             own: Number = tensor[5]
         else:
             force, moment, own = [0.0, 0.0, m], [hy, 0.0 - hx, 0.0], m
-        self.entries[k, k] = own + self.tree.armature[k]
-        j = i
+        ratio, j = joints[i].ratio, i
+        self._add(k, k, ratio**2 * own + (0.0 if joints[i].follows else self.tree.armature[k]))
         while j and joints[j].kind is not Kind.FREE:
             force = kinematics.up(j, force)
             moment = add(kinematics.up(j, moment), cross(kinematics.offset(j), force))
             j = joints[j].parent
             if j and joints[j].kind is Kind.FREE:
                 for c in range(3):
-                    self.entries[c, k], self.entries[3 + c, k] = force[c], moment[c]
+                    self._add(c, k, ratio * force[c])
+                    self._add(3 + c, k, ratio * moment[c])
             elif j:
-                self.entries[joints[j].v, k] = moment[2] if joints[j].kind is Kind.REVOLUTE else force[2]
-        self.root_forces[k] = (force, moment)
+                both, at = ratio * joints[j].ratio, joints[j].v
+                part = both * (moment[2] if joints[j].kind is Kind.REVOLUTE else force[2])
+                self._add(at, k, 2.0 * part if at == k else part)
+        own_force, own_moment = self.root_forces.get(k, (zero_vector(), zero_vector()))
+        self.root_forces[k] = (
+            add(own_force, scale(ratio, force)),
+            add(own_moment, scale(ratio, moment)),
+        )
+
+    def _add(self, i: int, j: int, number: Number) -> None:
+        """More of H_ij; followers and their leaders have one row."""
+        place = min(i, j), max(i, j)
+        self.entries[place] = self.entries[place] + number if place in self.entries else number
 
 
 def rnea(accelerations: Accelerations, *, gravity: bool) -> Vector:
@@ -479,8 +494,10 @@ def rnea(accelerations: Accelerations, *, gravity: bool) -> Vector:
         if joint.kind is Kind.FREE:
             tau[joint.v : joint.v + 6] = forces[i] + moments[i]
             continue
-        tau[joint.v] = moments[i][2] if joint.kind is Kind.REVOLUTE else forces[i][2]
-        tau[joint.v] = tau[joint.v] + tree.armature[joint.v] * accelerations.a[joint.v]
+        own = moments[i][2] if joint.kind is Kind.REVOLUTE else forces[i][2]
+        tau[joint.v] = tau[joint.v] + joint.ratio * own
+        if not joint.follows:
+            tau[joint.v] = tau[joint.v] + tree.armature[joint.v] * accelerations.a[joint.v]
         if joint.parent:
             force = kinematics.up(i, forces[i])
             moment = add(kinematics.up(i, moments[i]), cross(kinematics.offset(i), force))

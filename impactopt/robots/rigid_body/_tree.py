@@ -22,6 +22,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.robots.couplings import axis_of
 from impactopt.robots.rigid_body._spatial import (
     IDENTITY,
     Matrix,
@@ -56,8 +57,10 @@ class Kind(enum.Enum):
     PRISMATIC = "slides along z"
 
 
+_FOLLOWER = "JointModelMimic"  # turns or slides
 _KINDS = {
     "JointModelFreeFlyer": Kind.FREE,
+    _FOLLOWER: Kind.REVOLUTE,
     **{f"JointModel{name}": Kind.REVOLUTE for name in ("RX", "RY", "RZ", "RevoluteUnaligned")},
     **{f"JointModel{name}": Kind.REVOLUTE for name in ("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned")},
     **{f"JointModel{name}": Kind.PRISMATIC for name in ("PX", "PY", "PZ", "PrismaticUnaligned")},
@@ -74,8 +77,10 @@ class Joint:
     name: str
     kind: Kind
     parent: int
-    v: int  # index of its (first) velocity
+    v: int  # index of its (first) velocity; a follower's is its leader's
     q: int  # index of its (first) coordinate in Pinocchio's q
+    follows: bool  # another joint, whose velocity it has, times the ratio
+    ratio: float
     continuous: bool  # a revolute joint with coordinates (cos, sin) in Pinocchio's q
     turn: Any  # (3, 3) Q, from the turned frame to Pinocchio's joint frame
     rotation: Matrix  # of the joint's frame at q = 0, in the parent's frame
@@ -83,6 +88,15 @@ class Joint:
     mass: float  # [kg]
     first_moment: Vector  # [kg m]
     tensor: Vector  # about the frame's origin [kg m2]
+
+    def along(self, values: Vector) -> Number:
+        """Entry of this joint of velocities or accelerations (nv)."""
+        return self.ratio * values[self.v]
+
+    @property
+    def velocities(self) -> range:
+        """Indices of its velocities."""
+        return range(self.v, self.v + (6 if self.kind is Kind.FREE else 1))
 
 
 class Tree:
@@ -138,17 +152,23 @@ class Tree:
         return chain[::-1]
 
     def velocity_parents(self) -> list[int]:
-        """Parent of each velocity index in the tree of single degrees of freedom, -1 at a root.
+        """Parent of each velocity index in the elimination tree of H, -1 at a root.
 
-        The six of a free-flyer count as a chain (Featherstone 2008, expanded parent array).
+        Without followers that is the tree of single degrees of freedom, the six of a free-flyer being a chain
+        (Featherstone 2008, expanded parent array). A follower couples its own branch with its leader's.
         """
+        before: list[set[int]] = [set() for _ in range(self.nv)]
+        for i in range(1, len(self)):
+            own = self.joints[i].velocities
+            for j in self.support(i):
+                for k in own:
+                    for other in self.joints[j].velocities:
+                        before[max(k, other)].add(min(k, other))
         parents = [-1] * self.nv
-        for joint in self.joints[1:]:
-            if joint.kind is Kind.FREE:
-                parents[joint.v : joint.v + 6] = range(joint.v - 1, joint.v + 5)
-            elif joint.parent:
-                above = self.joints[joint.parent]
-                parents[joint.v] = above.v + (5 if above.kind is Kind.FREE else 0)
+        for k in range(self.nv - 1, -1, -1):
+            if coupled := before[k] - {k}:
+                parents[k] = max(coupled)
+                before[parents[k]] |= coupled
         return parents
 
     def frame(self, name: str) -> tuple[int, Matrix, Vector]:
@@ -184,6 +204,8 @@ def _universe() -> Joint:
         parent=-1,
         v=-1,
         q=-1,
+        follows=False,
+        ratio=1.0,
         continuous=False,
         turn=np.eye(3),
         rotation=IDENTITY,
@@ -202,8 +224,11 @@ def _read_joint(model: Any, i: int, turns: list[Any]) -> Joint:
             f"joint {name!r}: type {joint_model.shortname()} is not supported; use revolute, continuous or "
             "prismatic joints and a free-flyer at the root, or lock it (pin.buildReducedModel)"
         )
-    turn = np.eye(3) if kind is Kind.FREE else _turn_to_z(_axis(model, i, kind))
-    placement, inertia = model.jointPlacements[i], model.inertias[i]
+    placement, inertia, turn, ratio = model.jointPlacements[i], model.inertias[i], np.eye(3), 1.0
+    if kind is not Kind.FREE:
+        placement, subspace, ratio = axis_of(model, i)
+        kind = Kind.REVOLUTE if subspace[3:].any() else Kind.PRISMATIC
+        turn = _turn_to_z(subspace[3:] if kind is Kind.REVOLUTE else subspace[:3])
     c = turn.T @ inertia.lever
     about_origin = turn.T @ inertia.inertia @ turn + inertia.mass * (c @ c * np.eye(3) - np.outer(c, c))
     about_origin = _clip(about_origin, 1e-14 * np.abs(about_origin).max())
@@ -214,6 +239,8 @@ def _read_joint(model: Any, i: int, turns: list[Any]) -> Joint:
         parent=parent,
         v=int(joint_model.idx_v),
         q=int(joint_model.idx_q),
+        follows=joint_model.shortname() == _FOLLOWER,
+        ratio=ratio,
         continuous=joint_model.nq == 2,
         turn=turn,
         rotation=_snap(turns[parent].T @ placement.rotation @ turn).tolist(),
@@ -222,13 +249,6 @@ def _read_joint(model: Any, i: int, turns: list[Any]) -> Joint:
         first_moment=(inertia.mass * _clip(c, SNAP)).tolist(),
         tensor=[xx, xy, yy, xz, yz, zz],
     )
-
-
-def _axis(model: Any, i: int, kind: Kind) -> Any:
-    data = model.joints[i].createData()
-    model.joints[i].calc(data, pin.neutral(model))
-    S = np.asarray(data.S).reshape(6)
-    return S[3:] if kind is Kind.REVOLUTE else S[:3]
 
 
 def _turn_to_z(axis: Any) -> Any:
@@ -270,11 +290,11 @@ class Coordinates:
         for i, joint in enumerate(tree.joints[1:], start=1):
             k = joint.q if base == "quaternion" else joint.v
             if joint.kind is Kind.PRISMATIC:
-                self._travel[i] = q[k]
+                self._travel[i] = joint.ratio * q[k]
             elif joint.continuous and base == "quaternion":
                 self._cos_sin[i] = (q[k], q[k + 1])
             elif joint.kind is Kind.REVOLUTE:
-                self._cos_sin[i] = (cos(q[k]), sin(q[k]))
+                self._cos_sin[i] = (cos(joint.ratio * q[k]), sin(joint.ratio * q[k]))
         self._position: Vector = zero_vector()
         self._rotation: Matrix = IDENTITY
         if tree.floating:
@@ -375,7 +395,7 @@ class Coordinates:
             q[3:6] = scalar * quaternion[:3] + quaternion[3] * vector + ca.cross(vector, quaternion[:3])
             q[6] = scalar * quaternion[3] - ca.dot(vector, quaternion[:3])
         for joint in self.tree.joints[1:]:
-            if joint.kind is Kind.FREE:
+            if joint.kind is Kind.FREE or joint.follows:
                 continue
             if joint.continuous:
                 c, s = self.q[joint.q], self.q[joint.q + 1]

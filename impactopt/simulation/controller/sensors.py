@@ -75,7 +75,7 @@ class StateEstimate:
         self.model, self.floating = robot.model, robot.floating
         self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv
         self.data: Any = robot.model.createData()
-        joints = list(robot.model.joints)[-robot.n :]
+        joints = robot.joint_models
         self._place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
         self._stood = dict[int, Any]()

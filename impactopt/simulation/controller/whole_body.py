@@ -22,6 +22,7 @@ from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
 from impactopt.robots.dynamics import nonlinear_effects
+from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.clearance import MOST, Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
@@ -120,7 +121,6 @@ class HeldDynamics:
         self.hands = np.zeros((h, 3, nv))
         self.hand_places, self.hand_drift = np.zeros((2, h, 3))
         self._right[nv - n : nv, :n] = np.eye(n)
-        self._upper = np.triu(np.ones((nv, nv)), 1) + 0.5 * np.eye(nv)  # of H, half its diagonal
         self._none = np.zeros(nv)
         pin.framesForwardKinematics(self.model, self.data, q0)
         self._stood = [self.data.oMf[i].copy() for i in self._soles]
@@ -131,8 +131,7 @@ class HeldDynamics:
         left, right = self._left, self._right
         pin.forwardKinematics(model, data, q, v, self._none)
         pin.computeJointJacobians(model, data)
-        half = pin.crba(model, data, q) * self._upper
-        np.add(half, half.T, out=left[:nv, :nv])
+        left[:nv, :nv] = mass_matrix(model, data, q)
         right[:nv, n] = -nonlinear_effects(self._robot, data, q, v)
         self.places = []
         for k, i in enumerate(self._held):

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from impactopt.robots.build import effort_limit, is_floating, joint_names, velocity_limit
+from impactopt.robots.build import effort_limit, is_floating, joint_indices, joint_names, velocity_limit
+from impactopt.robots.couplings import couplings_of
 from impactopt.robots.gains import USUAL_ROTOR
 
 __all__ = ["Drives", "guess_drives"]
@@ -41,12 +42,12 @@ def guess_drives(model: pin.Model, known: Mapping[str, float], carrying: Collect
     known : torque limits that the model itself has not got.  carrying : joints of legs, with the robot above.
     """
     out, joints = Drives(), joint_names(model)
-    base, first = model.nv - len(joints), 2 if is_floating(model) else 1
+    base, indices = model.nv - len(joints), joint_indices(model)
     torque, speed = effort_limit(model)[base:], velocity_limit(model)[base:]
     lifting = _gravity(model)
     weight = THIGH * 9.81 * sum(float(body.mass) for body in model.inertias)
     for k, joint in enumerate(joints):
-        turns = "JointModelP" not in model.joints[first + k].shortname()
+        turns = "JointModelP" not in model.joints[indices[k]].shortname()
         limit = known.get(joint, float(torque[k]))
         if not 0 < limit < 1e15:
             limit = _rounded(max(WEIGHT * lifting[k], WEAKEST[turns], weight * (joint in carrying)))
@@ -74,11 +75,12 @@ def _gravity(model: pin.Model) -> list[float]:
         parent, length = int(model.parents[j]), float(np.linalg.norm(model.jointPlacements[j].translation))
         mass[parent] += mass[j]
         moment[parent] += moment[j] + mass[j] * length
-    slides = ["JointModelP" in model.joints[j].shortname() for j in range(first, model.njoints)]
-    return [
-        9.81 * float(mass[j] if slide else moment[j])
-        for j, slide in zip(range(first, model.njoints), slides, strict=True)
-    ]
+    for name, law in couplings_of(model).items():  # the leader's motor moves both
+        follower, leader = (model.getJointId(joint) for joint in (name, law.leader))
+        mass[leader] += abs(law.ratio) * mass[follower]
+        moment[leader] += abs(law.ratio) * moment[follower]
+    slides = [(j, "JointModelP" in model.joints[j].shortname()) for j in joint_indices(model)]
+    return [9.81 * float(mass[j] if slide else moment[j]) for j, slide in slides]
 
 
 def _rounded(number: float) -> float:

@@ -174,9 +174,9 @@ def _leg(
 
 
 def _rows(robot: Robot, joints: Sequence[int]) -> NDArray[np.intp]:
-    """Indices into arrays of length n of joints of the model."""
+    """Indices into arrays of length n of joints of the model, each once: a follower's is its leader's."""
     base = robot.nv - robot.n
-    return np.array([robot.model.joints[j].idx_v - base for j in joints], dtype=np.intp)
+    return np.array(list(dict.fromkeys(robot.model.joints[j].idx_v - base for j in joints)), dtype=np.intp)
 
 
 def _limits(robot: Robot, own: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -220,9 +220,9 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
 
 
 def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:
-    out, first = q.copy(), robot.model.njoints - robot.n
+    out = q.copy()
     for row, angle in zip(own, angles, strict=True):
-        joint = robot.model.joints[first + int(row)]
+        joint = robot.joint_models[int(row)]
         out[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
     return out
 

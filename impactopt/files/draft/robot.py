@@ -17,6 +17,7 @@ from impactopt.files.draft.default_drives import Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints
 from impactopt.robots.checks import LEG, REPAIRED, check_inertias
+from impactopt.robots.couplings import unfit
 from impactopt.robots.description import Description, Tie
 from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.robot import Robot
@@ -83,6 +84,10 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if is_floating(first.model) and not floats:
         _check_bolted(first, found)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
+    if led := _on_legs(first, found.robot, legs):  # a sole needs six joints of its own leg to hold it
+        locked |= led
+        found = _made(path, mjcf, True, locked)
+        legs = legs_of(found.robot.model, found.pieces)
     if legs:
         _check_legs(found.robot, legs)
         extra = dict.fromkeys(toes(found.robot.model, legs, found.pieces), "a toe")
@@ -100,6 +105,12 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if not arms and not legs:
         raise InputError(f"{path}: there is no limb, so nothing to strike with")
     return replace(found, legs=legs, arms=arms)
+
+
+def _on_legs(read: Description, robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
+    """Followers on legs, and why they are locked."""
+    names = {str(robot.model.names[j]) for leg in legs for j in leg.path} & robot.couplings.keys()
+    return {tie.follower: _why_locked(tie) for tie in read.ties if tie.follower in names}
 
 
 def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:
@@ -153,11 +164,21 @@ def _read(path: Path, mjcf: bool, floating: bool | None) -> Description:
 def _locked(read: Description) -> dict[str, str]:
     """Joints that no plan should move, or that follow others: an own reason for each kind."""
     out = to_lock(read.model)
-    for tie in read.ties:
-        if tie.follower and tie.follower not in out:
-            others = [joint for joint in tie.joints if joint != tie.follower]
-            out[tie.follower] = f"{tie.follower} follows {others[0]}" if others else f"{tie.follower} is held"
+    ties = [tie for tie in read.ties if tie.follower]
+    while stuck := [tie for tie in ties if tie.follower not in out and not _follows(read.model, tie, out)]:
+        out |= {tie.follower: _why_locked(tie) for tie in stuck}
     return out
+
+
+def _follows(model: pin.Model, tie: Tie, locked: Collection[str]) -> bool:
+    """True if a plan can have the tie's follower follow."""
+    law = tie.coupling
+    return law is not None and law.leader not in locked and not unfit(model, tie.follower, law)
+
+
+def _why_locked(tie: Tie) -> str:
+    others = [joint for joint in tie.joints if joint != tie.follower]
+    return f"{tie.follower} follows {others[0]}" if others else f"{tie.follower} is held"
 
 
 def _made(
@@ -168,7 +189,7 @@ def _made(
     for tie in read.ties:
         if tie.follower in locked:
             angles[tie.follower] = _followed(read.model, tie, angles)
-    model = lock_joints(read.model, angles)
+    model = read.moving(angles)
     drives = guess_drives(model, read.torque, carrying)
     wrong: tuple[str, ...] = ()
     try:

@@ -13,6 +13,7 @@ from impactopt.bodies.convex_hulls import Piece, inertia_box, is_far
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb
 from impactopt.robots.attachments import Striker
+from impactopt.robots.couplings import axis_of
 
 __all__ = ["find_edge", "find_striker", "first_link"]
 
@@ -133,7 +134,7 @@ def _axis(
     if size < 1e-6:  # nothing sticks out: on as the link before does
         return away
     axis = axis / size
-    turns = _turning_axis(model, limb.tip)
+    turns = axis_of(model, limb.tip).subspace[3:]  # zero of a joint that slides
     onwards = float(axis @ away)
     if onwards < -STRAIGHT and (size < SHORT or abs(float(axis @ turns)) > ROLLS):
         axis = -axis  # the link ends at its joint, and its shapes are behind that
@@ -147,11 +148,3 @@ def _straightened(axis: Array) -> Array:
     axis = axis / np.linalg.norm(axis)
     k = int(np.argmax(np.abs(axis)))
     return np.eye(3)[k] * np.sign(axis[k]) if abs(axis[k]) > STRAIGHT else np.asarray(axis)
-
-
-def _turning_axis(model: pin.Model, joint: int) -> Array:
-    """(3,) of a joint that turns, in its frame; zero of one that slides."""
-    data = model.createData()
-    # of a model with one joint Pinocchio gives (6,)
-    jac = np.reshape(pin.computeJointJacobian(model, data, pin.neutral(model), joint), (6, model.nv))
-    return np.array(jac[3:, model.joints[joint].idx_v]).reshape(3)

@@ -64,7 +64,8 @@ class Description:
         for each link or body, and an OP_FRAME for each site, by their names.
     kp, kd, torque : by joint, what its actuators say.
     springs : stiffness [N m/rad] and angle at rest [rad] by joint.
-    sites : names of those on links that move.  idle : joints that no actuator moves, where some have one.
+    sites : names of those on links that move.  driven : joints that actuators move.  idle : joints that no
+        actuator moves, where some have one.
     ties : what no plan has, unless joints are locked.
     notes : what was left out or taken otherwise than the file says, in words.
     """
@@ -76,6 +77,7 @@ class Description:
     torque: dict[str, float] = field(default_factory=dict)
     springs: dict[str, tuple[float, float]] = field(default_factory=dict)
     sites: list[str] = field(default_factory=list)
+    driven: list[str] = field(default_factory=list)
     idle: list[str] = field(default_factory=list)
     ties: list[Tie] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -145,7 +147,7 @@ class Description:
         joints, followers = joint_names(model), couplings_of(model)
         if idle := [repr(joint) for joint in self.idle if joint in joints]:
             yield f"no actuator moves {', '.join(idle)}: plans have a motor there all the same"
-        for name in followers.keys() & (self.torque.keys() | self.kp.keys()):
+        for name in [joint for joint in self.driven if joint in followers]:
             yield f"the actuator of {name!r} is left out: the motor of {followers[name].leader!r} moves both"
         for tie in self.ties:
             if tie.follower in followers:

@@ -300,6 +300,9 @@ class _Reader(Compiled):
         if len(self.roots) > 1 and floating:
             raise InputError(f"{what} has several bodies with joints on the ground: it cannot float")
         self.floating = bool(free) if floating is None else floating
+        # of joints, which have one number for an angle without limits
+        joints = (mj.eq_type == self.mujoco.mjtEq.mjEQ_JOINT) & (mj.eq_obj2id >= 0)
+        self.followers = set(map(int, mj.eq_obj1id[joints]))
         self.model.name = mj.names[: mj.names.index(b"\0")].decode() or "robot"
         self.out = Description(kind="MJCF", model=self.model)
 
@@ -370,7 +373,7 @@ class _Reader(Compiled):
             pin.SE3(pin.exp3(-zero * axis), np.zeros(3)) if hinge else pin.SE3(np.eye(3), -zero * axis)
         )
         limited, lasting = bool(mj.jnt_limited[j]), int(mj.jnt_dofadr[j])
-        kind, turn = _kind(axis, hinge, limited)
+        kind, turn = _kind(axis, hinge, limited or j in self.followers)
         added = int(model.addJoint(parent, kind, place * turn, name))
         at = model.joints[added]
         low, high = mj.jnt_range[j] if limited else (-np.inf, np.inf)
@@ -439,10 +442,10 @@ class _Reader(Compiled):
                     f"actuator {self.name('actuator', a)!r} has dynamics of its own, which are left out: a "
                     "motor gives its torque at once, or with the `bandwidth` and `delay` that you give it"
                 )
-        driven = bool(most)
+        self.out.driven += most
         for j in self.joint:
             name = self.name("joint", j)
-            if driven and name not in most and not mj.jnt_actfrclimited[j]:
+            if self.out.driven and name not in most and not mj.jnt_actfrclimited[j]:
                 self.out.idle.append(name)
             if mj.jnt_actfrclimited[j]:
                 bound = float(np.abs(mj.jnt_actfrcrange[j]).min())

@@ -20,6 +20,7 @@ from impactopt.bodies.visuals import visuals_of
 from impactopt.cli.app import app
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
+from impactopt.files.draft.default_drives import guess_drives
 from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.draft.robot import draft_robot
@@ -30,6 +31,7 @@ from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import best_share
+from impactopt.robots.urdf import read_urdf
 
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
 
@@ -570,16 +572,44 @@ def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:
         Robot.from_urdf(tmp_path / "robot.urdf")
 
 
-def test_a_follower_is_locked_where_its_leader_is_bent(tmp_path: Path) -> None:
-    text = urdfs.arm().replace('joint name="wrist"', 'joint name="hinge"')
-    follows = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/></joint>'
-    text = re.sub(r'(<joint name="elbow".*?)</joint>', rf"\1{follows}", text)
+def _following(text: str, joint: str, law: str) -> str:
+    return re.sub(rf'(<joint name="{joint}".*?)</joint>', rf"\1<mimic {law}/></joint>", text)
+
+
+def test_a_follower_on_an_arm_follows(tmp_path: Path) -> None:
+    text = _following(urdfs.arm(effort=0.0), "elbow", 'joint="shoulder" multiplier="-0.5" offset="0.1"')
     draft = _drafted(tmp_path, text)
-    # a quarter of the shoulder's range, -1.8 to 1.8 rad
-    assert read_toml(draft.text)["robot"]["locked_rad"]["elbow"] == pytest.approx(0.1 + 0.5 * 0.9)
-    assert any("'elbow' follows 'shoulder' by <mimic>; 'elbow' is locked" in line for line in draft.said)
-    with pytest.raises(InputError, match=r"'elbow' follows 'shoulder'.*lock one"):
+    robot = read_toml(draft.text)["robot"]
+    assert "elbow" not in {*robot["locked_rad"], *robot["postures_rad"]["ready"], *robot["torque_limit_N_m"]}
+    made = draft_robot(tmp_path / "robot.urdf").robot
+    assert made.joint_names == ("turn", "shoulder", "wrist") and made.couplings["elbow"].leader == "shoulder"
+    # its motor lifts both, stretched out level
+    free = guess_drives(read_urdf(tmp_path / "robot.urdf", floating=False).model, {}).torque
+    assert robot["torque_limit_N_m"]["shoulder"] > free["shoulder"]
+
+
+def test_followers_of_grippers_are_locked_with_their_leaders(tmp_path: Path) -> None:
+    draft = _drafted(tmp_path, _following(urdfs.arm(), "slide_1", 'joint="slide_0" multiplier="1"'))
+    assert {"slide_0", "slide_1"} <= read_toml(draft.text)["robot"]["locked_rad"].keys()
+
+
+def test_a_follower_that_cannot_follow_is_locked_where_its_leader_is_bent(tmp_path: Path) -> None:
+    text = _following(urdfs.arm(), "shoulder", 'joint="elbow" multiplier="-0.5" offset="0.1"')
+    draft = _drafted(tmp_path, text)
+    # a quarter of the elbow's range, -2.4 to 2.4 rad
+    assert read_toml(draft.text)["robot"]["locked_rad"]["shoulder"] == pytest.approx(0.1 + 0.5 * 1.2)
+    assert any("'shoulder' follows 'elbow' by <mimic>; 'shoulder' is locked" in line for line in draft.said)
+    with pytest.raises(
+        InputError,
+        match=r"'shoulder' cannot follow 'elbow'.*let 'elbow' follow 'shoulder'.*-2 .*0\.2.*lock it",
+    ):
         Robot.from_urdf(tmp_path / "robot.urdf", floating=False)
+
+
+def test_followers_on_legs_are_locked(tmp_path: Path) -> None:
+    text = _following(urdfs.biped(legs=7), "right_hip_tilt", 'joint="left_hip_tilt"')
+    draft = _drafted(tmp_path, text)
+    assert "right_hip_tilt" in read_toml(draft.text)["robot"]["locked_rad"]
 
 
 def test_check_tells_meshes_that_are_no_bodies(tmp_path: Path) -> None:

@@ -259,9 +259,13 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
         _between('<link name="between"><visual><geometry><sphere radius=".1"/></geometry></visual></link>'),
         "the link 'between' has shapes and mass 0 kg",
     ),
-    "`<mimic>`": (
+    "`<mimic>`: a follower": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>')],
-        "'j2' follows 'j1'",
+        "",
+    ),
+    "`<mimic>` of a joint": (
+        [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j"/></joint></robot>')],
+        "'j2' follows 'j' by <mimic>, and there is no such joint.*lock it",
     ),
     "`<joint>` of type floating": (
         [('name="j2" type="revolute"', 'name="j2" type="planar"')],
@@ -332,9 +336,13 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
         [_before(END, '<equality><weld name="rod" site1="s1" site2="s2"/></equality>')],
         "closes a loop by the equality 'rod'.*lock it",
     ),
-    "`<joint>` in `<equality>`": (
+    "`<joint>` in `<equality>`, linear": (
         [_before(END, '<equality><joint joint1="j2" joint2="j1"/></equality>')],
-        "'j2' follows 'j1'",
+        "",
+    ),
+    "`<joint>` in `<equality>`, otherwise": (
+        [_before(END, '<equality><joint joint1="j2" joint2="j1" polycoef="0 1 .1 0 0"/></equality>')],
+        "'j2' follows 'j1'.*lock one",
     ),
     "`<joint>` of type ball": (
         [

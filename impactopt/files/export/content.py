@@ -189,6 +189,10 @@ class Export:
                 "phases": list(PHASES),
                 **({"stances": s["stances"]} if "stances" in s else {}),
                 "joints": self._joints(),
+                "followers": [
+                    {"name": name, "joint": law.leader, "multiplier": law.ratio, "offset": law.offset}
+                    for name, law in robot.couplings.items()
+                ],
                 "base": None
                 if self.motion.base is None
                 else {"link": body_name(robot, 1), "quaternion": "w, x, y, z", "axes": "world"},

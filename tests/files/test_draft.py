@@ -572,12 +572,8 @@ def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:
         Robot.from_urdf(tmp_path / "robot.urdf")
 
 
-def _following(text: str, joint: str, law: str) -> str:
-    return re.sub(rf'(<joint name="{joint}".*?)</joint>', rf"\1<mimic {law}/></joint>", text)
-
-
 def test_a_follower_on_an_arm_follows(tmp_path: Path) -> None:
-    text = _following(urdfs.arm(effort=0.0), "elbow", 'joint="shoulder" multiplier="-0.5" offset="0.1"')
+    text = urdfs.following(urdfs.arm(effort=0.0), "elbow", 'joint="shoulder" multiplier="-0.5" offset="0.1"')
     draft = _drafted(tmp_path, text)
     robot = read_toml(draft.text)["robot"]
     assert "elbow" not in {*robot["locked_rad"], *robot["postures_rad"]["ready"], *robot["torque_limit_N_m"]}
@@ -589,12 +585,12 @@ def test_a_follower_on_an_arm_follows(tmp_path: Path) -> None:
 
 
 def test_followers_of_grippers_are_locked_with_their_leaders(tmp_path: Path) -> None:
-    draft = _drafted(tmp_path, _following(urdfs.arm(), "slide_1", 'joint="slide_0" multiplier="1"'))
+    draft = _drafted(tmp_path, urdfs.following(urdfs.arm(), "slide_1", 'joint="slide_0" multiplier="1"'))
     assert {"slide_0", "slide_1"} <= read_toml(draft.text)["robot"]["locked_rad"].keys()
 
 
 def test_a_follower_that_cannot_follow_is_locked_where_its_leader_is_bent(tmp_path: Path) -> None:
-    text = _following(urdfs.arm(), "shoulder", 'joint="elbow" multiplier="-0.5" offset="0.1"')
+    text = urdfs.following(urdfs.arm(), "shoulder", 'joint="elbow" multiplier="-0.5" offset="0.1"')
     draft = _drafted(tmp_path, text)
     # a quarter of the elbow's range, -2.4 to 2.4 rad
     assert read_toml(draft.text)["robot"]["locked_rad"]["shoulder"] == pytest.approx(0.1 + 0.5 * 1.2)
@@ -607,7 +603,7 @@ def test_a_follower_that_cannot_follow_is_locked_where_its_leader_is_bent(tmp_pa
 
 
 def test_followers_on_legs_are_locked(tmp_path: Path) -> None:
-    text = _following(urdfs.biped(legs=7), "right_hip_tilt", 'joint="left_hip_tilt"')
+    text = urdfs.following(urdfs.biped(legs=7), "right_hip_tilt", 'joint="left_hip_tilt"')
     draft = _drafted(tmp_path, text)
     assert "right_hip_tilt" in read_toml(draft.text)["robot"]["locked_rad"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -11,13 +12,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support import urdfs
 from support.rigid_body_cases import random_tree
+from support.small_robots import arm, parallelogram, slider
 
-from impactopt import RigidBody, Robot
-from impactopt.robots.couplings import Coupling, coupled, couplings_of
+from impactopt import SDC, FreeMass, RigidBody, Robot, SpringDamper, Striker
+from impactopt.errors import InputError
+from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
 from impactopt.robots.dynamics import inverse_dynamics
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.simulation.mujoco_world import MujocoOptions, MujocoRobot, mujoco_module, robot_bodies, spec_of
+from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 
 Array = NDArray[np.float64]
 RATIOS = st.floats(0.2, 2.0) | st.floats(-2.0, -0.2) | st.sampled_from([-1.0, 1.0])
@@ -196,3 +201,160 @@ def test_mujocos_tree_with_equalities_eliminated_by_hand_has_the_same_inertia_an
     own = to.T @ np.diag(there.world.dof_armature) @ to
     close(own, armature)
     close(to.T @ H @ to, pair.mass(q))
+
+
+# ---- what is read of files
+
+
+def described(tmp_path: Path, *laws: tuple[str, str], **options: Any) -> Robot:
+    """An arm whose joints follow by these `<mimic>`s; without its gripper."""
+    text = urdfs.arm()
+    for joint, law in laws:
+        text = urdfs.following(text, joint, law)
+    (tmp_path / "robot.urdf").write_text(text)
+    locked = {"slide_0": 0.0, "slide_1": 0.0}
+    return Robot.from_urdf(tmp_path / "robot.urdf", floating=False, locked=locked, **options)
+
+
+def test_a_leader_has_what_followers_have_by_joint(tmp_path: Path) -> None:
+    law = 'joint="shoulder" multiplier="-2" offset="0.5"/><dynamics damping="3" friction="0.7"'
+    robot = described(tmp_path, ("elbow", law), armature=0.1)
+    assert robot.joint_names == ("turn", "shoulder", "wrist")
+    shoulder = robot.joint_index("shoulder")
+    # -2.4 <= 0.5 - 2 q <= 2.4, and |2 v| <= 4
+    assert (robot.lower[shoulder], robot.upper[shoulder]) == pytest.approx((-0.95, 1.45))
+    assert robot.velocity_limit[shoulder] == 2.0 and robot.velocity_limit[0] == 4.0
+    actuator = robot.actuators[shoulder]
+    assert (actuator.viscous_friction, actuator.coulomb_friction) == pytest.approx((12.0, 1.4))
+
+
+def test_followers_of_followers_follow_the_first_leader(tmp_path: Path) -> None:
+    robot = described(
+        tmp_path,
+        ("elbow", 'joint="shoulder" multiplier="-0.5" offset="0.1"'),
+        ("wrist", 'joint="elbow" multiplier="2" offset="0.3"'),
+    )
+    assert robot.couplings["wrist"] == pytest.approx(("shoulder", -1.0, 0.5))
+    (shoulder,) = (k for k in robot.limb("wrist_link") if robot.joint_names[k] == "shoulder")
+    assert robot.limb("wrist_link") == (0, shoulder)
+
+
+@pytest.mark.parametrize(
+    ("laws", "said"),
+    [
+        ([("elbow", 'joint="should"')], "'elbow' follows 'should'.*no such joint.*'shoulder'"),
+        (
+            [("shoulder", 'joint="elbow" multiplier="2"')],
+            "comes after it.*let 'elbow' follow 'shoulder'.* 0.5",
+        ),
+        ([("elbow", 'joint="wrist"'), ("wrist", 'joint="elbow"')], "'elbow', 'wrist' follow each other"),
+        ([("elbow", 'joint="shoulder"'), ("elbow", 'joint="turn"')], "'elbow' follows 'shoulder' and 'turn'"),
+        ([("elbow", 'joint="shoulder" multiplier="0"')], "multiplier is 0"),
+        ([("elbow", 'joint="shoulder" offset="9"')], "lie outside the follower's, .*-11.4 to -6.6 rad"),
+    ],
+)
+def test_what_cannot_follow_is_refused_by_name(
+    laws: list[tuple[str, str]], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=said):
+        described(tmp_path, *laws)
+
+
+def test_a_joint_that_turns_without_end_neither_leads_nor_follows() -> None:
+    with pytest.raises(InputError, match=r"'turn' turns without end.*lock it"):
+        coupled(arm().model, {"elbow": Coupling("turn", 1.0, 0.0)})
+
+
+def test_springs_of_followers_add_to_their_leaders() -> None:
+    """The potential energy of both springs, at any angle, but for a constant."""
+    law, springs = Coupling("one", -1.5, 0.4), {"one": (20.0, 0.3), "two": (50.0, -0.2)}
+    stiffness, rest = with_followers(springs, {"two": law})["one"]
+    q = np.linspace(-1, 1, 7)
+    each = 10.0 * (q - 0.3) ** 2 + 25.0 * (law.ratio * q + law.offset + 0.2) ** 2
+    assert np.ptp(each - stiffness / 2 * (q - rest) ** 2) < 1e-12
+
+
+MJCF = """
+<mujoco><compiler angle="radian"/><worldbody><body name="one" pos="0 0 .3">
+  <joint name="a" axis="0 1 0" range="-1 1" ref=".2" actuatorfrcrange="-50 50" armature=".1"/>
+  <geom type="box" size=".05 .05 .2" pos="0 0 .2"/>
+  <body name="two" pos="0 0 .4">
+    <joint name="b" axis="0 1 1" pos="0 .1 0" ref="-.3" armature=".02"/>
+    <geom type="box" size=".04 .05 .15" pos=".1 0 .2"/>
+    <body name="three" pos="0 0 .3"><joint name="c" type="slide" axis="1 0 0" ref=".1" range="-1 1"/>
+    <geom size=".1" pos=".1 .1 0"/></body>
+  </body></body></worldbody>
+  <equality><joint joint1="b" joint2="a" polycoef=".3 -1.2 0 0 0"/>
+  <joint joint1="c" joint2="b" polycoef="0 .5 0 0 0"/></equality>
+  <actuator><motor joint="a"/><motor name="m" joint="b"/></actuator></mujoco>
+"""
+
+
+def test_followers_of_an_mjcf_are_where_mujoco_has_them(tmp_path: Path) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    (tmp_path / "robot.xml").write_text(MJCF)
+    robot = Robot.from_mjcf(tmp_path / "robot.xml", velocity_limit=5.0)
+    assert robot.joint_names == ("a",) and robot.source is not None
+    assert any(
+        "the actuator of 'b' is left out: the motor of 'a' moves both" in n for n in robot.source.notes
+    )
+    mj = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
+    there, data = mujoco.MjData(mj), robot.model.createData()
+    for angle in (-0.7, 0.1, 0.6):
+        b = -0.3 + 0.3 - 1.2 * (angle - 0.2)
+        there.qpos[:] = angle, b, 0.1 + 0.5 * (b + 0.3)
+        mujoco.mj_forward(mj, there)
+        np.testing.assert_allclose(there.efc_pos[:2], 0.0, atol=1e-12)
+        pin.framesForwardKinematics(robot.model, data, np.array([angle]))
+        for body in ("one", "two", "three"):
+            at = data.oMf[robot.model.getFrameId(body, pin.FrameType.BODY)]
+            np.testing.assert_allclose(at.translation, there.body(body).xpos, atol=1e-12)
+        H, S = np.zeros((3, 3)), np.array([1.0, -1.2, -0.6])
+        for k, unit in enumerate(np.eye(3)):
+            mujoco.mj_mulM(mj, there, H[k], unit)
+        assert mass_matrix(robot.model, data, np.array([angle]))[0, 0] == pytest.approx(S @ H @ S, rel=1e-12)
+        gravity = pin.computeGeneralizedGravity(robot.model, data, np.array([angle]))
+        assert gravity[0] == pytest.approx(S @ there.qfrc_bias, rel=1e-10)
+
+
+# ---- collisions
+
+
+@pytest.mark.parametrize("ratio", [-2.0, 0.5])
+def test_two_coupled_masses_hit_as_one_of_their_effective_mass(ratio: float) -> None:
+    """Of masses 2 and 3 kg on rails, the first strikes: 2 + 3 ratio^2."""
+    model = pin.Model()
+    for k, mass in enumerate((2.0, 3.0)):
+        joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), f"rail {k}")
+        model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.05), pin.SE3.Identity())
+        model.addJointFrame(joint)
+    two = Robot.from_model(
+        coupled(model, {"rail 1": Coupling("rail 0", ratio, 0.3)}),
+        kp=0.0,
+        kd=0.0,
+        torque_limit=1e4,
+        velocity_limit=10.0,
+        position_limit={"rail 0": (-5.0, 5.0)},
+        strikers=[Striker(name="tip", frame="rail 0", point=np.zeros(3))],
+    )
+    settings: dict[str, Any] = {"striker": "tip", "normal": np.array([1.0, 0.0, 0.0])}
+    settings |= {"law": SpringDamper(stiffness=1e4, damping=50.0), "target": FreeMass(mass=4.0)}
+    state = np.zeros(1), np.ones(1), np.zeros(1)
+    one = SDC(robot=slider(2.0 + 3.0 * ratio**2), **settings).collide(*state).impulse
+    for kind, within in ((SDC, 1e-9), (FullDynamics, 1e-6), (MujocoDynamics, 1e-4)):
+        assert kind(robot=two, **settings).collide(*state).impulse == pytest.approx(one, rel=within)
+
+
+def test_full_dynamics_of_followers_are_mujocos() -> None:
+    robot = parallelogram()
+    settings: dict[str, Any] = {"robot": robot, "striker": "tip", "normal": np.array([0.0, 0.0, -1.0])}
+    settings |= {"law": SpringDamper(stiffness=1e4, damping=50.0), "target": FreeMass(mass=2.0)}
+    q, v = robot.posture("start"), np.array([2.0, 1.0])
+    torque = np.array(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
+    full = FullDynamics(**settings).collide(q, v, torque)
+    other = FullDynamics(form="pinocchio", **settings).collide(q, v, torque)
+    assert other.impulse == pytest.approx(full.impulse, rel=1e-8)
+    mujoco = MujocoDynamics(**settings).collide(q, v, torque)
+    assert mujoco.impulse == pytest.approx(full.impulse, rel=1e-4)
+    np.testing.assert_allclose(mujoco.velocity, full.velocity, rtol=1e-3, atol=1e-4)
+    assert SDC(**settings).collide(q, v, torque).impulse == pytest.approx(full.impulse, rel=0.02)

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.couplings import Coupling, coupled
 from impactopt.robots.robot import Robot, Sole, Striker
 
 HALF_SITTING = {"hip pitch": -0.4, "knee": 0.8, "ankle pitch": -0.4}
@@ -128,6 +129,30 @@ def arm(**options: Any) -> Robot:
         **options,
     }
     return Robot.from_model(model, **settings)
+
+
+def parallelogram(**options: Any) -> Robot:
+    """A fixed planar arm of two motors, whose hand follows the elbow so that it keeps the upper arm's turn;
+    and a counterweight that slides as the shoulder turns, on a branch of its own.
+    """
+    model, free = pin.Model(), {"hand": ("elbow", -1.0, 0.1), "weight": ("shoulder", 0.2, 0.05)}
+    model.name = "parallelogram"
+    shoulder = _add(model, 0, pin.JointModelRY, (0.0, 0.0, 0.3), "shoulder", _body(3.0, 0.1, 0.1, 0.4))
+    elbow = _add(model, shoulder, pin.JointModelRY, (0.0, 0.0, 0.4), "elbow", _body(2.0, 0.1, 0.1, 0.4))
+    hand = _add(model, elbow, pin.JointModelRY, (0.0, 0.0, 0.4), "hand", _body(1.0, 0.1, 0.1, 0.1))
+    _add(model, shoulder, pin.JointModelPX, (-0.3, 0.0, 0.0), "weight", _body(0.5, 0.05, 0.05, 0.05))
+    _mark(model, hand, (0.1, 0.0, 0.05), "tip")
+    settings = {
+        "armature": 0.05,
+        "actuators": MOTORS,
+        "torque_limit": np.array([200.0, 100.0]),
+        "velocity_limit": 6.0,
+        "position_limit": {"shoulder": (-1.5, 1.5), "elbow": (-2.3, 2.3)},
+        "strikers": [Striker(name="tip", frame="tip", point=np.zeros(3))],
+        "postures": {"start": {"shoulder": -0.6, "elbow": 1.6}},
+        **options,
+    }
+    return Robot.from_model(coupled(model, {name: Coupling(*law) for name, law in free.items()}), **settings)
 
 
 def slider(mass: float, **options: Any) -> Robot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 LIMIT = '<limit lower="{low}" upper="{high}" effort="{effort}" velocity="{velocity}"/>'
@@ -55,6 +56,11 @@ def joint(
         f'<origin xyz="{" ".join(map(str, at))}"/><axis xyz="{axis}"/>'
         f"{LIMIT.format(low=low, high=high, effort=effort, velocity=velocity)}</joint>"
     )
+
+
+def following(text: str, joint: str, law: str) -> str:
+    """The text with a joint that follows another one by a `<mimic>` of these attributes."""
+    return re.sub(rf'(<joint name="{joint}".*?)</joint>', rf"\1<mimic {law}/></joint>", text)
 
 
 def robot(name: str, *parts: str) -> str:

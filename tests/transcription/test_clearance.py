@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from support.derivative_checks import check_derivatives
 from support.small_plans import BODILESS, changed, rod_hammer
-from support.small_robots import arm, biped, table
+from support.small_robots import arm, biped, parallelogram, table
 
 from impactopt import KeepOut, Obstacle, SelfCollision, Solution, load_problem, solve
 from impactopt.bodies.clearance import Places
@@ -90,6 +90,7 @@ class Posed:
 
 ROBOTS: dict[str, tuple[Callable[[], Robot], str, tuple[str, ...]]] = {
     "arm": (arm, "start", ()),
+    "parallelogram": (parallelogram, "start", ()),
     "slides": (lambda: table(2.0, postures={"start": {}}), "start", ()),
     "biped": (biped, "half_sitting", ("left", "right")),
     "on one leg": (biped, "half_sitting", ("left",)),

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.errors import InputError
 from impactopt.files.export.content import Export, body_name
 from impactopt.files.export.motion import Motion, motion_at
 
@@ -21,7 +22,17 @@ Array = NDArray[np.float64]
 
 
 def write(export: Export, directory: Path) -> None:
-    """`motion.npz`, and `missed.npz` of a plan with an abort motion."""
+    """`motion.npz`, and `missed.npz` of a plan with an abort motion.
+
+    Raises
+    ------
+    InputError : joints that follow others: policies have all joints of their MJCF, in its order.
+    """
+    if followers := ", ".join(map(repr, export.robot.couplings)):
+        raise InputError(
+            f"mjlab: policies have all joints, and those that follow others ({followers}) are no joints of "
+            "the plan: export to mujoco or csv instead"
+        )
     planned = export.planned
     for name, reference in (("motion", planned.reference), ("missed", planned.missed)):
         if reference is not None:

@@ -16,7 +16,7 @@ from support import urdfs
 from support.rigid_body_cases import random_tree
 from support.small_robots import arm, parallelogram, slider
 
-from impactopt import SDC, FreeMass, RigidBody, Robot, SpringDamper, Striker
+from impactopt import SDC, FreeMass, RigidBody, Robot, SoftGrip, SpringDamper, Striker, Tool
 from impactopt.errors import InputError
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
 from impactopt.robots.dynamics import inverse_dynamics
@@ -272,6 +272,33 @@ def test_springs_of_followers_add_to_their_leaders() -> None:
     q = np.linspace(-1, 1, 7)
     each = 10.0 * (q - 0.3) ** 2 + 25.0 * (law.ratio * q + law.offset + 0.2) ** 2
     assert np.ptp(each - stiffness / 2 * (q - rest) ** 2) < 1e-12
+
+
+@pytest.mark.parametrize("frame", ["tip", "shoulder"])
+def test_laws_outlive_another_joint_in_the_model(frame: str) -> None:
+    """A tool in a soft grip has a joint of its own, before that of the counterweight in the tree."""
+    grip = SoftGrip(axis=np.array([1.0, 0.0, 0.0]), stiffness=50.0, damping=1.0)
+    tool = {
+        "mass": 0.5,
+        "center": np.zeros(3),
+        "inertia": 1e-2 * np.eye(3),
+        "head": np.array([0.1, 0.0, 0.0]),
+    }
+    before = parallelogram()
+    after = before.with_tool(Tool(name="hammer", frame=frame, grip=grip, **tool))
+    assert after.couplings == before.couplings and after.n == before.n + 1
+    kept = [after.joint_index(name) for name in before.joint_names]
+    np.testing.assert_array_equal(after.armature[kept], before.armature)
+    q = after.posture("start")
+    for robot, at in ((before, before.posture("start")), (after, q)):
+        pin.forwardKinematics(robot.model, data := robot.model.createData(), at)
+        places = [data.oMi[robot.model.getJointId(name)].homogeneous for name in before.couplings]
+        if robot is before:
+            wanted = places
+    np.testing.assert_allclose(places, wanted, atol=1e-14)
+    body = RigidBody(after.model)
+    H = ca.Function("H", [body.q], [ca.densify(body.mass_matrix())])(q)
+    close(H, mass_matrix(after.model, after.model.createData(), q))
 
 
 MJCF = """

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.robots.checks import columns_above
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.result import Scene, distance_inside, stance_at, stance_begins
@@ -142,8 +143,8 @@ def _moved(robot: Robot, q: Array, q0: Array, scene: Scene, margin: float) -> Ar
     place = _inside(scene, np.array(pin.centerOfMass(model, data, q)[:2]), margin)
     moves = np.zeros(robot.nv)
     moves[:6] = 1.0
-    for joint in {j for i in soles for j in model.supports[model.frames[i].parentJoint] if j}:
-        moves[model.joints[joint].idx_v : model.joints[joint].idx_v + model.joints[joint].nv] = 1.0
+    for i in soles:
+        moves[columns_above(model, model.frames[i].parentJoint)] = 1.0
     turns = np.zeros((3, robot.nv))
     for _ in range(STEPS):
         now = pin.Quaternion(q[3:7]).toRotationMatrix()

@@ -83,7 +83,7 @@ def model_hash(model: pin.Model, springs: Mapping[str, tuple[float, float]] | No
         joint, inertia = model.joints[i], model.inertias[i]
         placement = model.jointPlacements[i].homogeneous
         add(str(model.names[i]), joint.shortname(), int(model.parents[i]), joint.idx_q, joint.idx_v)
-        add(*_motion(joint, neutral) if i else ())
+        add(*_motion(joint, neutral) if i else (None,))
         add(np.array(placement), float(inertia.mass), np.array(inertia.lever), np.array(inertia.inertia))
     add(np.array(model.armature))
     for frame in model.frames:
@@ -93,13 +93,13 @@ def model_hash(model: pin.Model, springs: Mapping[str, tuple[float, float]] | No
     return digest.hexdigest()
 
 
-def _motion(joint: Any, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Axes of a joint, (6, nv), and its placement: the only way from Python to the axis of an unaligned one,
-    and with a follower's multiplier and offset.
+def _motion(joint: Any, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Axes of a joint, (6, nv): the only way from Python to the axis of an unaligned one, and a follower's
+    times its multiplier; of a follower also its placement at its offset.
     """
     data = joint.createData()
     joint.calc(data, q)
-    return np.array(data.S), np.array(data.M.homogeneous)
+    return (np.array(data.S),) if joint.nv else (np.array(data.S), np.array(data.M.homogeneous))
 
 
 def canonical(item: Any) -> str:

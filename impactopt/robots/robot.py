@@ -35,8 +35,8 @@ class Robot:
     """A robot ready to strike; checked when built. Arrays are read-only; `dataclasses.replace` makes a
     changed copy.
 
-    Arrays of length n run over the joints without the free-flyer, in the order of Pinocchio's v. Units are
-    those of revolute joints; for a prismatic joint read m, m/s, N, kg.
+    Arrays of length n run over the joints without the free-flyer and without followers (`couplings`), in the
+    order of Pinocchio's v. Units are those of revolute joints; for a prismatic joint read m, m/s, N, kg.
 
     Attributes
     ----------
@@ -285,7 +285,7 @@ class Robot:
     def joint_names(self) -> tuple[str, ...]:
         return build.joint_names(self.model)
 
-    @cached_property
+    @property
     def joint_models(self) -> tuple[Any, ...]:
         """(n,) Pinocchio's models of its joints."""
         return tuple(build.moving_joints(self.model))

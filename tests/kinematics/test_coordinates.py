@@ -61,6 +61,8 @@ def make_case(robot: Robot, posture: str, soles: int | None = None, hands: tuple
     )
 
 
+HIPS = {f"{side} hip pitch": (f"{side} hip tilt", 2.0, -0.4) for side in ("left", "right")}
+YAW = {"right hip yaw": ("left hip yaw", -1.0, 0.0)}
 CASES = {
     "talos": lambda: make_case(load_robot("talos"), "half_sitting"),
     "g1": lambda: make_case(load_robot("g1"), "half_sitting"),
@@ -69,6 +71,8 @@ CASES = {
     "biped on legs of seven": lambda: make_case(biped(7), "half_sitting"),
     "biped with a waist": lambda: make_case(biped(waist=True), "half_sitting"),
     "biped on hinged soles": lambda: make_case(biped(5), "half_sitting"),
+    "biped whose hips follow": lambda: make_case(biped(7, followers=HIPS), "half_sitting"),
+    "biped on its left foot, with one hip motor": lambda: make_case(biped(followers=YAW), "half_sitting", 1),
     "stand-in that holds on": lambda: make_case(load_robot("standin"), "half_sitting", hands=("left_hand",)),
     "arm": lambda: make_case(arm(), "start"),
 }
@@ -116,6 +120,11 @@ def column(value: Any) -> Array:
 
 
 # ---- numbers and names
+
+
+def test_legs_that_share_a_motor_hold_one_sole_and_not_two() -> None:
+    with pytest.raises(InputError, match=r"legs share joints: .*left hip yaw move another held sole too"):
+        make_case(biped(followers=YAW), "half_sitting")
 
 
 def test_coordinates_are_the_base_and_the_joints_outside_the_held_legs(case: Case) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -43,11 +44,17 @@ MOTORS = {
 }
 
 
-def biped(legs: int = 6, *, waist: bool = False, hinge: str | None = "x") -> Robot:
+def biped(
+    legs: int = 6,
+    *,
+    waist: bool = False,
+    hinge: str | None = "x",
+    followers: Mapping[str, tuple[str, float, float]] | None = None,
+) -> Robot:
     """A 40 kg biped: two legs of six joints on box soles and an arm of three; 21 velocities.
 
     legs : 7: one more in each hip; 5: no ankle roll.  hinge : of soles on legs of five.  waist : two joints
-    from the trunk to the hips.
+    from the trunk to the hips.  followers : leader, ratio and offset by joint.
     """
     model = pin.Model()
     model.name = "small biped"
@@ -84,12 +91,14 @@ def biped(legs: int = 6, *, waist: bool = False, hinge: str | None = "x") -> Rob
     ):
         parent = _add(model, parent, kind, at, name, body)
     _mark(model, parent, (0.3, 0.0, 0.0), "fist")
-    names = list(model.names)[2:]
+    laws = {name: Coupling(*law) for name, law in (followers or {}).items()}
+    names = [name for name in list(model.names)[2:] if name not in laws]
     angles = {f"{side} {name}": angle for side in ("left", "right") for name, angle in HALF_SITTING.items()}
+    angles = {name: angle for name, angle in angles.items() if name in names}
     size: dict[str, Any] = {"length": 0.22, "width": 0.12, "hinge": hinge if legs == 5 else None}
     soles = [Sole.box(name=side, frame=f"{side} sole", **size) for side in ("left", "right")]
     return Robot.from_model(
-        model,
+        coupled(model, laws),
         armature=0.05,
         torque_limit=150.0,
         velocity_limit=6.0,

@@ -40,11 +40,11 @@ class Tie:
     @property
     def coupling(self) -> Coupling | None:
         """Law of the follower, if it is one that plans have."""
-        linear = len(self.follows) > 1 and not any(self.follows[2:])
-        others = [joint for joint in self.joints if joint != self.follower]
-        if not self.follower or not linear or len(others) != len(self.joints) - 1:
+        if not self.follower or len(self.joints) != 2 or any(self.follows[2:]):
             return None
-        return Coupling(others[0] if others else self.follower, self.follows[1], self.follows[0])
+        (leader,) = {*self.joints} - {self.follower} or {self.follower}
+        offset, ratio = (*self.follows, 0.0)[:2]
+        return Coupling(leader, ratio, offset)
 
     def broken(self, joints: tuple[str, ...]) -> str:
         """The mistake of a robot whose joints these are; "" if there is none."""

@@ -602,10 +602,21 @@ def test_a_follower_that_cannot_follow_is_locked_where_its_leader_is_bent(tmp_pa
         Robot.from_urdf(tmp_path / "robot.urdf", floating=False)
 
 
-def test_followers_on_legs_are_locked(tmp_path: Path) -> None:
+def test_a_leg_that_another_one_leads_is_locked_there(tmp_path: Path) -> None:
     text = urdfs.following(urdfs.biped(legs=7), "right_hip_tilt", 'joint="left_hip_tilt"')
     draft = _drafted(tmp_path, text)
     assert "right_hip_tilt" in read_toml(draft.text)["robot"]["locked_rad"]
+
+
+def test_followers_of_their_own_leg_follow(tmp_path: Path) -> None:
+    text = urdfs.biped(legs=7)
+    for side in ("left", "right"):
+        text = urdfs.following(text, f"{side}_hip_pitch", f'joint="{side}_hip_tilt" multiplier="2.5"')
+    draft = _drafted(tmp_path, text)
+    (tmp_path / "robot.toml").write_text(draft.text)
+    problem = load_problem(tmp_path / "robot.toml")  # whose start has level soles
+    assert problem.robot.couplings.keys() == {"left_hip_pitch", "right_hip_pitch"}
+    assert all(len(leg.joints) == 6 and not len(leg.before) for leg in problem.coordinates.legs)
 
 
 def test_check_tells_meshes_that_are_no_bodies(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -315,6 +316,16 @@ MJCF = """
   <joint joint1="c" joint2="b" polycoef="0 .5 0 0 0"/></equality>
   <actuator><motor joint="a"/><motor name="m" joint="b"/></actuator></mujoco>
 """
+
+
+def test_a_joint_that_an_mjcf_holds_still_follows_none(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    held = re.sub(
+        "<equality>.*</equality>", '<equality><joint joint1="b"/></equality>', MJCF, flags=re.DOTALL
+    )
+    (tmp_path / "robot.xml").write_text(held)
+    with pytest.raises(InputError, match=r"'b' is held by the equality.*lock it"):
+        Robot.from_mjcf(tmp_path / "robot.xml", velocity_limit=5.0)
 
 
 def test_followers_of_an_mjcf_are_where_mujoco_has_them(tmp_path: Path) -> None:

@@ -263,7 +263,11 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>')],
         "",
     ),
-    "`<mimic>` of a joint": (
+    "`<mimic>` of a joint that comes": (
+        [("</joint><joint", '<mimic joint="j2"/></joint><joint')],
+        "'j1' cannot follow 'j2': 'j2' comes after it",
+    ),
+    "`<mimic>` of a joint that does not": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j"/></joint></robot>')],
         "'j2' follows 'j' by <mimic>, and there is no such joint.*lock it",
     ),

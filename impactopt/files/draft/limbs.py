@@ -137,7 +137,7 @@ def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Pi
         return float(_heights(data, pieces, joint).min(initial=np.inf))
 
     out = []
-    for own in map(list, unshared(legs)):
+    for own in map(list, unshared(model, legs)):
         while len(own) > LEG:
             foot, toe = own[-2:]
             ahead = float(np.linalg.norm((data.oMi[toe].translation - data.oMi[foot].translation)[:2]))
@@ -147,10 +147,13 @@ def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Pi
     return out
 
 
-def unshared(legs: Sequence[Limb]) -> list[tuple[int, ...]]:
-    """Joints of each leg that lead to no other leg."""
+def unshared(model: pin.Model, legs: Sequence[Limb]) -> list[tuple[int, ...]]:
+    """Joints with a motor of each leg that lead to no other leg."""
     others = [{j for other in legs if other is not leg for j in other.path} for leg in legs]
-    return [tuple(j for j in leg.path if j not in of) for leg, of in zip(legs, others, strict=True)]
+    return [
+        tuple(j for j in leg.path if j not in of and model.joints[j].nv)
+        for leg, of in zip(legs, others, strict=True)
+    ]
 
 
 def renumbered(limb: Limb, old: pin.Model, new: pin.Model) -> Limb:

@@ -44,10 +44,11 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
     pin.framesForwardKinematics(model, data, neutral)
     turn = np.column_stack([forward, np.cross([0.0, 0.0, 1.0], forward), [0.0, 0.0, 1.0]])
     straight = [np.array(data.oMf[model.getFrameId(s.frame)].translation) for s in soles]
-    chains = unshared(legs)
+    chains = unshared(robot.model, legs)
     hips = [np.array(data.oMi[own[0]].translation) for own in chains]
     aside = [float(spot @ turn[:, 1]) for spot in straight]
-    length = float(np.mean([_path(robot, own[1:]) for own in chains]))
+    below = [[j for j in leg.path if j > own[0]] for leg, own in zip(legs, chains, strict=True)]
+    length = float(np.mean([_path(robot, joints) for joints in below]))
     height = min(float(spot[2]) for spot in straight) + BENT * length
     ahead = float(np.mean([hip @ forward for hip in hips]))
     rng, q = np.random.default_rng(0), neutral

@@ -84,7 +84,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if is_floating(first.model) and not floats:
         _check_bolted(first, found)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
-    if led := _on_legs(first, found.robot, legs):  # a sole needs six joints of its own leg to hold it
+    if led := _on_legs(first, found.robot, legs):  # a sole is held by six motors of its own leg
         locked |= led
         found = _made(path, mjcf, True, locked)
         legs = legs_of(found.robot.model, found.pieces)
@@ -108,9 +108,12 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
 
 
 def _on_legs(read: Description, robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
-    """Followers on legs, and why they are locked."""
-    names = {str(robot.model.names[j]) for leg in legs for j in leg.path} & robot.couplings.keys()
-    return {tie.follower: _why_locked(tie) for tie in read.ties if tie.follower in names}
+    """Followers on legs whose leaders are not of the same leg alone, and why they are locked."""
+    names, out = [str(name) for name in robot.model.names], set[str]()
+    for leg, own in zip(legs, unshared(robot.model, legs), strict=True):
+        led = {names[j] for j in leg.path} & robot.couplings.keys()
+        out |= {name for name in led if robot.couplings[name].leader not in {names[j] for j in own}}
+    return {tie.follower: _why_locked(tie) for tie in read.ties if tie.follower in out}
 
 
 def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:
@@ -254,7 +257,7 @@ def _bent(model: pin.Model, name: str) -> float:
 def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> None:
     """InputError for legs that no plan can hold."""
     model = robot.model
-    own = unshared(legs)
+    own = unshared(model, legs)
     told = "; ".join(", ".join(str(model.names[j]) for j in joints) for joints in own)
     of = " or ".join(str(count) for count in sorted({len(joints) for joints in own}))
     if len(legs) != 2 or min(map(len, own)) < LEG - 1:

@@ -59,7 +59,7 @@ def find_soles(
         ahead += middle * [1.0, 1.0, 0.0]
     forward = _forward(model, data, legs, ahead)
     soles = []
-    for name, leg, own, (up, low, flat) in zip(names, legs, unshared(legs), flats, strict=True):
+    for name, leg, own, (up, low, flat) in zip(names, legs, unshared(model, legs), flats, strict=True):
         x = data.oMi[leg.tip].rotation.T @ forward
         x = _unit(x - up * (up @ x))
         place = pin.SE3(np.column_stack([x, np.cross(up, x), up]), low * up)
@@ -88,7 +88,7 @@ def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> 
     """Forward direction (3,): opposite to the knees' bend, else towards the feet's middles, feet (3,) [m]."""
     back = np.zeros(3)
     pin.computeJointJacobians(model, data, pin.neutral(model))
-    for leg, own in zip(legs, unshared(legs), strict=True):
+    for leg, own in zip(legs, unshared(model, legs), strict=True):
         hip, ankle = data.oMi[own[0]].translation, data.oMi[leg.tip].translation
 
         def room(j: int, hip: Array = hip, ankle: Array = ankle) -> float:

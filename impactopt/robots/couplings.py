@@ -22,7 +22,18 @@ from impactopt.robots.build import (
     velocity_limit,
 )
 
-__all__ = ["Axis", "Coupling", "axis_of", "coupled", "couplings_of", "resolved", "unfit", "with_followers"]
+__all__ = [
+    "Axis",
+    "Coupling",
+    "axis_of",
+    "coupled",
+    "couplings_of",
+    "follower_axes",
+    "resolved",
+    "restore_followers",
+    "unfit",
+    "with_followers",
+]
 
 Array = NDArray[np.float64]
 _MIMIC = "JointModelMimic"
@@ -69,6 +80,31 @@ def couplings_of(model: pin.Model) -> dict[str, Coupling]:
             leader = leaders[int(model.joints[j].idx_v)]
             out[str(model.names[j])] = Coupling(leader, float(kind.scaling), float(kind.offset))
     return out
+
+
+def follower_axes(model: pin.Model) -> dict[int, Array]:
+    """Subspaces (6,) of a model's followers by index, which `restore_followers` needs."""
+    return {
+        model.getJointId(name): axis_of(model, model.getJointId(name)).subspace
+        for name in couplings_of(model)
+    }
+
+
+def restore_followers(model: pin.Model, axes: Mapping[int, Array]) -> None:
+    """Make followers anew, in place, in a model that was pickled: Pinocchio 4.1 loses how they move, and
+    crashes where they do.
+    """
+    leaders = {model.joints[j].idx_v: model.joints[j] for j in joint_indices(model)}
+    for j, axis in axes.items():
+        old, turns = model.joints[j], bool(axis[3:].any())
+        leader, law = leaders[old.idx_v], old.extract()
+        own = (
+            pin.JointModelRevoluteUnaligned(axis[3:]) if turns else pin.JointModelPrismaticUnaligned(axis[:3])
+        )
+        own.setIndexes(leader.id, leader.idx_q, leader.idx_v, leader.idx_vExtended)
+        new = pin.JointModelMimic(pin.JointModel(own), law.scaling, law.offset)
+        new.setIndexes(j, old.idx_q, old.idx_v, old.idx_vExtended)
+        model.joints[j] = pin.JointModel(new)
 
 
 def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:

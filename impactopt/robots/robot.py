@@ -20,7 +20,7 @@ from impactopt.robots import urdf as _urdf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
 from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, read_only
 from impactopt.robots.checks import GIVEN, REPAIRED, check_inertias, tell_apart
-from impactopt.robots.couplings import Coupling, couplings_of
+from impactopt.robots.couplings import Coupling, couplings_of, follower_axes, restore_followers
 from impactopt.robots.forward_kinematics import ForwardKinematics
 from impactopt.robots.tools import check_sole, with_hinges
 
@@ -253,6 +253,14 @@ class Robot:
             mjcf=None if mjcf is None else str(mjcf),
         )
         return dataclasses.replace(robot, postures={pose: robot.place(q) for pose, q in read.items()})
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_axes": follower_axes(self.model)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        axes = state.pop("_axes")
+        self.__dict__.update(state)
+        restore_followers(self.model, axes)
 
     def __repr__(self) -> str:
         """One line: its model and arrays would fill pages."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 import re
+from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ from support.rigid_body_cases import random_tree
 from support.small_robots import arm, parallelogram, slider
 
 from impactopt import SDC, FreeMass, RigidBody, Robot, SoftGrip, SpringDamper, Striker, Tool
+from impactopt.codegen.cache import model_hash
 from impactopt.errors import InputError
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
 from impactopt.robots.dynamics import inverse_dynamics
@@ -300,6 +304,15 @@ def test_laws_outlive_another_joint_in_the_model(frame: str) -> None:
     body = RigidBody(after.model)
     H = ca.Function("H", [body.q], [ca.densify(body.mass_matrix())])(q)
     close(H, mass_matrix(after.model, after.model.createData(), q))
+
+
+@pytest.mark.parametrize("copy", [lambda robot: pickle.loads(pickle.dumps(robot)), deepcopy])
+def test_laws_outlive_a_way_to_another_process(copy: Callable[[Robot], Robot]) -> None:
+    robot, v = parallelogram(), np.array([0.3, -0.5])
+    there, q = copy(robot), robot.posture("start")
+    assert there.couplings == robot.couplings and model_hash(there.model) == model_hash(robot.model)
+    found, wanted = (inverse_dynamics(r, r.model.createData(), q, v, v) for r in (there, robot))
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
 MJCF = """

@@ -185,18 +185,22 @@ def test_mujocos_tree_with_equalities_eliminated_by_hand_has_the_same_inertia_an
     robot, (q, v, _) = pair.robot(), pair.state()
     spec = spec_of(robot, MujocoOptions())
     robot_bodies(mujoco, spec, robot)
-    there = MujocoRobot(robot, spec.compile())
+    there, gravity = MujocoRobot(robot, spec.compile()), np.array(robot.model.gravity.linear)
+    if robot.floating:  # MuJoCo's free joints are in the world, this one is turned in it
+        gravity = pair.free.jointPlacements[1].rotation.T @ gravity
+    there.world.opt.gravity[:] = gravity
     there.put(q, v)
     mujoco.mj_forward(there.world, there.data)
     assert there.world.neq == len(pair.laws)
     np.testing.assert_allclose(there.data.efc_pos[: len(pair.laws)], 0.0, atol=1e-12)  # the laws hold
     # MuJoCo's columns: the base's linear velocity in the world's axes, joints in the order of the tree
-    T = np.zeros((there.world.nv, pair.free.nv))
+    T, drift = np.zeros((there.world.nv, pair.free.nv)), np.zeros(there.world.nv)
     for j in range(1, pair.free.njoints):
         joint, dof = pair.free.joints[j], int(there.world.joint(pair.free.names[j]).dofadr[0])
         T[dof : dof + joint.nv, joint.idx_v : joint.idx_v + joint.nv] = np.eye(joint.nv)
         if joint.nv == 6:
             T[dof : dof + 3, joint.idx_v : joint.idx_v + 3] = there.base_rotation()
+            drift[dof : dof + 3] = there.base_rotation() @ np.cross(v[3:6], v[:3])
     whole = np.array(there.data.qvel)
     close(T @ pair.S @ v, whole)
     H, to = np.zeros((there.world.nv,) * 2), T @ pair.S
@@ -206,6 +210,8 @@ def test_mujocos_tree_with_equalities_eliminated_by_hand_has_the_same_inertia_an
     own = to.T @ np.diag(there.world.dof_armature) @ to
     close(own, armature)
     close(to.T @ H @ to, pair.mass(q))
+    bias = pin.nonLinearEffects(robot.model, robot.model.createData(), q, v)
+    close(to.T @ (H @ drift + there.data.qfrc_bias), bias)
 
 
 # ---- what is read of files

@@ -131,7 +131,9 @@ def new(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="[NAME]", help="Name of the problem to start from.", autocompletion=complete_problem
+            metavar="[NAME]",
+            help="Name of the problem to start from; or a .urdf, or the .xml of an MJCF.",
+            autocompletion=complete_problem,
         ),
     ] = None,
     urdf: Annotated[
@@ -165,6 +167,11 @@ def new(
     with plain_errors("interrupted"):
         if sum(x is not None for x in (name, urdf, mjcf)) + reference > 1:
             raise typer.BadParameter("give one of NAME, --urdf, --mjcf and --reference")
+        kind = "" if name is None else Path(name).suffix.lower()
+        if kind in (".urdf", ".xacro"):
+            name, urdf = None, name
+        elif kind == ".xml":
+            name, mjcf = None, Path(str(name))
         if bolted and urdf is None and mjcf is None:
             raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint="--bolted")
         if motion is not None and urdf is None and mjcf is None:

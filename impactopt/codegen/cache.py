@@ -1,13 +1,15 @@
 """CasADi functions compiled to C and kept on disk, safe for two processes at once and private to the user.
 
 Compiled, a rigid-body function runs 8 to 23 times faster than in CasADi's virtual machine, but compiling
-costs from a second to a minute. There are two levels of keys:
+costs from a second to a minute. There are three kinds of files, each with a key of its own:
 
 * an *entry* (`<name>-<key>.json`) is found without building any graph: its key covers what the caller says it
   built (`recipe`), this package's sources, CasADi, compiler, flags and CPU. It lists the functions and their
   libraries;
 * a *library* (`<function>-<hash>.so`) is named after the C code in it, so that a change of the sources that
-  leaves the graph alone costs building the graph again, but no compilation.
+  leaves the graph alone costs building the graph again, but no compilation;
+* an *object file* (`<name>-<hash>.o`) is what several libraries have in common (`SharedCode`), and goes into
+  each when it is made.
 
 A library that someone else could have written is never loaded: see `impactopt.codegen.files`.
 """
@@ -41,11 +43,12 @@ from impactopt.codegen.compiler import (
     CompileError,
     Compiler,
     NativeCode,
-    c_code,
+    Source,
     find_compiler,
     library_of,
     longest_body,
     name_of,
+    source_of,
     why_no_compiler,
 )
 from impactopt.codegen.files import (
@@ -284,12 +287,11 @@ class _Work:
             self._error = error
             return
         # the longest first, so that the cores finish together; CasADi itself stays in this thread
-        together: dict[tuple[str, str], list[str]] = {}
+        together: dict[Source, list[str]] = {}
         for function in sorted(self._functions.values(), key=longest_body, reverse=True):
-            name, code, level = c_code(function)
-            together.setdefault((code, level), []).append(name)
-        for (code, level), names in together.items():
-            job = pool.submit(library_of, directory, scratch, names[0], code, level, compiler)
+            together.setdefault(source_of(function), []).append(name_of(function))
+        for source, names in together.items():
+            job = pool.submit(library_of, directory, scratch, names[0], source, compiler)
             self._jobs[job] = names
 
     def finished(self) -> dict[str, ca.Function]:

@@ -30,14 +30,16 @@ __all__ = [
     "CompileError",
     "Compiler",
     "NativeCode",
+    "SharedCode",
+    "Source",
     "address",
-    "c_code",
     "find_compiler",
     "library_of",
     "longest_body",
     "name_of",
     "native_library",
     "quick_to_compile",
+    "source_of",
     "why_no_compiler",
 ]
 
@@ -205,6 +207,22 @@ def _level() -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SharedCode:
+    """C code that is compiled once, and becomes part of the library of every function that calls it.
+
+    Attributes
+    ----------
+    name : for the file's name.
+    code : C, one translation unit, whose functions are hidden outside of a library.
+    level : of optimization, as the compiler's flags.
+    """
+
+    name: str
+    code: str
+    level: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class NativeCode:
     """A function whose C code is not CasADi's, but keeps to the interface that `ca.external` asks for.
 
@@ -214,12 +232,14 @@ class NativeCode:
     code : C, one translation unit, which may be that of other functions, too.
     level : of optimization, as the compiler's flags.
     graph : builds the function that takes its place where there is no compiler.
+    shared : what it calls, if that is compiled for others too.
     """
 
     name: str
     code: str
     graph: Callable[[], ca.Function]
     level: str = field(default_factory=_level)
+    shared: SharedCode | None = None
 
 
 Buildable = Any  # ca.Function or NativeCode
@@ -237,7 +257,8 @@ def native_library(package: str, name: str) -> Any:
             locked(directory / f"{slug(name)}.lock", on_wait=lambda: None),
             tempfile.TemporaryDirectory(dir=directory, prefix="tmp-") as scratch,
         ):
-            path = library_of(directory, Path(scratch), name, code, _NATIVE_LEVEL, compiler)[0]
+            source = Source(code=code, level=_NATIVE_LEVEL)
+            path = library_of(directory, Path(scratch), name, source, compiler)[0]
             return ctypes.CDLL(str(directory / path))
     except (CompileError, OSError, UnsafePath) as error:
         warnings.warn(f"{name}: {error}; its work is done in Python", NoCompilerWarning, stacklevel=3)
@@ -249,43 +270,79 @@ def address(array: npt.NDArray[Any]) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 
-def c_code(function: Buildable) -> tuple[str, str, str]:
-    """Name, C code and optimization level of a function."""
+@dataclass(frozen=True)
+class Source:
+    """All that a library is made of: C code, its level of optimization, and what is linked to it."""
+
+    code: str
+    level: str
+    shared: SharedCode | None = None
+
+
+def source_of(function: Buildable) -> Source:
+    """C code of a function."""
     if isinstance(function, NativeCode):
-        return function.name, function.code, function.level
-    name = str(function.name())
-    generator = ca.CodeGenerator(f"{name}.c", {"with_header": False})
+        return Source(function.code, function.level, function.shared)
+    generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
     generator.add(function)
     level = "-O1" if longest_body(function) <= MAX_OPTIMIZED else "-O0"
-    return name, str(generator.dump()), level
+    return Source(str(generator.dump()), level)
 
 
 def library_of(
-    directory: Path, scratch: Path, name: str, code: str, level: str, compiler: Compiler
+    directory: Path, scratch: Path, name: str, source: Source, compiler: Compiler
 ) -> tuple[str, str]:
     """File name and hash of the library of this C code: the one that is there, or a new one."""
-    key = hashlib.sha256("\0".join([code, level, compiler.key]).encode()).hexdigest()
-    library = directory / f"{slug(name)}-{key[:32]}.so"
-    seal = library.with_suffix(".sha256")
+    shared = source.shared
+    parts = [source.code, source.level, compiler.key]
+    if shared is None:
+        return _made(directory, scratch, f"{name}.so", parts, compiler, tuple)
+
+    def linked() -> tuple[Path, ...]:
+        code = [shared.code, f"{shared.level} -c", compiler.key]
+        # many functions that want it are compiled at once
+        with locked(directory / f"{slug(shared.name)}.lock", on_wait=lambda: None):
+            return (directory / _made(directory, scratch, f"{shared.name}.o", code, compiler, tuple)[0],)
+
+    return _made(directory, scratch, f"{name}.so", [*parts, shared.code, shared.level], compiler, linked)
+
+
+def _made(
+    directory: Path,
+    scratch: Path,
+    name: str,
+    parts: Sequence[str],
+    compiler: Compiler,
+    linked: Callable[[], tuple[Path, ...]],
+) -> tuple[str, str]:
+    """File name and hash of what is compiled: what is there, or a new one.
+
+    name : with the suffix of its kind.  parts : code, flags, and all else that it depends on.
+    linked : object files that go into it.
+    """
+    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    stem, suffix = os.path.splitext(name)
+    file = directory / f"{slug(stem)}-{key[:32]}{suffix}"
+    seal = file.with_suffix(".sha256")
     try:
-        check_private_file(library)
+        check_private_file(file)
         check_private_file(seal)
-        content = library.read_bytes()
+        content = file.read_bytes()
         digest = hashlib.sha256(content).hexdigest()
         if content and seal.read_text(encoding="ascii") == digest:
-            return library.name, digest
+            return file.name, digest
     except (UnsafePath, OSError, ValueError):
         pass
-    source, made = scratch / f"{name}.c", scratch / f"{name}.so"
-    source.write_text(code, encoding="utf-8")
-    compiler.run(source, made, level)
+    source, made = scratch / f"{stem}.c", scratch / name
+    source.write_text(parts[0], encoding="utf-8")
+    compiler.run(source, made, parts[1], *linked())
     content = made.read_bytes()
     if not content:
         raise CompileError(f"{compiler.command[0]} has made an empty library of {source.name}")
     digest = hashlib.sha256(content).hexdigest()
-    put(library, content, mode=0o700)
+    put(file, content, mode=0o700)
     put(seal, digest.encode())
-    return library.name, digest
+    return file.name, digest
 
 
 def longest_body(function: Buildable) -> int:

@@ -2,10 +2,11 @@
 
 CasADi's C takes the instances one after the other, a number at a time. The same operations on vectors need
 about as many of the CPU's instructions for eight instances as for one. They are numbers, which a few loops go
-through: a compiler has the loops to compile, and nothing else.
+through.
 
 As C, an operation a line, a function of TALOS keeps a compiler busy for ten seconds. As numbers it is there
-at once: an operation is the places of what it reads and of what it writes. Loops over runs of equal
+at once: an operation is the places of what it reads and of what it writes. The loops are the same for all
+functions, and are compiled once. Loops over runs of equal
 operations are as quick as the lines were, megabytes of code that a CPU has to fetch, too. So operations are
 brought into an order with long runs. None comes `WINDOW` operations before its turn: what they work on would
 leave the caches. None is done twice, and a product and the sum with it are one.
@@ -25,7 +26,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from impactopt.codegen.compiler import NativeCode, address, find_compiler, native_library
+from impactopt.codegen.compiler import NativeCode, SharedCode, address, find_compiler, native_library
 from impactopt.problem.block import LANES
 
 __all__ = ["LESS_PRODUCT", "PRODUCT_LESS", "SUM_OF_PRODUCT", "Arranged", "arranged", "in_lanes"]
@@ -53,7 +54,6 @@ class Arranged:
     """
 
     words: npt.NDArray[np.uint32]
-    kinds: frozenset[int]
     constants: tuple[float, ...]
     places: int
 
@@ -99,17 +99,7 @@ def arranged(function: ca.Function, known: Mapping[int, int]) -> Arranged | None
     )
     if length < 0:
         raise MemoryError(f"{function.name()}: no memory for {n} operations")
-    done = {*kinds.tolist()} - {_LOAD, _STORE}
-    return Arranged(
-        words[:length].copy(),
-        frozenset(
-            done
-            | {ca.OP_ASSIGN}
-            | ({SUM_OF_PRODUCT, PRODUCT_LESS, LESS_PRODUCT} if ca.OP_MUL in done else set())
-        ),
-        constants,
-        int(places[0]),
-    )
+    return Arranged(words[:length].copy(), constants, int(places[0]))
 
 
 def _pairs(of: Callable[[int], Sequence[int]], count: Numbers) -> tuple[Numbers, Numbers]:
@@ -193,10 +183,20 @@ def _formula(kind: int) -> str:
 
 _OPERANDS = {k: len({*re.findall(r"\b[abc]\b", _formula(k))}) for k in (*_OF_VECTORS, *_IN_EACH_LANE)}
 
-_HEAD = """#include <math.h>
+_VECTORS = """#define LANES %d
+#include <math.h>
 #include <stdint.h>
+typedef %s place;
 typedef double vec __attribute__((vector_size(8 * LANES)));
-#define ALL(number) ((vec){0} + (number))
+/* in one library with what calls them, and unknown outside of it */
+#pragma GCC visibility push(hidden)
+void into_lanes(const double *columns, int rows, vec *out);
+void out_of_lanes(const vec *rows, int count, double *columns);
+void into_all_lanes(const double *numbers, int count, vec *out);
+void run_in_lanes(const place *p, const place *stop, vec *v);
+#pragma GCC visibility pop
+"""
+_HEAD = """#define ALL(number) ((vec){0} + (number))
 /* loops over lanes, which are to become vectors */
 #define LOOPS __attribute__((optimize("O3", "no-math-errno", "no-trapping-math")))
 #define IN_EACH_LANE(name, formula) \\
@@ -206,14 +206,17 @@ typedef double vec __attribute__((vector_size(8 * LANES)));
     return c; \\
   }
 /* from a column an instance to a lane an instance, and back */
-LOOPS static void into_lanes(const double *columns, int rows, vec *out) {
+LOOPS void into_lanes(const double *columns, int rows, vec *out) {
   for (int k = 0; k < rows; k++)
     for (int i = 0; i < LANES; i++) out[k][i] = columns ? columns[i * rows + k] : 0;
 }
-LOOPS static void out_of_lanes(const vec *rows, int count, double *columns) {
+LOOPS void out_of_lanes(const vec *rows, int count, double *columns) {
   if (columns)
     for (int i = 0; i < LANES; i++)
       for (int k = 0; k < count; k++) columns[i * count + k] = rows[k][i];
+}
+void into_all_lanes(const double *numbers, int count, vec *out) {
+  for (int k = 0; k < count; k++) out[k] = ALL(numbers[k]);
 }
 #define OPERANDS_1 vec a = v[p[0]];
 #define OPERANDS_2 vec a = v[p[0]], b = v[p[1]];
@@ -224,7 +227,7 @@ LOOPS static void out_of_lanes(const vec *rows, int count, double *columns) {
     _Pragma("GCC unroll 4") for (; p < end; p += n + 1) { OPERANDS_##n v[p[n]] = formula; } \\
     break;
 """
-_LOOPS = """static void run(const place *p, const place *stop, vec *v) {
+_LOOPS = """void run_in_lanes(const place *p, const place *stop, vec *v) {
   while (p < stop) {
     const place kind = p[0], count = p[1], *end;
     p += 2;
@@ -246,29 +249,36 @@ def in_lanes(functions: Sequence[ca.Function], lanes: int = LANES) -> list[Nativ
         is, as all do where there is no compiler: how many instances a function takes is read off its columns.
     """
     programs = {f: found for f in functions if (found := arranged(f, _OPERANDS)) is not None}
-    code = _code(programs, lanes)
-    return [_native(f, code) if f in programs else f for f in functions]
-
-
-def _native(function: ca.Function, code: str) -> NativeCode:
-    return NativeCode(name=function.name(), code=code, graph=lambda: function, level=_LEVEL)
-
-
-def _code(programs: Mapping[ca.Function, Arranged], lanes: int) -> str:
-    """One translation unit: the loops, and of each function its program."""
-    kinds = sorted({kind for program in programs.values() for kind in program.kinds})
     short = all(program.places <= 1 << 16 for program in programs.values())
-    head = f"#define LANES {lanes}\n{_HEAD}typedef {'uint16_t' if short else 'uint32_t'} place;"
-    each = [f"IN_EACH_LANE(op_{kind}, {_IN_EACH_LANE[kind]})" for kind in kinds if kind in _IN_EACH_LANE]
-    loops = _LOOPS % "\n      ".join(map(_run, kinds))
+    place = "uint16_t" if short else "uint32_t"
+    code, loops = _code(programs, lanes, place), _loops(lanes, place)
+
+    def native(function: ca.Function) -> NativeCode:
+        # without loops of its own, there is nothing to optimize
+        return NativeCode(name=function.name(), code=code, graph=lambda: function, level="-O0", shared=loops)
+
+    return [native(f) if f in programs else f for f in functions]
+
+
+@functools.cache
+def _loops(lanes: int, place: str) -> SharedCode:
+    """Loops over operations of all kinds, that every function's program runs through."""
+    each = [f"IN_EACH_LANE(op_{kind}, {formula})" for kind, formula in _IN_EACH_LANE.items()]
+    loops = _LOOPS % "\n      ".join(map(_run, _OPERANDS))
+    code = "\n".join([_VECTORS % (lanes, place), _HEAD, *each, loops])
+    return SharedCode(name="lanes", code=code, level=_LEVEL)
+
+
+def _code(programs: Mapping[ca.Function, Arranged], lanes: int, place: str) -> str:
+    """One translation unit: of each function its program, and calls of the loops."""
     data = []
     for k, program in enumerate(programs.values()):
-        words = program.words.astype(np.uint16 if short else np.uint32).tobytes()
+        words = program.words.astype(np.dtype(place.removesuffix("_t"))).tobytes()
         text = "".join(map(_LITERAL.__getitem__, words))
         constants = ", ".join(map(_number, program.constants)) or "0"
         data.append(f"static const double constants_{k}[] = {{{constants}}};")
         data.append(f'static const char program_{k}[] __attribute__((aligned(64))) = "{text}";')
-    return "\n".join([head, *each, loops, *data, _interface(programs, lanes)])
+    return "\n".join([_VECTORS % (lanes, place), *data, _interface(programs, lanes)])
 
 
 def _body(function: ca.Function, program: Arranged, number: int) -> list[str]:
@@ -277,13 +287,13 @@ def _body(function: ca.Function, program: Arranged, number: int) -> list[str]:
     for i in range(function.n_in()):
         before.append(f"into_lanes(arg[{i}], {function.nnz_in(i)}, v + {at});")
         at += function.nnz_in(i)
-    before.append(f"for (int k = 0; k < {constants}; k++) v[{at} + k] = ALL(constants_{number}[k]);")
+    before.append(f"into_all_lanes(constants_{number}, {constants}, v + {at});")
     at += constants
     for i in range(function.n_out()):
         after.append(f"out_of_lanes(v + {at}, {function.nnz_out(i)}, res[{i}]);")
         at += function.nnz_out(i)
     start = f"(const place *)program_{number}"
-    return [*before, f"run({start}, {start} + {program.words.size}, v);", *after]
+    return [*before, f"run_in_lanes({start}, {start} + {program.words.size}, v);", *after]
 
 
 def _run(kind: int) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 import warnings
 from pathlib import Path
@@ -680,6 +681,15 @@ def test_the_command_writes_a_file_once(tmp_path: Path) -> None:
     again = CliRunner().invoke(app, words)
     assert again.exit_code == 2 and "already" in again.output
     assert CliRunner().invoke(app, ["new", "punch", "--urdf", "x"]).exit_code == 2
+
+
+def test_a_robots_file_in_place_of_a_name_is_drafted_for(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(urdfs.arm())
+    done = CliRunner().invoke(app, ["new", str(tmp_path / "arm.urdf"), "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["data"]["robot"]["urdf"].endswith("arm.urdf")
+    gone = CliRunner().invoke(app, ["new", "gone.xml"])
+    assert gone.exit_code == 2 and "MJCF gone.xml: no such file" in gone.output
 
 
 def test_angles_are_those_of_the_posture(tmp_path: Path) -> None:

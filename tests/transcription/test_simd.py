@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -139,6 +140,36 @@ def test_functions_of_a_block_are_one_library(cache: Path) -> None:
     compiled(*derivative_functions("all", *every_operation()))
     (library,) = [path for path in cache.glob("*.so") if "arrange" not in path.name]
     assert library.name.startswith("all-")
+
+
+def of_loops(cache: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in cache.glob("*.o")}
+
+
+@needs_compiler
+def test_functions_of_other_blocks_have_the_same_loops(cache: Path) -> None:
+    x, given = ca.SX.sym("x", 2), np.arange(2.0 * LANES).reshape(2, LANES)
+    first, second = ca.Function("f", [x], [3 * x]), ca.Function("g", [x], [ca.sin(x) + x[0]])
+    found = {**compiled(first), **cached("others", (), lambda: in_lanes([second]))}
+    assert len(of_loops(cache)) == 1 and {path.name[:2] for path in cache.glob("[fg]-*.so")} == {"f-", "g-"}
+    for function in (first, second):
+        np.testing.assert_array_equal(found[function.name()](given), function.map(LANES)(given))
+
+
+@needs_compiler
+@pytest.mark.parametrize("mode", [0o700, 0o722])
+def test_loops_that_others_could_have_written_are_not_linked(cache: Path, mode: int) -> None:
+    x, given = ca.SX.sym("x", 2), np.arange(2.0 * LANES).reshape(2, LANES)
+    compiled(ca.Function("f", [x], [3 * x]))
+    ((loops, content),) = of_loops(cache).items()
+    loops.write_bytes(b"of someone else")
+    if mode != 0o700:
+        loops.with_suffix(".sha256").write_text(hashlib.sha256(loops.read_bytes()).hexdigest())
+    loops.chmod(mode)
+    second = ca.Function("g", [x], [x - 1])
+    found = cached("others", (), lambda: in_lanes([second]))["g"]
+    np.testing.assert_array_equal(found(given), second.map(LANES)(given))
+    assert of_loops(cache) == {loops: content} and loops.stat().st_mode & 0o022 == 0
 
 
 @needs_compiler

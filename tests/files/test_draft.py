@@ -590,6 +590,14 @@ def test_followers_of_grippers_are_locked_with_their_leaders(tmp_path: Path) -> 
     assert {"slide_0", "slide_1"} <= read_toml(draft.text)["robot"]["locked_rad"].keys()
 
 
+def test_hips_that_share_a_motor_are_locked_straight(tmp_path: Path) -> None:
+    law = 'joint="left_hip_yaw" multiplier="-1" offset="0"'
+    problem = _problem(tmp_path, urdfs.following(urdfs.biped(), "right_hip_yaw", law))
+    locked = read_toml((tmp_path / "robot.toml").read_text())["robot"]["locked_rad"]
+    assert locked["left_hip_yaw"] == locked["right_hip_yaw"] == 0.0
+    assert [sole.hinge is not None for sole in problem.robot.soles] == [True, True]  # legs of five joints
+
+
 def test_a_follower_that_cannot_follow_is_locked_where_its_leader_is_bent(tmp_path: Path) -> None:
     text = urdfs.following(urdfs.arm(), "shoulder", 'joint="elbow" multiplier="-0.5" offset="0.1"')
     draft = _drafted(tmp_path, text)

@@ -84,7 +84,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if is_floating(first.model) and not floats:
         _check_bolted(first, found)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
-    if led := _on_legs(first, found.robot, legs):  # a sole is held by six motors of its own leg
+    if led := _on_legs(found.robot, legs):  # a sole is held by six motors of its own leg
         locked |= led
         found = _made(path, mjcf, True, locked)
         legs = legs_of(found.robot.model, found.pieces)
@@ -107,13 +107,17 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     return replace(found, legs=legs, arms=arms)
 
 
-def _on_legs(read: Description, robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
-    """Followers on legs whose leaders are not of the same leg alone, and why they are locked."""
-    names, out = [str(name) for name in robot.model.names], set[str]()
+def _on_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
+    """Followers on legs whose leaders are not of the same leg alone, with their leaders, and why both are
+    locked: with one leg turned and the other not, a robot stands badly.
+    """
+    names, out = [str(name) for name in robot.model.names], dict[str, str]()
     for leg, own in zip(legs, unshared(robot.model, legs), strict=True):
-        led = {names[j] for j in leg.path} & robot.couplings.keys()
-        out |= {name for name in led if robot.couplings[name].leader not in {names[j] for j in own}}
-    return {tie.follower: _why_locked(tie) for tie in read.ties if tie.follower in out}
+        for follower in sorted({names[j] for j in leg.path} & robot.couplings.keys()):
+            leader = robot.couplings[follower].leader
+            if leader not in {names[j] for j in own}:
+                out |= dict.fromkeys((leader, follower), f"{follower} follows {leader}")
+    return out
 
 
 def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:

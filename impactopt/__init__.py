@@ -81,6 +81,7 @@ _EXPORTS = {
     "robot_names": "robots.presets",
     "sensitivity_of": "planning.replanning",
     "solve": "api",
+    "space_arm": "robots.presets",
     "standin": "robots.presets",
     "striking_velocity": "kinematics.operational_space",
     "sweep": "sweeps",

@@ -1,5 +1,7 @@
 """Independent coordinates of a robot whose soles are held: the base's pose and the joints outside its legs.
 
+Of a robot that nothing holds they are the base's pose and all joints.
+
 References and distances between bodies ask for thousands of them, so what all have in common is kept.
 
 A motion that is written in these coordinates y keeps its soles where they are at *every* instant, not only at
@@ -41,6 +43,7 @@ __all__ = [
     "StanceCoordinates",
     "base_motion",
     "elimination_order",
+    "independent_rates",
     "solve_in_order",
     "solved",
     "striker_kinematics",
@@ -199,6 +202,17 @@ def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
     )
 
 
+def independent_rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
+    """ydot (ny) of a Pinocchio velocity."""
+    rates, b = np.zeros(c.ny), c.base
+    if b:
+        # v is linear in them
+        columns = [base_motion(y[:6], unit, np.zeros(6))[0] for unit in np.eye(6)]
+        rates[:6] = np.linalg.solve(np.transpose(columns), v[:6])
+    rates[b:] = v[b + c.independent]
+    return rates
+
+
 def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:
     """Row and column order in which Gaussian elimination needs no pivoting at any of the sample matrices.
 
@@ -288,6 +302,7 @@ class StanceCoordinates:
     ----------
     ny, nl : number of independent coordinates, and of dependent leg joints (6 a fixed sole or hand).
     soles, legs, hands : fixed soles; legs of soles and, after them, of hands; the legs of hands alone.
+    drifts : nothing holds the base, so that the joints' motion moves it: its momentum is conserved.
     independent : (ny - 6 or ny,) indices of the independent joints among the robot's joints.
     undriven : indices in v of what no motor moves but the soles' wrenches: the base, and soles' hinges.
     labels : names of the independent coordinates.
@@ -303,11 +318,6 @@ class StanceCoordinates:
         self.robot, self.soles, self.posture = robot, soles, posture
         self.model, self.data = robot.model, robot.model.createData()
         self.base = 6 if robot.floating else 0
-        if robot.floating and not soles:
-            raise InputError(
-                f"{robot.name} has a free-flyer: a stance needs at least one sole (or build it with "
-                "floating=False)"
-            )
         check_legs(self.model, [(sole.name, sole.frame) for sole in soles])
         lifted = [sole.name for sole in robot.soles if sole.hinge is not None and sole not in soles]
         if lifted:
@@ -329,6 +339,7 @@ class StanceCoordinates:
             order = elimination_order(self._leg_samples(frame, chain, posture))
             self.legs.append(Leg(name, sole, frame, chain[-LEG:], chain[:-LEG], order, placement))
         self.hands = [leg for leg in self.legs if leg.sole is None]
+        self.drifts = bool(self.base) and not self.legs
         held = {int(j) for leg in self.legs for j in leg.joints}
         self.dependent = np.array([j for leg in self.legs for j in leg.joints], dtype=np.intp)
         self.independent = np.array([j for j in range(robot.n) if j not in held], dtype=np.intp)

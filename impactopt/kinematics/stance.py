@@ -136,7 +136,7 @@ class FixedBase(Stance):
 class Free(Stance):
     """Nothing holds the robot: it floats freely, as a space robot or one in flight does.
 
-    Its base is moved by the joints' reaction and by the blow. Models of a collision have it; plans do not.
+    Its base is moved by the joints' reaction, by gravity and by the blow.
     """
 
     def soles(self, robot: Robot) -> tuple[Sole, ...]:

@@ -73,6 +73,8 @@ def minimum_jerk_baseline(
     ------
     InputError : not even a touch at 1 cm/s keeps the limits; a problem with stance phases.
     """
+    if problem.floats:
+        raise InputError("a minimum-jerk reach gives the base a motion: it has none where nothing holds it")
     if problem.stances:
         raise InputError("a minimum-jerk reach keeps one stance: there is none for stance phases")
     # (-speed, bound, duration): the fastest reach without contact, or where `bound` is 1 no more than a bound

@@ -124,6 +124,8 @@ def solve(
         raise InputError(
             f"unknown start {start!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
         )
+    if problem.floats and isinstance(start, str) and start == "strike":
+        raise InputError(f"robot {problem.robot.name!r} floats freely, and has no strike: start from 'reach'")
     one = partial(_planned, seed, refine)
     with stopping() as stop:
         budget = replace(budget, stop=stop)

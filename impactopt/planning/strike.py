@@ -115,6 +115,11 @@ def optimize_strike(
         raise InputError(f'method {method!r} {gone}: give "collocation", or leave it out')
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
     check_starts(starts, seed, workers, callback, given=start is not None)
+    if problem.floats:
+        raise InputError(
+            f"robot {problem.robot.name!r} floats freely: what it can have at contact hangs on the swing, so "
+            "there is no strike by itself; solve the whole motion, from a reach"
+        )
     if all(o.whole_motion for o in problem.objectives):
         raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
     one = partial(_optimized, seed)

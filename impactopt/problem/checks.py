@@ -17,7 +17,6 @@ from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import Held
-from impactopt.kinematics.stance import Free
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.motion_style import STYLES
 from impactopt.problem.objectives import Penetration
@@ -93,7 +92,7 @@ def check_world(problem: Any) -> None:
     check_apart("obstacle", [o.name for o in obstacles])
     if ground is not None and not isinstance(ground, Ground):
         raise InputError(f"ground must be a Ground, such as Ground(height=-0.8), not {ground!r}")
-    if ground is not None and ground.height and problem.robot.floating:
+    if ground is not None and ground.height and problem.robot.floating and not problem.floats:
         raise InputError(
             f"the ground of {problem.robot.name!r} is z = 0, where its soles stand: leave `ground` out"
         )
@@ -104,11 +103,6 @@ def check_stance(problem: Any) -> None:
     ground that is not level.
     """
     robot, stance = problem.robot, problem.stance
-    if isinstance(stance, Free):
-        raise InputError(
-            f"a plan stands {robot.name!r} on soles or on a fixed base, and Free() lets it float: models of "
-            "a collision have that (SDC, FullDynamics, effective_mass; impactopt collide)"
-        )
     pull = np.array(robot.model.gravity.linear)
     if stance.sole_frames(robot) and not (pull[2] < 0 and not pull[:2].any()):
         raise InputError(

@@ -36,7 +36,7 @@ from impactopt.errors import (
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
-from impactopt.kinematics.stance import BothSoles, Stance
+from impactopt.kinematics.stance import BothSoles, Free, Stance
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.checks import (
     COLLISIONS,
@@ -129,7 +129,8 @@ class ImpactProblem:
     scenarios : other targets, or none, that the robot has to survive with the same swing.
     body : the target's shape, which all of the robot but the striking point keeps off.
     obstacles : bodies in the world that the robot keeps off.
-    ground : the floor below a robot on a fixed base; None: there is none. Soles stand on the ground z = 0.
+    ground : the floor below a robot on a fixed base, or one that floats freely; None: there is none. Soles
+        stand on the ground z = 0.
     terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
         `GearLoad`, whose constraints a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
@@ -236,6 +237,11 @@ class ImpactProblem:
         if self.scenarios and not self.lasts:
             raise InputError(f'scenarios need a contact that lasts, as "full", not {self.collision!r}')
         check_apart("scenario", [s.name for s in self.scenarios])
+        if self.floats and self.abort_after is not None:
+            raise InputError(
+                f"robot {self.robot.name!r} floats freely, and has no abort motion: leave abort_after out of "
+                "its scenarios"
+            )
 
     def _check_terms(self) -> None:
         listed = isinstance(self.terms, (list, tuple))
@@ -252,7 +258,7 @@ class ImpactProblem:
 
     def _check_objectives(self) -> None:
         turns = not isinstance(self.target, Target) or self.target.turns
-        allowed = {"contact": self.lasts, "turns": turns, "balance": self.robot.floating}
+        allowed = {"contact": self.lasts, "turns": turns, "balance": self.robot.floating and not self.floats}
         checked = check_objectives(self.objectives, **allowed)
         object.__setattr__(self, "objectives", checked)
 
@@ -399,6 +405,11 @@ class ImpactProblem:
         return np.array(found or [[True] * len(names)], dtype=bool)
 
     @property
+    def floats(self) -> bool:
+        """True if nothing holds the robot."""
+        return isinstance(self.stance, Free)
+
+    @property
     def soles(self) -> tuple[Sole, ...]:
         """The soles that stand at some time, in the robot's order."""
         if not self.stances:
@@ -474,7 +485,7 @@ class ImpactProblem:
     @property
     def ground_height(self) -> float | None:
         """[m] of the floor; None: there is none."""
-        if self.robot.floating:
+        if self.robot.floating and not self.floats:
             return 0.0
         return None if self.ground is None else self.ground.height
 
@@ -524,7 +535,7 @@ class ImpactProblem:
             "law": repr(self.law),
             "hash": self.hash,
         }
-        if not self.robot.floating:
+        if self.floats or not self.robot.floating:
             out["ground"] = "none" if self.ground_height is None else f"z = {self.ground_height:g} m"
         if self.collision != "full":
             frozen = f", {self.freezes} freezes" if self.freezes else ""

@@ -44,6 +44,7 @@ __all__ = [
     "arm_model",
     "link",
     "planar_arm",
+    "space_arm",
     "standin_model",
 ]
 
@@ -185,12 +186,16 @@ ARM7 = (
 # fmt: on
 
 
-def arm_model(name: str, links: tuple[Link, ...]) -> Any:
-    """The pin.Model of a chain on the frame `base`, which is fixed to the ground."""
-    model = pin.Model()
+def arm_model(name: str, links: tuple[Link, ...], base: Box | None = None) -> Any:
+    """The pin.Model of a chain on the frame `base`: fixed to the ground, or of a body that floats freely."""
+    model, still, root, above = pin.Model(), pin.SE3.Identity(), 0, 0
     model.name = name
-    model.addBodyFrame("base", 0, pin.SE3.Identity(), 0)
-    add_links(model, links, {"base": 0})
+    if base is not None:
+        root = model.addJoint(0, pin.JointModelFreeFlyer(), still, "root_joint")
+        above = model.addJointFrame(root)
+        model.appendBodyToJoint(root, base.inertia(), still)
+    model.addBodyFrame("base", root, still, above)
+    add_links(model, links, {"base": root})
     return model
 
 
@@ -242,6 +247,24 @@ def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
     robot = Robot.from_model(arm_model("arm7", ARM7), **{**options, **overrides})
     grip = [0.0, 0.0, FLANGE - 0.08]
     return robot.with_tool(Tool.hammer(frame="joint_7", grip=grip) if tool is None else tool)
+
+
+def space_arm(**overrides: Any) -> Robot:
+    """The arm of `arm7` on a satellite of 60 kg, a cube of 0.5 m that floats freely without gravity; made up.
+
+    * Joints, drives, servo, striker `fist` and posture `ready` are those of `arm7`.
+
+    `overrides` go to `Robot.from_model`.
+    """
+    options: dict[str, Any] = {
+        "name": "space_arm",
+        "kd": _soft_kd(ARM7),
+        "gravity": [0.0, 0.0, 0.0],
+        "strikers": (Striker(name="fist", frame="joint_7", point=np.array([0.0, 0.0, FLANGE - 0.08])),),
+        "postures": {"ready": {"joint_2": -0.3, "joint_4": 1.6, "joint_6": 0.27}},
+    }
+    bus = Box(mass=60.0, sides=(0.5, 0.5, 0.5), center=(0.0, 0.0, -0.25))
+    return Robot.from_model(arm_model("space_arm", ARM7, bus), **{**options, **overrides})
 
 
 # Between the hips, on their axes. With thigh, shank and ankle it stands at 0.705 m.

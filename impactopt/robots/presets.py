@@ -1,4 +1,4 @@
-"""Robots ready to use: humanoids, and arms on a fixed base.
+"""Robots ready to use: humanoids, and arms on a fixed base or a satellite.
 
 The stand-in for HRP-2 and the arms need no files; TALOS and G1 are on the URDFs of the package
 example-robot-data, which the extra `robots` brings.
@@ -26,7 +26,17 @@ from impactopt.robots.robot import Robot, Sole, Striker
 
 P = ParamSpec("P")
 
-__all__ = ["arm7", "example_robots", "g1", "load_robot", "planar_arm", "robot_names", "standin", "talos"]
+__all__ = [
+    "arm7",
+    "example_robots",
+    "g1",
+    "load_robot",
+    "planar_arm",
+    "robot_names",
+    "space_arm",
+    "standin",
+    "talos",
+]
 
 
 def _preset(make: Callable[P, Robot]) -> Callable[P, Robot]:
@@ -39,7 +49,7 @@ def _preset(make: Callable[P, Robot]) -> Callable[P, Robot]:
     return made
 
 
-arm7, planar_arm = _preset(_arms.arm7), _preset(_arms.planar_arm)
+arm7, planar_arm, space_arm = map(_preset, (_arms.arm7, _arms.planar_arm, _arms.space_arm))
 
 
 @_preset
@@ -279,6 +289,7 @@ _PRESETS: dict[str, Callable[..., Robot]] = {
     "g1": g1,
     "planar_arm": planar_arm,
     "arm7": arm7,
+    "space_arm": space_arm,
 }
 
 

@@ -27,6 +27,7 @@ from impactopt.robots.tools import check_sole, with_hinges
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
 
 Array = NDArray[np.float64]
+STRONGEST = 1e3  # [m/s2] of gravity
 PerJoint = float | Mapping[str, float] | ArrayLike | None
 
 
@@ -197,6 +198,7 @@ class Robot:
         urdf: str | PathLike[str] | None = None,
         mjcf: str | PathLike[str] | None = None,
         actuators: Mapping[str, Actuator] | None = None,
+        gravity: ArrayLike | None = None,
     ) -> Robot:
         """A robot from a pin.Model (which is copied): a free-flyer, if any, first, and then one-DOF joints.
 
@@ -218,12 +220,15 @@ class Robot:
         disable_collisions : pairs of links that may pass through each other.
         urdf, mjcf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
         actuators : motors and gears, as of `with_actuators`; friction is the model's where they have none.
+        gravity (3,) : [m/s2], world axes; default the model's.
         """
         build.check_count("sole", soles)
         build.check_count("striker", strikers)
         model = model.copy()
         tell_apart(model)
         checks.check_joint_types(model)
+        if gravity is not None:
+            model.gravity.linear = check_array("gravity [m/s2]", gravity, (3,), most=STRONGEST)
         joints = build.joint_names(model)
         base = model.nv - len(joints)
         model.armature[base:] = build.armature(model, joints, armature, rotor or {})

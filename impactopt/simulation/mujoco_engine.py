@@ -47,7 +47,7 @@ THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after 
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
-SETTLES, SETTLES_BOLTED = 2.0, 0.3  # [s] beyond the motion: a robot on its feet may fall late
+SETTLES, SETTLES_SOLELESS = 2.0, 0.3  # [s] beyond the motion: a robot on its feet may fall late
 TOUCHING = 1e-9  # [m] that the robot starts lower: soles that rounding has above the floor bear nothing
 MOVED = 1e-3  # [m] from one step to the next: a striking link meets the target at another point
 SLID = 0.05  # [m] of a sole along the floor, about half of one's width: it stands where it was not to
@@ -130,7 +130,7 @@ class _Replay(MujocoRobot):
 
     def start(self, q: Array) -> None:
         self.put(q)
-        if self.floating:
+        if self.scene.soles:
             self.data.qpos[2] -= TOUCHING
         self.mujoco.mj_kinematics(self.world, self.data)
         self.grips.put(self.data)
@@ -255,7 +255,7 @@ class _Replay(MujocoRobot):
         time [s], which may bow deeply itself. A robot that recovers reaches the reference's postures after
         the blow later.
         """
-        if not self.floating:
+        if not self.scene.soles:
             return ""
         times = self.servo.time
         row = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
@@ -277,7 +277,7 @@ class _Replay(MujocoRobot):
 
     def not_standing(self, simulation: Simulation) -> str:
         """Reason why the robot does not stand at the end of its simulation; "" if it does."""
-        if not self.floating:
+        if not self.scene.soles:
             return ""
         lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))
         if lean > LEANS:
@@ -318,7 +318,7 @@ def simulate_mujoco(
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
 
-    settle : by default 2 s, in which it can fall, and 0.3 s for a robot that is bolted down.
+    settle : by default 2 s, in which it can fall, and 0.3 s for a robot without soles.
     reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of
     :class:`impactopt.transcription.plan.Trajectory`. step [s], iterations, tolerance : of MuJoCo
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
@@ -344,7 +344,7 @@ def simulate_mujoco(
             f"contact {contact!r}{did_you_mean(contact, CONTACTS)}: give one of {', '.join(CONTACTS)}"
         )
     world = perturbation if perturbation is not None else Perturbation()
-    beyond = settle if settle is not None else SETTLES if robot.floating else SETTLES_BOLTED
+    beyond = settle if settle is not None else SETTLES if scene.soles else SETTLES_SOLELESS
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller, contact)
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo

@@ -92,6 +92,7 @@ def sizes(
         "join": {"travel": 1},
         "link": {"contact": 1, "position": 1, "rate": 1},
         "pace": {"rate": 1},
+        "momentum": {"momentum": base},
     }[block]
 
 
@@ -220,6 +221,21 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
     return make_block([y, y1, legs, T], [polygon], out, [(u, y1 / T)], lanes=2, stages=stages)
 
 
+def momentum(c: StanceCoordinates) -> BlockExpression:
+    """Momentum of a robot that nothing holds.
+
+    z = y, y', T;  p = weight [N], lever [m];  out = linear momentum and angular momentum about the centre of
+    mass, world axes, over weight and weight x lever [s].
+    """
+    y, y1, T, u = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T"), ca.SX.sym("u", c.ny)
+    rb, none = c.rb, ca.SX(0, 1)
+    weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
+    found = ca.Function("momentum", [rb.q, rb.v], [rb.centroidal_momentum(rb.v)])
+    v, stages = velocity_in_stages(c, y, none, u)
+    out = found(c.configuration(y, none), v) / base_scale(c, weight, lever)
+    return make_block([y, y1, T], [weight, lever], {"momentum": out}, [(u, y1 / T)], stages=stages)
+
+
 def builders(
     c: StanceCoordinates,
     striker: str,
@@ -268,6 +284,7 @@ def builders(
         **({"impact": lambda: impact(c, striker)} if instant else hit),
         "link": link,
         **({"balance": lambda: balance(c, edges)} if c.legs else {}),
+        **({"momentum": lambda: momentum(c)} if c.drifts else {}),
         **({"spring": lambda: spring(c, chosen)} if c.robot.sprung.any() else {}),
     }
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 from scipy.optimize import lsq_linear
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.coordinates import StanceCoordinates, independent_rates
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
 from impactopt.problem.problem import ImpactProblem
@@ -24,6 +24,7 @@ from impactopt.transcription.contact_refinement import carry_contact, same_place
 from impactopt.transcription.layout import Array, Group, Row
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase
+from impactopt.transcription.plan import drifting_reference
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 
@@ -85,7 +86,8 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     if bounds is not None:
         mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]
         speed = speed_that_leaves(p.law, p.target, mass, speed, bounds.least, bounds.most)
-    rates = strike_rates(c, p.strikers, y, legs, speed * p.normal)
+    ease = {"base": 0.0} if c.drifts else {}  # its momentum says how it moves
+    rates = strike_rates(c, p.strikers, y, legs, speed * p.normal, **ease)
     return Contact(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
 
 
@@ -102,14 +104,37 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     swing = quintic(start, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
     # half of the rates is left after contact, as where two like masses meet
     back = quintic(hit.y, 0.5 * hit.rates, end, zero, follow_T, t.follow.breaks)
-    x = _motion(
-        t,
-        CubicSpline.fit(swing, t.swing.breaks, zero, hit.rates, swing_T),
-        CubicSpline.fit(back, t.follow.breaks, 0.5 * hit.rates, zero, follow_T),
-    )
+    curve = CubicSpline.fit(swing, t.swing.breaks, zero, hit.rates, swing_T)
+    after = CubicSpline.fit(back, t.follow.breaks, 0.5 * hit.rates, zero, follow_T)
+    if t.coordinates.drifts:
+        curve = _drifting(t.problem, curve)
+        hit = replace(hit, y=curve.sample(swing_T)[0][0], rates=curve.sample(swing_T)[1][0])
+        after = _drifting(t.problem, after, hit)
+    x = _motion(t, curve, after)
     t.hit.guess(x, hit.y, hit.rates, hit.legs)
     _draw_gains(t, x, noise, seed)
     return _finished(t, x)
+
+
+def _drifting(problem: ImpactProblem, curve: CubicSpline, since: Contact | None = None) -> CubicSpline:
+    """The spline with its joints' motion, and the base where that takes it if nothing holds it.
+
+    since : the state in which it begins; None: that of the spline.
+    """
+    breaks, c = curve.breaks, problem.coordinates
+    fine = with_middles(with_middles(breaks))
+    time = fine * curve.duration
+
+    def sample(at: Array) -> tuple[Array, ...]:
+        rows = curve.sample(at)
+        if since is not None and not at[0]:
+            rows[0][0, :6], rows[1][0, :6] = since.y[:6], since.rates[:6]
+        return rows
+
+    found = drifting_reference(problem, sample, time, backward=False)
+    y = np.array([c.split(q)[0] for q in found.q])
+    rates = [independent_rates(c, y[k], found.v[k]) for k in (0, -1)]
+    return CubicSpline.fit(y[np.isin(fine, breaks)], breaks, rates[0], rates[1], curve.duration)
 
 
 def strike_iterate(t: StrikeTranscription, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Array:

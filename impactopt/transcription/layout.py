@@ -375,6 +375,7 @@ class Rows:
 GRAVITY = 9.81
 LEVER = 0.1  # [m] scale of sole moments against forces
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
+FREE_BOX = np.array([10.0, 10.0, 10.0, 3.0, 1.2, 3.0])  # the same of one that nothing holds
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -400,7 +401,7 @@ class Limits:
         self.extension = p.term(LegExtension)
         self.weight = GRAVITY * float(sum(i.mass for i in r.model.inertias))
         lower, upper = inside(r, self.position.margin)
-        box, y0 = BASE_BOX[: c.base], c.start
+        box, y0 = (FREE_BOX if c.drifts else BASE_BOX)[: c.base], c.start
         self.y_lower = np.concatenate([y0[: c.base] - box, lower[c.independent]])
         self.y_upper = np.concatenate([y0[: c.base] + box, upper[c.independent]])
         self.legs_lower, self.legs_upper = lower[c.dependent], upper[c.dependent]

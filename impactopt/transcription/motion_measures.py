@@ -29,7 +29,7 @@ def motion_measures(problem: ImpactProblem, reference: Trajectory) -> dict[str, 
     peak_jerk_rad_s3 : largest jerk of a joint in swing and follow-through [rad/s^3].
     work_J : positive mechanical work of all joints before contact [J].
     end_posture_rad : largest distance of a joint from the start posture at the end [rad].
-    ground_force_share : least and largest normal force of the ground, over the weight; None on a fixed base.
+    ground_force_share : least and largest normal force of the ground, over the weight; None without soles.
     """
     robot, n = problem.robot, problem.robot.n
     rate, bend = reference.v[:, -n:], reference.a[:, -n:]
@@ -76,8 +76,8 @@ def first_touch(plan: Plan) -> dict[str, float | None]:
 
 
 def ground_force_share(problem: ImpactProblem, normal: Array) -> list[float] | None:
-    """Least and largest of normal forces (k,) [N] of the ground, over the weight; None on a fixed base."""
-    if not problem.robot.floating or not len(normal):
+    """Least and largest of normal forces (k,) [N] of the ground, over the weight; None without soles."""
+    if not problem.soles or not len(normal):
         return None
     weight = weight_of(problem.robot)
     return [float(normal.min() / weight), float(normal.max() / weight)]

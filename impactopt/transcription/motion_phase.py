@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_state import Contact, ContactState
 from impactopt.transcription.layout import (
     DIRECTIONS,
+    GRAVITY,
     Affine,
     Array,
     Group,
@@ -158,6 +160,8 @@ class MotionPhase:
     breaks : of the spline, from 0 to 1.  nodes (k,) : where legs and sole wrenches are, and constraints hold.
     more : which of these are beside the ends and middles of the spline's intervals.
     c, legs, w, T : variables: control points, legs and sole wrenches at the nodes, duration [s].
+    drift, bend : of a base that nothing holds: its part of the control points that an end at rest, or
+        without acceleration, gives for joints; and its y'' at the nodes, which their forces determine.
     unloaded : components of the sole wrenches that are zero, by the number of the node.
     """
 
@@ -193,6 +197,18 @@ class MotionPhase:
         self.legs = b.layout.add(f"{self.kind} legs", nodes, b.nl, **limits.of_legs)
         self.w = b.layout.add(f"{self.kind} sole wrench", nodes, b.nw, **limits.of_wrenches)
         self.T = b.duration(f"{self.kind} duration", self.phase.duration, 0.1)
+        self.drift: Group | None = None
+        self.bend: Group | None = None
+        self._drifting: tuple[int, ...] = ()
+        if b.coordinates.drifts:
+            self._drifting = ((2,) if begins == REST else ()) + {
+                REST: (self._last - 1, self._last),
+                COASTING: (self._last,),
+            }[str(ends)]
+            names, box = b.coordinates.labels[:6], {k: limits.of_y[k][:6] for k in ("lower", "upper")}
+            count = len(self._drifting)
+            self.drift = b.layout.add(f"{self.kind} base control point", count, 6, labels=names, **box)
+            self.bend = b.layout.add(f"{self.kind} base acceleration", nodes, 6, labels=names)
 
     def control(self, j: int) -> Affine:
         """Control point j = 0 .. N+2 of the spline.
@@ -202,6 +218,12 @@ class MotionPhase:
         ends with is the feed-forward of the collision: it does not jump, and a target that comes late meets
         the same motion.
         """
+        point = self._control(j)
+        if self.drift is None or j not in self._drifting:
+            return point
+        return stack([self.drift[self._drifting.index(j)], point[6:]])
+
+    def _control(self, j: int) -> Affine:
         if j < self.lead:
             return self._y0 if isinstance(self._begins, str) else self._begins
         if j < self.lead + self.c.count:
@@ -231,12 +253,17 @@ class MotionPhase:
         on = ~np.isin(w.rows, self.unloaded.get(k, ()))
         return w if on.all() else Affine(w.size, w.rows[on], w.cols[on], w.vals[on], w.const)
 
+    def at_node(self, k: int) -> tuple[Affine, Affine, Affine]:
+        """y, y', y'' at a node."""
+        y, y1, y2 = self.at(float(self.nodes[k]))
+        return y, y1, y2 if self.bend is None else stack([self.bend[k], y2[6:]])
+
     def place_at(self, s: float) -> Place:
         return Place(f"{self.name}, {percentage(s, self.more)}", f"{self.name} at {{s}}", self.T[0] * s)
 
     def instances(self) -> tuple[list[list[Affine]], list[Place]]:
         """Slots of the block ``node``, and the places of its instances."""
-        slots = [[*self.at(s), self.legs[k], self.wrench(k), self.T[0]] for k, s in enumerate(self.nodes)]
+        slots = [[*self.at_node(k), self.legs[k], self.wrench(k), self.T[0]] for k in range(len(self.nodes))]
         return slots, [self.place_at(s) for s in self.nodes]
 
     def motion(self) -> list[tuple[Place, list[Affine]]]:
@@ -259,6 +286,8 @@ class MotionPhase:
         found = [
             [*by_leg(self.legs.index(k)), self.w.index(k)[self._bearing(k)]] for k in range(self.w.count)
         ]
+        if self.bend is not None:
+            found = [[self.bend.index(k)] for k in range(self.bend.count)]
         return [each for parts in found for each in at_node(parts)]
 
     # ------------------------------------------------------------------ constraints
@@ -304,12 +333,47 @@ class MotionPhase:
                     measure=fast,
                 )
 
+    def add_momentum_rows(self, b: Builder) -> None:
+        """Rows: the momentum of a robot that nothing holds is what it was at the phase's start, and what
+        gravity adds.
+
+        They hold in the middles of the spline's intervals and at its end: as many places as the base has
+        control points that are not known. A phase that begins at rest has none at first.
+        """
+        middles = (self.breaks[1:] + self.breaks[:-1]) / 2
+        first = [0.0] if self._begins == FREE else []
+        spots = [*first, *middles.tolist(), 1.0]
+        at = b.add_block("momentum", [[*self.at(s)[:2], self.T[0]] for s in spots], b.limits.units)
+        outputs = [at + 6 * i + np.arange(6) for i in range(len(spots))]
+        measure = [replace(each, unit=f"{each.unit} s") for each in b.limits.unbalanced]
+        before = Affine.zeros(6)
+        if first:
+            told: dict[str, Any] = {"term": "momentum", "place": self.place_at(0.0), "labels": DIRECTIONS}
+            before = b.lift(f"{self.kind} momentum", outputs[0], **told)[0]
+        pull = np.append(np.array(b.robot.model.gravity.linear) / GRAVITY, np.zeros(3))
+        for s, out in list(zip(spots, outputs, strict=True))[len(first) :]:
+            b.rows.add(
+                term="momentum",
+                place=self.place_at(s),
+                components=DIRECTIONS,
+                outputs=out,
+                affine=-before - stack([self.T[0]] * 6) * (s * pull),
+                lower=0,
+                upper=0,
+                measure=measure,
+            )
+
     # ------------------------------------------------------------------ numbers
     def guess(self, x: Array, curve: CubicSpline) -> None:
         """Write a spline and its duration, as far as its control points are variables."""
         points = curve.control[self.lead : self.lead + self.c.count].copy()
         if self._ends == REST:
             points[-1] = curve.control[-1]
+        if self.drift is not None and self.bend is not None:
+            points[-1, :6] = curve.control[self.lead + self.c.count - 1, :6]
+            self.drift.write(x, curve.control[list(self._drifting), :6])
+            second = curve.sample(self.nodes * curve.duration)[2] * curve.duration**2
+            self.bend.write(x, second[:, :6])
         self.c.write(x, points)
         self.T.write(x, curve.duration)
 
@@ -348,7 +412,7 @@ class Swing(MotionPhase):
     @property
     def end(self) -> ContactState:
         """The state at contact."""
-        return ContactState(*self.at(1.0), T=self.T[0], legs=self.legs[-1], w=self.w[-1])
+        return ContactState(*self.at_node(-1), T=self.T[0], legs=self.legs[-1], w=self.w[-1])
 
 
 class FollowThrough(MotionPhase):

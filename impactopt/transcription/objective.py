@@ -117,6 +117,7 @@ def _priced(
     """Integrals by the nodes' shares of a phase; its typical duration makes all of it quadratic."""
     n, c = b.layout.n, b.coordinates
     speeds = np.full(b.ny, prices.speed)
+    speeds[: c.base] *= not c.drifts  # the blow says how fast it drifts
     speeds[c.base :] += prices.idle_speed * b.problem.idle_joints[c.independent]
     priced: list[Affine] = []
     for motion in motions:
@@ -138,8 +139,9 @@ def _priced(
     linear, constant = m.T @ constants, float(constants @ constants) / 2
     diagonal = np.zeros(n)
     for motion in to_rest:  # price (y_end - y_start)^2
-        end = motion.c.index(-1)
+        known = 6 * c.drifts
+        end, start = motion.c.index(-1)[known:], b.y0[known:]
         diagonal[end] += 2 * prices.end
-        linear[end] -= 2 * prices.end * b.y0
-        constant += prices.end * float(b.y0 @ b.y0)
+        linear[end] -= 2 * prices.end * start
+        constant += prices.end * float(start @ start)
     return Prices(m.T @ m + sp.diags_array(diagonal), linear, constant)

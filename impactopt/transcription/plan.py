@@ -5,9 +5,9 @@ This is the border to everything that checks, draws or executes a plan: arrays o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -98,6 +98,61 @@ def complete_reference(
     last = np.maximum.accumulate(np.where(moves, np.arange(n), 0))
     q, v, a, torque, corrected = (part[last] for part in (q, v, a, torque, corrected))
     return Completed(q, v, a, torque, total_ground_wrench(c, corrected), corrected)
+
+
+def drifting_reference(
+    problem: ImpactProblem, sample: Callable[[Array], Sequence[Array]], time: Array, *, backward: bool
+) -> Completed:
+    """Full motion and torques of a robot that nothing holds, whose base follows from the joints' motion.
+
+    sample : y, yd, ydd (k, ny) at times (k,) [s].  The base's state is that of the first time, or, going
+    ``backward``, of the last one; from there its momentum changes by gravity alone. Between times it is
+    integrated by the classical Runge-Kutta method, so it is as exact as the joints are.
+    """
+    c, robot = problem.coordinates, problem.robot
+    model, data = robot.model, robot.model.createData()
+    order = np.arange(len(time))[:: -1 if backward else 1]
+    y, yd, ydd = (np.array(part) for part in sample(time)[:3])
+    none, pull = np.zeros(0), np.append(np.array(model.gravity.linear), np.zeros(3))
+    pull *= sum(inertia.mass for inertia in model.inertias)
+
+    def velocity(y: Array, yd: Array, momentum: Array) -> Array:
+        q, v = c.join(y, none), np.append(np.zeros(6), yd[6:])
+        pin.ccrba(model, data, q, v)
+        v[:6] = solved(np.array(data.Ag[:, :6]), momentum - np.array(data.hg.vector))
+        return v
+
+    def rates(y: Array, v: Array) -> Array:
+        jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
+        return np.append(pin.rpy.rpyToMatrix(y[3:6]) @ v[:3], solved(jac, v[3:6]))
+
+    start = order[0]
+    q, v, _ = c.complete_motion(y[start], yd[start], ydd[start], none)
+    momentum = np.array(pin.computeCentroidalMomentum(model, data, q, v).vector)
+    middles, middle_rates, _ = sample((time[1:] + time[:-1]) / 2)[:3]
+    for one, other in pairwise(order.tolist()):
+        h, between = time[other] - time[one], min(one, other)
+        base, steps = y[one, :6], list[Array]()
+        for share, (joints, joint_rates) in (
+            (0.0, (y[one], yd[one])),
+            (0.5, (middles[between], middle_rates[between])),
+            (0.5, (middles[between], middle_rates[between])),
+            (1.0, (y[other], yd[other])),
+        ):
+            at = np.append(base + share * h * steps[-1] if steps else base, joints[6:])
+            since = time[one] + share * h - time[start]
+            steps.append(rates(at, velocity(at, joint_rates, momentum + since * pull)))
+        y[other, :6] = base + h / 6 * (steps[0] + 2 * steps[1] + 2 * steps[2] + steps[3])
+    q, v = c.join(y, np.zeros((len(y), 0))), np.zeros((len(y), model.nv))
+    a, torque = np.zeros_like(v), np.zeros((len(y), robot.n))
+    for k in range(len(y)):
+        v[k] = velocity(y[k], yd[k], momentum + (time[k] - time[start]) * pull)
+        a[k, 6:] = ydd[k, 6:]
+        inertia = np.array(pin.crba(model, data, q[k]))[:6, :6]
+        lacking = inverse_dynamics(robot, data, q[k], v[k], a[k])[:6]
+        a[k, :6] = -solved(np.triu(inertia) + np.triu(inertia, 1).T, lacking)
+        torque[k] = inverse_dynamics(robot, data, q[k], v[k], a[k])[6:]
+    return Completed(q, v, a, torque, np.zeros((len(y), 6)), np.zeros((len(y), 0)))
 
 
 def _correction_costs(c: StanceCoordinates, wrench: Array, least: float) -> Array:
@@ -416,7 +471,8 @@ class Plan:
         known : the other reference of this plan with this step, if it is known: their swing is the same.
 
         Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse
-        dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes.
+        dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes. A
+        base that nothing holds is integrated from contact, backward through the swing, and from after it on.
         The instants of contact and of its end are there twice: the reference jumps from the coasting one to
         the predicted state.
         """
@@ -438,7 +494,10 @@ class Plan:
             q = parts[-1][2][-1]
         contact = sampled(t0, t1, step)
         legs = self.coordinates.split(q)[1]
-        rows = complete_reference(problem, *self.independent(1, contact, missed=missed), legs)
+        if self.coordinates.drifts:
+            rows = drifting_reference(problem, partial(self.independent, 1), contact, backward=False)
+        else:
+            rows = complete_reference(problem, *self.independent(1, contact, missed=missed), legs)
         parts.append((1, contact, *self._of_all_soles(problem.blow, rows)))
         stance = np.append(stance, np.full(len(contact), problem.blow))
         for piece in pieces[len(self.before) + 1 :]:
@@ -471,6 +530,8 @@ class Plan:
     def _completed(self, piece: Piece, times: Array, near: Array) -> Completed:
         """Full motion of a piece at times (k,) [s], with legs near those of a configuration (nq,)."""
         c = self.problem.stance_coordinates[piece.number]
+        if c.drifts:
+            return drifting_reference(self.problem, piece.sample, times, backward=piece.phase == 0)
         rows = complete_reference(self.problem, *piece.sample(times), c.split(near)[1], c)
         return self._of_all_soles(piece.number, rows)
 

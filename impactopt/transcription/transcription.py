@@ -172,6 +172,9 @@ class Transcription(ContactProgram):
         add_clearance(b, self.swing, self.follow, self.hit.expected.target_state)
         self.hit.add_rows()
         self._add_links()
+        if coordinates.drifts:  # after the links, which determine where the follow-through starts
+            self.swing.add_momentum_rows(b)
+            self.follow.add_momentum_rows(b)
         if coordinates.legs:
             y, y1, T = self.follow.start
             left = [y, y1, self.follow.legs[0], T]

@@ -59,7 +59,7 @@ def test_every_problem_loads_and_is_sound(name: str) -> None:
     assert problem.name == read.content.problem.name
     assert isinstance(problem.stance, FixedBase) == (not problem.robot.floating)
     # a plan starts at rest: what holds the robot has to hold it there
-    if problem.robot.floating:
+    if problem.soles:
         sole = problem.coordinates.legs[0].placement.translation
         assert abs(float(sole[2])) < 1e-3
 

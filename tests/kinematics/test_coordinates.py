@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from support.small_robots import arm, biped
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates, base_motion, elimination_order, solve_in_order
+from impactopt.kinematics.coordinates import (
+    StanceCoordinates,
+    base_motion,
+    elimination_order,
+    independent_rates,
+    solve_in_order,
+)
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.robots.presets import load_robot
@@ -354,13 +360,22 @@ def test_the_order_pivots_on_what_is_large_in_every_sample() -> None:
     assert two[rows[0], cols[0]] == 1.0
 
 
-# ---- what cannot stand
+# ---- what nothing holds
 
 
-def test_a_free_flyer_needs_a_sole() -> None:
+def test_without_a_sole_all_joints_are_coordinates() -> None:
     robot = biped()
-    with pytest.raises(InputError, match="at least one sole"):
-        StanceCoordinates(robot, (), robot.posture("half_sitting"))
+    c = StanceCoordinates(robot, (), robot.posture("half_sitting"))
+    assert c.drifts and c.ny == robot.nv and c.nl == 0
+    rng = np.random.default_rng(0)
+    y = c.start + 0.1 * rng.standard_normal(c.ny)
+    np.testing.assert_allclose(c.split(c.join(y, np.zeros(0)))[0], y, atol=1e-12)
+    rates = rng.standard_normal(c.ny)
+    v = c.complete_motion(y, rates, np.zeros(c.ny), np.zeros(0))[1]
+    np.testing.assert_allclose(independent_rates(c, y, v), rates, atol=1e-12)
+
+
+# ---- what cannot stand
 
 
 def reduced(*joints: str, waist: bool = False) -> Robot:

@@ -152,6 +152,7 @@ class RobotSection(Section):
     srdf: str = optional("named postures and rotors of the URDF")
     name: str = optional("what reports call it")
     floating: bool = optional("false: the root link is fixed to the ground")
+    gravity: Vector = optional("gravity, by default the model's: 9.81 down [m/s2]", "gravity_m_s2")
     locked: dict[str, float] = optional("joints to remove, and their angles [rad]", "locked_rad")
     inertias: Literal["given", "repaired"] = optional(
         '"repaired": impossible ones are changed; `check` lists them'

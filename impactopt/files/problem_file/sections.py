@@ -234,7 +234,7 @@ class StanceSection(Section):
 
     soles: str = Field(
         default="both",
-        description='"both", or one; "none" (`impactopt collide`, sweeps of collisions): it floats freely',
+        description='"both", or one; "none": it floats freely',
     )
     hands: HandNames = Field(
         default=[],

@@ -112,6 +112,8 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
         data["name"] = options["name"]
     if "floating" in options and (source.mjcf is not None or not options["floating"]):
         data["floating"] = options["floating"]
+    if "gravity" in options:
+        data["gravity_m_s2"] = plain_value(options["gravity"])
     locked = options.get("locked", ())
     angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
     if angles or (locked != () and source.preset is not None):
@@ -288,6 +290,8 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
         | ({"steps_m": {name: list(step) for name, step in each.steps.items()}} if each.steps else {})
         for each in problem.stances
     ]
+    if problem.floats:
+        data["stance"] = {"soles": "none"}
     if (isinstance(stance, OneSole) and not problem.stances) or hands:
         data["stance"] = ({"soles": stance.name} if isinstance(stance, OneSole) else {}) | hands
     if problem.second is not None:

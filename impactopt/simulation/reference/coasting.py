@@ -7,9 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.settings import REFERENCE_ORDER, no_bend
 from impactopt.errors import InputError, check_array
-from impactopt.kinematics.coordinates import StanceCoordinates, base_motion
+from impactopt.kinematics.coordinates import StanceCoordinates, independent_rates
 
-__all__ = ["coasting_reference", "independent_rates"]
+__all__ = ["coasting_reference"]
 
 Array = NDArray[np.float64]
 _NODES = 3 * REFERENCE_ORDER
@@ -70,17 +70,6 @@ def coasting_reference(
         until *= _SHORTER
     reference = np.column_stack([bend[-robot.n :], fitted.T / until**orders])
     return {"reference": reference, "reference_until": np.array(until)}
-
-
-def independent_rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
-    """ydot (ny) of a Pinocchio velocity."""
-    rates, b = np.zeros(c.ny), c.base
-    if b:
-        # v is linear in them
-        columns = [base_motion(y[:6], unit, np.zeros(6))[0] for unit in np.eye(6)]
-        rates[:6] = np.linalg.solve(np.transpose(columns), v[:6])
-    rates[b:] = v[b + c.independent]
-    return rates
 
 
 def _at(c: StanceCoordinates, y: Array, rates: Array, near: Array) -> Array:

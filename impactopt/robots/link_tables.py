@@ -263,7 +263,7 @@ def space_arm(**overrides: Any) -> Robot:
         "strikers": (Striker(name="fist", frame="joint_7", point=np.array([0.0, 0.0, FLANGE - 0.08])),),
         "postures": {"ready": {"joint_2": -0.3, "joint_4": 1.6, "joint_6": 0.27}},
     }
-    bus = Box(mass=60.0, sides=(0.5, 0.5, 0.5), center=(0.0, 0.0, -0.25))
+    bus = Box(mass=60.0, sides=(0.5, 0.5, 0.5), center=(0.0, 0.0, -0.1))  # up to the first joint
     return Robot.from_model(arm_model("space_arm", ARM7, bus), **{**options, **overrides})
 
 

@@ -207,6 +207,19 @@ def test_the_animation_is_a_gif_with_every_instant(still: Replay, tmp_path: Path
     assert path.stat().st_size < 1_000_000
 
 
+def test_a_robot_without_soles_is_drawn_from_above(hammered: Solution) -> None:
+    planned = Planned(record=record_of(hammered), problem=hammered.problem, reference=hammered.trajectory)
+    drawing = _Drawing(replay(planned))
+    scene = drawing.look(0)
+    drawing.set_up([scene])
+    *_, above = drawing.panels
+    gone = np.asarray(drawing.draw(dataclasses.replace(scene, sticks=scene.sticks + 100.0), ""))
+    whole = np.asarray(drawing.draw(scene, ""))
+    box = above.get_window_extent()
+    columns = slice(int(box.x0), int(box.x1))
+    assert above.get_title() == "from above" and (gone[:, columns] != whole[:, columns]).any()
+
+
 def test_time_runs_slower_around_contact() -> None:
     times, paces = shown_times(0.8, 0.86, 2.0)
     slow = (times >= 0.8 - AROUND) & (times < 0.86 + AROUND)

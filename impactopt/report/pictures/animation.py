@@ -129,31 +129,37 @@ class _Drawing:
         body = np.concatenate([s.sticks.reshape(-1, 3) for s in scenes])
         near = [vertices for s in scenes for vertices in s.near]
         low, high = _bounds(np.concatenate([body, *near, *scenes[0].soles]), 0.08)
-        low[2] = min(low[2], -0.1)
+        floor = self.done.planned.problem.ground_height
+        if floor is not None:
+            low[2] = min(low[2], floor - 0.1)
         spans = [_bounds(np.array([low, high]) @ view.T, 0.0) for view in self.views]
-        if scenes[0].soles:
+        stands = bool(scenes[0].soles)
+        if stands:
             spans[2] = _bounds(np.concatenate(scenes[0].soles) @ ABOVE.T, 0.06)
         widths = [float(high[0] - low[0]) for low, high in spans[:2]]
         grid = self.figure.add_gridspec(
             1, 3, left=0.07, right=0.99, bottom=0.11, top=0.84, wspace=0.3, width_ratios=[*widths, widths[1]]
         )
         labels = (("x [m]", "z [m]"), (RIGHT, "z [m]"), (RIGHT, "x [m]"))
-        names = ("from its right", "from behind", "soles from above")
+        names = ("from its right", "from behind", "soles from above" if stands else "from above")
         for k, ((lowest, highest), name, (across, up)) in enumerate(zip(spans, names, labels, strict=True)):
             axes = self.figure.add_subplot(grid[k])
             axes.set_aspect("equal")
             axes.grid(False)
             axes.set(title=name, xlabel=across, ylabel=up)
             axes.set(xlim=(lowest[0], highest[0]), ylim=(lowest[1], highest[1]))
-            if k < 2:
-                axes.axhline(0.0, color=GREY, linewidth=1.0, zorder=0)
+            if k < 2 and floor is not None:
+                axes.axhline(floor, color=GREY, linewidth=1.0, zorder=0)
             self.panels.append(axes)
         key = [
             Line2D([], [], color=VERMILION, label="force on the target"),
             Line2D([], [], color=GREEN, marker="o", label="force of the floor on a sole"),
             Line2D([], [], color=BLACK, marker="D", linestyle="", markersize=4, label="zero-moment point"),
         ]
-        self.figure.legend(handles=key, loc="lower right", fontsize=8)
+        if stands:
+            self.figure.legend(handles=key, loc="lower right", fontsize=8)
+        else:
+            self.figure.legend(handles=key[:1], loc="upper right", fontsize=8)
 
     def draw(self, scene: _Instant, text: str) -> Image.Image:
         """One picture."""
@@ -161,7 +167,7 @@ class _Drawing:
         moving: list[Any] = []
         for axes, view in zip(self.panels, self.views, strict=True):
             from_above = view is ABOVE
-            if not from_above:
+            if not (from_above and scene.soles):
                 self._robot(axes, view, scene, moving)
             for corners in scene.soles:
                 flat = corners @ view.T
@@ -237,7 +243,8 @@ def save_animation(done: Replay, path: Path) -> Path:
             slow = f"   {pace} x slower" if pace > 1 else ""
             text = f"{sim.time[k]:6.3f} s   {PHASES[phase[k]]:<14}{sim.force[k]:4.0f} N on the target{slow}"
             pictures.append(stage.draw(scene, text))
-        pictures.append(stage.draw(scenes[-1], f"{sim.time[instants[-1]]:6.3f} s   {_verdict(sim.fall)}"))
+        verdict = _verdict(sim.fall) if scenes[-1].soles else ""
+        pictures.append(stage.draw(scenes[-1], f"{sim.time[instants[-1]]:6.3f} s   {verdict}"))
     data = _gif(pictures)
     write_file(path, lambda file: file.write(data))
     return path

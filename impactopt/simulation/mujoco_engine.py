@@ -343,6 +343,11 @@ def simulate_mujoco(
         raise InputError(
             f"contact {contact!r}{did_you_mean(contact, CONTACTS)}: give one of {', '.join(CONTACTS)}"
         )
+    if controller is not None and robot.floating and not scene.soles and not scene.hands:
+        raise InputError(
+            f"robot {robot.name!r} floats freely, and the whole-body controller moves bases by what they "
+            "stand on: take the servo"
+        )
     world = perturbation if perturbation is not None else Perturbation()
     beyond = settle if settle is not None else SETTLES if scene.soles else SETTLES_SOLELESS
     solver = MujocoOptions(step, iterations, tolerance)

@@ -192,8 +192,8 @@ def test_a_robot_in_flight_falls_to_the_target() -> None:
         assert solution.validate(engine=engine).impulse == pytest.approx(solution.impulse, rel=1e-2)
 
 
-def test_what_it_is_not_for() -> None:
-    problem = load_problem("space_arm")
+def test_what_it_is_not_for(thrown: Solution) -> None:
+    problem = thrown.problem
     with pytest.raises(InputError, match=r"floats freely: .* no strike by itself"):
         optimize_strike(problem)
     with pytest.raises(InputError, match="floats freely, and has no strike"):
@@ -203,5 +203,7 @@ def test_what_it_is_not_for() -> None:
     late = Scenario(name="late", missing=True, abort_after=0.02)
     with pytest.raises(InputError, match="floats freely, and has no abort motion"):
         replace(problem, scenarios=(late,))
+    with pytest.raises(InputError, match="floats freely, and the whole-body controller"):
+        thrown.validate(engine="mujoco", controller="wbc")
     with pytest.raises(InputError, match=r"gravity \[m/s2\]"):
         space_arm(gravity=[0.0, 0.0])

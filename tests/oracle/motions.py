@@ -26,11 +26,12 @@ from impactopt.robots.tools import inside
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["Limits", "Way", "node_piece", "rate_pieces"]
+__all__ = ["Limits", "Way", "momentum_pieces", "node_piece", "rate_pieces"]
 
 Array = NDArray[np.float64]
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
+FREE_BOX = np.array([10.0, 10.0, 10.0, 3.0, 1.2, 3.0])  # the same of one that nothing holds
 
 
 class Limits:
@@ -42,7 +43,7 @@ class Limits:
         self.cone, self.extension = problem.term(ContactWrenchCone), problem.term(LegExtension)
         self.grip = problem.extra(Grip)
         lower, upper = inside(r, problem.term(PositionLimit).margin)
-        box = BASE_BOX[: robot.base]
+        box = (FREE_BOX if robot.drifts else BASE_BOX)[: robot.base]
         self.y = (
             np.concatenate([robot.y0[: robot.base] - box, lower[robot.independent]]),
             np.concatenate([robot.y0[: robot.base] + box, upper[robot.independent]]),
@@ -98,6 +99,9 @@ class Way:
         inside = np.sort(np.concatenate([self.breaks, middles]))
         self.nodes = np.union1d(inside[1:] if self.swings else inside, more)
         self.more, self._y0 = more, robot.y0
+        self.drifts, last = robot.drifts, self.phase.intervals + 2
+        # control points whose base is a variable of its own, as an end at rest is one of joints alone
+        self._drifting = ((2, last) if self.swings else (last - 1, last)) if robot.drifts else ()
         t = knots(self.breaks)
         # the velocity's control points are these times differences of the curve's
         self.factors = 3.0 / (t[4:-1] - t[1:-4])
@@ -117,6 +121,13 @@ class Way:
         """Control point j = 0 .. intervals + 2: a swing starts at rest and ends without acceleration, the
         others end at rest.
         """
+        point = self._control(v, j)
+        if j not in self._drifting:
+            return point
+        base = v.get(f"{self.kind} base control point", self._drifting.index(j))
+        return np.concatenate([base, point[6:]])
+
+    def _control(self, v: Variables, j: int) -> Array:
         if not self.swings:
             return v.get(self.control_group, min(j, self.points - 1))
         if j <= 2:
@@ -143,6 +154,16 @@ class Way:
             return y, y1, y2
 
         return values
+
+    def at_node(self, s: float, k: int) -> Callable[[Variables], tuple[Array, Array, Array]]:
+        """The same at node k, where the acceleration of a base that nothing holds is a variable."""
+        at = self.at(s)
+
+        def values(v: Variables) -> tuple[Array, Array, Array]:
+            y, y1, y2 = at(v)
+            return y, y1, np.concatenate([v.get(f"{self.kind} base acceleration", k), y2[6:]])
+
+        return values if self.drifts else at
 
 
 def node_piece(
@@ -228,4 +249,23 @@ def rate_pieces(robot: RobotMotion, limits: Limits, way: Way) -> list[Piece]:
             for direction in ("forward", "backward")
         ]
         out.append(Piece.of(both, rows))
+    return out
+
+
+def momentum_pieces(robot: RobotMotion, way: Way) -> list[Piece]:
+    """Momentum of a robot that nothing holds, in the middles of a motion's intervals and at its end: as at
+    its beginning, and what gravity adds. A swing begins without any, a follow-through with what the blow has
+    left.
+    """
+    middles, out, lifted = (way.breaks[1:] + way.breaks[:-1]) / 2, [], f"{way.kind} momentum"
+    for s in map(float, [*([] if way.swings else [0.0]), *middles, 1.0]):
+
+        def value(v: Variables, s: float = s) -> Array:
+            y, y1, _ = way.at(s)(v)
+            T = v.one(way.T)
+            q, qd, _ = robot.motion(y, np.zeros(0), y1 / T, 0 * y)
+            before = 0.0 if way.swings else v.get(lifted)
+            return np.asarray(robot.weighed_momentum(q, qd) - before - s * T * robot.pull)
+
+        out.append(Piece.of(value, [("momentum", way.place(s), DIRECTIONS, 0.0, 0.0)]))
     return out

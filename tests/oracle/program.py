@@ -37,7 +37,7 @@ from impactopt.problem.terms import (
 from oracle.apart import apart_pieces
 from oracle.blow import Blow
 from oracle.drives import COASTED, Drives, node_torque
-from oracle.motions import Limits, Way, node_piece, rate_pieces
+from oracle.motions import Limits, Way, momentum_pieces, node_piece, rate_pieces
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 from oracle.worth import GONE, orientation_pieces, price_pieces, speed_pieces, worth_pieces
@@ -176,6 +176,9 @@ class Program:
                 lifted = None if last else self._lifted(place)
                 self.rows.append(node_piece(self.robot, limits, place, node, feedforward=last, lifted=lifted))
             self.rows += rate_pieces(self.robot, limits, way)
+            if self.robot.drifts:
+                self.rows += momentum_pieces(self.robot, way)
+                self.bounds[f"{way.kind} base control point"] = limits.y[0][:6], limits.y[1][:6]
         base, names = self.robot.base, self.robot.labels[self.robot.base :]
         lower, upper = (bound[base:] for bound in limits.y)
         self.rows.append(
@@ -205,7 +208,7 @@ class Program:
 
     def node(self, way: Way, s: float, k: int) -> Callable[[Variables], Any]:
         """y, y', y'', legs, sole wrenches and T at node k of a motion, at its fraction s."""
-        at = way.at(s)
+        at = way.at_node(s, k)
 
         def state(v: Variables) -> tuple[Array, Array, Array, Array, Array, float]:
             legs, w = v.get(f"{way.kind} legs", k), v.get(f"{way.kind} sole wrench", k)

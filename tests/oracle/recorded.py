@@ -104,6 +104,8 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
     y0, u0, ff = p.at_contact(v), p.state_at_contact(v)[1], v.get("feed-forward at contact")
     polygon = support_polygon(r, p.problem.coordinates) if robot.soles else np.zeros((0, 2))
     curves = {way.kind: way.curve(v) for way in (swing, last)}
+    left = v.get(f"{last.kind} momentum") if robot.drifts else np.zeros(0)
+    drifted: tuple[Any, ...] = ()
     for k, time in enumerate(map(float, a["time"])):
         where = f"{prefix} at {time:.4g} s"
         phase = int(a["phase"][k])
@@ -115,7 +117,23 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
             s = min(max((time - begin) / T, 0.0), 1.0)
             y, u, slope = (c(s) / T**order for order, c in enumerate(curves[way.kind]))
         found, legs = robot.split(a["q"][k])
+        if robot.drifts:
+            y, u, slope = _with_base(p, (y, u, slope), found, a["v"][k], a["a"][k])
         q, qd, qdd = robot.motion(y, legs, u, slope)
+        if robot.drifts:
+            first = phase == 0 or (phase == 1 and time == start)
+            lasted, before = (time, 0.0) if first else (time - end, left)
+            if phase != 1 or time == start:
+                momentum = robot.weighed_momentum(q, qd) - before - lasted * robot.pull
+                worst.note(f"{prefix} momentum", _gap(momentum, 0 * momentum), where)
+            if time == start:
+                worst.note(f"{prefix} posture", _gap(y, y0), where)
+            if drifted and drifted[0] == phase:
+                h, ends = time - drifted[1], drifted[2:]
+                # the trapezoidal rule with its end correction, of fourth order
+                way = h * (ends[1] + u[:6]) / 2 + h**2 * (ends[2] - slope[:6]) / 12
+                worst.note(f"{prefix} posture", _gap(y[:6] - ends[0], way), where)
+            drifted = phase, time, y[:6], u[:6], slope[:6]
         worst.note(f"{prefix} posture", _gap(found, y), where)
         tau = robot.torque(q, qd, qdd, np.zeros(6 * len(robot.soles)))
         worst.note(f"{prefix} rates", _gap(a["v"][k], qd), where)
@@ -140,6 +158,19 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
     yield from worst.all()
 
 
+def _with_base(
+    p: Program, planned: tuple[Array, Array, Array], found: Array, v: Array, a: Array
+) -> tuple[Array, Array, Array]:
+    """Planned y, rates and second rates with a record's base, which nothing holds: the joints move it."""
+    y, u, slope = (part.copy() for part in planned)
+    y[:6], none = found[:6], np.zeros(0)
+    unit = [p.robot.motion(y, none, np.append(e, u[6:]), 0 * u)[1][:6] for e in np.eye(6)]
+    u[:6] = np.linalg.solve(np.transpose(unit), v[:6])
+    drift = p.robot.motion(y, none, u, np.append(np.zeros(6), slope[6:]))[2][:6]
+    slope[:6] = np.linalg.solve(np.transpose(unit), a[:6] - drift)
+    return y, u, slope
+
+
 def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) -> Iterator[tuple[str, float]]:
     """Whether torques and the ground's wrench are what a motion needs, that needs tau (nv,) without soles.
 
@@ -153,6 +184,8 @@ def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) ->
         wrenches = robot.wrenches(q, tau - np.concatenate([np.zeros(robot.base), torque]))
         robot.relieve(rest, q, wrenches)  # a hand that holds on is borne by the waist, too
     yield "torque", _gap(torque[free] / limit[free], rest[robot.base + free] / limit[free])
+    if robot.drifts:
+        yield "equation of motion of the base", _gap(rest[:6] / robot.base_scale, np.zeros(6))
     if not robot.soles:
         return
     world = robot.ground(wrenches)

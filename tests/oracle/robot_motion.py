@@ -25,6 +25,7 @@ class RobotMotion:
     Attributes
     ----------
     ny, nl, n, base : numbers of coordinates, leg joints, joints, and the base's coordinates (6 or 0).
+    drifts : whether nothing holds the base.
     undriven : indices in v of the base and of soles' hinges.
     y0 (ny,), legs0 (nl,) : the start posture.  weight : of the robot [N].
     soles : what is held, each with its leg, frame, joints in v, and placement: soles first, then hands.
@@ -50,6 +51,7 @@ class RobotMotion:
         self.standing = len(held.soles)
         self.independent, self.dependent = held.independent, held.dependent
         self.undriven = held.undriven
+        self.drifts = bool(self.base) and not self.soles
         self.ny, self.nl = self.base + len(self.independent), len(self.dependent)
         self.labels, self.leg_labels = held.labels, held.leg_labels
         self.y0, self.legs0 = self.split(problem.start_posture)
@@ -263,3 +265,13 @@ class RobotMotion:
         h = pin.computeCentroidalMomentum(self.model, self.data, q, v)
         total = float(sum(inertia.mass for inertia in self.model.inertias))
         return np.array(self.data.com[0]), np.array(h.linear) / total, np.array(h.angular)
+
+    def weighed_momentum(self, q: Array, v: Array) -> Array:
+        """(6,) [s] momentum, and angular momentum about the centre of mass, over the scale of forces."""
+        h = pin.computeCentroidalMomentum(self.model, self.data, q, v)
+        return np.asarray(np.concatenate([h.linear, h.angular]) / self.base_scale)
+
+    @property
+    def pull(self) -> Array:
+        """(6,) that gravity adds to it in a second."""
+        return np.append(np.array(self.model.gravity.linear) / GRAVITY, np.zeros(3))

@@ -29,6 +29,7 @@ from impactopt.problem.terms import (
 )
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip
+from impactopt.robots.presets import space_arm
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.transcription import Transcription, block_functions, statement_of
@@ -161,6 +162,13 @@ def test_of_two_hands(name: str) -> None:
     problem = load_problem(PROBLEMS / f"{name}.toml")
     functions = block_functions(problem, problem.coordinates)
     check_rows(Transcription(problem, problem.coordinates, functions))
+
+
+@pytest.mark.parametrize("gravity", [0.0, -2.0])
+def test_of_a_robot_that_nothing_holds(gravity: float) -> None:
+    problem = load_problem(PROBLEMS / "space_arm.toml")
+    robot = space_arm(gravity=[0.0, 0.0, gravity])
+    check_rows(transcribed(dataclasses.replace(problem, robot=robot)))
 
 
 @pytest.mark.parametrize("name", ["arm_planar", "chop_arm"])

@@ -128,6 +128,7 @@ def price_pieces(
     """Prices of the motion style, and small ones of accelerations, wrenches and ends away from the start."""
     p, style, out = problem, problem.style_prices, list[Piece]()
     moving = np.full(robot.ny, style.speed)
+    moving[: robot.base] *= not robot.drifts
     moving[robot.base :] += style.idle_speed * p.idle_joints[robot.independent]
     for way in ways:
         typical = float(np.mean(way.phase.duration))
@@ -153,7 +154,7 @@ def price_pieces(
         if not way.swings:
 
             def away(v: Variables, way: Way = way) -> Array:
-                gap = way.control(v, way.phase.intervals + 2) - robot.y0
+                gap = (way.control(v, way.phase.intervals + 2) - robot.y0)[6 * robot.drifts :]
                 return np.array([(p.return_price + style.end) * np.sum(gap**2)])
 
             out.append(Piece(away))

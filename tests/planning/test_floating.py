@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from oracle.verdict import verify_record
 
 from impactopt import (
     Free,
@@ -156,6 +157,16 @@ def test_its_record_is_verified(thrown: Solution, tmp_path: Path) -> None:
     save_record(record_of(thrown, problem=text), tmp_path)
     verdict = verify(tmp_path)
     assert verdict.ok, verdict.reason
+
+
+def test_its_program_written_down_a_second_time_agrees(thrown: Solution) -> None:
+    record = record_of(thrown)
+    verdict = verify_record(thrown.problem, record.arrays, record.summary)
+    assert verdict.ok, verdict.reason
+    q = record.arrays["reference_q"].copy()
+    q[len(q) // 4, 0] += 1e-3  # the base of one instant
+    wrong = verify_record(thrown.problem, {**record.arrays, "reference_q": q}, record.summary)
+    assert not wrong.ok and "reference posture" in wrong.reason
 
 
 def test_two_bodies_strike_as_hard_as_the_closed_form_says() -> None:

@@ -63,7 +63,7 @@ def check(
         typer.echo(printable(f"{file} is sound:"))
         plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
         for name, value in (problem.describe() | plain).items():
-            for text in value if name in ("inertias", "notes") else [_in_words(value)]:
+            for text in value if name in ("inertias", "notes", "followers") else [_in_words(value)]:
                 typer.echo(printable(f"  {name:<10} {text}"))
         if lost := _lost_meshes(problem.robot):
             typer.echo(printable(f"  {'meshes':<10} {lost}"))

@@ -547,6 +547,11 @@ class ImpactProblem:
             out["stances"] = names_of(self.stances)
         if hands := self.stance.held_hands(self.robot):
             out["holds_on_with"] = [hand.name for hand in hands]
+        if self.robot.couplings:
+            out["followers"] = [
+                f"{joint} = {ratio:g} {leader} {offset:+g}"
+                for joint, (leader, ratio, offset) in self.robot.couplings.items()
+            ]
         if self.robot.source and self.robot.source.repairs:
             out["inertias"] = [f"repaired: {text}" for text in self.robot.source.repairs]
         if self.robot.source and self.robot.source.notes:

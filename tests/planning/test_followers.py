@@ -96,6 +96,10 @@ def test_the_hand_keeps_the_turn_of_the_upper_arm(plan: Solution) -> None:
         np.testing.assert_allclose(data.oMi[robot.model.getJointId("wrist")].rotation, wanted, atol=1e-9)
 
 
+def test_the_problem_is_told_with_its_followers(plan: Solution) -> None:
+    assert plan.problem.describe()["followers"] == ["wrist = -1 elbow +1.7"]
+
+
 def test_followers_have_no_motor(plan: Solution) -> None:
     assert plan.problem.robot.joint_names == ("turn", "shoulder", "elbow")
     assert plan.trajectory.torque.shape[1] == 3

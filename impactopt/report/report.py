@@ -19,7 +19,7 @@ from impactopt.robots.loads import shortfalls
 __all__ = ["Report", "report_of"]
 
 COLUMN_NOTES = {
-    "simulated": "Simulated: replayed in Pinocchio's full dynamics, with the soles fixed.",
+    "simulated": "Simulated: replayed in Pinocchio's full dynamics, any soles fixed.",
     "held soles": "Held soles: replayed in Pinocchio's full dynamics, with the soles fixed.",
     "free soles": "Free soles: replayed in MuJoCo, with nothing fixed.",
 }

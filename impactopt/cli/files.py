@@ -167,11 +167,10 @@ def new(
     with plain_errors("interrupted"):
         if sum(x is not None for x in (name, urdf, mjcf)) + reference > 1:
             raise typer.BadParameter("give one of NAME, --urdf, --mjcf and --reference")
-        kind = "" if name is None else Path(name).suffix.lower()
-        if kind in (".urdf", ".xacro"):
-            name, urdf = None, name
-        elif kind == ".xml":
-            name, mjcf = None, Path(str(name))
+        if name is not None and Path(name).suffix.lower() in (".urdf", ".xacro"):
+            urdf, name = name, None
+        elif name is not None and Path(name).suffix.lower() == ".xml":
+            mjcf, name = Path(name), None
         if bolted and urdf is None and mjcf is None:
             raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint="--bolted")
         if motion is not None and urdf is None and mjcf is None:

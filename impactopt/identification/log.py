@@ -17,6 +17,7 @@ from scipy.integrate import trapezoid
 from impactopt.codegen.files import read_archive
 from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, shortened
 from impactopt.kinematics.operational_space import Held
+from impactopt.robots.couplings import axis_of
 from impactopt.robots.robot import Robot
 
 __all__ = ["FORCE", "SPEED", "TIME", "Blow", "ImpactLog", "find_blows", "noise_of", "read_log"]
@@ -207,10 +208,7 @@ def _joint(columns: Mapping[str, Array], robot: Robot, k: int, name: str) -> Arr
 
 
 def _turns(robot: Robot, k: int) -> bool:
-    joint = robot.joint_models[k]
-    data = joint.createData()
-    joint.calc(data, pin.neutral(robot.model))
-    return bool(np.any(np.asarray(data.S).reshape(6)[3:]))
+    return bool(axis_of(robot.model, robot.joint_models[k].id).subspace[3:].any())
 
 
 def _configurations(robot: Robot, angles: Array) -> Array:

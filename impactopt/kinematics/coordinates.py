@@ -42,6 +42,7 @@ __all__ = [
     "Limb",
     "StanceCoordinates",
     "base_motion",
+    "base_rates",
     "elimination_order",
     "independent_rates",
     "solve_in_order",
@@ -202,15 +203,16 @@ def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
     )
 
 
+def base_rates(y: Array, v: Array) -> Array:
+    """ydot (6,) of the base, of a Pinocchio velocity; the inverse of `base_motion`."""
+    jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
+    return np.append(pin.rpy.rpyToMatrix(y[3:6]) @ v[:3], solved(jac, v[3:6]))
+
+
 def independent_rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
     """ydot (ny) of a Pinocchio velocity."""
-    rates, b = np.zeros(c.ny), c.base
-    if b:
-        # v is linear in them
-        columns = [base_motion(y[:6], unit, np.zeros(6))[0] for unit in np.eye(6)]
-        rates[:6] = np.linalg.solve(np.transpose(columns), v[:6])
-    rates[b:] = v[b + c.independent]
-    return rates
+    own = v[c.base + c.independent]
+    return np.append(base_rates(y, v), own) if c.base else own
 
 
 def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:

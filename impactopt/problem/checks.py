@@ -92,7 +92,7 @@ def check_world(problem: Any) -> None:
     check_apart("obstacle", [o.name for o in obstacles])
     if ground is not None and not isinstance(ground, Ground):
         raise InputError(f"ground must be a Ground, such as Ground(height=-0.8), not {ground!r}")
-    if ground is not None and ground.height and problem.robot.floating and not problem.floats:
+    if ground is not None and ground.height and problem.stands:
         raise InputError(
             f"the ground of {problem.robot.name!r} is z = 0, where its soles stand: leave `ground` out"
         )

@@ -32,7 +32,7 @@ def problem_hash(problem: Any) -> str:
         if not shape[name]:
             shape.pop(name)
     shape.pop("ground")
-    if problem.floats or not problem.robot.floating:
+    if not problem.stands:
         shape["ground"] = problem.ground_height
     if gains := shape.pop("gains"):
         each = zip(problem.gain_joints, gains, strict=True)

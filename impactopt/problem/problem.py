@@ -258,7 +258,7 @@ class ImpactProblem:
 
     def _check_objectives(self) -> None:
         turns = not isinstance(self.target, Target) or self.target.turns
-        allowed = {"contact": self.lasts, "turns": turns, "balance": self.robot.floating and not self.floats}
+        allowed = {"contact": self.lasts, "turns": turns, "balance": self.stands}
         checked = check_objectives(self.objectives, **allowed)
         object.__setattr__(self, "objectives", checked)
 
@@ -410,6 +410,11 @@ class ImpactProblem:
         return isinstance(self.stance, Free)
 
     @property
+    def stands(self) -> bool:
+        """True if soles bear the robot: it neither floats freely, nor is its base fixed."""
+        return self.robot.floating and not self.floats
+
+    @property
     def soles(self) -> tuple[Sole, ...]:
         """The soles that stand at some time, in the robot's order."""
         if not self.stances:
@@ -485,7 +490,7 @@ class ImpactProblem:
     @property
     def ground_height(self) -> float | None:
         """[m] of the floor; None: there is none."""
-        if self.robot.floating and not self.floats:
+        if self.stands:
             return 0.0
         return None if self.ground is None else self.ground.height
 
@@ -535,7 +540,7 @@ class ImpactProblem:
             "law": repr(self.law),
             "hash": self.hash,
         }
-        if self.floats or not self.robot.floating:
+        if not self.stands:
             out["ground"] = "none" if self.ground_height is None else f"z = {self.ground_height:g} m"
         if self.collision != "full":
             frozen = f", {self.freezes} freezes" if self.freezes else ""

@@ -49,7 +49,7 @@ def joint_indices(model: pin.Model) -> list[int]:
     """Indices of the joints in the order of v, without the free-flyer, and without followers, whose
     coordinates are their leaders'.
     """
-    return [j for j in range(2 if is_floating(model) else 1, model.njoints) if model.joints[j].nv]
+    return [joint.id for joint in moving_joints(model)]
 
 
 def joint_names(model: pin.Model) -> tuple[str, ...]:

@@ -29,6 +29,7 @@ __all__ = [
     "mujoco_module",
     "no_log_file",
     "primitive",
+    "put_followers",
     "quaternion",
     "robot_bodies",
     "robot_on_floor",
@@ -270,6 +271,14 @@ def _hard(equality: Any, step: float) -> Any:
     return equality
 
 
+def put_followers(world: Any, robot: Robot, qpos: Array, qvel: Array) -> None:
+    """Put joints that follow others, in place, where their laws have them and as fast."""
+    for name, (leader, ratio, offset) in robot.couplings.items():
+        own, other = world.joint(name), world.joint(leader)
+        qpos[own.qposadr[0]] = ratio * qpos[other.qposadr[0]] + offset
+        qvel[own.dofadr[0]] = ratio * qvel[other.dofadr[0]]
+
+
 def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[str], step: float) -> None:
     """Sites at these frames of the robot, welded as hard as MuJoCo lets them be in steps [s] of this length.
 
@@ -336,11 +345,6 @@ class MujocoRobot:
         self._place = np.array([joint.idx_q for joint in own], dtype=np.intp)
         # a continuous joint's angle is (cosine, sine) in Pinocchio
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
-        # of followers: place in qpos and qvel, index of the leader, ratio and offset
-        self._laws = [
-            (int(j.qposadr[0]), int(j.dofadr[0]), robot.joint_index(law.leader), law.ratio, law.offset)
-            for j, law in ((world.joint(name), law) for name, law in robot.couplings.items())
-        ]
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._rows, self.along = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
         self.friction = friction
@@ -352,14 +356,11 @@ class MujocoRobot:
         if self.floating:
             d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
         d.qpos[self.place] = robot.joint_positions(q)
-        for place, _, leader, ratio, offset in self._laws:
-            d.qpos[place] = ratio * d.qpos[self.place[leader]] + offset
         if v is not None:
             if self.floating:
                 d.qvel[:3], d.qvel[3:6] = self.base_rotation() @ v[:3], v[3:6]
             d.qvel[self.dof] = v[-robot.n :]
-            for _, dof, leader, ratio, _ in self._laws:
-                d.qvel[dof] = ratio * v[leader - robot.n]
+        put_followers(self.world, robot, d.qpos, d.qvel)
 
     def state(self) -> tuple[Array, Array]:
         """q (nq), v (nv)."""

@@ -16,7 +16,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates, solved
+from impactopt.kinematics.coordinates import StanceCoordinates, base_rates, solved
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
@@ -24,6 +24,7 @@ from impactopt.problem.stances import places_of_soles
 from impactopt.problem.terms import ContactWrenchCone, GearLoad
 from impactopt.robots.dynamics import inverse_dynamics
 from impactopt.robots.loads import BEARS, DriveLoads, cop_margin, gear_torque, least_margins, weight_of
+from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
 __all__ = [
@@ -122,10 +123,6 @@ def drifting_reference(
         v[:6] = solved(np.array(data.Ag[:, :6]), momentum - np.array(data.hg.vector))
         return v
 
-    def rates(y: Array, v: Array) -> Array:
-        jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
-        return np.append(pin.rpy.rpyToMatrix(y[3:6]) @ v[:3], solved(jac, v[3:6]))
-
     start = order[0]
     q, v, _ = c.complete_motion(y[start], yd[start], ydd[start], none)
     momentum = np.array(pin.computeCentroidalMomentum(model, data, q, v).vector)
@@ -141,17 +138,17 @@ def drifting_reference(
         ):
             at = np.append(base + share * h * steps[-1] if steps else base, joints[6:])
             since = time[one] + share * h - time[start]
-            steps.append(rates(at, velocity(at, joint_rates, momentum + since * pull)))
+            steps.append(base_rates(at, velocity(at, joint_rates, momentum + since * pull)))
         y[other, :6] = base + h / 6 * (steps[0] + 2 * steps[1] + 2 * steps[2] + steps[3])
     q, v = c.join(y, np.zeros((len(y), 0))), np.zeros((len(y), model.nv))
     a, torque = np.zeros_like(v), np.zeros((len(y), robot.n))
     for k in range(len(y)):
         v[k] = velocity(y[k], yd[k], momentum + (time[k] - time[start]) * pull)
         a[k, 6:] = ydd[k, 6:]
-        inertia = np.array(pin.crba(model, data, q[k]))[:6, :6]
-        lacking = inverse_dynamics(robot, data, q[k], v[k], a[k])[:6]
-        a[k, :6] = -solved(np.triu(inertia) + np.triu(inertia, 1).T, lacking)
-        torque[k] = inverse_dynamics(robot, data, q[k], v[k], a[k])[6:]
+        force = inverse_dynamics(robot, data, q[k], v[k], a[k])  # with the base's acceleration still zero
+        of_base = mass_matrix(model, data, q[k])[:, :6]
+        a[k, :6] = -solved(of_base[:6], force[:6])
+        torque[k] = force[6:] + of_base[6:] @ a[k, :6]
     return Completed(q, v, a, torque, np.zeros((len(y), 6)), np.zeros((len(y), 0)))
 
 

@@ -221,9 +221,9 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
 
 
 def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:
-    out = q.copy()
+    out, joints = q.copy(), robot.joint_models
     for row, angle in zip(own, angles, strict=True):
-        joint = robot.joint_models[int(row)]
+        joint = joints[int(row)]
         out[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
     return out
 

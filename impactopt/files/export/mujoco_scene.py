@@ -26,6 +26,7 @@ from impactopt.simulation.mujoco_world import (
     mujoco_module,
     no_log_file,
     primitive,
+    put_followers,
     quaternion,
     robot_on_floor,
 )
@@ -243,9 +244,7 @@ def _add_keyframes(spec: Any, export: Export) -> None:
         for column, joint in enumerate(export.joints):
             qpos[model.joint(joint).qposadr[0]] = motion.position[k, column]
             qvel[model.joint(joint).dofadr[0]] = motion.velocity[k, column]
-        for joint, (leader, ratio, offset) in export.robot.couplings.items():
-            qpos[model.joint(joint).qposadr[0]] = ratio * qpos[model.joint(leader).qposadr[0]] + offset
-            qvel[model.joint(joint).dofadr[0]] = ratio * qvel[model.joint(leader).dofadr[0]]
+        put_followers(model, export.robot, qpos, qvel)
         if (base := motion.base) is not None:
             qpos[:3], qpos[3:7] = base.position[k], base.quaternion[k]
             turned = pin.Quaternion(*base.quaternion[k]).toRotationMatrix()

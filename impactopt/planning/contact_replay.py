@@ -42,7 +42,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 AGREED, REFUTED = 1.0, 5.0  # [%] of the impulse: a plan that is off by more is not solved; is none
-_STEP, _STEPS = 2e-4, 60  # [s] at most; of the planned contact, at least
+_STEP, _STEPS = 8e-4, 60  # [s] at most; of the planned contact, at least
 _LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that comes back, or goes on, is seen
 _SAMPLED = 1e-3  # [s] of a coasting reference
 # freezes of the SDC that stands for full dynamics

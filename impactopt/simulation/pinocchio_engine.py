@@ -235,8 +235,10 @@ def follow_contact(
 ) -> Followed:
     """The contact alone, in the same full dynamics, from the state and at the time at which it is planned.
 
-    reference : as of :func:`simulate_pinocchio`.  step [s].  until [s] since contact: it goes on for so long,
-    and from then on while they touch, for the `longest` time.
+    reference : as of :func:`simulate_pinocchio`.
+    step [s] : at most; less where the servo's damping needs it.
+    until [s] : since contact: it goes on for so long, and from then on while they touch, for the `longest`
+        time.
 
     Raises
     ------
@@ -244,6 +246,9 @@ def follow_contact(
     """
     world = _World(robot, scene, reference)
     state, start = world.at_contact(reference), float(reference.contact_start)
+    world.body.look(state.q, state.v)
+    fastest = world.body.fastest_rate(np.diag(world.servo.kd))
+    step = min(step, 1 / fastest) if fastest > 0 else step  # explicit midpoint rule: stable up to twice that
     left, peak, touches = state.target, 0.0, list[list[float]]()
     side, events = world.struck.side(state.target, 0.0), list[float]()
     touching = False

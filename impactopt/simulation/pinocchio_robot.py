@@ -74,6 +74,13 @@ class Body(ABC):
         acceleration.
         """
 
+    def fastest_rate(self, damping: Array) -> float:
+        """[1/s] Largest rate at which joint damping (n, n) alone slows the joints, where it has been last."""
+        none = np.zeros(len(self.hands))
+        still = self.accelerate(np.zeros(self.n), none)
+        gains = [(self.accelerate(unit, none) - still)[-self.n :] for unit in np.eye(self.n)]
+        return float(np.abs(np.linalg.eigvals(np.column_stack(gains) @ damping)).max())
+
     def hand_places(self) -> Array:
         """(hands, 3) [m] of the striking points, where they have been last."""
         return np.array(
@@ -147,13 +154,6 @@ class DenseBody(Body):
 
     def wrenches(self) -> Array:
         return self._wrenches
-
-    def fastest_rate(self, damping: Array) -> float:
-        """[1/s] Largest rate at which joint damping (n, n) alone slows the joints, where it has been last."""
-        right = np.zeros((len(self._matrix), self.n))
-        right[self.nv - self.n : self.nv] = np.eye(self.n)
-        joints = np.linalg.solve(self._matrix, right)[self.nv - self.n : self.nv]
-        return float(np.abs(np.linalg.eigvals(joints @ damping)).max())
 
 
 class PinocchioBody(Body):

@@ -217,16 +217,11 @@ class ContactProgram(ABC):
     @cached_property
     def program(self) -> StructuredProgram:
         """All of it, for a solver."""
-        objective, quadratic, linear = self._worth
-        if self.apart_rows:  # all that such constraints may couple: solvers' structures serve any of them
-            quadratic = coupled(quadratic, self.body_spots())
         return StructuredProgram(
             self.layout,
             self.blocks,
             self.rows,
-            objective=objective,
-            quadratic=quadratic,
-            linear=linear,
+            **self._objective(),
             determined=by_choice(
                 [*(determined(Turn.LIFTED, g.index(0)) for g, _ in self.builder.lifted), *self._determined()]
             ),
@@ -263,10 +258,14 @@ class ContactProgram(ABC):
                 take(b)
         own = len(self._bare.blocks)
         move_apart(problem, self.blocks[own:], self.apart_rows)
+        self.program.take_numbers(self.layout, self.blocks, self.rows, **self._objective())
+
+    def _objective(self) -> dict[str, Any]:
+        """Objective of the program: affine part, quadratic and linear prices."""
         objective, quadratic, linear = self._worth
-        self.program.take_numbers(
-            self.layout, self.blocks, self.rows, objective=objective, quadratic=quadratic, linear=linear
-        )
+        if self.apart_rows:  # all that such constraints may couple: solvers' structures serve any of them
+            quadratic = coupled(quadratic, self.body_spots())
+        return {"objective": objective, "quadratic": quadratic, "linear": linear}
 
     def with_lifted(self, x: Array) -> Array:
         """The variables (n,) with lifted ones made equal to what they stand for."""

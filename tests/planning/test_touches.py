@@ -112,6 +112,19 @@ def test_steps_of_replays_do_not_move_the_second_touch(chopped: Solution) -> Non
     assert coarse.touches[1][0] == pytest.approx(fine.touches[1][0], rel=5e-4)
 
 
+def test_a_servo_of_much_damping_is_followed_too(chopped: Solution) -> None:
+    """An explicit rule is stable for steps below two over its fastest rate alone."""
+    p, duration = chopped.problem, chopped.plan.compression + chopped.plan.restitution
+    robot = dataclasses.replace(p.robot, kd=400 * p.robot.kd)
+    coarse, fine = (
+        follow_contact(
+            robot, chopped.plan.reference, scene_of(p), step=step, until=duration, longest=duration
+        )
+        for step in (duration / 10, 1e-6)
+    )
+    assert coarse.impulse == pytest.approx(fine.impulse, rel=5e-3)
+
+
 def test_a_strike_is_planned_so_too() -> None:
     strike = optimize_strike(stiff())
     assert strike.status is Status.SOLVED

@@ -28,6 +28,8 @@ from impactopt.planning.clearance_constraints import (
     solved_apart,
     spots_of,
 )
+from impactopt.planning.parameter_changes import parameter_of
+from impactopt.planning.reconstruction import program_on
 from impactopt.planning.refinement import Guess
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
@@ -212,6 +214,23 @@ def test_a_program_stays_as_it_is_when_one_with_more_rows_is_made_of_it(
     assert more.program.m > t.program.m
     for program in (more.program, t.program):
         check_derivatives(program, x + 0.01)
+
+
+def test_a_program_with_such_rows_takes_the_numbers_of_another_problem(
+    arm_transcription: Transcription,
+) -> None:
+    bare = changed(arm_transcription)
+    rows = Watch(bare, margins_of(bare), first_iterate(bare)).rows(0.2)
+    problem = bare.problem
+    other = parameter_of(problem, "contact.stiffness").at(1.3 * problem.law.parameters["stiffness"])
+    moving, whole = (
+        program_on(p, bare.nodes, bare.hit.elements, bare.hit.shares).with_apart(rows)
+        for p in (problem, other)
+    )
+    assert moving.program.m > bare.program.m
+    assert not moving.program.same_numbers(whole.program)
+    moving.move_to(other)
+    assert moving.program.same_numbers(whole.program)
 
 
 def without(t: Transcription) -> Transcription:

@@ -406,6 +406,8 @@ class StructuredProgram:
         np.add.at(self._c, affine.cols, affine.vals)
         self._c += linear
         self._c0, self._Q = float(affine.const.sum()), sp.csc_array(quadratic)
+        self._curvature = self._Q.copy()  # without the zeros of places that clearance may couple
+        self._curvature.eliminate_zeros()
 
     def same_numbers(self, other: StructuredProgram) -> bool:
         """True if bounds, constants, weights and parameters equal those of another program, to rounding."""
@@ -455,10 +457,10 @@ class StructuredProgram:
         return np.concatenate([b.value(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)])
 
     def objective(self, x: Array) -> float:
-        return float(self._c0 + self._c @ x + 0.5 * (x @ (self._Q @ x)))
+        return float(self._c0 + self._c @ x + 0.5 * (x @ (self._curvature @ x)))
 
     def gradient(self, x: Array) -> Array:
-        return self._c + self._Q @ x
+        return self._c + self._curvature @ x
 
     def constraints(self, x: Array) -> Array:
         t = time.perf_counter()

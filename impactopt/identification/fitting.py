@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from impactopt.collision.sdc import VirtualMass
 from impactopt.contact.laws import ContactLaw
@@ -404,7 +404,7 @@ def _told(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
     residuals, jacobian = fit.residuals(z), fit.jacobian(z)
     force, motion = _parts(fit, residuals)
     n, m, p = len(force), len(motion), len(z)
-    spread = _standard_errors(jacobian) * float(student.ppf(0.5 + level / 2, max(n + m - p, 1)))
+    spread = _standard_errors(jacobian) * float(stdtrit(max(n + m - p, 1), 0.5 + level / 2))
     estimates = {}
     for each, at, off in zip(fit.free, z, spread, strict=False):
         low, high = (float(each.number(np.asarray(at + side * off))) for side in (-1, 1))

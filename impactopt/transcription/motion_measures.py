@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid, trapezoid
-from scipy.signal import find_peaks
 
 from impactopt.bodies.clearance import Places
 from impactopt.problem.problem import ImpactProblem
@@ -91,5 +90,15 @@ def _slope(time: Array, values: Array) -> Array:
 
 
 def _turns(angle: Array) -> int:
-    """Number of times that an angle (k,) [rad] turns back."""
-    return len(find_peaks(angle, prominence=TURN)[0]) + len(find_peaks(-angle, prominence=TURN)[0])
+    """Number of times that an angle (k,) [rad] turns back by `TURN` or more.
+
+    SciPy's `find_peaks` by prominence finds as many, and takes half a second to import.
+    """
+    turns, way, low, high = 0, 0, angle[0], angle[0]
+    for value in angle.tolist():
+        low, high = min(low, value), max(high, value)
+        now = 1 if value - low >= TURN and way <= 0 else -1 if high - value >= TURN and way >= 0 else 0
+        if now:
+            turns += way != 0
+            way, low, high = now, value, value
+    return turns

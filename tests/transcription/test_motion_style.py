@@ -7,7 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.integrate import quad, trapezoid
+from scipy.integrate import cumulative_trapezoid, quad, trapezoid
+from scipy.signal import find_peaks
 from support.small_plans import Planned, changed
 
 from impactopt.errors import InputError
@@ -105,6 +106,20 @@ def test_measures_are_those_of_the_reference(biped_plan: Planned) -> None:
     weight = 9.81 * sum(body.mass for body in problem.robot.model.inertias)
     assert low * weight == pytest.approx(reference.ground[:, 2].min())
     assert high * weight == pytest.approx(reference.ground[:, 2].max())
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_reversals_are_peaks_and_valleys_by_their_prominence(biped_plan: Planned, seed: int) -> None:
+    problem, reference = biped_plan.problem, biped_plan.trajectory
+    rates = 3.0 * np.random.default_rng(seed).standard_normal(reference.v.shape)
+    found = motion_measures(problem, replace(reference, v=rates))["reversals"]
+    before = reference.phase == 0
+    angle = cumulative_trapezoid(rates[before], reference.time[before], axis=0, initial=0.0)
+    counts = [
+        sum(len(find_peaks(side, prominence=0.02)[0]) for side in (column, -column))
+        for column in angle[:, -problem.robot.n :].T
+    ]
+    assert found == np.median(counts) > 0
 
 
 def test_a_robot_at_rest_presses_with_its_weight(biped_plan: Planned) -> None:

@@ -117,7 +117,7 @@ def _instants(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
 
 
 ALLOWED = 1e-2  # of the impulse
-HALVINGS = 2
+HALVINGS = 3
 BEYOND = 0.02  # [s] after the blow that the comparison goes on
 
 
@@ -126,7 +126,7 @@ def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any)
 
     It is compared up to the end of the blow with one of twice the step, or where that was given longer than
     the engine's own with one of that. Where more than 1 % is left, or it diverges, and the step is no longer,
-    it is halved, twice at most.
+    it is halved, three times at most.
     """
     own = float((run.__kwdefaults__ or {})["step"])
     step = float(options.pop("step", own))

@@ -289,7 +289,7 @@ def simulate_pinocchio(
     reference: Any,
     scene: Scene,
     *,
-    step: float = 1e-4,
+    step: float = 2e-4,
     settle: float = 0.3,
     record: int = 5,
     missing: bool = False,

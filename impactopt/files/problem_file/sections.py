@@ -247,7 +247,7 @@ class StancePhaseSection(Section):
 
     soles: list[str] = required("names of the soles that stand")
     duration: Duration = optional(
-        "duration [s]; left out of the phase with the blow, which has the times of [swing] and [follow]",
+        "duration [s]; of the phase with the blow left out: it has those of [swing] and [follow]",
         "duration_s",
     )
     intervals: int = optional("intervals of the spline, at least 6, by default 12")
@@ -255,8 +255,7 @@ class StancePhaseSection(Section):
         "longest over shortest interval, the short ones at the contact, by default 3"
     )
     steps: dict[str, list[float]] = optional(
-        "by sole that touches down as the phase begins: forward and to the left [m], such as "
-        "{ left = [0.3, 0.0] }; without one it comes down where it was",
+        "by sole that touches down: forward and to the left [m], such as { left = [0.3, 0.0] }",
         "steps_m",
     )
 
@@ -305,9 +304,7 @@ class CollisionSection(Section):
         "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    touches: Touches = optional(
-        "times that a board is met, the last of which breaks it; left out: as often as point masses meet it"
-    )
+    touches: Touches = optional("times that a board is met; left out: as often as point masses meet it")
     compression: Fractions = optional("lengths of its collocation elements")
     restitution: Fractions = optional("lengths of its collocation elements")
 

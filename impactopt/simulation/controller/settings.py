@@ -43,16 +43,15 @@ class ControllerSettings(Described):
     impact: str = field(
         default="planned",
         metadata=about(
-            "feedback about the impact: as always (none), impact-invariant projection, reference spreading, "
-            "both, or both with the plan's servos in contact (planned)",
+            "feedback about the impact: as always, impact-invariant projection, reference spreading, both; "
+            "planned: both with the plan's servos in contact",
             choices=IMPACTS,
         ),
     )
     follow: str = field(
         default="recover",
         metadata=about(
-            "after the impact: the plan's follow-through, or the same, slower and with the centre of mass "
-            "farther inside the soles (recover)",
+            "after the impact: the plan's follow-through; recover: slower, and farther inside the soles",
             choices=FOLLOWS,
         ),
     )

@@ -26,8 +26,9 @@ PATIENCE = 20.0  # [s] that each of the two ways may take
 _STEPS = 3e-3, 1e-2  # [s] least and most between instants of the motion that is drawn
 _IN_CONTACT = 6  # instants, if the least step allows it
 _WORST = 5  # constraints that are reported
-# of the solver: the impulse is within a thousandth, in half of the iterations
-_LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-3}
+# of the solver: impulses are within 0.15 %, in two thirds of the iterations. With a looser complementarity
+# the barrier holds plans off their bounds: 1e-3 took a tenth of a nail stroke's impulse
+_LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-5}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

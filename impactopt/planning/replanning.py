@@ -264,9 +264,9 @@ def _binding(bent: Bent) -> tuple[Binding, ...]:
 
 _FIRST_ORDER = 1e-3  # of constraints: a first-order plan that is off by more is none
 _ENOUGH, _CORRECTIONS = 1e-4, 4  # of constraints: no more steps; and so many at most beside the first
-_BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near
-# First barriers, and most iterations, from the plan itself. With the smaller one the solver keeps to bounds
-# that hold no more, and takes a third longer. In one of 50 shifts either of them fails.
+# First barriers of the solver, and most iterations. With the smaller one the solver keeps to bounds that hold
+# no more, and takes a third longer. In one of 50 shifts either of them fails. A plan of first order is a
+# better start for shifts of a millimetre alone, and takes longer than what it saves
 _FROM_PLAN = ((1e-3, 150), (1e-5, None))
 
 
@@ -286,14 +286,15 @@ def moved_solution(
     """
     problem = moved_problem(solution.problem, **changes)
     bent = bent_of(solution)
-    _ = bent.predictor  # what all that is moved shares
+    if not polish:
+        _ = bent.predictor  # what all that is moved shares
     began = time.perf_counter()
     t = bent.program_for(problem, anew=polish)
     built = time.perf_counter()
-    budget = Budget(solver="ipm", options=options, time_limit=time_limit, callback=callback).started()
-    first = _first_order(solution, t, bent)
     if not polish:
+        first = _first_order(solution, t, bent)
         return _solution(solution, Outcome.of(t, first), (built - began, time.perf_counter() - built))
+    budget = Budget(solver="ipm", options=options, time_limit=time_limit, callback=callback).started()
     margins = Margins(problem) if problem.keeps_apart else None
     origin = Guess(program=t, start=solution.result)
     # new constraints are farther off than what a tolerance for small moves makes up for
@@ -306,18 +307,14 @@ def moved_solution(
     def solve(guess: Guess[Transcription]) -> Outcome[Transcription]:
         return refined(Outcome.of(guess.program, exact.run(guess.program.program, guess.start), guess))
 
-    first = _polished(budget, t, first, solution.result)
-    outcome = refined(Outcome.of(t, first, origin))
+    outcome = refined(Outcome.of(t, _polished(budget, t, solution.result), origin))
     outcome = refine_with(outcome, [LazyTerms(finer=False)], solve, budget)
     return _solution(solution, outcome, (built - began, time.perf_counter() - built))
 
 
-def _polished(budget: Budget, t: Transcription, first: SolverResult, old: SolverResult) -> SolverResult:
-    """Solution of the changed program, started from the first-order step if that nearly satisfies the
-    constraints. Otherwise, or if the solver fails from there, it starts from the old solution, which is the
-    better guess then.
-    """
-    result = budget.near_by().run(t.program, first, _BARRIER) if first.status.usable else None
+def _polished(budget: Budget, t: Transcription, old: SolverResult) -> SolverResult:
+    """Solution of the changed program, started from the old one."""
+    result: SolverResult | None = None
     for barrier, most in _FROM_PLAN:
         if result and (result.status.usable or result.status is Status.INTERRUPTED or budget.left == 0):
             break

@@ -89,11 +89,11 @@ def test_a_bent_plan_is_that_of_the_changed_problem(arm: Solution, changes: dict
     assert first.result.iterations <= 5 and "first order" in first.result.message
 
 
-@pytest.mark.parametrize("failing", [0, 1, 2])
+@pytest.mark.parametrize("failing", [0, 1])
 def test_where_one_start_leads_nowhere_the_next_does(
     arm: Solution, failing: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the first-order plan, from the plan with a high barrier, from the plan with a low one."""
+    """From the plan with a high barrier, or with a low one."""
     own, done = Budget.run, list[SolverResult]()
 
     def run(self: Budget, *given: Any) -> SolverResult:

@@ -271,7 +271,7 @@ def word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> R
 def _of_joints(names: Sequence[Any]) -> Row:
     """Row with the joints that the numbers above belong to, from the left."""
     different = dict.fromkeys(str(name) for name in names if name)
-    return Row(f"  {', '.join(different)}", (Cell(""),) * len(names))
+    return Row(f"  at {', '.join(different)}", (Cell(""),) * len(names))
 
 
 def _of_replays(row: Row | None) -> Row | None:

@@ -83,6 +83,7 @@ _BODIES: dict[str, _Kinds] = {
 }
 _REPLAYS_NUMBERS = (
     *("impulse_error_pct?", "step_error_pct?", "saturated_ms?", "final_posture_error_rad?"),
+    "beyond_range_rad?",
     *("sole_slip_mm?", "sole_lift_mm?", "sole_lift_collision_mm?"),
 )
 _LOADS: dict[str, _Kinds] = {
@@ -106,6 +107,7 @@ _ANY_REPLAY: dict[str, _Kinds] = {
     **_LOADS,
     **dict.fromkeys(_REPLAYS_NUMBERS, _NUMBER),
     **dict.fromkeys(("engine?", "reason?", "error?"), _TEXT),
+    "beyond_range?": (str, type(None)),
     "standing?": _YES,
     **_SOLES,
 }

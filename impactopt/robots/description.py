@@ -16,6 +16,7 @@ from impactopt.robots.attachments import Source, Striker
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.checks import REPAIRED, check_choice, repair_inertias
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
+from impactopt.robots.tendons import Tendon
 
 __all__ = ["Description", "Tie", "between"]
 
@@ -64,6 +65,7 @@ class Description:
         for each link or body, and an OP_FRAME for each site, by their names.
     kp, kd, torque : by joint, what its actuators say.
     springs : stiffness [N m/rad] and angle at rest [rad] by joint.
+    tendons : ranges of sums of joint angles.
     sites : names of those on links that move.  driven : joints that actuators move.  idle : joints that no
         actuator moves, where some have one.
     ties : what no plan has, unless joints are locked.
@@ -76,6 +78,7 @@ class Description:
     kd: dict[str, float] = field(default_factory=dict)
     torque: dict[str, float] = field(default_factory=dict)
     springs: dict[str, tuple[float, float]] = field(default_factory=dict)
+    tendons: list[Tendon] = field(default_factory=list)
     sites: list[str] = field(default_factory=list)
     driven: list[str] = field(default_factory=list)
     idle: list[str] = field(default_factory=list)
@@ -127,6 +130,13 @@ class Description:
         sites = [Striker(name=s, frame=s, point=np.zeros(3)) for s in self.sites if s not in named]
         return {**out, "strikers": [*sites, *given.get("strikers", ())]}
 
+    def tendons_of(self, model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> list[Tendon]:
+        """Tendons of a model with locked joints, whose followers follow."""
+        angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
+        left = [tendon.without(angles, couplings_of(model)) for tendon in self.tendons]
+        # one that is too long or too short with all of its joints locked is refused by the robot
+        return [tendon for tendon in left if tendon.coefficients or not tendon.lower <= 0 <= tendon.upper]
+
     def made(
         self, path: str | PathLike[str], given: Mapping[str, Any], options: Mapping[str, Any]
     ) -> tuple[pin.Model, dict[str, Any], Source]:
@@ -139,6 +149,7 @@ class Description:
         model, kind = self.moving(given["locked"]), self.kind.lower()
         repairs = tuple(repair_inertias(model)) if given["inertias"] == REPAIRED else ()
         every = {"name": given["name"] or model.name, kind: path, **self.options(model, options)}
+        every["tendons"] = [*self.tendons_of(model, given["locked"]), *options.get("tendons", ())]
         notes = (*self.notes, *self._approximated(model))
         own: dict[str, Any] = {kind: fspath(path), "options": {**given, **options}}
         return model, every, Source(repairs=repairs, notes=notes, **own)

@@ -326,6 +326,10 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     "`stiffness`, ": ([(J2, f'stiffness="9" springref=".5" {J2}')], ""),
     "`stiffness` that": ([(J2, f'stiffness="9 1" {J2}')], "'j2' has a spring whose torque is not linear"),
     "`damping` that": ([(J2, f'damping="2 1" {J2}')], "'j2' has damping that is not linear"),
+    "`<fixed>`": (
+        [_before(END, '<tendon><fixed name="t" range="-1 1"><joint joint="j2" coef="2"/></fixed></tendon>')],
+        "",
+    ),
     "`<tendon>`": (
         [
             _before(
@@ -393,7 +397,7 @@ def _lines(kind: str) -> list[tuple[str, str]]:
 def _shape(robot: Robot) -> tuple[Any, ...]:
     """All that a robot's file gives it."""
     numbers = (robot.kp, robot.kd, robot.torque_limit, robot.lower, robot.upper, robot.armature)
-    return model_hash(robot.model), robot.actuators, *(tuple(x) for x in numbers)
+    return model_hash(robot.model), robot.actuators, robot.tendons, *(tuple(x) for x in numbers)
 
 
 def _tried(kind: str, text: str, folder: Path) -> Robot:

@@ -18,7 +18,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, missing_package
-from impactopt.robots.build import existing, friction, set_friction
+from impactopt.robots.build import ROOT, existing, friction, set_friction
 from impactopt.robots.description import Description, Tie, between
 from impactopt.robots.tendons import Tendon
 
@@ -336,6 +336,10 @@ class _Reader(Compiled):
                 self._add_site(s)
         self._actuators()
         self._keyframes()
+        if self.floating:
+            q = pin.neutral(self.model)
+            q[3:7] = pin.Quaternion(_rotation(self.mj.body_quat[self.roots[0]])).coeffs()
+            self.model.referenceConfigurations[ROOT] = q
         self.model.gravity = pin.Motion(gravity_of(self), np.zeros(3))
         self.out.ties += ties_of(self)
         self.out.tendons += tendons_of(self)

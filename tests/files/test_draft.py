@@ -8,6 +8,7 @@ import re
 import warnings
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -649,12 +650,47 @@ def test_crossed_limits_are_a_mistake(tmp_path: Path) -> None:
         _drafted(tmp_path, text)
 
 
-def test_an_mjcf_of_a_walker_without_a_free_joint_stands(tmp_path: Path) -> None:
+def _walker(folder: Path) -> Path:
+    """An MJCF of the biped, without a free joint."""
     mujoco = pytest.importorskip("mujoco")
-    path, xml = tmp_path / "robot.urdf", tmp_path / "robot.xml"
+    path, xml = folder / "robot.urdf", folder / "robot.xml"
     kept = '<mujoco><compiler fusestatic="false"/></mujoco></robot>'  # its root is bolted, and a body still
     path.write_text(urdfs.biped().replace("</robot>", kept))
     mujoco.mj_saveLastXML(str(xml), mujoco.MjModel.from_xml_path(str(path)))
+    return xml
+
+
+def test_a_walker_whose_roots_frame_lies_is_drafted_upright(tmp_path: Path) -> None:
+    xml = _walker(tmp_path)
+    (tmp_path / "upright.toml").write_text(draft_problem(xml, folder=tmp_path, mjcf=True).text)
+    turn, tree = pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), ElementTree.parse(xml)
+    (root,) = tree.findall("worldbody/body")
+    for part in root:  # all on it is turned back
+        place = [float(x) for x in part.get("pos", "0 0 0").split()]
+        w, x, y, z = (float(x) for x in part.get("quat", "1 0 0 0").split())
+        part.set("pos", _words(turn.T @ place))
+        part.set("quat", _words(_wxyz(turn.T @ pin.Quaternion(w, x, y, z).matrix())))
+    root.set("quat", _words(_wxyz(turn)))
+    tree.write(xml)
+    (tmp_path / "turned.toml").write_text(draft_problem(xml, folder=tmp_path, mjcf=True).text)
+    upright, turned = (load_problem(tmp_path / f"{name}.toml") for name in ("upright", "turned"))
+    own, same = upright.start_posture, turned.start_posture
+    assert turned.robot.joint_positions(same) == pytest.approx(upright.robot.joint_positions(own), abs=1e-4)
+    assert pin.Quaternion(*same[[6, 3, 4, 5]]).matrix() == pytest.approx(turn)
+    assert turned.point == pytest.approx(upright.point, abs=2e-3)
+    assert turned.normal == pytest.approx(upright.normal)
+
+
+def _wxyz(turn: Any) -> Any:
+    return pin.Quaternion(turn).coeffs()[[3, 0, 1, 2]]
+
+
+def _words(numbers: Any) -> str:
+    return " ".join(f"{x:.15g}" for x in numbers)
+
+
+def test_an_mjcf_of_a_walker_without_a_free_joint_stands(tmp_path: Path) -> None:
+    xml = _walker(tmp_path)
     draft = draft_problem(xml, folder=tmp_path, mjcf=True)
     robot = read_toml(draft.text)["robot"]
     assert robot["floating"] is True and len(robot["soles"]) == 2

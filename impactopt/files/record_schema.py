@@ -45,7 +45,7 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"}
     | dict.fromkeys(("velocity", "acceleration"), "? p n"),
     "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "normal": "3", "contact": ""}
-    | {"target": "? b c 3", "obstacles": "? o u 3"},
+    | {"target": "? b c 3", "obstacles": "? o u 3", "ground": "? g"},
     "history": dict.fromkeys(("iteration", "objective", "max_violation", "kkt"), "i"),
 }
 _TEXTS = ("joints", "replayed_soles", "program_statement")

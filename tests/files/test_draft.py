@@ -78,12 +78,9 @@ def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("motion", ["punch", "nail"])
-@pytest.mark.parametrize("moves", ["turn", "elbow"])
-def test_a_robot_of_one_joint_is_told_that_it_reaches_no_target(
-    tmp_path: Path, moves: str, motion: str
-) -> None:
+def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path, motion: str) -> None:
     text = urdfs.arm()
-    for name in {"turn", "shoulder", "elbow", "wrist"} - {moves}:
+    for name in ("shoulder", "elbow", "wrist"):
         text = text.replace(f'<joint name="{name}" type="revolute">', f'<joint name="{name}" type="fixed">')
     with pytest.raises(InputError, match="no posture is found with 'hand' in front"):
         _drafted(tmp_path, text, motion=motion)
@@ -648,6 +645,22 @@ def test_crossed_limits_are_a_mistake(tmp_path: Path) -> None:
     text = re.sub('lower="-2.4" upper="2.4"', 'lower="2.4" upper="-2.4"', urdfs.arm())
     with pytest.raises(InputError, match=r"'elbow' .*lower 2.4, upper -2.4.*URDF's <limit>"):
         _drafted(tmp_path, text)
+
+
+@pytest.mark.parametrize("axis", ["0 1 0", "0.3 1 0.2"])
+def test_one_joint_strikes_along_its_circle(tmp_path: Path, axis: str) -> None:
+    bar = urdfs.link("bar", 2.0, (0.05, 0.05, 0.5), (0, 0, 0.25))
+    turn = urdfs.joint("turn", "base", "bar", axis, (0, 0, 1), (-2, 2))
+    problem = _problem(
+        tmp_path, urdfs.robot("one", urdfs.link("base", 1.0, (0.1, 0.1, 0.1), (0, 0, 0)), bar, turn)
+    )
+    about = np.array([float(x) for x in axis.split()])
+    arm = problem.point - [0.0, 0.0, 1.0]
+    end = problem.robot.striker(problem.striker).point
+    assert arm @ about == pytest.approx(end @ about, abs=1e-8)
+    assert np.linalg.norm(arm) == pytest.approx(np.linalg.norm(end), abs=1e-8)
+    assert [problem.normal @ about, problem.normal @ arm] == pytest.approx([0.0, 0.0], abs=1e-8)
+    assert solve(problem).status.usable
 
 
 def _walker(folder: Path) -> Path:

@@ -344,6 +344,7 @@ class _Reader(Compiled):
         self.out.ties += ties_of(self)
         self.out.tendons += tendons_of(self)
         self.out.notes += notes_of(self)
+        self.out.lead_from_root()
         return self.out
 
     def _driven(self, root: int) -> bool:

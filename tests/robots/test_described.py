@@ -265,7 +265,14 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`<mimic>` of a joint that comes": (
         [("</joint><joint", '<mimic joint="j2"/></joint><joint')],
-        "'j1' cannot follow 'j2': 'j2' comes after it",
+        "'j1' follows 'j2' by <mimic>, which comes after it in the tree: 'j1' leads",
+    ),
+    "`<mimic>` of a joint that turns": (
+        [
+            ('type="revolute"', 'type="continuous"'),
+            ('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>'),
+        ],
+        "turns without end",
     ),
     "`<mimic>` of a joint that does not": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j"/></joint></robot>')],

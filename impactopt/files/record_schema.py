@@ -45,7 +45,7 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"}
     | dict.fromkeys(("velocity", "acceleration"), "? p n"),
     "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "normal": "3", "contact": ""}
-    | {"target": "? b c 3", "obstacles": "? o u 3"},
+    | {"target": "? b c 3", "obstacles": "? o u 3", "ground": "? g"},
     "history": dict.fromkeys(("iteration", "objective", "max_violation", "kkt"), "i"),
 }
 _TEXTS = ("joints", "replayed_soles", "program_statement")
@@ -83,6 +83,7 @@ _BODIES: dict[str, _Kinds] = {
 }
 _REPLAYS_NUMBERS = (
     *("impulse_error_pct?", "step_error_pct?", "saturated_ms?", "final_posture_error_rad?"),
+    "beyond_range_rad?",
     *("sole_slip_mm?", "sole_lift_mm?", "sole_lift_collision_mm?"),
 )
 _LOADS: dict[str, _Kinds] = {
@@ -106,6 +107,7 @@ _ANY_REPLAY: dict[str, _Kinds] = {
     **_LOADS,
     **dict.fromkeys(_REPLAYS_NUMBERS, _NUMBER),
     **dict.fromkeys(("engine?", "reason?", "error?"), _TEXT),
+    "beyond_range?": (str, type(None)),
     "standing?": _YES,
     **_SOLES,
 }

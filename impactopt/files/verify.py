@@ -286,6 +286,9 @@ def motion_of_record(
             needed = np.concatenate([still, torque[i]])
             yield f"{prefix}: equation of motion", float(np.abs((tau - needed) / scale).max()), where
         yield f"{prefix}: torque limit", float(np.abs(torque[i] / limit).max() - 1), where
+        if phase[i] != 1:  # in contact the reference coasts
+            name, excess = robot.ranges.excess(robot.joint_positions(q[i : i + 1]))
+            yield f"{prefix}: position limit", excess, f"{name}, {where}"
         fast = np.abs(v[i][-robot.n :]) / robot.velocity_limit
         yield f"{prefix}: velocity limit", float(fast.max() - 1), where
     if prefix == "reference" and (phase == 0).any():

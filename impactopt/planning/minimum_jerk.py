@@ -162,7 +162,7 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
             q, v, a, *_ = complete_reference(problem, y, yd, ydd, wrench, legs0)
         except InputError:  # a leg too short for the base's way
             return False
-        joints, rates = q[:, -r.n :], v[:, -r.n :]
+        joints, rates = r.ranges.positions(q[:, -r.n :]), v[:, -r.n :]
         if (joints < lower).any() or (joints > upper).any():
             return False
         if (np.abs(rates) > problem.term(VelocityLimit).most(r)).any():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import pickle
+import re
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -30,6 +32,7 @@ AnySolution = TypeVar("AnySolution", bound=Solved)
 Run = Callable[[ImpactProblem, Any, Budget, range, int], AnySolution]
 Guesses = Iterable[tuple[str, Callable[[], Guess[Program]]]]
 MORE = 2  # starts, where all that were asked for end with solutions that are refused
+ALIKE = 0.1  # relative difference of two violations, of refusals in the same words
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
 
 
@@ -104,20 +107,35 @@ def best_of(
 
     guesses : names, and what makes each when its turn comes. More than ``count`` are tried while each ends
         with a solution that is refused, such as for penetration: where a motion passes bodies on the wrong
-        side, others may not. An interrupted solve is the last one, and so is one after which no time is left.
+        side, others may not; none more after two that end alike. An interrupted solve is the last one, and so
+        is one after which no time is left.
 
     Of those that meet their constraints the one of least objective is best, else the one of least violation.
     """
     found = list[tuple[str, Outcome[Program]]]()
+    alike = 1  # outcomes that are refused for the same
     for k, (name, make) in enumerate(guesses):
-        if k >= count and not all(outcome.refused for _, outcome in found):
+        if k >= count and (alike > 1 or not all(outcome.refused for _, outcome in found)):
             break
-        found.append((name, solve(make())))
-        if found[-1][1].result.status is Status.INTERRUPTED or budget.left == 0:
+        new = solve(make())
+        alike = max(alike, 1 + sum(_alike(new, outcome) for _, outcome in found))
+        found.append((name, new))
+        if new.result.status is Status.INTERRUPTED or budget.left == 0:
             break
     best = min((outcome for _, outcome in found), key=lambda outcome: rank_of(outcome.result))
     attempts = [replace(outcome.attempt(name), kept=outcome is best) for name, outcome in found]
-    return replace(best, attempts=tuple(attempts))
+    result = best.result
+    if best.refused and alike > 1:
+        ended = f"{alike} of {len(found)} starts ended alike."
+        result = replace(result, message=f"{result.message} {ended}")
+    return replace(best, result=result, attempts=tuple(attempts))
+
+
+def _alike(one: Outcome[Program], other: Outcome[Program]) -> bool:
+    """True if both are refused in the same words, with nearly the same numbers."""
+    words, others = (re.sub(r"[\d.]+", "", outcome.result.message) for outcome in (one, other))
+    worst = (outcome.result.max_violation for outcome in (one, other))
+    return one.refused and other.refused and words == others and math.isclose(*worst, rel_tol=ALIKE)
 
 
 def _best_side_by_side(

@@ -84,7 +84,7 @@ def solve(
     starts : int
         Number of starts. The first one is plain, the others have perturbed postures and other speeds, drawn
         by `seed`. The best motion is kept; ``Solution.attempts`` has all. Where all end with bodies in each
-        other, up to two more are tried.
+        other, up to two more are tried, unless two end alike.
     seed : int
         Seed of the starts that are drawn.
     options : mapping, optional

@@ -61,7 +61,9 @@ def _robot(robot: Robot, striker: str) -> dict[str, Any]:
         "soles": [(sole.name, sole.frame, sole.polygon) for sole in robot.soles],
         "striker": (hits.frame, hits.point),
         "disable_collisions": sorted(map(sorted, robot.disable_collisions)),
-    } | ({"passive": robot.passive} if robot.passive.any() else {})
+        **({"passive": robot.passive} if robot.passive.any() else {}),
+        **({"tendons": robot.tendons} if robot.tendons else {}),
+    }
 
 
 def _drives(problem: Any) -> dict[str, Any]:

@@ -557,6 +557,8 @@ class ImpactProblem:
                 f"{joint} = {ratio:g} {leader} {offset:+g}"
                 for joint, (leader, ratio, offset) in self.robot.couplings.items()
             ]
+        if self.robot.tendons:
+            out["tendons"] = list(map(str, self.robot.tendons))
         if self.robot.source and self.robot.source.repairs:
             out["inertias"] = [f"repaired: {text}" for text in self.robot.source.repairs]
         if self.robot.source and self.robot.source.notes:

@@ -35,6 +35,7 @@ NEARBY = 0.4  # [m] from a problem's point
 AHEAD = 0.25  # of the reach: a target stands so far ahead of the base at least
 DOWN = np.array([0.0, 0.0, -1.0])
 NORMALS = (*map(np.array, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0))), DOWN)
+ASLANT = float(np.cos(np.radians(30)))  # least cosine between a single joint's line and a normal
 PRESSED = 1e-3  # [m] at which a law's stiffness is read
 
 
@@ -136,7 +137,8 @@ def drawn_blows(
 ) -> list[Blow]:
     """Estimated blows ahead of the base, the hardest first: in `DRAWN` postures, along each normal.
 
-    The joints that move the striker are anywhere inside their limits, and the others as in q (nq,). A striker
+    The joints that move the striker are anywhere inside their limits, and the others as in q (nq,). A single
+    joint strikes along its circle or line, within `ASLANT` of a normal. A striker
     whose face is known meets the target with it, as `FirstTouch` asks by default; not if not `with_face`.
     """
     robot = strength.robot
@@ -153,10 +155,15 @@ def drawn_blows(
         step = np.zeros(robot.nv)
         step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own
         posture, ways = np.array(pin.integrate(model, q, step)), normals
+        if len(limb) == 1:
+            jac = pin.computeFrameJacobian(model, data, posture, frame, pin.LOCAL_WORLD_ALIGNED)
+            way = np.reshape(jac, (6, robot.nv))[:3, robot.nv - robot.n + limb[0]]
+            both = np.outer([1.0, -1.0], way / max(float(np.linalg.norm(way)), 1e-9))
+            ways = [line for line in both if max(n @ line for n in normals) > ASLANT]
         if face is not None:
             pin.framesForwardKinematics(model, data, posture)
             ahead = data.oMf[frame].rotation @ face.normal
-            ways = [n for n in normals if n @ ahead >= square]
+            ways = [n for n in ways if n @ ahead >= square]
         if ways:
             blows += strength.at(posture, ways)
             met += 1

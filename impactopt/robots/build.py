@@ -243,6 +243,21 @@ def joint_positions(model: pin.Model, q: Array) -> Array:
     )
 
 
+ROOT = "root of the MJCF"  # a reference configuration, which is no posture
+
+
+def neutral(model: pin.Model) -> Array:
+    """(nq,) with all joints at zero; the root upright as its MJCF has it, at yaw 0."""
+    q = pin.neutral(model)
+    for entry in model.referenceConfigurations:
+        if entry.key() == ROOT:
+            roll, pitch, _ = pin.rpy.matrixToRpy(
+                pin.Quaternion(*np.array(entry.data())[[6, 3, 4, 5]]).matrix()
+            )
+            q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(roll, pitch, 0.0)).coeffs()
+    return q
+
+
 def set_joints(model: pin.Model, q: Array, angles: Mapping[str, float], what: str) -> Array:
     """A copy of the configuration with some joint angles set by name."""
     q = np.array(q, dtype=np.float64)
@@ -259,6 +274,7 @@ def reference_configurations(model: pin.Model) -> dict[str, Array]:
     return {
         str(entry.key()): pin.normalize(model, np.array(entry.data(), dtype=np.float64))
         for entry in model.referenceConfigurations
+        if entry.key() != ROOT
     }
 
 
@@ -330,7 +346,7 @@ def read_postures(model: pin.Model, given: Mapping[str, Mapping[str, float] | Ar
     for name, value in given.items():
         what = f"posture {name!r}"
         if isinstance(value, Mapping):
-            postures[name] = set_joints(model, found.get(name, pin.neutral(model)), value, what)
+            postures[name] = set_joints(model, found.get(name, neutral(model)), value, what)
         else:
             postures[name] = check_configuration(model, value, what)
     return postures

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike, fspath
 from typing import Any
 
@@ -13,9 +13,16 @@ import pinocchio as pin
 from impactopt.errors import InputError, Mistakes
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source, Striker
-from impactopt.robots.build import joint_names, lock_joints
+from impactopt.robots.build import (
+    effort_limit,
+    joint_names,
+    lock_joints,
+    set_velocity_limit,
+    velocity_limit,
+)
 from impactopt.robots.checks import REPAIRED, check_choice, repair_inertias
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
+from impactopt.robots.tendons import Tendon
 
 __all__ = ["Description", "Tie", "between"]
 
@@ -28,6 +35,7 @@ class Tie:
     text : of a message; begins with the thing and its name.  fix : another one than to lock.
     follower : the joint that has no motor, "" if none is meant; follows : a polynomial of the other joint's
         angle [rad], the lowest coefficient first, which is the follower's.
+    note : what is told where it follows.
     """
 
     text: str
@@ -36,6 +44,7 @@ class Tie:
     fix: str = ""
     follower: str = ""
     follows: tuple[float, ...] = (0.0,)
+    note: str = ""
 
     @property
     def coupling(self) -> Coupling | None:
@@ -64,6 +73,7 @@ class Description:
         for each link or body, and an OP_FRAME for each site, by their names.
     kp, kd, torque : by joint, what its actuators say.
     springs : stiffness [N m/rad] and angle at rest [rad] by joint.
+    tendons : ranges of sums of joint angles.
     sites : names of those on links that move.  driven : joints that actuators move.  idle : joints that no
         actuator moves, where some have one.
     ties : what no plan has, unless joints are locked.
@@ -76,11 +86,46 @@ class Description:
     kd: dict[str, float] = field(default_factory=dict)
     torque: dict[str, float] = field(default_factory=dict)
     springs: dict[str, tuple[float, float]] = field(default_factory=dict)
+    tendons: list[Tendon] = field(default_factory=list)
     sites: list[str] = field(default_factory=list)
     driven: list[str] = field(default_factory=list)
     idle: list[str] = field(default_factory=list)
     ties: list[Tie] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def lead_from_root(self) -> None:
+        """Let joints that come before their leader in the tree lead, by the inverse law, with its motor."""
+        model, followers = self.model, {tie.follower for tie in self.ties}
+        for k, tie in enumerate(self.ties):
+            law = tie.coupling
+            if (
+                law is None
+                or not law.ratio
+                or law.leader in followers
+                or not model.existJointName(law.leader)
+            ):
+                continue
+            own, other = (model.joints[model.getJointId(joint)] for joint in (tie.follower, law.leader))
+            if own.id > other.id or not own.nq == other.nq == 1:
+                continue
+            note = f"{tie.text}, which comes after it in the tree: {tie.follower!r} leads, with its motor"
+            inverse = (-law.offset / law.ratio, 1 / law.ratio)
+            self.ties[k] = replace(tie, follower=law.leader, follows=inverse, note=note)
+            followers ^= {tie.follower, law.leader}
+            gain, speed = abs(law.ratio), velocity_limit(model)
+            effort = float(effort_limit(model)[other.idx_v])
+            if 0 < effort < np.finfo(float).max:  # Pinocchio's largest double stands for none
+                self.torque.setdefault(law.leader, effort)
+            for numbers, power in ((self.torque, 1), (self.kp, 2), (self.kd, 2)):
+                numbers.pop(tie.follower, None)
+                if law.leader in numbers:
+                    numbers[tie.follower] = numbers.pop(law.leader) / gain**power
+            if not speed[own.idx_v] > 0:  # many files give a follower none
+                speed[own.idx_v] = gain * speed[other.idx_v]
+                set_velocity_limit(model, speed)
+            self.idle = [joint for joint in self.idle if joint != tie.follower]
+            for names in (self.driven, self.idle):
+                names[:] = [tie.follower if joint == law.leader else joint for joint in names]
 
     def moving(self, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
         """The model without locked joints, whose followers follow.
@@ -127,6 +172,13 @@ class Description:
         sites = [Striker(name=s, frame=s, point=np.zeros(3)) for s in self.sites if s not in named]
         return {**out, "strikers": [*sites, *given.get("strikers", ())]}
 
+    def tendons_of(self, model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> list[Tendon]:
+        """Tendons of a model with locked joints, whose followers follow."""
+        angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
+        left = [tendon.without(angles, couplings_of(model)) for tendon in self.tendons]
+        # one that is too long or too short with all of its joints locked is refused by the robot
+        return [tendon for tendon in left if tendon.coefficients or not tendon.lower <= 0 <= tendon.upper]
+
     def made(
         self, path: str | PathLike[str], given: Mapping[str, Any], options: Mapping[str, Any]
     ) -> tuple[pin.Model, dict[str, Any], Source]:
@@ -139,6 +191,7 @@ class Description:
         model, kind = self.moving(given["locked"]), self.kind.lower()
         repairs = tuple(repair_inertias(model)) if given["inertias"] == REPAIRED else ()
         every = {"name": given["name"] or model.name, kind: path, **self.options(model, options)}
+        every["tendons"] = [*self.tendons_of(model, given["locked"]), *options.get("tendons", ())]
         notes = (*self.notes, *self._approximated(model))
         own: dict[str, Any] = {kind: fspath(path), "options": {**given, **options}}
         return model, every, Source(repairs=repairs, notes=notes, **own)
@@ -151,6 +204,7 @@ class Description:
             yield f"the actuator of {name!r} is left out: the motor of {followers[name].leader!r} moves both"
         for tie in self.ties:
             if tie.follower in followers:
+                yield from [tie.note] if tie.note else []
                 continue
             left = [joint for joint in tie.joints if joint in joints]
             if left and len(left) < len(tie.joints):

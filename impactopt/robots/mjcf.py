@@ -18,10 +18,11 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, missing_package
-from impactopt.robots.build import existing, friction, set_friction
+from impactopt.robots.build import ROOT, existing, friction, set_friction
 from impactopt.robots.description import Description, Tie, between
+from impactopt.robots.tendons import Tendon
 
-__all__ = ["Compiled", "compile_mjcf", "gravity_of", "notes_of", "read_mjcf", "ties_of"]
+__all__ = ["Compiled", "compile_mjcf", "gravity_of", "notes_of", "read_mjcf", "tendons_of", "ties_of"]
 
 Array = NDArray[np.float64]
 _OUT = "take it out"
@@ -194,33 +195,19 @@ def _loop(c: Compiled, name: str, one: int, other: int) -> Iterator[Tie]:
     yield Tie(text=text, joints=between(c.model, *ends), free=0, fix=f"{_OUT}, with the rods that it holds")
 
 
-def _tendons(c: Compiled) -> Iterator[Tie]:
+def tendons_of(c: Compiled) -> Iterator[Tendon]:
+    """Fixed tendons that have a range, and do nothing else."""
     mj = c.mj
-    driven = (
-        {
-            int(i)
-            for i, kind in zip(
-                c.numbers("actuator_trnid")[:, :1].ravel(), c.numbers("actuator_trntype"), strict=True
-            )
-            if kind == c.mujoco.mjtTrn.mjTRN_TENDON
-        }
-        if mj.nu
-        else set()
-    )
-    equal = c.mujoco.mjtEq.mjEQ_TENDON
-    held = {
-        int(i) for e in range(mj.neq) if mj.eq_type[e] == equal for i in (mj.eq_obj1id[e], mj.eq_obj2id[e])
-    }
     for t in range(mj.ntendon):
-        does = [
-            key
-            for key in ("stiffness", "damping", "frictionloss", "armature", "limited")
-            if c.numbers(f"tendon_{key}")[t : t + 1].any()
-        ]
-        does += ["an actuator"] if t in driven else []
-        does += ["an equality"] if t in held else []
-        joints = _joints_of_tendon(c, t)
-        if does and joints:
+        if _actions(c, t) == ["limited"] and (sum_of := _sum_of(c, t)):
+            low, high = map(float, mj.tendon_range[t])
+            yield Tendon(name=c.name("tendon", t), coefficients=sum_of, lower=low, upper=high)
+
+
+def _tendons(c: Compiled) -> Iterator[Tie]:
+    for t in range(c.mj.ntendon):
+        does, joints = _actions(c, t), _joints_of_tendon(c, t)
+        if does and joints and not (does == ["limited"] and _sum_of(c, t)):
             yield Tie(
                 text=f"tendon {c.name('tendon', t)!r} acts on {', '.join(joints)} ({', '.join(does)}), which "
                 "no plan has",
@@ -228,6 +215,38 @@ def _tendons(c: Compiled) -> Iterator[Tie]:
                 free=0,
                 fix=_OUT,
             )
+
+
+def _actions(c: Compiled, t: int) -> list[str]:
+    """Effects of a tendon on its joints, in words."""
+    mj = c.mj
+    driven = [
+        int(mj.actuator_trnid[a, 0])
+        for a in range(len(mj.actuator_trntype))
+        if mj.actuator_trntype[a] == c.mujoco.mjtTrn.mjTRN_TENDON
+    ]
+    equal = [e for e in range(mj.neq) if mj.eq_type[e] == c.mujoco.mjtEq.mjEQ_TENDON]
+    held = [int(i) for e in equal for i in (mj.eq_obj1id[e], mj.eq_obj2id[e])]
+    does = [
+        key
+        for key in ("stiffness", "damping", "frictionloss", "armature", "limited")
+        if c.numbers(f"tendon_{key}")[t : t + 1].any()
+    ]
+    return [*does, *(["an actuator"] if t in driven else []), *(["an equality"] if t in held else [])]
+
+
+def _sum_of(c: Compiled, t: int) -> dict[str, float]:
+    """Coefficients by joint of a fixed tendon; empty for another one, and for joints that turn without end
+    or are not the robot's.
+    """
+    mj, out = c.mj, dict[str, float]()
+    first = int(mj.tendon_adr[t])
+    for w in range(first, first + int(mj.tendon_num[t])):
+        joint = c.joint.get(int(mj.wrap_objid[w]), 0)
+        if mj.wrap_type[w] != c.mujoco.mjtWrap.mjWRAP_JOINT or not joint or c.model.joints[joint].nq != 1:
+            return {}
+        out[c.name("joint", int(mj.wrap_objid[w]))] = float(mj.wrap_prm[w])
+    return out
 
 
 def _joints_of_tendon(c: Compiled, t: int) -> tuple[str, ...]:
@@ -317,9 +336,15 @@ class _Reader(Compiled):
                 self._add_site(s)
         self._actuators()
         self._keyframes()
+        if self.floating:
+            q = pin.neutral(self.model)
+            q[3:7] = pin.Quaternion(_rotation(self.mj.body_quat[self.roots[0]])).coeffs()
+            self.model.referenceConfigurations[ROOT] = q
         self.model.gravity = pin.Motion(gravity_of(self), np.zeros(3))
         self.out.ties += ties_of(self)
+        self.out.tendons += tendons_of(self)
         self.out.notes += notes_of(self)
+        self.out.lead_from_root()
         return self.out
 
     def _driven(self, root: int) -> bool:

@@ -22,6 +22,7 @@ from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, 
 from impactopt.robots.checks import GIVEN, REPAIRED, check_inertias, tell_apart
 from impactopt.robots.couplings import Coupling, couplings_of, follower_axes, restore_followers
 from impactopt.robots.forward_kinematics import ForwardKinematics
+from impactopt.robots.tendons import Ranges, Tendon, check_tendons
 from impactopt.robots.tools import check_sole, with_hinges
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
@@ -46,6 +47,7 @@ class Robot:
     kp, kd : (n,) servo stiffness [N m/rad] and damping [N m s/rad].
     torque_limit, velocity_limit : (n,) [N m], [rad/s], largest magnitudes.
     lower, upper : (n,) position limits [rad]; infinite for a continuous joint.
+    tendons : ranges of sums of joint angles.
     actuators : one a joint, of which nothing may be known; armature is None there, it is in `armature`.
     soles : flat feet, in a fixed order.
     strikers : by name.
@@ -80,6 +82,7 @@ class Robot:
     urdf: str | None = None
     mjcf: str | None = None
     actuators: tuple[Actuator, ...] = ()
+    tendons: tuple[Tendon, ...] = ()
 
     def __post_init__(self) -> None:
         checks.check_joint_types(self.model)
@@ -88,6 +91,7 @@ class Robot:
             value = check_array(f"{name} of {self.name!r}", getattr(self, name), (self.n,), finite=False)
             object.__setattr__(self, name, read_only(value))
         object.__setattr__(self, "soles", tuple(self.soles))
+        object.__setattr__(self, "tendons", tuple(self.tendons))
         object.__setattr__(self, "strikers", dict(self.strikers))
         found, limits = Mistakes(), (self.torque_limit, self.velocity_limit, self.lower, self.upper)
         found.attempt(lambda: check_inertias(self.model))
@@ -96,6 +100,7 @@ class Robot:
         found.raise_if_any(f"robot {self.name!r}")
         object.__setattr__(self, "actuators", known(self.actuators or (Actuator(),) * self.n))
         checks.check_actuators(self.joint_names, self.actuators)
+        check_tendons(self.tendons, self.joint_names)
         checks.check_springs(self.model, self.springs)
         for sole in self.soles:
             check_sole(self.model, sole)
@@ -199,6 +204,7 @@ class Robot:
         mjcf: str | PathLike[str] | None = None,
         actuators: Mapping[str, Actuator] | None = None,
         gravity: ArrayLike | None = None,
+        tendons: Sequence[Tendon] = (),
     ) -> Robot:
         """A robot from a pin.Model (which is copied): a free-flyer, if any, first, and then one-DOF joints.
 
@@ -221,6 +227,7 @@ class Robot:
         urdf, mjcf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
         actuators : motors and gears, as of `with_actuators`; friction is the model's where they have none.
         gravity (3,) : [m/s2], world axes; default the model's.
+        tendons : ranges of sums of joint angles.
         """
         build.check_count("sole", soles)
         build.check_count("striker", strikers)
@@ -256,6 +263,7 @@ class Robot:
             disable_collisions=build.link_pairs(model, disable_collisions),
             urdf=None if urdf is None else str(urdf),
             mjcf=None if mjcf is None else str(mjcf),
+            tendons=tuple(tendons),
         )
         return dataclasses.replace(robot, postures={pose: robot.place(q) for pose, q in read.items()})
 
@@ -307,6 +315,11 @@ class Robot:
     def couplings(self) -> dict[str, Coupling]:
         """Laws of the joints that follow others and have no motor, by name; `joint_names` has them not."""
         return couplings_of(self.model)
+
+    @cached_property
+    def ranges(self) -> Ranges:
+        """Position limits of the joints, and ranges of the tendons."""
+        return Ranges.of(self.joint_names, self.lower, self.upper, self.tendons)
 
     @property
     def armature(self) -> Array:
@@ -428,8 +441,9 @@ class Robot:
         return check_array(name, v, (self.nv,))
 
     def check_limits(self, q: ArrayLike, *, name: str = "q") -> None:
-        """InputError unless all joints of the configuration are inside their position limits."""
-        checks.check_positions(self.joint_names, self.joint_positions(q), self.lower, self.upper, name)
+        """InputError unless all joints and tendons of the configuration are inside their position limits."""
+        own = self.ranges
+        checks.check_positions(own.names, own.positions(self.joint_positions(q)), own.lower, own.upper, name)
 
     def check_stance(
         self,

@@ -145,11 +145,13 @@ def check_held(model: pin.Model, sole: Sole, q: Array, columns: Any) -> None:
 
 
 def inside(robot: Any, margin: float) -> tuple[Array, Array]:
-    """(n,) lower and upper position limits [rad] of a `Robot`, less a margin; of hinges, whose range is
-    small, less a quarter of it.
+    """(n + tendons,) lower and upper limits [rad] of a `Robot`'s `ranges`, less a margin; of hinges and
+    tendons, whose range may be small, less a quarter of it at most.
     """
-    less = np.where(robot.hinges, np.minimum(margin, (robot.upper - robot.lower) / 8), margin)
-    return robot.lower + less, robot.upper - less
+    own = robot.ranges
+    small = np.append(robot.hinges, np.ones(len(robot.tendons), dtype=bool))
+    less = np.where(small, np.minimum(margin, (own.upper - own.lower) / 8), margin)
+    return own.lower + less, own.upper - less
 
 
 def hinge_torque(model: pin.Model) -> float:

@@ -66,6 +66,7 @@ def read_urdf(
     out.ties += [*_mimics(root, model), *_of_gazebo(root, model), *_hollow(root, model)]
     out.springs |= _springs(root, model)
     out.notes += [*_weightless(root), *_rotors(root)]
+    out.lead_from_root()
     return out
 
 

@@ -118,6 +118,7 @@ def _instants(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
 
 ALLOWED = 1e-2  # of the impulse
 HALVINGS = 3
+ALLOWED_RANGE = 1e-3  # [rad] that a joint may be out of its range untold
 BEYOND = 0.02  # [s] after the blow that the comparison goes on
 
 
@@ -223,7 +224,10 @@ def simulate(
             )
     _check_times({**(run.__kwdefaults__ or {}), **options}, float(reference.end))
     found = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
-    return with_clearance(problem, replace(found, expected=float(reference.contact_start)))
+    name, beyond = problem.robot.ranges.excess(problem.robot.joint_positions(found.q))
+    beyond_range = (name, beyond) if beyond > ALLOWED_RANGE else ("", 0.0)
+    found = replace(found, expected=float(reference.contact_start), beyond_range=beyond_range)
+    return with_clearance(problem, found)
 
 
 def _check_times(options: Mapping[str, Any], end: float) -> None:

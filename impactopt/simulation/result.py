@@ -38,6 +38,8 @@ REPORT = (
     "torque_ratio",
     "saturated_ms",
     "final_posture_error_rad",
+    "beyond_range_rad",
+    "beyond_range",
     "impulses_Ns",
     "zmp_margin_by_phase_m",
     "torque_ratio_by_phase",
@@ -124,7 +126,8 @@ class Simulation:
     ``broken``).  saturated [s]: how long the demand of some joint was above its torque limit.  fall: why the
     robot does not stand at the end, "" if it stands; None where the engine holds the soles and cannot say.
     posture_error [rad]: of the joint, or of the base's orientation, that ends farthest from the reference's
-    last posture.  touched: pairs of bodies that touched and should not have, if the engine has solids that
+    last posture.  beyond_range: joint or tendon that was farthest out of its range, and by how much [rad];
+    "" if none was.  touched: pairs of bodies that touched and should not have, if the engine has solids that
     push back.  clearance [m], nearest: the least distance of any two bodies that are not to touch, by exact
     geometry, and which two.  missed: there was no target.  expected [s]: when the reference has contact
     begin.  touches: start and end [s] and impulse [N s] of
@@ -161,6 +164,7 @@ class Simulation:
     saturated: float
     posture_error: float
     fall: str | None
+    beyond_range: tuple[str, float] = ("", 0.0)
     touched: tuple[Touched, ...] = ()
     clearance: float = np.nan
     nearest: tuple[str, ...] = ()
@@ -238,6 +242,9 @@ class Simulation:
             "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]) if hit else None,
             "saturated_ms": 1e3 * self.saturated,
             "final_posture_error_rad": self.posture_error,
+            # None: no joint is out of its range
+            "beyond_range_rad": self.beyond_range[1] or None,
+            "beyond_range": self.beyond_range[0] or None,
             "clearance_mm": 1e3 * self.clearance if known else None,
             "nearest": " and ".join(self.nearest),
             "contacts_besides": [touched.summary() for touched in self.touched] if known else None,

@@ -110,7 +110,8 @@ def fastest_at_contact(problem: ImpactProblem) -> float:
     motions = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
     pin.computeJointJacobians(model, data, c.join(y, legs))
     frame = model.getFrameId(f"striker:{problem.striker}")
-    jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
+    jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+    jacobian = np.reshape(jacobian, (6, model.nv))[:3]  # pin drops an axis where nv is 1
     row, joints = problem.normal @ jacobian @ motions, motions[c.base :]
     bounds = np.concatenate([limit, limit])
     found = linprog(-row, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))

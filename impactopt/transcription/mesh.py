@@ -94,9 +94,10 @@ def _middles_outside(plan: Plan, way: Trajectory, piece: Piece) -> list[float]:
     # the others' positions and rates are bounded by their splines' control points
     outside |= (np.abs(way.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
     lower, upper = inside(p.robot, _SHARE * p.term(PositionLimit).margin)
-    angles = p.robot.joint_positions(way.q[at])
+    angles = p.robot.ranges.positions(p.robot.joint_positions(way.q[at]))
     legs = c.dependent[~p.robot.hinges[c.dependent]]  # hinges keep a quarter of their range at the nodes
-    outside |= ((angles < lower) | (angles > upper))[:, legs].any(axis=1)
+    of_nodes = [*legs, *range(p.robot.n, len(lower))]  # and tendons
+    outside |= ((angles < lower) | (angles > upper))[:, of_nodes].any(axis=1)
     outside |= gear_share(p, way.torque[at], way.a[at, joints]) > 1.0 + GEAR
     outside |= _soles_outside(p, piece.number, way.sole_wrench[at])
     time = (way.time[at[outside]] - piece.start) / duration

@@ -49,6 +49,7 @@ class Limits:
             np.concatenate([robot.y0[: robot.base] + box, upper[robot.independent]]),
         )
         self.legs = lower[robot.dependent], upper[robot.dependent]
+        self.tendons = lower[r.n :], upper[r.n :]
 
     def cone_rows(
         self, robot: RobotMotion, place: str, margin: float | None, least: float

@@ -118,6 +118,7 @@ class Program:
         if problem.lasts and problem.frozen is None:
             self._blows(claims)
         self._ways()
+        self._tendons()
         self._touch()
         self._clearance()
         self._slide()
@@ -223,6 +224,20 @@ class Program:
             for way in self.ways
             for k, s in enumerate(way.nodes)
         }
+
+    def _tendons(self) -> None:
+        """Sums of joint angles in their ranges, at all nodes."""
+        r = self.problem.robot
+        names = [f"tendon {tendon.name}" for tendon in r.tendons]
+        for place, node in self.nodes().items():
+
+            def value(v: Variables, node: Callable[[Variables], Any] = node) -> Array:
+                y, _, _, legs, *_ = node(v)
+                angle = dict(zip(r.joint_names, r.joint_positions(self.robot.posture(y, legs)), strict=True))
+                return np.array([sum(k * angle[j] for j, k in t.coefficients.items()) for t in r.tendons])
+
+            if names:
+                self.rows.append(Piece.of(value, [("position limit", place, names, *self.limits.tendons)]))
 
     @property
     def _tangents(self) -> Array:

@@ -30,6 +30,7 @@ from impactopt.problem.terms import (
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.presets import space_arm
+from impactopt.robots.tendons import Tendon
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.transcription import Transcription, block_functions, statement_of
@@ -100,6 +101,14 @@ def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> No
     rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).rows(0.15)
     assert len(rows) > 100
     check_rows(t.with_apart(rows))
+
+
+@pytest.mark.parametrize("make", [arm_problem, biped_problem])
+def test_of_tendons(make: Any) -> None:
+    p = make()
+    two = dict(zip(p.robot.joint_names, (0.5, -0.25), strict=False))
+    tendon = Tendon(name="t", coefficients=two, lower=-2.0, upper=0.7)
+    check_rows(transcribed(dataclasses.replace(p, robot=dataclasses.replace(p.robot, tendons=(tendon,)))))
 
 
 def test_with_scenarios() -> None:

@@ -12,8 +12,10 @@ from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.terms import VelocityLimit
 from impactopt.simulation import scene_of, simulate_pinocchio
 from impactopt.solvers.program import Status
+from impactopt.transcription.contact_guess import fastest_at_contact
 
 MASS, ARMATURE = 2.0, 0.1  # [kg], [kg] or [kg m2]
 REACH = 0.5  # [m] of the arm
@@ -68,3 +70,10 @@ def test_one_joint_strikes_with_all_that_it_has(kind: str) -> None:
     blow = optimize_strike(made)
     assert blow.status is Status.SOLVED
     assert blow.impulse > 0.999 * plan.impulse  # the blow alone can do no less
+
+
+@pytest.mark.parametrize(("kind", "lever"), [("ram", 1.0), ("arm", REACH)])
+def test_the_fastest_contact_is_that_of_the_joint(kind: str, lever: float) -> None:
+    made = problem(kind)
+    most = made.term(VelocityLimit).fraction * 20.0
+    assert fastest_at_contact(made) == pytest.approx(lever * most, rel=1e-6)

@@ -250,14 +250,31 @@ def test_followers_of_followers_follow_the_first_leader(tmp_path: Path) -> None:
     assert robot.limb("wrist_link") == (0, shoulder)
 
 
+def test_who_comes_before_a_leader_leads_it_by_the_inverse_law(tmp_path: Path) -> None:
+    """shoulder = 2 elbow + 0.3, and the wrist follows the elbow."""
+    others = ("wrist", 'joint="elbow" multiplier="-1" offset="0.2"')
+    made = described(tmp_path, ("shoulder", 'joint="elbow" multiplier="2" offset="0.3"'), others)
+    same = described(tmp_path, ("elbow", 'joint="shoulder" multiplier="0.5" offset="-0.15"'), others)
+    for name in ("elbow", "wrist"):
+        assert made.couplings[name] == pytest.approx(same.couplings[name])
+    q = np.array([0.4, -0.7])
+    for robot in (made, same):
+        close(
+            mass_matrix(robot.model, robot.model.createData(), q),
+            mass_matrix(same.model, same.model.createData(), q),
+        )
+    for name in ("lower", "upper", "velocity_limit", "armature"):
+        close(getattr(made, name), getattr(same, name))
+    # the elbow's motor, whose power is the same at the shoulder's coordinate
+    elbow = described(tmp_path).torque_limit[2]
+    assert made.torque_limit[1] == pytest.approx(elbow / 2)
+    assert made.source is not None and "'shoulder' leads" in "; ".join(made.source.notes)
+
+
 @pytest.mark.parametrize(
     ("laws", "said"),
     [
         ([("elbow", 'joint="should"')], "'elbow' follows 'should'.*no such joint.*'shoulder'"),
-        (
-            [("shoulder", 'joint="elbow" multiplier="2"')],
-            "comes after it.*let 'elbow' follow 'shoulder'.* 0.5",
-        ),
         ([("elbow", 'joint="wrist"'), ("wrist", 'joint="elbow"')], "'elbow', 'wrist' follow each other"),
         ([("elbow", 'joint="shoulder"'), ("elbow", 'joint="turn"')], "'elbow' follows 'shoulder' and 'turn'"),
         ([("elbow", 'joint="shoulder" multiplier="0"')], "multiplier is 0"),
@@ -345,6 +362,23 @@ def test_a_joint_that_an_mjcf_holds_still_follows_none(tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text(held)
     with pytest.raises(InputError, match=r"'b' is held by the equality.*lock it"):
         Robot.from_mjcf(tmp_path / "robot.xml", velocity_limit=5.0)
+
+
+def test_a_leader_behind_its_follower_brings_its_servo(tmp_path: Path) -> None:
+    """b = 0.1 - 2 a, by an equality in which a follows b."""
+    pytest.importorskip("mujoco")
+    text = re.sub("<equality>.*</actuator>", "%s", MJCF, flags=re.DOTALL).replace(
+        'ref="-.3"', 'ref="-.3" range="-3 3"'
+    )
+    equality = '<equality><joint joint1="a" joint2="b" polycoef="0 -.5 0 0 0"/></equality>'
+    servo = '<actuator><position joint="b" kp="80" kv="4" forcerange="-30 30"/></actuator>'
+    (tmp_path / "robot.xml").write_text(text % (equality + servo))
+    robot = Robot.from_mjcf(tmp_path / "robot.xml", velocity_limit=5.0, torque_limit={"c": 9.0})
+    assert robot.joint_names == ("a", "c") and robot.couplings["b"].ratio == pytest.approx(-2.0)
+    # where both are as compiled, the law holds: b + 0.3 = -2 (a - 0.2)
+    assert robot.couplings["b"].offset == pytest.approx(0.1)
+    assert (robot.kp[0], robot.kd[0], robot.torque_limit[0]) == pytest.approx((320.0, 16.0, 60.0))
+    assert robot.source is not None and "no actuator moves 'a'" not in "; ".join(robot.source.notes)
 
 
 def test_followers_of_an_mjcf_are_where_mujoco_has_them(tmp_path: Path) -> None:

@@ -265,7 +265,14 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`<mimic>` of a joint that comes": (
         [("</joint><joint", '<mimic joint="j2"/></joint><joint')],
-        "'j1' cannot follow 'j2': 'j2' comes after it",
+        "'j1' follows 'j2' by <mimic>, which comes after it in the tree: 'j1' leads",
+    ),
+    "`<mimic>` of a joint that turns": (
+        [
+            ('type="revolute"', 'type="continuous"'),
+            ('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>'),
+        ],
+        "turns without end",
     ),
     "`<mimic>` of a joint that does not": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j"/></joint></robot>')],
@@ -326,6 +333,10 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     "`stiffness`, ": ([(J2, f'stiffness="9" springref=".5" {J2}')], ""),
     "`stiffness` that": ([(J2, f'stiffness="9 1" {J2}')], "'j2' has a spring whose torque is not linear"),
     "`damping` that": ([(J2, f'damping="2 1" {J2}')], "'j2' has damping that is not linear"),
+    "`<fixed>`": (
+        [_before(END, '<tendon><fixed name="t" range="-1 1"><joint joint="j2" coef="2"/></fixed></tendon>')],
+        "",
+    ),
     "`<tendon>`": (
         [
             _before(
@@ -393,7 +404,7 @@ def _lines(kind: str) -> list[tuple[str, str]]:
 def _shape(robot: Robot) -> tuple[Any, ...]:
     """All that a robot's file gives it."""
     numbers = (robot.kp, robot.kd, robot.torque_limit, robot.lower, robot.upper, robot.armature)
-    return model_hash(robot.model), robot.actuators, *(tuple(x) for x in numbers)
+    return model_hash(robot.model), robot.actuators, robot.tendons, *(tuple(x) for x in numbers)
 
 
 def _tried(kind: str, text: str, folder: Path) -> Robot:

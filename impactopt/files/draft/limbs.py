@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece
-from impactopt.robots.build import effort_limit, is_floating
+from impactopt.robots.build import effort_limit, is_floating, neutral
 from impactopt.robots.checks import LEG
 
 __all__ = ["Limb", "arms_of", "legs_of", "limbs_of", "renumbered", "to_lock", "toes", "unshared"]
@@ -66,7 +66,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
     mass, total = _beyond(model, children), sum(float(body.mass) for body in model.inertias)
     reach = _reach(model, children)
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
-    weight = np.abs(pin.computeGeneralizedGravity(model, model.createData(), pin.neutral(model)))
+    weight = np.abs(pin.computeGeneralizedGravity(model, model.createData(), neutral(model)))
     for j in range(model.njoints - 1, first - 1, -1):
         joint, name = model.joints[j], str(model.names[j])
         low, high = (
@@ -101,7 +101,7 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
     pieces : by the joint that moves them.
     """
     data = model.createData()
-    pin.forwardKinematics(model, data, pin.neutral(model))
+    pin.forwardKinematics(model, data, neutral(model))
 
     def heights(joint: int) -> Array:
         found = _heights(data, pieces, joint)
@@ -131,7 +131,7 @@ def arms_of(model: pin.Model, legs: tuple[Limb, ...]) -> tuple[Limb, ...]:
 def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Piece, ...]]) -> list[str]:
     """Names of joints that end a leg beyond the sixth, on a link that stands on the ground itself."""
     data = model.createData()
-    pin.forwardKinematics(model, data, pin.neutral(model))
+    pin.forwardKinematics(model, data, neutral(model))
 
     def low(joint: int) -> float:
         return float(_heights(data, pieces, joint).min(initial=np.inf))

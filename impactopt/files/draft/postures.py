@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
+from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
 from impactopt.robots.dynamics import generalized_gravity
 from impactopt.robots.robot import Robot, Sole
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 BENT = 0.06  # of the legs' length: how much lower than straight it sits
 LEVEL = 1e-7  # [m], [rad] off its goal: a sole that stands
 STARTS = 10
+WIDTHS = (1.0, 0.9, 0.8)  # of the soles' distance in the zero posture: splayed legs may not stand level
 HELD = 0.5  # of its torque limit: what gravity may ask of a joint that does not strike
 INSIDE = 0.1  # of a joint's range that is left to its limits
 REST = 0.02  # [m] that the whole range of a joint costs: postures in the middle of their ranges
@@ -39,19 +41,32 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
     ------
     InputError : none is found.
     """
+    errors = list[InputError]()
+    for width in WIDTHS:
+        try:
+            return _half_sitting(robot, legs, soles, forward, width)
+        except InputError as error:
+            errors.append(error)
+    raise errors[0]
+
+
+def _half_sitting(
+    robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array, width: float
+) -> Array:
+    """The same with the soles so far from each other, of their distance in the zero posture."""
     model, data = robot.model, robot.model.createData()
-    neutral = rested(robot)
-    pin.framesForwardKinematics(model, data, neutral)
+    q = rested(robot)
+    pin.framesForwardKinematics(model, data, q)
     turn = np.column_stack([forward, np.cross([0.0, 0.0, 1.0], forward), [0.0, 0.0, 1.0]])
     straight = [np.array(data.oMf[model.getFrameId(s.frame)].translation) for s in soles]
     chains = unshared(robot.model, legs)
     hips = [np.array(data.oMi[own[0]].translation) for own in chains]
-    aside = [float(spot @ turn[:, 1]) for spot in straight]
+    aside = [width * float(spot @ turn[:, 1]) for spot in straight]
     below = [[j for j in leg.path if j > own[0]] for leg, own in zip(legs, chains, strict=True)]
     length = float(np.mean([_path(robot, joints) for joints in below]))
     height = min(float(spot[2]) for spot in straight) + BENT * length
     ahead = float(np.mean([hip @ forward for hip in hips]))
-    rng, q = np.random.default_rng(0), neutral
+    rng = np.random.default_rng(0)
     for _ in range(4):  # feet go where the weight is
         for own, sole, out in zip(chains, soles, aside, strict=True):
             spot = ahead * turn[:, 0] + out * turn[:, 1] + height * turn[:, 2]
@@ -189,7 +204,7 @@ def _limits(robot: Robot, own: NDArray[np.intp]) -> tuple[Array, Array]:
 
 def rested(robot: Robot) -> Array:
     """The configuration (nq,) nearest to zero that is well inside the limits."""
-    q, every = pin.neutral(robot.model), np.arange(robot.n)
+    q, every = neutral(robot.model), np.arange(robot.n)
     low, high = _limits(robot, every)
     return _set(robot, q, every, np.clip(robot.joint_positions(q), low, high))
 

@@ -15,6 +15,7 @@ from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
 from impactopt.files.draft.strikers import first_link
 from impactopt.robots.attachments import Sole
+from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
 
 __all__ = ["find_soles", "sides"]
@@ -40,7 +41,7 @@ def find_soles(
     InputError : a foot without a flat face; a leg of five joints that no hinge completes.
     """
     data = model.createData()
-    pin.forwardKinematics(model, data, pin.neutral(model))
+    pin.forwardKinematics(model, data, neutral(model))
     names = sides(model, [leg.tip for leg in legs])
     flats, ahead = [], np.zeros(3)
     for leg in legs:
@@ -87,7 +88,7 @@ def find_soles(
 def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> Array:
     """Forward direction (3,): opposite to the knees' bend, else towards the feet's middles, feet (3,) [m]."""
     back = np.zeros(3)
-    pin.computeJointJacobians(model, data, pin.neutral(model))
+    pin.computeJointJacobians(model, data, neutral(model))
     for leg, own in zip(legs, unshared(model, legs), strict=True):
         hip, ankle = data.oMi[own[0]].translation, data.oMi[leg.tip].translation
 
@@ -116,7 +117,7 @@ def _hinge(model: pin.Model, leg: Limb, own: Sequence[int], place: Any) -> str:
     columns, scale = [model.joints[j].idx_v for j in own], np.repeat([1 / FAR, 1.0], 3)[:, None]
     worth: dict[str, list[float]] = {axis: [] for axis in "xyz"}
     for _ in range(DRAWN):
-        q = pin.neutral(model)
+        q = neutral(model)
         for j in own:
             at = model.joints[j].idx_q
             q[at] = rng.uniform(low[at], max(low[at], high[at])) if model.joints[j].nq == 1 else q[at]
@@ -136,7 +137,7 @@ def _hinge(model: pin.Model, leg: Limb, own: Sequence[int], place: Any) -> str:
 def sides(model: pin.Model, tips: Sequence[int]) -> list[str]:
     """Names for limbs: "left" and "right" where two are on both sides of the middle, else their links'."""
     data = model.createData()
-    pin.forwardKinematics(model, data, pin.neutral(model))
+    pin.forwardKinematics(model, data, neutral(model))
     links = [first_link(model, tip)[0] for tip in tips]
     if len(tips) != 2:
         return links

@@ -117,7 +117,8 @@ def _problem(
     """A blow's problem, from a start on the way that it comes, so far behind the target's plane at least [m];
     None: there is a fault in it.
     """
-    point = np.round(blow.point, 3) + 0.0
+    # fewer than three joints reach a curve or a surface, which a rounded point is beside
+    point = np.round(blow.point, 3 if len(arm.limb.path) > 2 else 9) + 0.0
     size = float(np.abs(blow.v).max())
     way = blow.v / size * float(np.clip(RUN * size, *BACK))
     for part in SHORTER:

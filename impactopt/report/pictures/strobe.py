@@ -54,7 +54,8 @@ def draw_strobe(figure: FigureBase, record: Record) -> None:
             style: Any = {"color": BLUE, "zorder": 4} if strikes else {"color": BLACK, "zorder": 3}
             axes.plot(*(ends + shift).T, linewidth=1.8, solid_capstyle="round", **style)
         axes.plot(*(links[k][0][1] + shift), "o", color=BLUE, markersize=3, zorder=5)
-    axes.axhline(0.0, color=GREY, linewidth=0.8, zorder=0)
+    for height in _ground(record):
+        axes.axhline(height, color=GREY, linewidth=0.8, zorder=0)
     axes.set_aspect("equal")
     axes.set(xlim=(-0.5 * (width + GAP), places[-1] + 0.5 * (width + GAP)), ylim=(low, high))
     body = float(np.median(links[0][..., 0])) - across  # times stand below it
@@ -108,7 +109,12 @@ def _extent(record: Record) -> tuple[float, float, float]:
     """Lowest and highest point, and width, of all that is drawn of a pose [m]."""
     points = _drawn(record)
     (low, high), width = (points[:, 1].min(), points[:, 1].max()), np.ptp(points[:, 0])
-    return min(float(low), 0.0) - 0.05, float(high) + 0.05, float(width)
+    return min([float(low), *_ground(record)]) - 0.05, float(high) + 0.05, float(width)
+
+
+def _ground(record: Record) -> Array:
+    """Height (1,) [m] of the ground, (0,) without one; results of old have it at 0."""
+    return record.arrays.get("pose_ground", np.zeros(1))
 
 
 def _drawn(record: Record) -> Array:

@@ -28,8 +28,8 @@ class Poses:
     time (m,) [s]; links (m, l, 2, 3) [m], ends of each link; strikes (l,): whether a link is of the limb that
     strikes; contact: which of the poses is the first in contact; path (k, 3) [m] of the striking point, at
     the k instants of the reference; target, obstacles (b, c, 3) [m]: points about each body of the target at
-    contact, and of the user's; normal (3,) of the blow; inverse_mass (3, 3) [1/kg] of the striking point at
-    contact.
+    contact, and of the user's; ground (1,) [m]: its height, (0,) if there is none; normal (3,) of the blow;
+    inverse_mass (3, 3) [1/kg] of the striking point at contact.
     """
 
     time: Array
@@ -39,6 +39,7 @@ class Poses:
     path: Array
     target: Array
     obstacles: Array
+    ground: Array
     normal: Array
     inverse_mass: Array
 
@@ -64,6 +65,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
         path=np.array([_place(robot, problem.striker, q) for q in reference.q]),
         target=_corners([b for b in seen if b.of_target]),
         obstacles=_corners([b for b in seen if not b.of_target]),
+        ground=np.array([z for z in [problem.ground_height] if z is not None]),
         normal=problem.normal,
         inverse_mass=inverse_mass(problem, at_contact),
     )

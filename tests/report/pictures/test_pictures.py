@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import re
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from support.small_plans import Planned
 from typer.testing import CliRunner
 
 from impactopt import Solution
+from impactopt.bodies.world import Ground
 from impactopt.collision import effective_mass
 from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of
@@ -162,6 +164,25 @@ def test_the_strobe_draws_every_pose_and_the_way(punch_record: Record) -> None:
     heights = np.concatenate([np.asarray(line.get_ydata()) for line in axes.lines])
     for links in a["pose_links"]:
         assert np.isin(links[:, :, 2].ravel(), heights).all()
+
+
+@pytest.mark.parametrize(("which", "heights"), [("biped", [0.0]), ("arm", []), ("arm on a floor", [-0.7])])
+def test_the_strobe_draws_a_ground_where_there_is_one(
+    records: dict[str, Record], arm_plan: Planned, which: str, heights: list[float]
+) -> None:
+    record = records[which.split()[0]]
+    if "floor" in which:
+        problem = dataclasses.replace(arm_plan.problem, ground=Ground(height=-0.7))
+        poses = poses_of(problem, arm_plan.trajectory)
+        record = dataclasses.replace(record, arrays={**record.arrays, "pose_ground": poses.ground})
+    picture = PICTURES["strobe"](record)
+    assert picture is not None
+    (axes,) = picture.axes
+    lines = [np.asarray(line.get_ydata(), dtype=float) for line in axes.lines]
+    across = [np.asarray(line.get_xdata(), dtype=float) for line in axes.lines]
+    found = [y[0] for x, y in zip(across, lines, strict=True) if list(x) == [0, 1] and y[0] == y[-1]]
+    assert found == heights
+    assert all(axes.get_ylim()[0] < height for height in heights)
 
 
 def test_the_strobe_draws_the_target_as_large_as_it_is(biped_plan: Planned, punch_record: Record) -> None:

@@ -1,0 +1,57 @@
+"""Starts beyond those asked for: tried while solutions are refused, and no more once two end alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+from support.small_plans import Planned
+
+from impactopt.planning.budget import Budget
+from impactopt.planning.multistart import best_of
+from impactopt.planning.refinement import Guess, Outcome
+from impactopt.solvers.program import Status
+from impactopt.transcription.transcription import Transcription
+
+DEEP = "Bodies penetrate each other by {:.1f} mm, and no motion was found in which they do not: {}."
+
+
+def found(plan: Planned, refusals: Sequence[tuple[float, str] | None]) -> Outcome[Transcription]:
+    """Best of starts that end with penetrations [mm] of pairs, or with a solution; one was asked for."""
+    program, good = plan.transcription, plan.result
+    ends = iter(refusals)
+
+    def solved(guess: Guess[Transcription]) -> Outcome[Transcription]:
+        end = next(ends)
+        if end is None:
+            return Outcome.of(guess.program, good)
+        depth, pair = end
+        refused = {
+            "status": Status.FAILED,
+            "max_violation": 1e-3 * depth,
+            "message": DEEP.format(depth, pair),
+        }
+        return Outcome.of(guess.program, replace(good, **refused))
+
+    def guess() -> Guess[Transcription]:
+        return Guess(program=program, start=good.x)
+
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
+    return best_of([(f"reach {k}", guess) for k in range(3)], solved, budget, 1)
+
+
+def test_two_starts_that_end_alike_are_the_last(arm_plan: Planned) -> None:
+    best = found(arm_plan, [(20.0, "arm and board"), (20.4, "arm and board"), None])
+    assert len(best.attempts) == 2 and not best.usable
+    assert best.result.message.endswith("2 of 2 starts ended alike.")
+
+
+@pytest.mark.parametrize("second", [(30.0, "arm and board"), (20.0, "hand and board")])
+def test_starts_that_end_otherwise_are_followed_by_another(
+    arm_plan: Planned, second: tuple[float, str]
+) -> None:
+    best = found(arm_plan, [(20.0, "arm and board"), second, None])
+    assert len(best.attempts) == 3 and best.usable
+    assert [attempt.kept for attempt in best.attempts] == [False, False, True]
+    assert "alike" not in best.result.message

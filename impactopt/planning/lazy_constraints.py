@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Generic
 
 import numpy as np
@@ -153,6 +153,7 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
 
 
 _BARRIER = 1e-2  # a plan within such limits is another one: at a low barrier the way there is a crawl
+_OTHER = 0.5  # beyond what a gear may bear: the motion within it is another one, and a warm start a detour
 _KINDS: dict[str, type[Term]] = {snake_case(type(term).__name__): type(term) for term in ON_DEMAND_TERMS}
 
 
@@ -192,17 +193,20 @@ class LazyTerms(Generic[Program]):
         t, origin = outcome.program, outcome.origin
         bounded, said = with_rows(t.problem, broken), "; ".join(broken.values())
 
-        def guesses() -> Iterator[Guess[Program]]:
-            yield Guess.mapped(
-                program_for(t, bounded, report=self._report), t, outcome.result, barrier=_BARRIER
-            )
-            cold = program_for(origin.program, bounded, constraints={}, report=self._report)
-            yield Guess(program=cold, start=start_of(cold, origin.program, origin.x))
+        def warm() -> Guess[Program]:
+            new = program_for(t, bounded, report=self._report)
+            return Guess.mapped(new, t, outcome.result, barrier=_BARRIER)
+
+        def cold() -> Guess[Program]:
+            new = program_for(origin.program, bounded, constraints={}, report=self._report)
+            return Guess(program=new, start=start_of(new, origin.program, origin.x))
+
+        far = "gear_load" in broken and gears_beyond(t.problem, self._gears(outcome), more=_OTHER)
 
         return Additions(
             name="lazy constraints",
             why=f"{said}: on with constraints of {', '.join(_KINDS[name].name for name in broken)}",
-            guesses=guesses(),
+            guesses=(guess() for guess in ((cold, warm) if far else (warm, cold))),
             without=f"Without {', '.join(f'[terms.{name}]' for name in broken)} there is a plan, but {said}.",
         )
 
@@ -216,9 +220,7 @@ class LazyTerms(Generic[Program]):
                 continue
             words = ""
             if isinstance(term, GearLoad):
-                error = outcome.at.contact_error if self._finer else None
-                finer = () if error is None or error.missed else error.finer
-                words = gears_beyond(problem, _loads(outcome.program.robot, planned, finer))
+                words = gears_beyond(problem, self._gears(outcome))
             elif isinstance(term, Slide) and isinstance(planned, Plan):
                 words = slides_beyond(term, planned)
             elif isinstance(term, ReferenceRange) and isinstance(planned, Plan):
@@ -227,6 +229,12 @@ class LazyTerms(Generic[Program]):
             if words:
                 out[name] = words
         return out
+
+    def _gears(self, outcome: Outcome[Program]) -> list[DriveLoads]:
+        """Gear loads of a solution."""
+        error = outcome.at.contact_error if self._finer else None
+        finer = () if error is None or error.missed else error.finer
+        return _loads(outcome.program.robot, outcome.at.planned, finer)
 
 
 def _loads(

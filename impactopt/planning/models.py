@@ -26,7 +26,12 @@ from impactopt.planning.solution import Solved
 from impactopt.problem.checks import met_once
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.contact_guess import fastest_at_contact, mass_at_contact, touches_needed
+from impactopt.transcription.contact_guess import (
+    can_meet,
+    fastest_at_contact,
+    mass_at_contact,
+    touches_needed,
+)
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.initial_guess import strike_rates
 
@@ -54,14 +59,28 @@ def carried_start(
 
 
 def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactProblem:
-    """The same with as many touches as point masses need, where it leaves their number open."""
-    if problem.touches is not None or problem.scenarios or met_once(problem):
+    """The same with as many touches as point masses need, where it leaves their number open.
+
+    Raises
+    ------
+    InputError : it gives a number of them that point masses do not meet in.
+    """
+    if met_once(problem) or problem.touches == 1 or (problem.scenarios and problem.touches is None):
         return problem
     mass, most = mass_at_contact(problem), fastest_at_contact(problem)
-    needed = touches_needed(problem.law, problem.target, mass, most) if np.isfinite(most) else None
-    if needed in (None, 1):
+    if not np.isfinite(most):
         return problem
     event = problem.target.guards[-1]
+    if problem.touches is not None:
+        if can_meet(problem.law, problem.target, mass, most, problem.touches):
+            return problem
+        raise InputError(
+            f"touches is {problem.touches}, but at no speed that the joints allow do point masses as heavy "
+            f"as striker and target meet so often until the target's {event!r}: leave it out"
+        )
+    needed = touches_needed(problem.law, problem.target, mass, most)
+    if needed in (None, 1):
+        return problem
     say(f"point masses part before the target's {event!r}: planned with {needed} touches")
     return changed(problem, touches=needed)
 

@@ -153,6 +153,19 @@ def touches_needed(law: ContactLaw, target: Target, mass: float, fastest: float)
     return least
 
 
+def can_meet(law: ContactLaw, target: Target, mass: float, fastest: float, touches: int) -> bool:
+    """True if a point mass [kg] brings about all events of a target in so many touches, at some speed up to
+    the fastest.
+    """
+    for k in range(2 * TRIES * FINER):
+        found = _histories(law, target, mass, fastest * FASTER ** (-k / FINER), touches)
+        if found.touches == touches and _phases(found, target) is not None:
+            return True
+        if _first_event(found, target) is None:  # slower, there is none either
+            return False
+    return False
+
+
 def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
     """Detects that a point mass [kg] and a target part before the phases' events, at all speeds up to the
     fastest.

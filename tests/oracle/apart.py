@@ -28,20 +28,20 @@ LONGEST, STEPS, DONE = 0.3, 60, 1e-11  # of u a step, and how many; [m] of slope
 def apart_pieces(
     problem: ImpactProblem,
     robot: RobotMotion,
-    nodes: Mapping[str, Callable[[Variables], Any]],
+    postures: Mapping[str, Callable[[Variables], Array]],
     rows: Sequence[Mapping[str, Any]],
 ) -> tuple[list[Piece], list[str]]:
     """The constraints that a result says it had, in its order; and what is not known of them.
 
-    nodes : of all motions, by their places.  rows : place, joint, other and number, way, reach [m] and travel
-    [m], as `impactopt.transcription.clearance` has them.
+    postures (nq,) : at all nodes, by their places.  rows : place, joint, other and number, way, reach [m] and
+    travel [m], as `impactopt.transcription.clearance` has them.
     """
     known: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
         known.setdefault(str(row["place"]), []).append(row)
-    missing = [f"rows between bodies at {place!r}" for place in known if place not in nodes]
+    missing = [f"rows between bodies at {place!r}" for place in known if place not in postures]
     pieces = [
-        _piece(problem, robot, place, nodes[place], at) for place, at in known.items() if place in nodes
+        _piece(problem, robot, place, postures[place], at) for place, at in known.items() if place in postures
     ]
     return pieces, missing
 
@@ -108,7 +108,7 @@ def _piece(
     problem: ImpactProblem,
     robot: RobotMotion,
     place: str,
-    node: Callable[[Variables], Any],
+    posture: Callable[[Variables], Array],
     at: Sequence[Mapping[str, Any]],
 ) -> Piece:
     """All constraints at a place."""
@@ -137,8 +137,7 @@ def _piece(
         shifts.append(body.place + float(row["travel"]) * bodies.normal * body.moves)
 
     def value(v: Variables) -> Array:
-        y, _, _, legs, _, _ = node(v)
-        pin.forwardKinematics(robot.model, robot.data, robot.posture(y, legs))
+        pin.forwardKinematics(robot.model, robot.data, posture(v))
         placed = [robot.data.oMi[joint] for joint in joints]
         turn = np.array([*(at.rotation for at in placed), *turns])
         shift = np.array([*(at.translation for at in placed), *shifts])

@@ -43,7 +43,7 @@ class Moves(Protocol):
     ways: list[Way]
     blows: list[Blow]
 
-    def node(self, way: Way, s: float, k: int) -> Callable[[Variables], Any]:
+    def node(self, way: Way, k: int) -> Callable[[Variables], Any]:
         """y, y', y'', legs, sole wrenches and T at a node."""
         ...
 
@@ -107,7 +107,7 @@ class Drives:
             return motion
 
         out = [
-            Point(way.place(float(s)), self._torque(way, k), moving(self._moves.node(way, float(s), k)))
+            Point(way.place(float(s)), self._torque(way, k), moving(self._moves.node(way, k)))
             for way in self._moves.ways
             for k, s in enumerate(way.nodes)
         ]
@@ -188,11 +188,13 @@ class FirstInstant:
         def value(v: Variables) -> Array:
             y, legs, u = self._state(v)
             none, force = np.zeros(robot.ny), v.one(self._force)
+            _, rates, _ = robot.motion(y, legs, u, none)
             q, jump, _ = robot.motion(y, legs, v.get(self._change), none)
             fast = float(robot.normal @ robot.striking(y, u)[1])
             still = np.zeros(robot.model.nv)
             bare = robot.torque(q, still, still, 0 * v.get(self._wrench))
-            left = robot.torque(q, still, jump, v.get(self._wrench), [force]) - bare
+            left = robot.torque(q, still, jump, v.get(self._wrench)) - bare
+            left += robot.pushed(q, rates, [force])
             wanted = float(law.branch(0.0, fast - before, True, self._blow.law))
             return np.concatenate(
                 [

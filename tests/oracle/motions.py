@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -26,12 +26,15 @@ from impactopt.robots.tools import inside
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["Limits", "Way", "momentum_pieces", "node_piece", "rate_pieces"]
+__all__ = ["COASTING", "FREE", "REST", "Limits", "Way", "momentum_pieces", "node_piece", "rate_pieces"]
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
+End = str | Callable[["Variables"], NDArray[np.float64]]  # rest, free, coasting, or at these coordinates
+NONE = np.zeros(0)
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
 FREE_BOX = np.array([10.0, 10.0, 10.0, 3.0, 1.2, 3.0])  # the same of one that nothing holds
+REST, FREE, COASTING = "rest", "free", "coasting"  # how a spline may begin or end
 
 
 class Limits:
@@ -52,13 +55,22 @@ class Limits:
         self.tendons = lower[r.n :], upper[r.n :]
 
     def cone_rows(
-        self, robot: RobotMotion, place: str, margin: float | None, least: float
+        self,
+        robot: RobotMotion,
+        place: str,
+        margin: float | None,
+        least: float,
+        fading: Collection[str] = (),
+        lifted: Array = NONE,
     ) -> tuple[Callable[[Array], Array], list[Any]]:
         """Of wrenches (6 a sole): how far inside the cone they are, and what hands that hold on bear, over
         what they may; with the rows that say so.  margin : [m]; None: the cone is not asked for.
+        fading : soles that may bear nothing.  lifted : numbers of those that do.
         """
         parts, rows = [], list[Any]()
         for k, (leg, *_) in enumerate(robot.soles):
+            if k in lifted:
+                continue
             if leg.sole is None:
                 assert self.grip is not None  # the problem has it
                 most = np.repeat([self.grip.force, self.grip.moment], 3)
@@ -70,10 +82,13 @@ class Limits:
             facets = contact_wrench_cone(leg.sole.polygon, self.cone.friction, margin=margin) / robot.weight
             normal = np.zeros((1, 6))
             normal[0, 2] = 1 / robot.weight
-            parts.append((k, np.vstack([facets, normal])))
             name = leg.end
             components = [f"{name}, facet {i}" for i in range(len(facets))]
             rows.append((self.cone.name, place, components, 0.0, np.inf))
+            if leg.name in fading:
+                parts.append((k, facets))
+                continue
+            parts.append((k, np.vstack([facets, normal])))
             rows.append(("normal force", place, [name], least / robot.weight, np.inf))
 
         def inside(w: Array) -> Array:
@@ -87,40 +102,54 @@ class Way:
     """A motion before or after contact: a cubic spline whose control points are variables.
 
     kind : first word of its variables' names; name : of its places.  more : nodes beside the ends and middles
-    of its intervals.
+    of its intervals.  fine_end : whether its intervals are finer where it ends.
+
+    Attributes
+    ----------
+    number : of its stance phase.  lifted : soles that bear nothing, by the node where they begin or cease to.
     """
 
     def __init__(
-        self, problem: ImpactProblem, robot: RobotMotion, kind: str, name: str, more: tuple[float, ...]
+        self,
+        robot: RobotMotion,
+        number: int,
+        names: tuple[str, str],
+        phase: Phase,
+        more: tuple[float, ...],
+        begins: End,
+        ends: End,
+        *,
+        fine_end: bool,
     ) -> None:
-        self.kind, self.name, self.swings = kind, name, kind == "swing"
-        self.phase: Phase = problem.swing if self.swings else problem.follow
-        self.breaks = graded_breaks(self.phase.intervals, self.phase.grading, fine_end=self.swings)
+        self.robot, self.number, self.phase, (self.kind, self.name) = robot, number, phase, names
+        self.swings, self.rests = ends == COASTING, ends == REST
+        self._begins, self._ends, self.lifted = begins, ends, dict[int, Array]()
+        self.breaks = graded_breaks(phase.intervals, phase.grading, fine_end=fine_end)
         middles = (self.breaks[1:] + self.breaks[:-1]) / 2
         inside = np.sort(np.concatenate([self.breaks, middles]))
-        self.nodes = np.union1d(inside[1:] if self.swings else inside, more)
+        self.nodes = np.union1d(inside[1:] if begins == REST else inside, more)
         self.more, self._y0 = more, robot.y0
-        self.drifts, last = robot.drifts, self.phase.intervals + 2
+        self.drifts, self.last = robot.drifts, phase.intervals + 2
+        # how many control points at its ends are no variables
+        self.lead = {REST: 3, FREE: 0}[begins] if isinstance(begins, str) else 1
+        tail = {REST: 2, FREE: 0, COASTING: 1}[ends] if isinstance(ends, str) else 1
+        self._points = self.last + 1 - self.lead - tail
         # control points whose base is a variable of its own, as an end at rest is one of joints alone
-        self._drifting = ((2, last) if self.swings else (last - 1, last)) if robot.drifts else ()
+        ends_drift = (2, self.last) if self.swings else (self.last - 1, self.last)
+        self._drifting = ends_drift if robot.drifts else ()
         t = knots(self.breaks)
         # the velocity's control points are these times differences of the curve's
         self.factors = 3.0 / (t[4:-1] - t[1:-4])
         self._curve = BSpline(t, np.eye(len(self.breaks) + 2), 3)
-        self.control_group, self.T = f"{kind} control point", f"{kind} duration"
-
-    @property
-    def points(self) -> int:
-        """How many control points are variables."""
-        return self.phase.intervals + (-1 if self.swings else 1)
+        self.control_group, self.T = f"{self.kind} control point", f"{self.kind} duration"
 
     def place(self, s: float) -> str:
         percent = f"{100 * s:.2f} %" if s in self.more else f"{100 * s:.0f} %"
         return f"{self.name}, {percent}"
 
     def control(self, v: Variables, j: int) -> Array:
-        """Control point j = 0 .. intervals + 2: a swing starts at rest and ends without acceleration, the
-        others end at rest.
+        """Control point j = 0 .. intervals + 2: three that are the same make a start or an end at rest, and
+        a last one on the line of those before it an end without acceleration.
         """
         point = self._control(v, j)
         if j not in self._drifting:
@@ -129,12 +158,12 @@ class Way:
         return np.concatenate([base, point[6:]])
 
     def _control(self, v: Variables, j: int) -> Array:
-        if not self.swings:
-            return v.get(self.control_group, min(j, self.points - 1))
-        if j <= 2:
-            return self._y0
-        if j < self.phase.intervals + 2:
-            return v.get(self.control_group, j - 3)
+        if j < self.lead:
+            return self._y0 if isinstance(self._begins, str) else self._begins(v)
+        if j < self.lead + self._points or self.rests:
+            return v.get(self.control_group, min(j - self.lead, self._points - 1))
+        if not isinstance(self._ends, str):
+            return self._ends(v)
         one, two = self.control(v, j - 2), self.control(v, j - 1)
         return two + (two - one) * (self.factors[-2] / self.factors[-1])
 
@@ -156,6 +185,17 @@ class Way:
 
         return values
 
+    def wrench(self, v: Variables, k: int) -> Array:
+        """Sole wrenches (6 a sole) at node k."""
+        w = v.get(f"{self.kind} sole wrench", k)
+        for sole in self.lifted.get(k, ()):
+            w = np.where(np.arange(len(w)) // 6 == sole, 0.0, w)
+        return w
+
+    def end(self, v: Variables, s: float) -> tuple[Array, Array]:
+        """Coordinates and legs where it begins (s = 0) or ends (1)."""
+        return self.at(s)(v)[0], v.get(f"{self.kind} legs", -1 if s else 0)
+
     def at_node(self, s: float, k: int) -> Callable[[Variables], tuple[Array, Array, Array]]:
         """The same at node k, where the acceleration of a base that nothing holds is a variable."""
         at = self.at(s)
@@ -176,8 +216,9 @@ def node_piece(
     closed: bool = True,
     feedforward: bool = False,
     lifted: str | None = None,
+    soles: tuple[Collection[str], Array] = ((), NONE),
 ) -> Piece:
-    """Rows of a node.  state : y, y', y'', legs, sole wrenches, T.
+    """Rows of a node.  state : y, y', y'', legs, sole wrenches, T.  soles : fading and lifted ones.
 
     closed : whether its legs have rows of their own.  feedforward : whether its torque is that variable.
     lifted : variables that are its torque over limit; None: there are none.
@@ -185,7 +226,7 @@ def node_piece(
     problem_limits, n = robot.robot, robot.n
     names, fraction = problem_limits.joint_names, limits.torque.fraction
     rates, fast = problem_limits.velocity_limit[robot.dependent], limits.velocity.fraction
-    inside, cone = limits.cone_rows(robot, place, limits.cone.margin, limits.cone.minimum_force)
+    inside, cone = limits.cone_rows(robot, place, limits.cone.margin, limits.cone.minimum_force, *soles)
     closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
 
     def value(v: Variables) -> Array:
@@ -228,7 +269,7 @@ def rate_pieces(robot: RobotMotion, limits: Limits, way: Way) -> list[Piece]:
     bound = (limits.velocity.fraction * robot.robot.velocity_limit)[robot.independent]
     names = robot.labels[robot.base :]
     shortest, longest = way.phase.duration
-    steps = range(2, way.phase.intervals + 2) if way.swings else range(way.phase.intervals)
+    steps = range(max(way.lead - 1, 0), way.last - 2 * way.rests)
     out = []
     for j in steps:
 

@@ -25,6 +25,7 @@ from impactopt.problem.terms import (
     DEFAULT_TERMS,
     Balance,
     FirstTouch,
+    Gaze,
     GearLoad,
     Grip,
     GroundForce,
@@ -37,12 +38,20 @@ from impactopt.problem.terms import (
 from oracle.apart import apart_pieces
 from oracle.blow import Blow
 from oracle.drives import COASTED, Drives, node_torque
-from oracle.motions import Limits, Way, momentum_pieces, node_piece, rate_pieces
+from oracle.motions import NONE, Limits, Way, momentum_pieces, node_piece, rate_pieces
 from oracle.robot_motion import RobotMotion
+from oracle.stances import change_pieces, course, fading_soles, height_pieces
 from oracle.variables import Piece, Variables
-from oracle.worth import GONE, orientation_pieces, price_pieces, speed_pieces, worth_pieces
+from oracle.worth import (
+    GONE,
+    gaze_pieces,
+    orientation_pieces,
+    price_pieces,
+    speed_pieces,
+    worth_pieces,
+)
 
-__all__ = ["Claims", "Program"]
+__all__ = ["Claims", "Program", "unknown"]
 
 Array = NDArray[np.float64]
 EARLY = 0.12  # [s] before contact: from then on no corner of the striking link is beyond the target's plane
@@ -51,6 +60,7 @@ CLEARANCE, HASTE, PARTING = 0.02, 0.04, 0.12
 _KNOWN_TERMS = (
     *map(type, DEFAULT_TERMS),
     FirstTouch,
+    Gaze,
     GearLoad,
     Grip,
     GroundForce,
@@ -67,14 +77,15 @@ class Claims:
     """How a result says that its program was made: what no problem states.
 
     groups : names, counts and sizes of its variables, in their order.  rows : terms, places and components.
-    more : nodes beside those of the mesh, of swing and follow-through.  elements : of the contact's phases.
+    more : nodes beside those of the mesh, of swing, follow-through and each stance phase.
+    elements : of the contact's phases.
     shortest : of each collision, least durations [s] of its phases.  guarded : whether elements are finer.
     apart : rows between bodies, as `impactopt.transcription.clearance` has them.
     """
 
     groups: Sequence[tuple[str, int, int]]
     rows: Sequence[tuple[str, str, str]]
-    more: tuple[tuple[float, ...], tuple[float, ...]]
+    more: Sequence[tuple[float, ...]]
     elements: Sequence[Sequence[float]]
     shortest: Sequence[Sequence[float]]
     guarded: bool
@@ -89,26 +100,32 @@ class Program:
     rows : with bounds and names.  worth : parts of the objective, one number each.
     scales, bounds : of variables, by the names of their groups; bounds (count, size) in physical units.
     missing : what is asked for and not known here.
-    ways : swing, follow-through, and the abort motion if there is one.  blows : with all targets.
+    ways : swing, follow-through, and the abort motion if there is one.  courses : those of each with the
+    stance phases before it, or after it.  stands : all of these phases.  blows : with all targets.
     """
 
     def __init__(self, problem: ImpactProblem, claims: Claims) -> None:
-        self.problem, self.robot = problem, RobotMotion(problem)
+        phases = len(problem.stance_coordinates)
+        robots = [RobotMotion(problem, k) for k in range(phases)]
+        self.problem, self.robot = problem, robots[problem.blow]
         self.limits = Limits(problem, self.robot)
         self._names = {name for name, _, _ in claims.groups}
         self.missing = unknown(problem)
         self.rows: list[Piece] = []
         self.worth: list[Piece] = []
-        swing, follow = claims.more
-        self.ways = [
-            Way(problem, self.robot, "swing", "swing", swing),
-            Way(problem, self.robot, "follow", "follow-through", follow),
+        swing, follow, *stands = claims.more
+        after = range(problem.blow, phases)
+        self.courses = [
+            course(problem, robots, range(problem.blow + 1), ("swing", "swing"), [swing, *stands]),
+            course(problem, robots, after, ("follow", "follow-through"), [follow, *stands]),
         ]
         if problem.abort_after is not None:
-            self.ways.append(Way(problem, self.robot, "abort", "abort", follow))
-        self.scales = {way.T: np.array([0.1]) for way in self.ways}
-        wrenches = [f"{way.kind} sole wrench" for way in self.ways] + ["coasting sole wrench"]
-        self.scales |= dict.fromkeys(wrenches, self.robot.wrench_scale)
+            self.courses.append(course(problem, robots, after, ("abort", "abort"), [follow, *stands]))
+        self.ways = [each[problem.blow] for each in self.courses]
+        self.stands = [way for each in self.courses for k, way in each.items() if k != problem.blow]
+        self.scales = {"coasting sole wrench": self.robot.wrench_scale}
+        for way in (*self.ways, *self.stands):
+            self.scales |= {way.T: np.array([0.1]), f"{way.kind} sole wrench": way.robot.wrench_scale}
         fraction = self.limits.torque.fraction
         self.bounds: dict[str, tuple[Array, Array]] = {
             "feed-forward at contact": (np.array([-fraction]), np.array([fraction]))
@@ -119,16 +136,19 @@ class Program:
             self._blows(claims)
         self._ways()
         self._tendons()
+        for each in self.courses:
+            self.rows += [*change_pieces(each, self.node), *height_pieces(problem, each)]
         self._touch()
         self._clearance()
         self._slide()
         self._reference_range()
         self._first_touch()
         self._ground_force()
-        found, strange = apart_pieces(problem, self.robot, self.nodes(), claims.apart)
+        found, strange = apart_pieces(problem, self.robot, self._postures(), claims.apart)
         self.rows += found
         self.missing += strange
         self.rows += orientation_pieces(problem, self.robot, self.at_contact)
+        self.rows += gaze_pieces(problem, self.ways[0])
         if self.blows:
             self._links()
             self._balance()
@@ -140,7 +160,7 @@ class Program:
             rows, worth = worth_pieces(problem, self.blows[0])
             self.worth += worth
             self.rows += [*rows, *speed_pieces(problem, self.blows[0], self.ways[1])]
-            self.worth += price_pieces(problem, self.robot, self.ways, self.blows)
+            self.worth += price_pieces(problem, [*self.ways, *self.stands], self.blows)
 
     # ------------------------------------------------------------------ parts
     def _blows(self, claims: Claims) -> None:
@@ -164,8 +184,9 @@ class Program:
         return y, y1 / v.one(swing.T)
 
     def _ways(self) -> None:
-        limits, problem = self.limits, self.problem
-        for way in self.ways:
+        problem, fading = self.problem, fading_soles(self.problem, self.problem.blow)
+        for way in (*self.ways, *self.stands):
+            robot, limits = way.robot, Limits(problem, way.robot)
             self.bounds |= {
                 way.control_group: limits.y,
                 f"{way.kind} legs": limits.legs,
@@ -173,15 +194,18 @@ class Program:
             }
             for k, s in enumerate(way.nodes):
                 last = way.swings and k == len(way.nodes) - 1
-                node, place = self.node(way, float(s), k), way.place(float(s))
+                node, place = self.node(way, k), way.place(float(s))
                 lifted = None if last else self._lifted(place)
-                self.rows.append(node_piece(self.robot, limits, place, node, feedforward=last, lifted=lifted))
-            self.rows += rate_pieces(self.robot, limits, way)
-            if self.robot.drifts:
-                self.rows += momentum_pieces(self.robot, way)
+                soles = fading_soles(problem, way.number), way.lifted.get(k, NONE)
+                self.rows.append(
+                    node_piece(robot, limits, place, node, feedforward=last, lifted=lifted, soles=soles)
+                )
+            self.rows += rate_pieces(robot, limits, way)
+            if robot.drifts:
+                self.rows += momentum_pieces(robot, way)
                 self.bounds[f"{way.kind} base control point"] = limits.y[0][:6], limits.y[1][:6]
         base, names = self.robot.base, self.robot.labels[self.robot.base :]
-        lower, upper = (bound[base:] for bound in limits.y)
+        lower, upper = (bound[base:] for bound in self.limits.y)
         self.rows.append(
             Piece.of(
                 lambda v: self.at_contact(v)[base:], [("position limit", "contact", names, lower, upper)]
@@ -196,7 +220,17 @@ class Program:
                 return y, y1, 0 * y, v.get("abort legs"), v.get("coasting sole wrench"), v.one(abort.T)
 
             lifted = self._lifted(COASTED)
-            self.rows.append(node_piece(self.robot, limits, COASTED, coasting, closed=False, lifted=lifted))
+            self.rows.append(
+                node_piece(
+                    self.robot,
+                    self.limits,
+                    COASTED,
+                    coasting,
+                    closed=False,
+                    lifted=lifted,
+                    soles=(fading, NONE),
+                )
+            )
             self._coasting = coasting
 
     def _lifted(self, place: str) -> str | None:
@@ -207,21 +241,28 @@ class Program:
         self.bounds[name] = -fraction, fraction
         return name
 
-    def node(self, way: Way, s: float, k: int) -> Callable[[Variables], Any]:
-        """y, y', y'', legs, sole wrenches and T at node k of a motion, at its fraction s."""
-        at = way.at_node(s, k)
+    def node(self, way: Way, k: int) -> Callable[[Variables], Any]:
+        """y, y', y'', legs, sole wrenches and T at node k of a motion."""
+        at = way.at_node(float(way.nodes[k]), k)
 
         def state(v: Variables) -> tuple[Array, Array, Array, Array, Array, float]:
-            legs, w = v.get(f"{way.kind} legs", k), v.get(f"{way.kind} sole wrench", k)
-            return (*at(v), legs, w, v.one(way.T))
+            return (*at(v), v.get(f"{way.kind} legs", k), way.wrench(v, k), v.one(way.T))
 
         return state
 
     def nodes(self) -> dict[str, Callable[[Variables], Any]]:
-        """y, y', y'', legs, sole wrenches and T at each node, by its place."""
+        """y, y', y'', legs, sole wrenches and T at each node of the phases with the blow, by its place."""
+        return {way.place(float(s)): self.node(way, k) for way in self.ways for k, s in enumerate(way.nodes)}
+
+    def _postures(self) -> dict[str, Callable[[Variables], Array]]:
+        """Configuration (nq,) at each node of all phases, by its place."""
+
+        def posture(way: Way, at: Callable[[Variables], Any], k: int, v: Variables) -> Array:
+            return way.robot.posture(at(v)[0], v.get(f"{way.kind} legs", k))
+
         return {
-            way.place(float(s)): self.node(way, float(s), k)
-            for way in self.ways
+            way.place(float(s)): partial(posture, way, way.at(float(s)), k)
+            for way in (*self.ways, *self.stands)
             for k, s in enumerate(way.nodes)
         }
 
@@ -337,15 +378,19 @@ class Program:
     def _ground_force(self) -> None:
         """Normal forces of the soles over the weight, at the nodes and in contact."""
         term, robot = self.problem.term(GroundForce), self.robot
-        soles = [(k, leg.end) for k, (leg, *_) in enumerate(robot.soles) if leg.sole is not None]
+        soles = [k for k, (leg, *_) in enumerate(robot.soles) if leg.sole is not None]
         if not term.active or not soles:
             return
-        named = [name for _, name in soles] if len(soles) > 1 else []
+        fades = fading_soles(self.problem, self.problem.blow)
+        held = [(k, leg.end) for k, (leg, *_) in enumerate(robot.soles) if leg.sole and leg.name not in fades]
+        own, named = [6 * k + 2 for k, _ in held], [name for _, name in held]
+        if len(soles) == 1:
+            own, named = [], []
 
         def add(place: str, wrench: Callable[[Variables], Array]) -> None:
             def value(v: Variables) -> Array:
-                normal = wrench(v)[[6 * k + 2 for k, _ in soles]] / robot.weight
-                return np.array([normal.sum(), *(normal if named else [])])
+                normal = wrench(v) / robot.weight
+                return np.array([normal[[6 * k + 2 for k in soles]].sum(), *normal[own]])
 
             rows: list[Any] = [(term.name, place, ["all soles"], term.least, term.most)]
             rows.append((term.name, place, named, term.sole, np.inf))
@@ -366,7 +411,7 @@ class Program:
     def _clearance_of(self, k: int, striker: str, point: Array) -> None:
         p, robot = self.problem, self.robot
         swing, follow = self.ways[:2]
-        start = robot.striking(robot.y0, np.zeros(robot.ny), k)[0]
+        start = robot.striking(robot.split(p.start_posture)[0], np.zeros(robot.ny), k)[0]
         nearest = min(CLEARANCE, max(float(p.normal @ (point - start)), 0.0))
 
         def along(y: Array) -> float:

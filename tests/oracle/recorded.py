@@ -9,19 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.terms import ContactWrenchCone
 from impactopt.robots.loads import SHARE, cop_margin, least_kept
 from oracle.motions import Way
 from oracle.program import Program
+from oracle.stances import fading_soles
 from oracle.variables import Variables
 
 __all__ = ["Off", "off_in_record"]
 
 Array = NDArray[np.float64]
 Arrays = Mapping[str, NDArray[Any]]
-INTEGRAL = 0.02  # of the impulse: by how much forces at a few instants may miss it
+FINER = 0.005  # of impulse and duration: by how much they may be others on elements half as long
 
 
 class Off(NamedTuple):
@@ -37,7 +39,7 @@ def off_in_record(p: Program, v: Variables, arrays: Arrays, summary: Mapping[str
     yield from _splines(p, v, arrays)
     for prefix, last in (("reference", 1), ("missed", 2)):
         if f"{prefix}_time" in arrays and last < len(p.ways):
-            yield from _reference(p, v, arrays, prefix, p.ways[last])
+            yield from _reference(p, v, arrays, prefix, last)
     if p.blows:
         yield from _blow(p, v, arrays)
         yield from _summary(p, v, summary)
@@ -65,8 +67,8 @@ def _splines(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
             if f"{way.kind}_{key}" in arrays:
                 yield Off("spline", _gap(arrays[f"{way.kind}_{key}"], value), f"{way.kind}_{key}")
         if f"plan_{way.kind}_wrench" in arrays and p.robot.soles:
-            found = arrays[f"plan_{way.kind}_wrench"][int(way.swings) :]
-            wanted = v.all(f"{way.kind} sole wrench")
+            found = arrays[f"plan_{way.kind}_wrench"][int(way.nodes[0] > 0) :]
+            wanted = [way.wrench(v, k) for k in range(len(way.nodes))]
             yield Off("spline", _gap(found, wanted, p.robot.wrench_scale), f"plan_{way.kind}_wrench")
 
 
@@ -84,38 +86,57 @@ class _Worst:
         yield from (Off(name, amount, where) for name, (amount, where) in self.found.items())
 
 
-def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way) -> Iterator[Off]:
-    """The servo's reference: the splines', on held soles, with the torque that it needs, within limits."""
+def _start(p: Program, v: Variables) -> float:
+    """Contact [s] since the motion's start."""
+    return sum(v.one(way.T) for way in p.courses[0].values())
+
+
+def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, course: int) -> Iterator[Off]:
+    """The servo's reference: the splines', on held soles, with the torque that it needs, within limits.
+
+    course : number of that from contact to rest.
+    """
+    last = p.ways[course]
     a = {name: arrays[f"{prefix}_{name}"] for name in ("time", "phase", "q", "v", "a", "torque", "ground")}
-    robot, swing, worst = p.robot, p.ways[0], _Worst()
+    robot, worst = p.robot, _Worst()
     r, n = robot.robot, robot.n
     start, end = (float(arrays[f"{prefix}_contact_{side}"]) for side in ("start", "end"))
-    worst.note(f"{prefix} times", _gap(start, v.one(swing.T)), "contact")
+    worst.note(f"{prefix} times", _gap(start, _start(p, v)), "contact")
     lasts = blow = sum(v.one(name) for name in p.blows[0].durations) if p.blows else end - start
     if not p.problem.lasts:
         lasts = blow = 0.0
     if last.kind == "abort":
         lasts = float(p.problem.abort_after or 0.0)
     worst.note(f"{prefix} times", _gap(end - start, lasts), "end of contact")
-    worst.note(f"{prefix} times", _gap(float(arrays[f"{prefix}_end"]), end + v.one(last.T)), "end")
+    # phases before contact and after it, with when each begins, its spline and its support polygon
+    parts = dict[tuple[int, int], tuple[Way, float, Any, Array]]()
+    begin = 0.0
+    for phase, ways in ((0, p.courses[0]), (2, p.courses[course])):
+        for k, way in ways.items():
+            held = p.problem.stance_coordinates[k]
+            polygon = support_polygon(r, held) if way.robot.soles else np.zeros((0, 2))
+            parts[phase, k] = way, begin, way.curve(v), polygon
+            begin += v.one(way.T)
+        begin = begin if phase else end
+    numbers = arrays[f"{prefix}_stance"] if p.stands else np.zeros(len(a["time"]), dtype=int)
+    worst.note(f"{prefix} times", _gap(float(arrays[f"{prefix}_end"]), begin), "end")
     angles = np.array([r.joint_positions(q) for q in a["q"]])
     if "reference_angle" in arrays and prefix == "reference":
         worst.note(f"{prefix} angles", _gap(arrays["reference_angle"], angles), "reference_angle")
     y0, u0, ff = p.at_contact(v), p.state_at_contact(v)[1], v.get("feed-forward at contact")
-    polygon = support_polygon(r, p.problem.coordinates) if robot.soles else np.zeros((0, 2))
-    curves = {way.kind: way.curve(v) for way in (swing, last)}
     left = v.get(f"{last.kind} momentum") if robot.drifts else np.zeros(0)
     drifted: tuple[Any, ...] = ()
     for k, time in enumerate(map(float, a["time"])):
         where = f"{prefix} at {time:.4g} s"
         phase = int(a["phase"][k])
+        way, begin, curve, polygon = parts[2 if phase == 2 else 0, int(numbers[k])]
+        robot = way.robot
         if phase == 1:
             y, u, slope = y0 + u0 * (time - start), u0, 0 * u0
         else:
-            way, begin = (swing, 0.0) if phase == 0 else (last, end)
             T = v.one(way.T)
             s = min(max((time - begin) / T, 0.0), 1.0)
-            y, u, slope = (c(s) / T**order for order, c in enumerate(curves[way.kind]))
+            y, u, slope = (c(s) / T**order for order, c in enumerate(curve))
         found, legs = robot.split(a["q"][k])
         if robot.drifts:
             y, u, slope = _with_base(p, (y, u, slope), found, a["v"][k], a["a"][k])
@@ -131,8 +152,8 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
             if drifted and drifted[0] == phase:
                 h, ends = time - drifted[1], drifted[2:]
                 # the trapezoidal rule with its end correction, of fourth order
-                way = h * (ends[1] + u[:6]) / 2 + h**2 * (ends[2] - slope[:6]) / 12
-                worst.note(f"{prefix} posture", _gap(y[:6] - ends[0], way), where)
+                moved = h * (ends[1] + u[:6]) / 2 + h**2 * (ends[2] - slope[:6]) / 12
+                worst.note(f"{prefix} posture", _gap(y[:6] - ends[0], moved), where)
             drifted = phase, time, y[:6], u[:6], slope[:6]
         worst.note(f"{prefix} posture", _gap(found, y), where)
         tau = robot.torque(q, qd, qdd, np.zeros(6 * len(robot.soles)))
@@ -142,7 +163,7 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
         if phase == 1 and time <= start + blow + 1e-9:  # its last instant is rounded otherwise
             worst.note(f"{prefix} torque", _gap(demand, ff), where)
         else:
-            for what, off in _balanced(p, q, tau, a["torque"][k], a["ground"][k]):
+            for what, off in _balanced(p, way, q, tau, a["torque"][k], a["ground"][k]):
                 worst.note(f"{prefix} {what}", off, where)
         worst.note(f"{prefix} closed legs", _gap(robot.closure(q), 0 * robot.closure(q)), where)
         worst.note(f"{prefix} torque limit", float(np.abs(demand).max() - 1), where)
@@ -171,13 +192,15 @@ def _with_base(
     return y, u, slope
 
 
-def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) -> Iterator[tuple[str, float]]:
+def _balanced(
+    p: Program, way: Way, q: Array, tau: Array, torque: Array, ground: Array
+) -> Iterator[tuple[str, float]]:
     """Whether torques and the ground's wrench are what a motion needs, that needs tau (nv,) without soles.
 
     Each sole's wrench follows from its leg's torques; together they have to be the ground's, and each has to
     keep half of the margins that the problem asks for.
     """
-    robot, limit = p.robot, p.problem.robot.torque_limit
+    robot, limit = way.robot, p.problem.robot.torque_limit
     free, rest = np.setdiff1d(np.arange(robot.n), robot.dependent), tau.copy()
     wrenches = np.zeros(0)
     if robot.soles:
@@ -197,7 +220,11 @@ def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) ->
         own, cone = wrenches.reshape(-1, 6)[: robot.standing], p.problem.term(ContactWrenchCone)
         kept = float(cop_margin(robot.robot, corners, own[None]).min())
         yield "margin of a sole's centre of pressure", least_kept(cone.margin) - kept
-        yield "normal force of a sole", (SHARE * cone.minimum_force - float(own[:, 2].min())) / robot.weight
+        fades = fading_soles(p.problem, way.number)
+        bears = [k for k in range(robot.standing) if robot.soles[k][0].name not in fades]
+        if bears:
+            least = float(own[bears, 2].min())
+            yield "normal force of a sole", (SHARE * cone.minimum_force - least) / robot.weight
 
 
 def _blow(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
@@ -214,23 +241,40 @@ def _blow(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
         yield Off("blow", _gap(time[1:], own), "collision_time")
         yield Off("blow", _gap(force[1:], forces, 100.0), "collision_force")
     else:
-        given = float(np.trapezoid(force, time))
-        off = abs(given - impulse) / abs(impulse) - INTEGRAL
-        yield Off("blow", max(off, 0.0), "impulse of collision_force")
+        off_times, given = _quadrature(time, force, p.problem.collision_stages)
+        yield Off("blow", off_times, "collision_time")
+        for what, found, planned in (("end", time[-1], own[-1]), ("impulse", given, impulse)):
+            off = max(_gap(found, planned, abs(planned)) - FINER, 0.0)
+            yield Off("blow", off, f"{what} of the finer contact")
     limits = p.problem.robot.torque_limit
     start = v.get("feed-forward at contact")
     yield Off("blow", _gap(arrays["collision_torque"][0] / limits, start), "collision_torque at contact")
+
+
+def _quadrature(time: Array, force: Array, stages: int) -> tuple[float, float]:
+    """By how much instants [s] after the first are no Radau points of elements; the impulse [N s] of forces
+    [N] there, as exact as the collocation is.
+    """
+    radau = Radau.of_stages(stages)
+    if (len(time) - 1) % stages:
+        return np.inf, np.nan
+    ends = time[::stages]
+    lengths = np.diff(ends)
+    points = ends[:-1, None] + lengths[:, None] * radau.c
+    forces = np.reshape(force[1:], (-1, stages))
+    return _gap(np.reshape(time[1:], (-1, stages)), points), float(lengths @ (forces @ radau.a[-1]))
 
 
 def _summary(p: Program, v: Variables, summary: Mapping[str, Any]) -> Iterator[Off]:
     blow = p.blows[0]
     contact = sum(v.one(name) for name in blow.durations)
     y, u = p.state_at_contact(v)
+    moving = sum(v.one(way.T) for course in p.courses[:2] for way in course.values())
     wanted = {
         "impulse_Ns": float(blow.get(v, "impulse so far", blow.end[-1])[0]),
         "contact_ms": 1e3 * contact,
         "hand_speed_m_s": float(p.robot.normal @ p.robot.striking(y, u)[1]),
-        "duration_s": contact + sum(v.one(way.T) for way in p.ways[:2]),
+        "duration_s": contact + moving,
     }
     for key, value in wanted.items():
         if key in summary:
@@ -266,7 +310,7 @@ def _bodies(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
         stages = [blow.moved(v, i, y0) for i in range(len(blow.stages))]
         legs = [blow.get(v, "collision legs", i) for i in range(len(stages))]
         postures = np.array([p.robot.posture(s[0], leg) for s, leg in zip(stages, legs, strict=True)])
-        times = np.array([s[1] for s in stages]) + v.one(p.ways[0].T)
+        times = np.array([s[1] for s in stages]) + _start(p, v)
         survey = bodies.survey(
             times,
             Places.of(

@@ -32,8 +32,9 @@ class RobotMotion:
     wrench_scale (6 a sole), base_scale (base,) : weight, and weight x lever for moments [N, N m].
     """
 
-    def __init__(self, problem: ImpactProblem) -> None:
-        held, robot = problem.coordinates, problem.robot
+    def __init__(self, problem: ImpactProblem, number: int | None = None) -> None:
+        """number : of a stance phase, if not that with the blow."""
+        held, robot = problem.stance_coordinates[problem.blow if number is None else number], problem.robot
         self.robot, self.model = robot, robot.model
         self.data: Any = robot.model.createData()
         self.base, self.n = held.base, robot.n
@@ -54,13 +55,13 @@ class RobotMotion:
         self.drifts = bool(self.base) and not self.soles
         self.ny, self.nl = self.base + len(self.independent), len(self.dependent)
         self.labels, self.leg_labels = held.labels, held.leg_labels
-        self.y0, self.legs0 = self.split(problem.start_posture)
+        self.y0, self.legs0 = self.split(held.posture)
         self.weight = GRAVITY * float(sum(inertia.mass for inertia in self.model.inertias))
         six = self.weight * np.array([1, 1, 1, LEVER, LEVER, LEVER])
         self.wrench_scale = np.tile(six, len(self.soles))
         self.base_scale = six[: self.base]
         self.hands = [self.model.getFrameId(f"striker:{name}") for name in problem.strikers]
-        self.normal = np.asarray(problem.normal, dtype=float)
+        self.normal, self.friction = np.asarray(problem.normal, dtype=float), problem.friction
         self._seen: Array | None = None
         self._places: list[Any] = []
         self._jacobians: list[Array] = []
@@ -84,10 +85,14 @@ class RobotMotion:
         if self.base:
             q[:3] = y[:3]
             q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(*y[3:6])).coeffs()
-        joints = np.empty(self.n)
-        joints[self.independent], joints[self.dependent] = y[self.base :], legs
-        self._write(q, joints)
+        self._write(q, self.joints(y, legs))
         return q
+
+    def joints(self, y: Array, legs: Array) -> Array:
+        """Angles (n,) of coordinates and legs."""
+        out = np.empty(self.n)
+        out[self.independent], out[self.dependent] = y[self.base :], legs
+        return out
 
     def _write(self, q: Array, joints: Array) -> None:
         q[self._plain[0]] = joints[self._plain[1]]
@@ -182,7 +187,7 @@ class RobotMotion:
 
     def torque(self, q: Array, v: Array, a: Array, wrenches: Array, forces: Iterable[float] = ()) -> Array:
         """Generalized force (nv,) that this motion needs, under wrenches (6 a sole) in the soles' frames and
-        the contact's forces [N] against the normal at the hands.
+        the contact's normal forces [N] at the hands.
         """
         model, data = self.model, self.data
         tau: Array = np.array(pin.rnea(model, data, q, v, a))
@@ -193,11 +198,23 @@ class RobotMotion:
                 tau[joint.idx_v] += drive.spring_stiffness * (q[joint.idx_q] - drive.spring_rest)
         if self.soles:
             self.relieve(tau, q, wrenches)
+        return tau + self.pushed(q, v, forces)
+
+    def pushed(self, q: Array, v: Array, forces: Iterable[float]) -> Array:
+        """Generalized force (nv,) against normal forces [N] on the hands, and against their friction."""
+        out = np.zeros(self.model.nv)
         for hand, force in zip(self.hands, forces, strict=False):
             self._seen = None
-            jac = np.reshape(pin.computeFrameJacobian(model, data, q, hand, _AXES), (6, model.nv))
-            tau += jac[:3].T @ self.normal * force
-        return tau
+            frame = pin.computeFrameJacobian(self.model, self.data, q, hand, _AXES)
+            jac = np.reshape(frame, (6, self.model.nv))[:3]
+            push = self.normal * force
+            if self.friction is not None:
+                fast = jac @ v
+                slide = fast - (fast @ self.normal) * self.normal
+                full = np.hypot(np.linalg.norm(slide), self.friction.slip_speed)
+                push = push + self.friction.coefficient * force * slide / full
+            out += jac.T @ push
+        return out
 
     def resting(self) -> Array:
         """Torques (n,) [N m] at rest in the start posture, on the least sole wrenches that carry it.
@@ -254,9 +271,7 @@ class RobotMotion:
     def coasting(self, y: Array, legs: Array, u: Array, rates: Array) -> Array:
         """(12 a sole) closure, and twists of soles whose legs go at given rates (nl,)."""
         q, v, _ = self._upper(y, u)
-        joints = np.zeros(self.n)
-        joints[self.independent], joints[self.dependent] = y[self.base :], legs
-        self._write(q, joints)
+        self._write(q, self.joints(y, legs))
         v[self.base + self.dependent] = rates
         return np.concatenate([self.closure(q), self.twists(q, v)])
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.small_plans import Planned, arm_problem, biped_problem, changed, transcribed
 
-from impactopt.contact import Board, FreeMass, KelvinVoigt
+from impactopt.contact import Board, ContactFriction, FreeMass, KelvinVoigt
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.clearance_constraints import Margins, Watch
 from impactopt.problem.objectives import Effort
@@ -21,6 +21,7 @@ from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import (
     ContactWrenchCone,
     FirstTouch,
+    Gaze,
     GearLoad,
     GroundForce,
     ReferenceRange,
@@ -31,11 +32,12 @@ from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.presets import space_arm
 from impactopt.robots.tendons import Tendon
+from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.transcription import Transcription, block_functions, statement_of
 from oracle.kkt import lagrangian_gradient
-from oracle.program import Program
+from oracle.program import Program, unknown
 from oracle.recorded import off_in_record
 from oracle.variables import Variables
 from oracle.verdict import claims_of
@@ -173,6 +175,18 @@ def test_of_two_hands(name: str) -> None:
     check_rows(Transcription(problem, problem.coordinates, functions))
 
 
+@pytest.mark.parametrize("name", sorted(path.stem for path in PROBLEMS.glob("*.toml")))
+def test_all_that_a_problem_states_is_known(name: str) -> None:
+    assert unknown(load_problem(PROBLEMS / f"{name}.toml")) == []
+
+
+def test_of_a_head_that_looks_at_the_hit_point() -> None:
+    problem = load_problem(PROBLEMS / "nailing.toml")
+    t = _drawn(problem)
+    assert any(row.term == Gaze.name for row in t.rows.origins)
+    check_rows(t)
+
+
 @pytest.mark.parametrize("gravity", [0.0, -2.0])
 def test_of_a_robot_that_nothing_holds(gravity: float) -> None:
     problem = load_problem(PROBLEMS / "space_arm.toml")
@@ -246,3 +260,38 @@ def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned)
             short, abs=1e-6
         )
         assert off["reference normal force of a sole"] < 0
+
+
+@pytest.mark.parametrize("name", ["punch_step", "kick"])
+def test_of_soles_that_change(name: str) -> None:
+    """Before and after the blow, and where nothing is hit."""
+    problem = load_problem(PROBLEMS / f"{name}.toml")
+    t = _drawn(problem)
+    rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).rows(0.05)
+    assert any(row.place.startswith("on ") for row in rows)
+    check_rows(t.with_apart(rows))
+
+
+@pytest.mark.parametrize("robot", ["arm", "biped"])
+def test_of_friction_at_the_hit(robot: str) -> None:
+    """In the contact and at its first instant, where the servo's torques are variables."""
+    p = {"arm": arm_problem, "biped": biped_problem}[robot]()
+    t = _drawn(
+        dataclasses.replace(p, friction=ContactFriction(coefficient=0.6), terms=(*p.terms, GearLoad()))
+    )
+    check_rows(t)
+
+
+def test_forces_of_a_finer_contact_integrate_to_its_impulse(biped_plan: Planned) -> None:
+    """By the weights of their collocation points, also where a trapezoidal rule would miss by per cents."""
+    t, x = biped_plan.transcription, biped_plan.result.x
+    error = contact_error(t, x)
+    assert error is not None
+    hit = error.finer[0]
+    program, v = second(t, x)
+    for factor, off in ((1.0, 0.0), (1.03, 0.03)):
+        arrays = {f"collision_{name}": getattr(hit, name) for name in ("time", "torque")}
+        arrays["collision_force"] = factor * hit.force
+        found = max(each.amount for each in off_in_record(program, v, arrays, {}) if each.name == "blow")
+        wanted = off and off - 0.005 + factor * error.coarse / 100
+        assert found == pytest.approx(wanted, abs=1e-6 if not off else 2e-3)

@@ -74,7 +74,7 @@ def claims_of(arrays: Mapping[str, NDArray[Any]]) -> Claims:
         return Claims(
             groups=[(str(name), int(count), int(size)) for name, count, size in told["groups"]],
             rows=[(str(term), str(place), c) for term, place, k in told["rows"] for c in lists[k]],
-            more=(tuple(map(float, told["more"][0])), tuple(map(float, told["more"][1]))),
+            more=[tuple(map(float, places)) for places in told["more"]],
             elements=[tuple(map(float, phase)) for phase in told["elements"]],
             shortest=[tuple(map(float, times)) for times in told["shortest"]],
             guarded=bool(told["guarded"]),
@@ -94,9 +94,6 @@ def verify_record(
     ------
     InputError : it does not say what its variables are.
     """
-    if problem.stances or problem.friction is not None:
-        unknown = f"not known to verify: {'stance phases' if problem.stances else 'friction at the hit'}"
-        return Verdict(ok=False, max_violation=np.inf, kkt=None, objective=None, rows={}, reason=unknown)
     claims = claims_of(arrays)
     program = Program(problem, claims)
     x = np.asarray(arrays["solver_x"], dtype=float)

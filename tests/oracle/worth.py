@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.problem.objectives import (
@@ -18,13 +19,13 @@ from impactopt.problem.objectives import (
     TargetEnergy,
 )
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import HandOrientation, TargetSpeed
+from impactopt.problem.terms import Gaze, HandOrientation, TargetSpeed
 from oracle.blow import DEPTH, Blow
 from oracle.motions import Way
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["GONE", "orientation_pieces", "price_pieces", "speed_pieces", "worth_pieces"]
+__all__ = ["GONE", "gaze_pieces", "orientation_pieces", "price_pieces", "speed_pieces", "worth_pieces"]
 
 Array = NDArray[np.float64]
 GONE = "target's way after contact"  # [m], a variable where the target may be slow then
@@ -46,6 +47,27 @@ def orientation_pieces(
         return np.array([direction @ turn @ axis / np.sin(angle)])
 
     return [Piece.of(value, [(term.name, "contact", [problem.striker], 1 / np.tan(angle), np.inf)])]
+
+
+def gaze_pieces(problem: ImpactProblem, swing: Way) -> list[Piece]:
+    """Where a frame looks, at the swing's nodes after a part of it."""
+    term, robot = problem.extra(Gaze), swing.robot
+    if term is None:
+        return []
+    frame = robot.model.getFrameId(term.frame)
+
+    def piece(k: int, s: float) -> Piece:
+        def value(v: Variables) -> Array:
+            y, legs = swing.at(s)(v)[0], v.get("swing legs", k)
+            pin.forwardKinematics(robot.model, robot.data, robot.posture(y, legs))
+            at = pin.updateFramePlacement(robot.model, robot.data, frame)
+            way = problem.point - at.translation
+            cosine = way @ at.rotation @ np.asarray(term.axis) / np.sqrt(way @ way + 1e-8)
+            return np.array([cosine / np.sin(term.angle)])
+
+        return Piece.of(value, [(term.name, swing.place(s), [term.frame], 1 / np.tan(term.angle), np.inf)])
+
+    return [piece(k, float(s)) for k, s in enumerate(swing.nodes) if s >= term.since]
 
 
 def speed_pieces(problem: ImpactProblem, blow: Blow, follow: Way) -> list[Piece]:
@@ -122,15 +144,14 @@ def _lifted(
     return (lambda v: unit * v.one(name)), Piece.of(row, [(name, "", [name], 0.0, 0.0)])
 
 
-def price_pieces(
-    problem: ImpactProblem, robot: RobotMotion, ways: Sequence[Way], blows: Sequence[Blow]
-) -> list[Piece]:
+def price_pieces(problem: ImpactProblem, ways: Sequence[Way], blows: Sequence[Blow]) -> list[Piece]:
     """Prices of the motion style, and small ones of accelerations, wrenches and ends away from the start."""
     p, style, out = problem, problem.style_prices, list[Piece]()
-    moving = np.full(robot.ny, style.speed)
-    moving[: robot.base] *= not robot.drifts
-    moving[robot.base :] += style.idle_speed * p.idle_joints[robot.independent]
     for way in ways:
+        robot = way.robot
+        moving = np.full(robot.ny, style.speed)
+        moving[: robot.base] *= not robot.drifts
+        moving[robot.base :] += style.idle_speed * p.idle_joints[robot.independent]
         typical = float(np.mean(way.phase.duration))
         for s, length in zip(way.nodes, np.gradient(way.nodes), strict=True):
             weight, at = p.smoothness * length / typical**3, way.at(float(s))
@@ -151,24 +172,22 @@ def price_pieces(
                 return np.array([weight * np.sum(third**2)])
 
             out.append(Piece(jerking))
-        if not way.swings:
+        if way.rests:
 
             def away(v: Variables, way: Way = way) -> Array:
-                gap = (way.control(v, way.phase.intervals + 2) - robot.y0)[6 * robot.drifts :]
+                gap = (way.control(v, way.last) - way.robot.y0)[6 * way.drifts :]
                 return np.array([(p.return_price + style.end) * np.sum(gap**2)])
 
             out.append(Piece(away))
-    if not robot.soles:
-        return out
-    groups = [(f"{way.kind} sole wrench", len(way.nodes)) for way in ways]
-    groups += [(f"{blow.prefix}collision sole wrench", len(blow.stages)) for blow in blows]
-    groups += [("coasting sole wrench", 1)] if p.abort_after is not None else []
-    for name, count in groups:
-        for k in range(count):
+    groups = [(f"{way.kind} sole wrench", len(way.nodes), way.robot) for way in ways]
+    groups += [(f"{blow.prefix}collision sole wrench", len(blow.stages), blow.robot) for blow in blows]
+    groups += [("coasting sole wrench", 1, ways[0].robot)] if p.abort_after is not None else []
+    for name, count, robot in groups:
+        price = 0.5 * p.wrench_price / count / robot.wrench_scale**2
+        for k in range(count if robot.soles else 0):
 
-            def pushing(v: Variables, name: str = name, k: int = k, count: int = count) -> Array:
-                w = v.get(name, k) / robot.wrench_scale
-                return np.array([0.5 * p.wrench_price / count * np.sum(w**2)])
+            def pushing(v: Variables, name: str = name, k: int = k, price: Array = price) -> Array:
+                return np.array([np.sum(price * v.get(name, k) ** 2)])
 
             out.append(Piece(pushing))
     return out

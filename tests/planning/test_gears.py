@@ -29,6 +29,7 @@ from impactopt.files.replay import load_planned, resumed
 from impactopt.planning.lazy_constraints import gear_caution, gears_beyond, rows_on_demand, with_rows
 from impactopt.report.report import report_of
 from impactopt.simulation import Perturbation
+from impactopt.solvers.program import IterationRecord
 
 OFF = GearLoad(enabled=False)
 LIMIT = 1.8  # a plan that does not look at its gears has 2.01
@@ -72,6 +73,21 @@ def test_a_plan_that_goes_beyond_gets_rows_and_goes_on(bounded: Solution) -> Non
     assert bounded.impulse == pytest.approx(own.impulse, rel=1e-4) and bounded.impulse < free.impulse
     assert _on_gears(bounded.problem) and bounded.summary()["rows_on_demand"]
     assert bounded.result.iterations > free.result.iterations, "the effort of both"
+
+
+@pytest.mark.filterwarnings("ignore::impactopt.errors.NotSolvedWarning")
+@pytest.mark.parametrize(("limit", "again"), [(LIMIT, False), (1.2, True)])
+def test_a_gear_far_beyond_sends_it_back_to_the_initial_guess(limit: float, again: bool) -> None:
+    records = list[IterationRecord]()
+
+    def second(record: IterationRecord) -> bool:
+        records.append(record)
+        return record.iteration == 0 and len(records) > 1
+
+    solve(_weak(limit), callback=second)
+    first, *_, last, new = (record.objective for record in records)
+    assert new == pytest.approx(first if again else last, rel=1e-3)
+    assert first != pytest.approx(last, rel=0.1)
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])

@@ -23,7 +23,7 @@ from impactopt.problem.terms import GearLoad
 from impactopt.simulation.engines import scene_of
 from impactopt.simulation.pinocchio_engine import follow_contact
 from impactopt.solvers.program import Status
-from impactopt.transcription.contact_guess import natural_durations, parting, touches_needed
+from impactopt.transcription.contact_guess import can_meet, natural_durations, parting, touches_needed
 
 BOARD = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
 
@@ -142,11 +142,11 @@ def test_one_touch_has_no_plan_and_the_number_that_has_one_is_named() -> None:
     assert "`[collision] touches = 2` plans them" in strike.result.message
 
 
-def test_touches_that_do_not_come_are_named() -> None:
-    with pytest.warns(
-        NotSolvedWarning, match="`\\[collision\\] touches` is 2, and point masses need 1 to 'break'"
-    ):
-        optimize_strike(stiff(1e5, touches=2), options={"max_iterations": 200})
+@pytest.mark.parametrize("plan", [solve, optimize_strike])
+@pytest.mark.parametrize(("stiffness", "touches"), [(1e5, 2), (1e6, 3)])
+def test_touches_that_do_not_come_are_refused(plan: Any, stiffness: float, touches: int) -> None:
+    with pytest.raises(InputError, match=f"touches is {touches}, but at no speed .*'break': leave it out"):
+        plan(stiff(stiffness, touches=touches))
 
 
 def test_a_plan_starts_from_a_neighbour(chopped: Solution) -> None:
@@ -212,6 +212,8 @@ def test_touches_of_point_masses() -> None:
     soft, hard = (KelvinVoigt(stiffness=k, damping=50.0) for k in (1e5, 1e7))
     assert touches_needed(soft, BOARD, 0.9, 8.0) == 1
     assert touches_needed(hard, BOARD, 0.9, 8.0) == 2
+    assert [can_meet(soft, BOARD, 0.9, 8.0, k) for k in (1, 2)] == [True, False]
+    assert can_meet(hard, BOARD, 0.9, 8.0, 2)
     found = parting(hard, BOARD, 0.9, 8.0)
     assert found is not None
     assert found.touches == 2

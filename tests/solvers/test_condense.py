@@ -103,6 +103,22 @@ def test_a_variable_that_is_held_does_not_move(algebra):
     assert np.abs(step).min(initial=1.0, where=np.arange(step.size) != c.free[1]) > 0.0
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_steep_hessian_costs_no_digits(algebra, seed):
+    """The weight of the equalities left follows its curvature, and hides what the others curve."""
+    J, H, eliminations, rng = chained(seed)
+    (m, n), equal = J.shape, np.zeros(J.shape[0], dtype=bool)
+    H = sp.csc_array(H + 1e7 * sp.diags_array(1.0 * (np.arange(n) == n - 1)))
+    equal[eliminations[0].rows.ravel()] = equal[m - 5 : m - 3] = True
+    c = Condenser(J, H, eliminations, equal, np.zeros(n, dtype=bool), algebra)
+    newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
+    assert newton.factor(J, H, np.zeros(c.free.size), lambda _: np.ones(c.rows.size), hard=True)
+    gradient, residual = rng.normal(size=n), rng.normal(size=m)
+    step, y = newton.solve(gradient, residual)
+    np.testing.assert_allclose(gradient + H @ step + newton.shift * step + J.T @ y, 0, atol=1e-11)
+    np.testing.assert_allclose((J @ step + residual)[equal], 0, atol=1e-12)
+
+
 @pytest.mark.parametrize("ties", [False, True])
 def test_a_structure_serves_programs_with_other_inequalities(ties):
     """Where these couple what is coupled anyway; it gets another one where they tie two systems together."""

@@ -199,6 +199,9 @@ class BlockCholesky:
 _KEPT = 3  # structures
 _PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step
 _RANK = 1e-15  # singular values below this part of the largest are none
+# of a solve, at most, each of which leaves less than this part of what was left: weights of ten decades cost
+# digits
+_ROUNDS, _LESS = 6, 0.5
 _HELD = 1e15  # on the diagonal of variables that must not move
 _FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
 _SMALL = 1e-5  # none is tried before a shift that would be smaller
@@ -338,16 +341,19 @@ class NewtonSystem:
         c, w, equal = self.condenser, self._weights.copy(), self._equal
         w[equal] = 0.0
         exact = np.concatenate([c.eliminated, equal]) if self._hard else c.eliminated
-        d, y, rows, dual = self._respond(q + self._pulled(w * r), r, w)
-        # once more, with what is left of the equations: weights of ten decades cost digits
-        left, hard = np.zeros(c.m), np.zeros(c.m)
-        left[exact] = (rows + r)[exact]
-        hard[c.eliminated], hard[equal] = y[c.eliminated], y[equal]
-        dual += self._pulled(hard)
-        dual[c.free[self.held]] = 0.0
-        if max(np.abs(dual).max(initial=0.0), np.abs(left).max(initial=0.0)) > close:
-            more_d, more_y, _, _ = self._respond(dual, left, w)
-            d, y = d + more_d, y + more_y
+        g, left, worst = q + self._pulled(w * r), r, np.inf
+        d, y, rows = np.zeros(c.n), np.zeros(c.m), np.zeros(c.m)
+        for _ in range(_ROUNDS):
+            more_d, more_y, more_rows, g = self._respond(g, left, w)
+            d, y, rows = d + more_d, y + more_y, rows + more_rows
+            left, hard = np.zeros(c.m), np.zeros(c.m)
+            left[exact] = (rows + r)[exact]
+            hard[c.eliminated], hard[equal] = more_y[c.eliminated], more_y[equal]
+            g += self._pulled(hard)
+            g[c.free[self.held]] = 0.0
+            before, worst = worst, max(np.abs(g).max(initial=0.0), np.abs(left).max(initial=0.0))
+            if worst <= close or worst > _LESS * before:
+                break
         return d, y + w * r
 
     def _respond(self, g: Vector, r: Vector, w: Vector) -> tuple[Vector, Vector, Vector, Vector]:

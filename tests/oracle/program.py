@@ -270,11 +270,10 @@ class Program:
         """Sums of joint angles in their ranges, at all nodes."""
         r = self.problem.robot
         names = [f"tendon {tendon.name}" for tendon in r.tendons]
-        for place, node in self.nodes().items():
+        for place, posture in self._postures().items():
 
-            def value(v: Variables, node: Callable[[Variables], Any] = node) -> Array:
-                y, _, _, legs, *_ = node(v)
-                angle = dict(zip(r.joint_names, r.joint_positions(self.robot.posture(y, legs)), strict=True))
+            def value(v: Variables, posture: Callable[[Variables], Array] = posture) -> Array:
+                angle = dict(zip(r.joint_names, r.joint_positions(posture(v)), strict=True))
                 return np.array([sum(k * angle[j] for j, k in t.coefficients.items()) for t in r.tendons])
 
             if names:

@@ -19,6 +19,7 @@ __all__ = [
     "NoCompilerWarning",
     "NotSolvedWarning",
     "check_array",
+    "check_choice",
     "did_you_mean",
     "missing_package",
     "printable",
@@ -86,6 +87,17 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     candidates = {str(option).casefold(): str(option) for option in options}
     near = difflib.get_close_matches(str(name).casefold(), list(candidates), n=1, cutoff=0.6)
     return f" (did you mean {candidates[near[0]]!r}?)" if near else ""
+
+
+def check_choice(what: str, given: object, known: Iterable[str]) -> None:
+    """InputError for a name that is none of those known.
+
+    what : begins the message, as "there is no picture".
+    """
+    names = [*known]
+    if given not in names:
+        near = did_you_mean(str(given), names)
+        raise InputError(f"{what} {shortened(repr(given))}{near}; there are {', '.join(names) or 'none'}")
 
 
 def missing_package(what: str, package: str, extra: str) -> InputError:

@@ -15,7 +15,7 @@ from impactopt.bodies.solids import Solid, capsule
 from impactopt.bodies.solids import box as cuboid
 from impactopt.contact.fields import Described, about
 from impactopt.contact.targets import Board, Nail, RigidWall, Target
-from impactopt.errors import FARTHEST, InputError, check_array, check_name, did_you_mean, shortened
+from impactopt.errors import FARTHEST, InputError, check_array, check_choice, check_name
 
 __all__ = [
     "BEHIND",
@@ -64,12 +64,8 @@ class TargetBody(Described):
     )
 
     def __post_init__(self) -> None:
-        if self.shape is not None and not (isinstance(self.shape, str) and self.shape in TARGET_SHAPES):
-            near = did_you_mean(str(self.shape), TARGET_SHAPES)
-            raise InputError(
-                f"TargetBody.shape is {shortened(repr(self.shape))}{near}; "
-                f"give one of {', '.join(TARGET_SHAPES)}"
-            )
+        if self.shape is not None:
+            check_choice("TargetBody.shape", self.shape, TARGET_SHAPES)
         if self.size is None:
             return
         wanted = 1 if self.shape == "ball" else 3

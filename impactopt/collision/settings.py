@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.contact import ContactFriction, ContactLaw, Target
-from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, raw_array
+from impactopt.errors import MOST, InputError, check_array, check_choice, check_direction, raw_array
 from impactopt.robots.robot import Robot
 
 __all__ = ["NO_LIMIT", "REFERENCE_ORDER", "Effects", "JointFriction", "Settings", "no_bend", "servo_settings"]
@@ -152,11 +152,7 @@ class Settings(Mapping[str, Array]):
         InputError : an unknown name, a wrong shape, NaN, a sign, or a normal that is not a unit vector.
         """
         for name in changes:
-            if name not in self._values:
-                raise InputError(
-                    f"no setting {name!r} in this collision{did_you_mean(name, self._values)}; it has "
-                    + ", ".join(self._values)
-                )
+            check_choice("no setting", name, self._values)
         return {
             name: self._check(name, changes[name]) if name in changes else v
             for name, v in self._values.items()

@@ -18,7 +18,7 @@ from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS
 from impactopt.collision.settings import Effects, JointFriction, Settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.contact.friction import check_friction
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_array, check_choice
 
 __all__ = ["SteppedModel", "contact_functions", "law_is_linear", "number_of_steps", "target_is_linear"]
 
@@ -173,10 +173,8 @@ class SteppedModel(CollisionModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.method is not None and self.method not in STEPS:
-            raise InputError(
-                f"method {self.method!r}{did_you_mean(self.method, STEPS)}; there are {', '.join(STEPS)}"
-            )
+        if self.method is not None:
+            check_choice("method", self.method, STEPS)
         check_friction("contact_friction", self.contact_friction)
         if self.contact_friction is not None and self.method == "implicit":
             raise InputError("method 'implicit': its steps have no contact_friction; give 'rk4', or none")

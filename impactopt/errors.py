@@ -20,6 +20,7 @@ __all__ = [
     "NotSolvedWarning",
     "check_array",
     "check_choice",
+    "check_positive",
     "did_you_mean",
     "missing_package",
     "printable",
@@ -189,6 +190,14 @@ def raw_array(name: str, value: object) -> NDArray[Any]:
 def check_number(name: str, value: object, *, finite: bool = True, most: float | None = None) -> float:
     """A single number as a float; InputError as of `check_array`."""
     return float(check_array(name, value, (), finite=finite, most=most))  # type: ignore[arg-type]
+
+
+def check_positive(name: str, value: object, *, most: float | None = None) -> float:
+    """A number above zero as a float; InputError if it is none, or as of `check_array`."""
+    number = check_number(name, value, most=most)
+    if not number > 0:
+        raise InputError(f"{name}: {number:g}; give a number > 0")
+    return number
 
 
 def check_whole(name: str, value: object, *, least: int, most: int) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 import coal
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.solids import Solid, capsule
@@ -143,11 +144,7 @@ class Obstacle(Described):
                 return np.eye(3)
             along = np.subtract(self.end or (), self.start or ()) / self._length
             return face_axes(along)[[1, 2, 0]].T
-        (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
-        about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-        about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-        about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-        return np.asarray(about_z @ about_y @ about_x)
+        return np.asarray(pin.rpy.rpyToMatrix(*self.rpy))
 
 
 @dataclass(frozen=True, kw_only=True)

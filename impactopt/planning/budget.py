@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_array, check_choice
+from impactopt.errors import InputError, check_choice, check_positive
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.options import OPTIONS
@@ -93,8 +93,8 @@ class Budget:
 
     def __post_init__(self) -> None:
         check_choice("unknown solver", self.solver, SOLVERS)
-        if self.time_limit is not None and not check_array("time_limit [s]", self.time_limit, ()) > 0:
-            raise InputError(f"time_limit [s]: {self.time_limit:g}; give a number > 0")
+        if self.time_limit is not None:
+            check_positive("time_limit [s]", self.time_limit)
         if self.options is None:
             return
         if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):

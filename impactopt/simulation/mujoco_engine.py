@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_choice
+from impactopt.errors import InputError, check_choice, check_positive
 from impactopt.robots.loads import BEARS, weight_of
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import Besides
@@ -337,8 +337,7 @@ def simulate_mujoco(
     InputError : MuJoCo is not installed, there is no such contact, or the simulation diverges (with the time
     at which it did).
     """
-    if not step > 0:
-        raise InputError(f"the step of the simulation is {step} s; give a number > 0")
+    check_positive("step [s]", step)
     check_choice("contact", contact, CONTACTS)
     if controller is not None and robot.floating and not scene.soles and not scene.hands:
         raise InputError(

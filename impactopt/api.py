@@ -89,7 +89,7 @@ class Solution(solution.Solution):
 
         simulation, replay : as of :func:`impactopt.animate`.
         """
-        from impactopt.report.solutions import animate
+        from impactopt.report.animation import animate
 
         return animate(self, simulation=simulation, replay=replay)
 
@@ -102,7 +102,7 @@ class Solution(solution.Solution):
         ------
         InputError : it cannot be written, or its name does not end in .html.
         """
-        from impactopt.report.solutions import report_page
+        from impactopt.report.report import report_page
 
         return report_page(self, simulation=simulation, replay=replay).save(path)
 

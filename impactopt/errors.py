@@ -19,6 +19,8 @@ __all__ = [
     "NoCompilerWarning",
     "NotSolvedWarning",
     "check_array",
+    "check_choice",
+    "check_positive",
     "did_you_mean",
     "missing_package",
     "printable",
@@ -86,6 +88,17 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     candidates = {str(option).casefold(): str(option) for option in options}
     near = difflib.get_close_matches(str(name).casefold(), list(candidates), n=1, cutoff=0.6)
     return f" (did you mean {candidates[near[0]]!r}?)" if near else ""
+
+
+def check_choice(what: str, given: object, known: Iterable[str]) -> None:
+    """InputError for a name that is none of those known.
+
+    what : begins the message, as "there is no picture".
+    """
+    names = [*known]
+    if given not in names:
+        near = did_you_mean(str(given), names)
+        raise InputError(f"{what} {shortened(repr(given))}{near}; there are {', '.join(names) or 'none'}")
 
 
 def missing_package(what: str, package: str, extra: str) -> InputError:
@@ -177,6 +190,14 @@ def raw_array(name: str, value: object) -> NDArray[Any]:
 def check_number(name: str, value: object, *, finite: bool = True, most: float | None = None) -> float:
     """A single number as a float; InputError as of `check_array`."""
     return float(check_array(name, value, (), finite=finite, most=most))  # type: ignore[arg-type]
+
+
+def check_positive(name: str, value: object, *, most: float | None = None) -> float:
+    """A number above zero as a float; InputError if it is none, or as of `check_array`."""
+    number = check_number(name, value, most=most)
+    if not number > 0:
+        raise InputError(f"{name}: {number:g}; give a number > 0")
+    return number
 
 
 def check_whole(name: str, value: object, *, least: int, most: int) -> int:

@@ -9,13 +9,14 @@ from typing import Any
 
 import coal
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.solids import Solid, capsule
 from impactopt.bodies.solids import box as cuboid
 from impactopt.contact.fields import Described, about
 from impactopt.contact.targets import Board, Nail, RigidWall, Target
-from impactopt.errors import FARTHEST, InputError, check_array, check_name, did_you_mean, shortened
+from impactopt.errors import FARTHEST, InputError, check_array, check_choice, check_name
 
 __all__ = [
     "BEHIND",
@@ -64,12 +65,8 @@ class TargetBody(Described):
     )
 
     def __post_init__(self) -> None:
-        if self.shape is not None and not (isinstance(self.shape, str) and self.shape in TARGET_SHAPES):
-            near = did_you_mean(str(self.shape), TARGET_SHAPES)
-            raise InputError(
-                f"TargetBody.shape is {shortened(repr(self.shape))}{near}; "
-                f"give one of {', '.join(TARGET_SHAPES)}"
-            )
+        if self.shape is not None:
+            check_choice("TargetBody.shape", self.shape, TARGET_SHAPES)
         if self.size is None:
             return
         wanted = 1 if self.shape == "ball" else 3
@@ -147,11 +144,7 @@ class Obstacle(Described):
                 return np.eye(3)
             along = np.subtract(self.end or (), self.start or ()) / self._length
             return face_axes(along)[[1, 2, 0]].T
-        (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
-        about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-        about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-        about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-        return np.asarray(about_z @ about_y @ about_x)
+        return np.asarray(pin.rpy.rpyToMatrix(*self.rpy))
 
 
 @dataclass(frozen=True, kw_only=True)

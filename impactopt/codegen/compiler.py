@@ -203,7 +203,7 @@ _NATIVE_LEVEL = f"-O3 {_NATIVE_FLAGS}"
 
 
 def _level() -> str:
-    return f"-Og {_NATIVE_FLAGS}" if quick_to_compile() else _NATIVE_LEVEL
+    return f"-O0 {_NATIVE_FLAGS}" if quick_to_compile() else _NATIVE_LEVEL
 
 
 @dataclass(frozen=True, kw_only=True)

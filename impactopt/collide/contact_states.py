@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from impactopt.codegen.cache import cached, model_hash
 from impactopt.collision.frozen import _inverse_of_cholesky
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_choice
 from impactopt.files.output import load_record
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
@@ -221,14 +221,10 @@ class ContactStates:
         robot, v, torque, lasts = self.robot, None, None, _LONG
         if result is not None:
             q, v, torque, lasts = self._of_result(result)
-        elif name in robot.postures:
-            q = robot.posture(name)
         else:
             known = ("reach", *robot.postures)
-            raise InputError(
-                f"[at_contact] posture: {robot.name} has no posture {name!r}{did_you_mean(name, known)}; "
-                f"there are {', '.join(known)}"
-            )
+            check_choice(f"[at_contact] posture: {robot.name} has no posture", name, known)
+            q = robot.posture(name)
         if isinstance(self.stance, Free) and result is None:
             return Posture(q=q, polygon=np.zeros((0, 2)))
         robot.check_stance(q, self.stance.sole_names(robot))

@@ -17,7 +17,7 @@ from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.sdc import frozen_model
 from impactopt.contact.targets import Target
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_choice
 from impactopt.files.output import Record, load_record, plain, replay_name
 from impactopt.files.problem_file import ProblemFile, parse_problem_file
 from impactopt.files.problem_file.diagnostics import mistakes_of, report_mistakes
@@ -227,11 +227,7 @@ def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
     known = {**MEASURES, **results}
     out = {}
     for name in names:
-        if name not in known:
-            raise InputError(
-                f"there is no output {name!r}{did_you_mean(name, known)} of a sweep of collisions; there are "
-                + ", ".join(known)
-            )
+        check_choice("a sweep of collisions has no output", name, known)
         out[name] = known[name]
     if not out:
         raise InputError(f"outputs: name at least one of {', '.join(known)}")

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.outputs import HISTORIES, OUTPUTS, SCALARS
 from impactopt.contact import ContactLaw, Target
-from impactopt.errors import InputError, check_array, check_direction
+from impactopt.errors import InputError, check_direction, check_positive
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.robot import Robot
 
@@ -145,8 +145,7 @@ class CollisionModel(ABC):
         if frame in self.held_by.constraint_frames(self.robot):
             raise InputError(f"striker {self.striker!r}: it is held by the stance; strike with another")
         object.__setattr__(self, "normal", check_direction("normal", self.normal))
-        if not check_array("horizon [s]", self.horizon, ()) > 0:
-            raise InputError(f"horizon [s]: {self.horizon:g}; give a number > 0")
+        check_positive("horizon [s]", self.horizon)
 
     @property
     def held_by(self) -> Stance:

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 
 from impactopt.collision.model import JointSpaceModel, Segment
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_choice
 
 __all__ = [
     "HISTORIES",
@@ -56,10 +56,7 @@ OF_SERVO = ("joint_velocity", "torque", "demand", "hand_wrench", *OF_SOLES)
 def check_outputs(names: tuple[str, ...]) -> None:
     """InputError for an output that there is not."""
     for name in names:
-        if name not in OUTPUTS:
-            raise InputError(
-                f"no output {name!r}{did_you_mean(name, OUTPUTS)}; there are {', '.join(OUTPUTS)}"
-            )
+        check_choice("no output", name, OUTPUTS)
 
 
 def check_jacobian(names: tuple[str, ...], method: str, freezes: int) -> None:

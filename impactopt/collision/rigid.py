@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.contact import FreeMass, RigidWall
-from impactopt.errors import InputError, check_array, check_number, did_you_mean
+from impactopt.errors import InputError, check_array, check_choice, check_number
 from impactopt.kinematics.operational_space import Held
 
 __all__ = ["RigidImpact"]
@@ -77,8 +77,7 @@ class RigidImpact(CollisionModel):
     ) -> Collision:
         q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
         for name in overrides:
-            if name not in self.settings:
-                raise InputError(f"there is no setting {name!r}{did_you_mean(name, self.settings)}")
+            check_choice("there is no setting", name, self.settings)
         known = self.settings | {n: float(check_array(n, x, ())) for n, x in overrides.items()}
         numbers = {name: known[f"target_{name}"] for name in self.target.parameters}
         state = np.zeros(self.target.n_states)

@@ -13,7 +13,7 @@ from impactopt.collision.checks import caution, more_often
 from impactopt.collision.settings import Effects, JointFriction, servo_settings
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import ContactFriction, ContactLaw, FreeMass, SpringDamper, Target
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_array, check_choice
 from impactopt.kinematics.stance import BothSoles, FixedBase, Stance
 from impactopt.robots.robot import Robot
 
@@ -166,13 +166,9 @@ def frozen_model(
     ------
     InputError : an unknown name; what the models refuse.
     """
+    check_choice("no model with frozen dynamics is called", name, FROZEN)
     if name == "virtual-mass":
         return VirtualMass(**scene)
     if name == "sdc-paper":
         return replace(SDC.paper(**scene), method=None, step=None)
-    if name == "sdc":
-        return SDC(**scene, freezes=freezes, accuracy=accuracy)
-    raise InputError(
-        f"no model with frozen dynamics is called {name!r}{did_you_mean(name, FROZEN)}: there are "
-        + ", ".join(FROZEN)
-    )
+    return SDC(**scene, freezes=freezes, accuracy=accuracy)

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.contact import ContactFriction, ContactLaw, Target
-from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, raw_array
+from impactopt.errors import (
+    MOST,
+    InputError,
+    check_array,
+    check_choice,
+    check_direction,
+    check_positive,
+    raw_array,
+)
 from impactopt.robots.robot import Robot
 
 __all__ = ["NO_LIMIT", "REFERENCE_ORDER", "Effects", "JointFriction", "Settings", "no_bend", "servo_settings"]
@@ -74,8 +82,7 @@ class JointFriction:
             number = check_array(f"JointFriction: {name}", value, shape, most=MOST)
             if (number < 0).any():
                 raise InputError(f"JointFriction: {name} must be >= 0")
-        if not check_array("JointFriction: transition [rad/s]", self.transition, (), most=MOST) > 0:
-            raise InputError(f"JointFriction: transition [rad/s]: {self.transition:g}; give a number > 0")
+        check_positive("JointFriction: transition [rad/s]", self.transition, most=MOST)
 
     def arrays(self, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(viscous, coulomb), each (n,)."""
@@ -152,11 +159,7 @@ class Settings(Mapping[str, Array]):
         InputError : an unknown name, a wrong shape, NaN, a sign, or a normal that is not a unit vector.
         """
         for name in changes:
-            if name not in self._values:
-                raise InputError(
-                    f"no setting {name!r} in this collision{did_you_mean(name, self._values)}; it has "
-                    + ", ".join(self._values)
-                )
+            check_choice("no setting", name, self._values)
         return {
             name: self._check(name, changes[name]) if name in changes else v
             for name, v in self._values.items()

@@ -18,7 +18,7 @@ from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS
 from impactopt.collision.settings import Effects, JointFriction, Settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.contact.friction import check_friction
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_array, check_choice, check_positive
 
 __all__ = ["SteppedModel", "contact_functions", "law_is_linear", "number_of_steps", "target_is_linear"]
 
@@ -173,17 +173,14 @@ class SteppedModel(CollisionModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.method is not None and self.method not in STEPS:
-            raise InputError(
-                f"method {self.method!r}{did_you_mean(self.method, STEPS)}; there are {', '.join(STEPS)}"
-            )
+        if self.method is not None:
+            check_choice("method", self.method, STEPS)
         check_friction("contact_friction", self.contact_friction)
         if self.contact_friction is not None and self.method == "implicit":
             raise InputError("method 'implicit': its steps have no contact_friction; give 'rk4', or none")
         if not 1e-14 <= check_array("tolerance", self.tolerance, ()) <= 1e-2:
             raise InputError(f"tolerance: {self.tolerance:g}; give a number from 1e-14 to 1e-2")
-        if not check_array("step [s]", self.step_length, ()) > 0:
-            raise InputError(f"step [s]: {self.step_length:g}; give a number > 0")
+        check_positive("step [s]", self.step_length)
         if self.step_length > self.horizon:
             raise InputError(f"step [s]: {self.step_length:g} is longer than the horizon, {self.horizon:g} s")
         steps = ceil(self.horizon / self.step_length)

@@ -17,7 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.errors import MOST, InputError, check_array
+from impactopt.errors import MOST, InputError, check_number
 
 __all__ = [
     "About",
@@ -83,6 +83,13 @@ class About:
             and (self.least is None or number >= self.least)
             and (self.most is None or number <= self.most)
         )
+
+    def checked(self, name: str, value: object) -> float:
+        """A number as a float; InputError, which begins with ``name``, if it is none or out of its range."""
+        number = check_number(name, value, most=MOST)
+        if not self.allows(number):
+            raise InputError(f"{name}: {number:g}; give a number {self.range}")
+        return number
 
     def key_of(self, field: str) -> str:
         """The key of a field in a file: `stiffness` in [N/m^1.5] is `stiffness_N_m1_5`."""
@@ -167,9 +174,7 @@ def check_numbers(instance: Any) -> None:
     """
     for field, told in abouts(type(instance)):
         name = f"{type(instance).__name__}: {field.name}" + (f" [{told.unit}]" if told.unit else "")
-        number = float(check_array(name, getattr(instance, field.name), (), most=MOST))
-        if not told.allows(number):
-            raise InputError(f"{name}: {number:g}; give a number {told.range}")
+        number = told.checked(name, getattr(instance, field.name))
         if 0 < number < 1 / MOST and not told.allows(-1.0):
             zero = "0, or " if told.allows(0.0) else ""
             raise InputError(f"{name}: {number:g}; give {zero}a number of at least {1 / MOST:g}")

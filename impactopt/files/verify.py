@@ -24,7 +24,6 @@ from impactopt.errors import InputError
 from impactopt.files.output import LARGEST, NUMBERS, SUMMARY, Record, load_record, record_of
 from impactopt.files.replay import problem_of, program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.dynamics import inverse_dynamics
 from impactopt.robots.loads import weight_of
 from impactopt.solvers.program import bound_violations, complementarity, row_violations, scaled_residual
 from impactopt.transcription.contact_refinement import contact_error
@@ -272,7 +271,7 @@ def motion_of_record(
     scale = np.concatenate([np.full(len(still), max(1.0, weight_of(robot))), limit])
     for i, instant in enumerate(time):
         where = f"{instant:.4g} s"
-        tau = inverse_dynamics(robot, data, q[i], v[i], a[i])
+        tau = robot.inverse_dynamics(data, q[i], v[i], a[i])
         pin.computeJointJacobians(model, data, q[i])
         pin.updateFramePlacements(model, data)
         for leg in held[stance[i]]:

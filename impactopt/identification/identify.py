@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from impactopt.contact.laws import LAWS, ContactLaw
-from impactopt.errors import InputError, check_number, did_you_mean
+from impactopt.errors import InputError, check_choice, check_number
 from impactopt.identification.fitting import fit_law
 from impactopt.identification.log import ImpactLog, find_blows, read_log
 from impactopt.identification.result import Identification
@@ -80,10 +80,7 @@ def _law(law: str | type[ContactLaw] | ContactLaw) -> ContactLaw:
         return law
     if isinstance(law, str):
         words = {kind.word: kind for kind in LAWS}
-        if law not in words:
-            raise InputError(
-                f"there is no law {law!r}{did_you_mean(law, words)}; laws are {', '.join(words)}"
-            )
+        check_choice("there is no law", law, words)
         law = words[law]
     if law not in LAWS:
         raise InputError(f"laws: {law!r}; give one of the package's, or one with numbers")

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import MOST, InputError, check_array
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, usual_stance
-from impactopt.robots.dynamics import generalized_gravity, nonlinear_effects
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
@@ -43,7 +42,7 @@ def static_wrenches(c: StanceCoordinates, y: Array, legs: Array) -> Array:
     if not c.legs:
         return np.zeros(0)
     q = c.join(y, legs)
-    tau = generalized_gravity(c.robot, c.model.createData(), q)
+    tau = c.robot.generalized_gravity(c.model.createData(), q)
     jac = c.sole_jacobians(q)[0][: 6 * len(c.soles), c.undriven]
     lever = np.array([1, 1, 1, 10, 10, 10] * len(c.soles))  # moments cost more: keep the CoP in the sole
     found = np.linalg.lstsq(jac.T / lever, tau[c.undriven], rcond=None)[0] / lever
@@ -141,7 +140,7 @@ def holding_torque(
     q = robot.check_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.check_velocity(v)
     held_by = usual_stance(robot) if stance is None else stance
-    bias = nonlinear_effects(robot, robot.model.createData(), q, v)
+    bias = robot.nonlinear_effects(robot.model.createData(), q, v)
     if not np.all(np.isfinite(bias)):
         raise InputError("q, v: the forces of this motion are no finite numbers; give smaller ones")
     held = _jacobians(robot.model, q, held_by.constraint_frames(robot))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_choice, check_positive
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.options import OPTIONS
@@ -92,13 +92,9 @@ class Budget:
     stop: Stop = field(default_factory=Stop)
 
     def __post_init__(self) -> None:
-        if self.solver not in SOLVERS:
-            raise InputError(
-                f"unknown solver {self.solver!r}{did_you_mean(self.solver, SOLVERS)}: there are "
-                f"{', '.join(SOLVERS)}"
-            )
-        if self.time_limit is not None and not check_array("time_limit [s]", self.time_limit, ()) > 0:
-            raise InputError(f"time_limit [s]: {self.time_limit:g}; give a number > 0")
+        check_choice("unknown solver", self.solver, SOLVERS)
+        if self.time_limit is not None:
+            check_positive("time_limit [s]", self.time_limit)
         if self.options is None:
             return
         if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):
@@ -106,11 +102,7 @@ class Budget:
         if kind := OPTIONS.get(self.solver):
             known = [f.name for f in fields(kind)]
             for name in self.options:
-                if name not in known:
-                    raise InputError(
-                        f"the solver {self.solver!r} has no option {name!r}{did_you_mean(name, known)}; it "
-                        f"has {', '.join(known)}"
-                    )
+                check_choice(f"the solver {self.solver!r} has no option", name, known)
             kind(**self.options)
 
     def started(self) -> Budget:

@@ -24,7 +24,6 @@ from impactopt.kinematics.splines import quintic
 from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
-from impactopt.robots.dynamics import inverse_dynamics
 from impactopt.robots.tools import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.transcription.initial_guess import strike_rates
@@ -177,7 +176,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     program).
     """
     c, r = problem.coordinates, problem.robot
-    tau = inverse_dynamics(r, c.data, q, v, a)
+    tau = r.inverse_dynamics(c.data, q, v, a)
     limit = problem.term(TorqueLimit).fraction * np.where(r.hinges, 0.0, r.torque_limit)
     if not c.legs:
         return bool(np.all(np.abs(tau) <= limit))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from impactopt.contact.fields import snake_case
-from impactopt.errors import InputError, check_array, check_number, did_you_mean
+from impactopt.errors import InputError, check_array, check_choice, check_number
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
@@ -84,10 +84,7 @@ def moved_problem(
 
 def _with(thing: Any, name: str, value: float) -> Any:
     known = [field.name for field in dataclasses.fields(thing)]
-    if name not in known:
-        raise InputError(
-            f"{type(thing).__name__} has no {name!r}{did_you_mean(name, known)}: it has {', '.join(known)}"
-        )
+    check_choice(f"{type(thing).__name__} has no number", name, known)
     return dataclasses.replace(thing, **{name: value})
 
 
@@ -148,10 +145,7 @@ def parameter_of(problem: ImpactProblem, name: str) -> Parameter:
             value = getattr(term, told.name)
             if isinstance(value, float) and np.isfinite(value):
                 known[f"terms.{section}.{told.name}"] = ("terms", (type(term), told.name), value)
-    if name not in known:
-        raise InputError(
-            f"no number {name!r} of this problem{did_you_mean(name, known)}: there are {', '.join(known)}"
-        )
+    check_choice("this problem has no number", name, known)
     field, part, value = known[name]
     return Parameter(
         name=name, problem=problem, value=check_number(name, value), _field=str(field), _part=part

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stages import Stage
 
-__all__ = ["LANES", "BlockExpression", "BlockRecipe", "make_block"]
+__all__ = ["LANES", "BlockExpression", "BlockRecipe", "JointMotion", "joint_motion", "make_block"]
 
 # Instances that a compiled block takes at once, on any CPU: where its vectors are narrower, the compiler
 # takes several. Fewer, a power of two, for blocks of few instances: lanes that are idle cost as much as the
@@ -72,3 +73,26 @@ class BlockRecipe:
     build: Callable[..., BlockExpression]
     key: tuple[Any, ...] = ()
     of_stages: bool = False
+
+
+class JointMotion(NamedTuple):
+    """Velocities and accelerations of all joints.
+
+    z : what it is a function of, as `ContactProgram.drive_points` has slots for it.  velocity (n) [rad/s],
+    acceleration (n) [rad/s^2].  through : of `make_block`.
+    """
+
+    z: list[Any]
+    velocity: Any
+    acceleration: Any
+    through: list[tuple[Any, Any]]
+
+
+def joint_motion(c: StanceCoordinates) -> JointMotion:
+    """z = y0; d1, T1, d, T: y = y0 + T1 d1 + T d; r, r', S: ydot = r/S, yddot = r'/(S T); legs (nl)."""
+    names = ("y0", "d1", "d", "r", "r1", "y", "u", "udot")
+    y0, d1, d, r, r1, y, u, udot = (ca.SX.sym(name, c.ny) for name in names)
+    T1, T, S, legs = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("S"), ca.SX.sym("legs", c.nl)
+    v, a = c.motion(y, legs, u, udot)
+    through = [(y, y0 + T1 * d1 + T * d), (u, r / S), (udot, r1 / (S * T))]
+    return JointMotion([y0, d1, T1, d, T, r, r1, S, legs], v[c.base :], a[c.base :], through)

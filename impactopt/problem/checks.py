@@ -14,7 +14,16 @@ from impactopt.bodies.world import Ground, Obstacle, TargetBody
 from impactopt.contact.friction import check_friction
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
-from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened
+from impactopt.errors import (
+    MOST,
+    InputError,
+    check_array,
+    check_choice,
+    check_number,
+    check_whole,
+    did_you_mean,
+    shortened,
+)
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import Held
 from impactopt.kinematics.support import margin, support_polygon
@@ -195,9 +204,7 @@ def check_collision(problem: Any) -> None:
             f"{1e3 * rough:g} mm, where a plan's search passes: write its powers with "
             "impactopt.contact.power, as power(x, 1.5)"
         )
-    if problem.collision not in COLLISIONS:
-        near = did_you_mean(problem.collision, COLLISIONS)
-        raise InputError(f"unknown collision {problem.collision!r}{near}: there are {', '.join(COLLISIONS)}")
+    check_choice("unknown collision", problem.collision, COLLISIONS)
     e = check_number("coefficient_of_restitution", problem.coefficient_of_restitution)
     object.__setattr__(problem, "coefficient_of_restitution", e)
     if not 0 <= e <= 1:
@@ -289,9 +296,7 @@ def check_elements(problem: Any) -> None:
 
 def check_prices(problem: Any) -> None:
     """InputError for prices on motion that are no numbers of 0 or more."""
-    if problem.style not in STYLES:
-        near = did_you_mean(str(problem.style), STYLES)
-        raise InputError(f"unknown style {problem.style!r}{near}: give {' or '.join(map(repr, STYLES))}")
+    check_choice("unknown style", problem.style, STYLES)
     for name in ("smoothness", "wrench_price", "return_price", "motion_price", "price_scale"):
         number = check_number(name, getattr(problem, name))
         object.__setattr__(problem, name, number)

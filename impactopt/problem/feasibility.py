@@ -15,7 +15,6 @@ from impactopt.kinematics.support import support_polygon
 from impactopt.problem.plausibility import giant_soles
 from impactopt.problem.terms import TorqueLimit
 from impactopt.problem.terms.first_touch import face_of
-from impactopt.robots.dynamics import generalized_gravity
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
@@ -57,7 +56,7 @@ def too_weak(problem: ImpactProblem) -> str:
     """
     robot, c, limit = problem.robot, problem.coordinates, problem.term(TorqueLimit).fraction
     q = problem.start_posture
-    weight = generalized_gravity(robot, robot.model.createData(), q)
+    weight = robot.generalized_gravity(robot.model.createData(), q)
     held = c.sole_jacobians(q)[0].T if c.legs else np.zeros((robot.nv, 0))
     base = robot.nv - robot.n
     driven = np.flatnonzero(~(robot.passive | robot.hinges))

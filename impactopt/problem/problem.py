@@ -25,8 +25,8 @@ from impactopt.bodies.world import (
 from impactopt.collision.settings import Effects
 from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
-from impactopt.contact.phases import ContactPhase, contact_phases
 from impactopt.contact.targets import Target
+from impactopt.contact.targets.base import ContactPhase, contact_phases
 from impactopt.errors import (
     FARTHEST,
     InputError,

@@ -14,7 +14,6 @@ from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.contact.targets.base import scaled_numbers
 from impactopt.errors import (
     FARTHEST,
-    MOST,
     InputError,
     check_array,
     check_name,
@@ -185,19 +184,15 @@ class Scenario(Described):
             value = getattr(self, f.name)
             if value is None and f.default is None:
                 continue
-            number = check_array(f"{where}: {f.name}", value, (), most=MOST)
-            if f.name != "abort_after" and not told.allows(float(number)):
-                raise InputError(f"{where}: {f.name} is {value:g}; give a number {told.range}")
+            told.checked(f"{where}: {f.name}", value)
         changed = [f.name for f in fields(self)[1:] if getattr(self, f.name) != f.default]
         unused = [name for name in changed if name not in ("missing", "abort_after", "capture_margin")]
         if self.missing and unused:
             raise InputError(
                 f"{where}: with a target that is missing there is no collision; drop {unused[0]}"
             )
-        if self.abort_after is not None and not (self.missing and self.abort_after > 0):
-            raise InputError(
-                f"{where}: abort_after is a time > 0 s, for a missing target; drop it, or give missing=True"
-            )
+        if self.abort_after is not None and not self.missing:
+            raise InputError(f"{where}: abort_after is for a missing target; drop it, or give missing=True")
 
     def numbers(self, law: ContactLaw, target: Target) -> tuple[dict[str, float], dict[str, float]]:
         """The contact law's and the target's numbers by name, with the scenario's factors.

@@ -17,7 +17,6 @@ from impactopt.contact.targets import FreeMass, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.terms import FirstTouch, TorqueLimit
-from impactopt.robots.dynamics import generalized_gravity
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
@@ -76,7 +75,7 @@ class Strength:
         jac = np.reshape(
             pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED), (6, model.nv)
         )[:3]
-        weight = np.abs(generalized_gravity(robot, data, q))
+        weight = np.abs(robot.generalized_gravity(data, q))
         point = np.array(data.oMf[frame].translation)
         spread = np.linalg.solve(inertia, jac.T)
         mobility = jac @ spread

@@ -12,12 +12,12 @@ from typing import Any
 _EXPORTS = {
     "Animation": "animation",
     "Report": "report",
-    "animate": "solutions",
+    "animate": "animation",
     "animation_of": "animation",
     "bodies_page": "robot_page",
     "bodies_page_of_problem": "robot_page",
     "report_of": "report",
-    "report_page": "solutions",
+    "report_page": "report",
 }
 
 

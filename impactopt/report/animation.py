@@ -6,14 +6,16 @@ import os
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from impactopt.errors import InputError
-from impactopt.files.output import Record, write_file
+from impactopt.files.output import Record, record_of, write_file
+from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.page import html_page
 from impactopt.report.stage import stage_of
 
-__all__ = ["Animation", "animation_of"]
+__all__ = ["Animation", "animate", "animation_of"]
 
 BODY = '<main><div id="trouble"></div><div id="animation"></div></main>'
 HEIGHT = 660  # pixels, in a notebook
@@ -66,3 +68,16 @@ def animation_of(record: Record, problem: ImpactProblem) -> Animation:
     header, arrays = stage_of(record, problem)
     name = str(record.summary.get("problem", {}).get("name", "")) or "motion"
     return Animation(html_page(title=name, kind="alone", body=BODY, header=header, arrays=arrays))
+
+
+def animate(solution: Solution, *, simulation: Any | None = None, replay: Any | None = None) -> Animation:
+    """The planned motion; and beside it, if given, its simulations on held and on free soles.
+
+    simulation, replay : what :meth:`impactopt.Solution.validate` gave, by "pinocchio" and by "mujoco".
+
+    Raises
+    ------
+    InputError : the solve ended before there was a motion.
+    """
+    record = record_of(solution, simulation=simulation, replay=replay)
+    return animation_of(record, solution.problem)

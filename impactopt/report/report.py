@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from impactopt.files.output import Record
+from impactopt.files.output import Record, record_of
+from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.animation import Page
 from impactopt.report.charts import charts_of
@@ -16,7 +17,7 @@ from impactopt.report.result_rows import result_columns, result_rows, worst_rows
 from impactopt.report.stage import stage_of
 from impactopt.robots.loads import shortfalls
 
-__all__ = ["Report", "report_of"]
+__all__ = ["Report", "report_of", "report_page"]
 
 COLUMN_NOTES = {
     "simulated": "Simulated: replayed in Pinocchio's full dynamics, any soles fixed.",
@@ -48,6 +49,12 @@ def report_of(record: Record, problem: ImpactProblem | None = None) -> Report:
         title=title, kind="report", body=body, header={**header, "charts": charts}, arrays=arrays
     )
     return Report(page)
+
+
+def report_page(solution: Solution, *, simulation: Any | None = None, replay: Any | None = None) -> Report:
+    """A page as of `impactopt show`; simulation, replay : as of :func:`impactopt.animate`."""
+    record = record_of(solution, simulation=simulation, replay=replay)
+    return report_of(record, solution.problem)
 
 
 def _body(record: Record, title: str, *, animated: bool) -> Iterator[str]:

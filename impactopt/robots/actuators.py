@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.contact.fields import Described, about, abouts
-from impactopt.errors import FARTHEST, InputError, check_number, did_you_mean
+from impactopt.errors import FARTHEST, InputError, check_choice
 from impactopt.robots.checks import HEAVIEST, STRONGEST
 
 __all__ = ["MOMENTARY_PEAK", "Actuator", "fitting", "known", "numbers_of", "with_classes"]
@@ -122,10 +122,7 @@ class Actuator(Described):
             value = getattr(self, told_of.name)
             if value is None:
                 continue
-            name = f"Actuator: {told_of.name} [{told.unit}]"
-            number = check_number(name, value)
-            if not told.allows(number):
-                raise InputError(f"{name}: {number:g}; give a number {told.range}")
+            number = told.checked(f"Actuator: {told_of.name} [{told.unit}]", value)
             object.__setattr__(self, told_of.name, number)
         if (self.stall_torque is None) != (self.no_load_speed is None):
             raise InputError(
@@ -177,10 +174,7 @@ def fitting(pattern: str, joints: Sequence[str], where: str) -> list[int]:
     """Places of the joints that a name or pattern fits; InputError, which begins with ``where``, if none."""
     fits = [k for k, joint in enumerate(joints) if joint == pattern or fnmatchcase(joint, pattern)]
     if not fits:
-        raise InputError(
-            f"{where}: no joint is called {pattern!r}{did_you_mean(pattern, joints)}; joints are "
-            f"{', '.join(joints)}"
-        )
+        check_choice(f"{where}: no joint is called", pattern, joints)
     return fits
 
 

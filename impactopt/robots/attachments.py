@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import FARTHEST, InputError, check_array, raw_array
+from impactopt.errors import FARTHEST, InputError, check_array, check_positive, raw_array
 from impactopt.robots import checks
 from impactopt.robots.checks import HEAVIEST
 
@@ -130,9 +130,7 @@ class SoftGrip:
         point = check_array("soft grip: point [m]", self.point, (3,), most=FARTHEST)
         object.__setattr__(self, "point", read_only(point))
         for name, unit in (("stiffness", "N m/rad"), ("damping", "N m s/rad"), ("range", "rad")):
-            number = float(check_array(f"soft grip: {name} [{unit}]", getattr(self, name), (), most=HEAVIEST))
-            if not number > 0:
-                raise InputError(f"soft grip: {name} is {number:g} {unit}; give a number > 0")
+            number = check_positive(f"soft grip: {name} [{unit}]", getattr(self, name), most=HEAVIEST)
             object.__setattr__(self, name, number)
 
     @property
@@ -176,8 +174,7 @@ class Tool:
 
     def __post_init__(self) -> None:
         what = f"tool {self.name!r}"
-        if not check_array(f"{what}: mass [kg]", self.mass, (), most=HEAVIEST) > 0:
-            raise InputError(f"{what}: mass is {self.mass:g} kg; give a number > 0")
+        check_positive(f"{what}: mass [kg]", self.mass, most=HEAVIEST)
         inertia = raw_array(f"{what}: inertia [kg m2]", self.inertia)
         inertia = check_array(
             f"{what}: inertia [kg m2]",
@@ -201,8 +198,7 @@ class Tool:
             if not np.linalg.norm(bar) > 0:
                 raise InputError(f"{what}: its bar has no length; leave it out for a rod")
             object.__setattr__(self, "bar", read_only(bar))
-        if not check_array(f"{what}: bar_width [m]", self.bar_width, (), most=FARTHEST) > 0:
-            raise InputError(f"{what}: bar_width is {self.bar_width:g} m; give a number > 0")
+        check_positive(f"{what}: bar_width [m]", self.bar_width, most=FARTHEST)
 
     @classmethod
     def hammer(

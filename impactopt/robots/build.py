@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.files import is_plain_file
-from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
+from impactopt.errors import InputError, check_array, check_choice, raw_array, shortened
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Striker
 from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame, reduced, tell_apart
@@ -58,10 +58,7 @@ def joint_names(model: pin.Model) -> tuple[str, ...]:
 
 
 def joint_index(names: Sequence[str], name: str, what: str) -> int:
-    if name not in names:
-        raise InputError(
-            f"{what}: no joint {name!r}{did_you_mean(name, names)}; joints are {', '.join(names)}"
-        )
+    check_choice(f"{what}: no joint", name, names)
     return list(names).index(name)
 
 
@@ -316,11 +313,7 @@ def by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:
 
 def pick(kind: str, name: str, options: Mapping[str, Any], robot: str) -> Any:
     """The thing of that name, or an InputError that says what there is."""
-    if not isinstance(name, str) or name not in options:
-        known = ", ".join(map(repr, options)) or "none"
-        raise InputError(
-            f"robot {robot!r} has no {kind} {name!r}{did_you_mean(name, options)}; it has {known}"
-        )
+    check_choice(f"robot {robot!r} has no {kind}", name, options)
     return options[name]
 
 

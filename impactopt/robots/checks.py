@@ -21,7 +21,6 @@ __all__ = [
     "REPAIRED",
     "STRONGEST",
     "check_arms",
-    "check_choice",
     "check_configuration",
     "check_frame",
     "check_inertias",
@@ -455,9 +454,3 @@ def repair_inertias(model: pin.Model) -> list[str]:
 
 def _three(numbers: Any) -> str:
     return ", ".join(f"{x:.3g}" for x in numbers)
-
-
-def check_choice(inertias: str) -> None:
-    """InputError for what is neither "given" nor "repaired"."""
-    if inertias not in INERTIAS:
-        raise InputError(f'inertias = {inertias!r}; give "{GIVEN}" (as the file has them) or "{REPAIRED}"')

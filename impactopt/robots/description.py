@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt.errors import InputError, Mistakes
+from impactopt.errors import InputError, Mistakes, check_choice
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source, Striker
 from impactopt.robots.build import (
@@ -20,7 +20,7 @@ from impactopt.robots.build import (
     set_velocity_limit,
     velocity_limit,
 )
-from impactopt.robots.checks import REPAIRED, check_choice, repair_inertias
+from impactopt.robots.checks import INERTIAS, REPAIRED, repair_inertias
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
 from impactopt.robots.tendons import Tendon
 
@@ -187,7 +187,7 @@ class Description:
         given : name, locked and inertias, as of `Robot.from_urdf`, and what is recorded beside them.
         options : of `Robot.from_model`, that were given.
         """
-        check_choice(given["inertias"])
+        check_choice("inertias", given["inertias"], INERTIAS)
         model, kind = self.moving(given["locked"]), self.kind.lower()
         repairs = tuple(repair_inertias(model)) if given["inertias"] == REPAIRED else ()
         every = {"name": given["name"] or model.name, kind: path, **self.options(model, options)}

@@ -16,7 +16,7 @@ from typing import Any, ParamSpec
 import numpy as np
 import pinocchio as pin
 
-from impactopt.errors import InputError, did_you_mean, missing_package
+from impactopt.errors import check_choice, missing_package
 from impactopt.robots import link_tables as _arms
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source
@@ -295,10 +295,7 @@ _PRESETS: dict[str, Callable[..., Robot]] = {
 
 def load_robot(name: str, /, **overrides: Any) -> Robot:
     """The preset of that name; `overrides` go to its function, such as `standin`."""
-    if name not in _PRESETS:
-        raise InputError(
-            f"no robot {name!r}{did_you_mean(name, _PRESETS)}; presets are {', '.join(_PRESETS)}"
-        )
+    check_choice("no robot", name, _PRESETS)
     return _PRESETS[name](**overrides)
 
 

@@ -350,6 +350,24 @@ class Robot:
             out[at.idx_v - self.nv + self.n] = stiffness * (q[at.idx_q] - rest)
         return out
 
+    def inverse_dynamics(self, data: Any, q: Array, v: Array, a: Array) -> Array:
+        """Forces (nv,) [N, N m] of a motion q (nq), v, a (nv): `pin.rnea` and the springs' torques."""
+        return self._sprung(q, pin.rnea(self.model, data, q, v, a))
+
+    def nonlinear_effects(self, data: Any, q: Array, v: Array) -> Array:
+        """Forces (nv,) [N, N m] without acceleration: `pin.nonLinearEffects` and the springs' torques."""
+        return self._sprung(q, pin.nonLinearEffects(self.model, data, q, v))
+
+    def generalized_gravity(self, data: Any, q: Array) -> Array:
+        """Forces (nv,) [N, N m] at rest: `pin.computeGeneralizedGravity` and the springs' torques."""
+        return self._sprung(q, pin.computeGeneralizedGravity(self.model, data, q))
+
+    def _sprung(self, q: Array, forces: Any) -> Array:
+        out = np.array(forces)
+        if self.springs:
+            out[self.nv - self.n :] += self.spring_torque(q)
+        return out
+
     def joint_index(self, name: str) -> int:
         """Index of a joint in arrays of length n."""
         return build.joint_index(self.joint_names, name, f"robot {self.name!r}")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
 from impactopt.collision import Collision, effective_mass
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_positive
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.kinematics.support import margin as margin_in
@@ -51,8 +51,7 @@ def posture_of_effective_mass(
     InputError : a mass that is not positive; an unknown striker; a stance the robot cannot take; no such
         posture found (with the nearest mass).
     """
-    if not check_array("mass [kg]", mass, ()) > 0:
-        raise InputError(f"mass [kg]: {mass:g}; give a number > 0")
+    check_positive("mass [kg]", mass)
     if start is None and "half_sitting" not in robot.postures:
         raise InputError(f"robot {robot.name!r} has no posture half_sitting; give start=")
     q0 = robot.posture("half_sitting") if start is None else robot.check_configuration(start, name="start")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import MISSED, Places
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_array, check_choice
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, Touched
@@ -202,10 +202,7 @@ def simulate(
     ------
     InputError : an unknown engine or option; a step or a time beyond the motion that no replay has.
     """
-    if engine not in ENGINES:
-        raise InputError(
-            f"unknown engine {engine!r}{did_you_mean(engine, ENGINES)}: there are {', '.join(ENGINES)}"
-        )
+    check_choice("unknown engine", engine, ENGINES)
     run = ENGINES[engine]
     known = set(run.__kwdefaults__ or {})
     if "controller" in options:
@@ -217,11 +214,7 @@ def simulate(
             raise InputError(
                 f"engine {engine!r} replays what was planned, no perturbation; take engine 'mujoco'"
             )
-        if name not in known:
-            raise InputError(
-                f"engine {engine!r} has no option {name!r}{did_you_mean(name, known)}: there are "
-                f"{', '.join(sorted(known))}"
-            )
+        check_choice(f"engine {engine!r} has no option", name, sorted(known))
     _check_times({**(run.__kwdefaults__ or {}), **options}, float(reference.end))
     found = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
     name, beyond = problem.robot.ranges.excess(problem.robot.joint_positions(found.q))

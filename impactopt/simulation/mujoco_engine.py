@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_choice, check_positive
 from impactopt.robots.loads import BEARS, weight_of
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import Besides
@@ -337,12 +337,8 @@ def simulate_mujoco(
     InputError : MuJoCo is not installed, there is no such contact, or the simulation diverges (with the time
     at which it did).
     """
-    if not step > 0:
-        raise InputError(f"the step of the simulation is {step} s; give a number > 0")
-    if contact not in CONTACTS:
-        raise InputError(
-            f"contact {contact!r}{did_you_mean(contact, CONTACTS)}: give one of {', '.join(CONTACTS)}"
-        )
+    check_positive("step [s]", step)
+    check_choice("contact", contact, CONTACTS)
     if controller is not None and robot.floating and not scene.soles and not scene.hands:
         raise InputError(
             f"robot {robot.name!r} floats freely, and the whole-body controller moves bases by what they "

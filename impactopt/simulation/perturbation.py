@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from impactopt.contact.targets.base import scaled_numbers
-from impactopt.errors import FARTHEST, InputError, check_array, shortened
+from impactopt.errors import FARTHEST, InputError, check_array, check_positive, shortened
 from impactopt.simulation.result import Scene
 
 LARGEST = 1e6  # factor, friction, payload [kg]
@@ -81,8 +81,7 @@ class Perturbation:
                 f"perturbation: payload is {self.payload:g}; give 0, or at least {LIGHTEST:g} kg"
             )
         for name in ("mass", "stiffness", "friction", "floor_time", "torque_limit"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"perturbation: {name} is {getattr(self, name):g}; give a number > 0")
+            check_positive(f"perturbation: {name}", getattr(self, name))
 
     def scene(self, planned: Scene) -> Scene:
         """The planned scene with this perturbation.

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_array, check_whole, shortened
+from impactopt.errors import InputError, check_array, check_positive, check_whole, shortened
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation import Perturbation, Scene, Simulation, scene_of, simulate_mujoco
@@ -296,8 +296,7 @@ def robustness(
     perturbations = draw_perturbations(draws, seed, chosen)
     if workers < 1:
         raise InputError(f"{workers} workers; ask for at least 1")
-    if not (np.isfinite(step) and step > 0):
-        raise InputError(f"the step of the simulation is {step} s; give a number > 0")
+    check_positive("step [s]", step)
     mujoco_module()
     if workers > 1:
         _check_travels(scene)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_array, check_choice
 from impactopt.solvers.qp.registry import QP_SOLVERS, check_qp_solver
 
 HESSIANS = ("exact", "bfgs")
@@ -96,9 +96,7 @@ class SQPOptions(SolverOptions):
     def __post_init__(self) -> None:
         """Refuse what cannot be meant, as `SolverOptions` does."""
         check_qp_solver(self.qp_solver, QP_SOLVERS)
-        if self.hessian not in HESSIANS:
-            near = did_you_mean(self.hessian, HESSIANS)
-            raise InputError(f"hessian: no '{self.hessian}'{near}; there are: {', '.join(sorted(HESSIANS))}")
+        check_choice("hessian", self.hessian, HESSIANS)
         super().__post_init__()
 
 

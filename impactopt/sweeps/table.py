@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, did_you_mean, missing_package
+from impactopt.errors import InputError, check_choice, missing_package
 from impactopt.files.output import write_file
 from impactopt.sweeps.design import Columns
 
@@ -94,8 +94,7 @@ def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     try:
         there = arrow.parquet.read_schema(path).names
         for name in names:
-            if name not in there:
-                raise InputError(f"{path} has no column {name!r}{did_you_mean(name, there)}")
+            check_choice(f"{path} has no column", name, there)
         table = arrow.parquet.read_table(path, columns=list(names))
     except (OSError, arrow.ArrowException) as error:
         raise InputError(f"cannot read {path}: {error}") from error

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.contact.laws import ContactLaw
-from impactopt.contact.phases import SEPARATION, TOUCH, TURN
+from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
@@ -252,7 +252,7 @@ class Collocated:
         return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
 
     def _motion(self, i: int) -> list[Affine]:
-        """Slots of a `impactopt.problem.joint_motion.joint_motion` at a stage."""
+        """Slots of a `impactopt.problem.block.joint_motion` at a stage."""
         rates = self._slots(self.u, i, self.contact.u0[0])
         return [self.contact.state.y, *self._travel(i), *rates, Affine.constant(1.0), self.legs[i]]
 

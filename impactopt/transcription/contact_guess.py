@@ -18,8 +18,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linprog
 
 from impactopt.contact.laws import ContactLaw
-from impactopt.contact.phases import contact_phases
 from impactopt.contact.targets import FreeMass, Nail, Target
+from impactopt.contact.targets.base import contact_phases
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import Held

@@ -202,7 +202,7 @@ class Contact(NamedTuple):
 class DrivePoint(NamedTuple):
     """State of the drives at a node.
 
-    torque (n,) : of the servos, over limit.  slots : z of `impactopt.problem.joint_motion.joint_motion`.
+    torque (n,) : of the servos, over limit.  slots : z of `impactopt.problem.block.joint_motion`.
     """
 
     place: Place
@@ -213,7 +213,7 @@ class DrivePoint(NamedTuple):
 class ContactEnd(NamedTuple):
     """A contact's two ends.
 
-    before, after : z of `impactopt.problem.joint_motion.joint_motion`.  change (ny,) : of ydot.
+    before, after : z of `impactopt.problem.block.joint_motion`.  change (ny,) : of ydot.
     """
 
     place: Place

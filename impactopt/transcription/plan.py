@@ -22,7 +22,6 @@ from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.stances import places_of_soles
 from impactopt.problem.terms import ContactWrenchCone, GearLoad
-from impactopt.robots.dynamics import inverse_dynamics
 from impactopt.robots.loads import BEARS, DriveLoads, cop_margin, gear_torque, least_margins, weight_of
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
@@ -88,7 +87,7 @@ def complete_reference(
     for k, (whole, _) in zip(kept.tolist(), c.closing.follow(y[kept], legs), strict=True):
         q[k] = whole
         v[k], a[k], jac = c.closing.rates(whole, y[k], yd[k], ydd[k])
-        tau = inverse_dynamics(robot, data, q[k], v[k], a[k])
+        tau = robot.inverse_dynamics(data, q[k], v[k], a[k])
         if c.legs:
             # least |cost dw|^2 with B' dw = miss: dw = C^-2 B (B' C^-2 B)^-1 miss, base = B' C^-1
             base = jac[:, c.undriven].T / cost[k]
@@ -145,7 +144,7 @@ def drifting_reference(
     for k in range(len(y)):
         v[k] = velocity(y[k], yd[k], momentum + (time[k] - time[start]) * pull)
         a[k, 6:] = ydd[k, 6:]
-        force = inverse_dynamics(robot, data, q[k], v[k], a[k])  # with the base's acceleration still zero
+        force = robot.inverse_dynamics(data, q[k], v[k], a[k])  # with the base's acceleration still zero
         of_base = mass_matrix(model, data, q[k])[:, :6]
         a[k, :6] = -solved(of_base[:6], force[:6])
         torque[k] = force[6:] + of_base[6:] @ a[k, :6]

@@ -11,7 +11,7 @@ import pytest
 
 from impactopt import Solution, optimize_strike, solve
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, SpringDamper
-from impactopt.contact.phases import SEPARATION, TOUCH, contact_phases
+from impactopt.contact.targets.base import SEPARATION, TOUCH, contact_phases
 from impactopt.errors import InputError, NotSolvedWarning
 from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import load_problem

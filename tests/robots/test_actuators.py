@@ -77,7 +77,7 @@ def test_the_armature_of_an_actuator_is_the_robots() -> None:
         (lambda: arm().with_actuators({"elbw": Actuator()}), "no joint is called 'elbw'.*mean 'elbow'"),
         (
             lambda: arm().with_actuators({"leg_*": Actuator()}),
-            "no joint is called 'leg_[*]'; joints are turn",
+            "no joint is called 'leg_[*]'; there are turn",
         ),
         (lambda: arm().with_actuators({"elbow": 3.0}), "give an Actuator"),  # type: ignore[dict-item]
         (lambda: replace(arm(), actuators=[Actuator()] * 3), "3 actuators for 4 joints"),

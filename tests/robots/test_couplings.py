@@ -24,7 +24,6 @@ from impactopt import SDC, FreeMass, RigidBody, Robot, SoftGrip, SpringDamper, S
 from impactopt.codegen.cache import model_hash
 from impactopt.errors import InputError
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
-from impactopt.robots.dynamics import inverse_dynamics
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.simulation.mujoco_world import MujocoOptions, MujocoRobot, mujoco_module, robot_bodies, spec_of
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
@@ -168,7 +167,7 @@ def test_a_robots_model_is_the_free_tree_with_its_laws(pair: Pair) -> None:
     close(mass_matrix(model, data, q), pair.mass(q))
     other = free.createData()
     close(
-        inverse_dynamics(robot, data, q, v, a),
+        robot.inverse_dynamics(data, q, v, a),
         pair.S.T @ pin.rnea(free, other, pair.q(q), pair.S @ v, pair.S @ a),
     )
     pin.forwardKinematics(free, other, pair.q(q))
@@ -334,7 +333,7 @@ def test_laws_outlive_a_way_to_another_process(copy: Callable[[Robot], Robot]) -
     robot, v = parallelogram(), np.array([0.3, -0.5])
     there, q = copy(robot), robot.posture("start")
     assert there.couplings == robot.couplings and model_hash(there.model) == model_hash(robot.model)
-    found, wanted = (inverse_dynamics(r, r.model.createData(), q, v, v) for r in (there, robot))
+    found, wanted = (r.inverse_dynamics(r.model.createData(), q, v, v) for r in (there, robot))
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 

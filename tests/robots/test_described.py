@@ -19,7 +19,6 @@ from support import urdfs
 from impactopt import Robot
 from impactopt.codegen.cache import model_hash
 from impactopt.errors import InputError
-from impactopt.robots.dynamics import nonlinear_effects
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -160,7 +159,7 @@ def _same_as_mujoco(robot: Robot, mj: Any, seed: int, held: dict[str, float]) ->
         assert np.abs(own - mass[np.ix_(dofs, dofs)]).max() <= EQUAL * np.abs(own).max()
         # what no motor gives: Coriolis, centrifugal and gravity forces, damping, compensated weight
         other = (there.qfrc_bias - there.qfrc_passive)[dofs]
-        mine = nonlinear_effects(robot, here, q, rates) + viscous * rates
+        mine = robot.nonlinear_effects(here, q, rates) + viscous * rates
         assert np.abs(mine - other).max() <= EQUAL * max(1.0, np.abs(other).max())
     dry = [actuator.coulomb_friction for actuator in robot.actuators]
     assert dry == pytest.approx(mj.dof_frictionloss[dofs], rel=EQUAL)

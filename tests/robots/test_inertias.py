@@ -84,7 +84,7 @@ def test_repairs_have_to_be_said_and_are_listed(tmp_path: Path) -> None:
     robot = Robot.from_urdf(path, inertias="repaired", armature=0.05)
     assert robot.source is not None
     assert [text.split("'")[1] for text in robot.source.repairs] == ["right_elbow"]
-    with pytest.raises(InputError, match='give "given"'):
+    with pytest.raises(InputError, match="there are given, repaired"):
         Robot.from_urdf(path, inertias="fixed")
 
 

@@ -348,7 +348,7 @@ def test_missing_limits_can_be_given() -> None:
     [
         ({"kp": {"elbo": 1.0}}, r"kp: no joint 'elbo' \(did you mean 'elbow'\?\)"),
         ({"armature": {"Elbow ": 1.0}}, r"armature: no joint 'Elbow ' \(did you mean 'elbow'\?\)"),
-        ({"rotor": {"x": (1.0, 2.0)}}, r"rotor: no joint 'x'; joints are shoulder, elbow, slide"),
+        ({"rotor": {"x": (1.0, 2.0)}}, r"rotor: no joint 'x'; there are shoulder, elbow, slide"),
         ({"rotor": {"elbow": 1.0}}, r"rotor of joint 'elbow' .*shape \(2\), got \(\)"),
         ({"torque_limit": {"slid": 1.0}}, r"torque_limit: no joint 'slid' \(did you mean 'slide'\?\)"),
         ({"position_limit": {"slid": (0, 1)}}, r"position_limit: no joint 'slid'"),

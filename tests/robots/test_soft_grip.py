@@ -164,8 +164,8 @@ def test_the_meshes_of_its_urdf_do_not_need_the_grip() -> None:
     ("make", "said"),
     [
         (lambda: grip(axis=[0, 2, 0]), "no unit vector; divide it by its length"),
-        (lambda: grip(stiffness=0.0), r"stiffness is 0 N m/rad; give a number > 0"),
-        (lambda: grip(damping=-1.0), r"damping is -1 N m s/rad; give a number > 0"),
+        (lambda: grip(stiffness=0.0), r"stiffness \[N m/rad\]: 0; give a number > 0"),
+        (lambda: grip(damping=-1.0), r"damping \[N m s/rad\]: -1; give a number > 0"),
         (lambda: planar_arm().with_grip("hamer", grip()), "has no tool 'hamer'.*did you mean 'hammer'"),
         (
             lambda: planar_arm().with_grip("hammer", grip()).with_grip("hammer", grip()),

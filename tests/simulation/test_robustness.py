@@ -80,7 +80,7 @@ def test_every_range_is_a_condition() -> None:
         ({"mass": (2.0, 0.5)}, "mass is from 2 to 0.5"),
         ({"kp": (0.0, 1.0)}, "kp starts at 0"),
         ({"payload": (-1.0, 1.0)}, "payload is -1"),
-        ({"friction": (0.0, 1.0)}, "friction is 0"),
+        ({"friction": (0.0, 1.0)}, "friction: 0; give"),
         ({"distance": (0.0, np.inf)}, "distance: inf at index 1; give a finite number"),
         ({"period": -1.0}, "period is -1"),
     ],
@@ -245,8 +245,8 @@ def test_what_an_engine_raises_is_a_row(still: tuple[Any, Any], monkeypatch: pyt
         ({"draws": 0}, "draws: 0; give a whole number from 1"),
         ({"seed": -1}, "seed: -1; give a whole number from 0"),
         ({"workers": 0}, "0 workers"),
-        ({"step": 0.0}, "step of the simulation"),
-        ({"step": float("nan")}, "step of the simulation"),
+        ({"step": 0.0}, r"step \[s\]: 0; give a number > 0"),
+        ({"step": float("nan")}, r"step \[s\]: nan; give a finite number"),
     ],
 )
 def test_options_out_of_range_are_refused(still: tuple[Any, Any], options: dict[str, Any], text: str) -> None:

@@ -1,9 +1,10 @@
-"""Targets: how what is hit moves along the normal under the contact force."""
+"""Targets: how what is hit moves along the normal under the contact force, and in which phases."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -12,7 +13,16 @@ from impactopt.contact.fields import Described, Parameters, check_numbers, numbe
 from impactopt.contact.laws.base import ContactLaw
 from impactopt.errors import InputError
 
-__all__ = ["UNITS", "Target", "scaled_numbers"]
+__all__ = [
+    "SEPARATION",
+    "TOUCH",
+    "TURN",
+    "UNITS",
+    "ContactPhase",
+    "Target",
+    "contact_phases",
+    "scaled_numbers",
+]
 
 UNITS = {"speed": "m_s", "depth": "m"}  # of targets' results
 
@@ -211,3 +221,40 @@ def scaled_numbers(
             what = "law" if of is law else "target"
             raise InputError(f"{where}: the {what} {type(of).__name__} has no {name}; leave it out")
     return of_law, of_target
+
+
+TURN, SEPARATION, TOUCH = "end of compression", "separation", "touch"  # ends of phases that no target has
+
+
+@dataclass(frozen=True)
+class ContactPhase:
+    """One phase of a contact.
+
+    mode : the target's phase whose motion it has (`impactopt.contact.targets.Target.smooth`).
+    end : one of the target's guards, `TURN`, `SEPARATION` or `TOUCH`.
+    apart : whether striker and target are apart in it.
+    """
+
+    name: str
+    mode: int
+    end: str
+    apart: bool = False
+
+
+def contact_phases(target: Target, touches: int = 1) -> tuple[ContactPhase, ...]:
+    """Phases of a contact in which the striker meets the target so many times.
+
+    With one touch they are the target's. With more, the target's events come in the last touch, and
+    compression and restitution are not told apart.
+    """
+    if touches == 1:
+        last = len(target.phases) - 1
+        ends = [*target.guards, *[TURN] * (last - len(target.guards)), SEPARATION]
+        return tuple(ContactPhase(*each) for each in zip(target.phases, range(last + 1), ends, strict=True))
+    out = []
+    for k in range(1, touches):
+        out.append(ContactPhase(f"touch {k}", 0, SEPARATION))
+        out.append(ContactPhase(f"apart after touch {k}", 0, TOUCH, apart=True))
+    names = [f"touch {touches}", *(f"touch {touches}, after the {guard}" for guard in target.guards)]
+    ends = [*target.guards, SEPARATION]
+    return (*out, *(ContactPhase(*each) for each in zip(names, range(len(names)), ends, strict=True)))

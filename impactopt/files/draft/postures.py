@@ -14,7 +14,6 @@ from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
 from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
-from impactopt.robots.dynamics import generalized_gravity
 from impactopt.robots.robot import Robot, Sole
 
 __all__ = ["arm_length", "bend_arm", "eased", "half_sitting", "rested", "shoulder"]
@@ -220,7 +219,7 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
     rest, rng = robot.joint_positions(q)[own], np.random.default_rng(0)
 
     def errors(angles: Array) -> Array:
-        weight = generalized_gravity(robot, data, _set(robot, q, own, angles))
+        weight = robot.generalized_gravity(data, _set(robot, q, own, angles))
         share = np.abs(weight[robot.nv - robot.n + own]) / robot.torque_limit[own]
         return np.concatenate([np.maximum(share - HELD, 0.0), REST * (angles - rest) / (high - low)])
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_choice
 from impactopt.files.export.content import check_export, export_of, write_directory
 from impactopt.files.output import record_of
 from impactopt.files.replay import Planned
@@ -66,7 +66,8 @@ def export(
         needs the whole effort, without gravity; a robot on soles, or limits that no motion is within,
         smoothed. Nothing is written then.
     """
-    usual = _format(to).rate
+    check_choice("there is no format", to, FORMATS)
+    usual = FORMATS[to].rate
     # before the record's numbers are computed
     check_export(solution.status.value, solution.problem.robot, usual if rate is None else rate, joints)
     record = record_of(solution)
@@ -88,19 +89,11 @@ def export_planned(
     smooth: tuple[float, float] | None = None,
 ) -> list[Path]:
     """The same of a plan that was read from a disk."""
-    chosen = _format(to)
+    check_choice("there is no format", to, FORMATS)
+    chosen = FORMATS[to]
     if chosen.whole and not gravity:
         raise InputError(f"gravity: {to} needs the whole effort; leave gravity at its default")
     rate = chosen.rate if rate is None else rate
     content = export_of(planned, rate=rate, joints=joints, gravity=gravity, smooth=smooth)
     writer = importlib.import_module(f"impactopt.files.export.{chosen.module}")
     return write_directory(Path(directory), to, content.meta, lambda new: writer.write(content, new))
-
-
-def _format(to: str) -> Format:
-    if to not in FORMATS:
-        raise InputError(
-            f"there is no format {to!r} to export to{did_you_mean(to, FORMATS)}: "
-            f"there are {', '.join(FORMATS)}"
-        )
-    return FORMATS[to]

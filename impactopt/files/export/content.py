@@ -23,7 +23,7 @@ from impactopt.codegen.files import read_plain
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.errors import InputError, check_number, did_you_mean
+from impactopt.errors import InputError, check_choice, check_number
 from impactopt.files.export.motion import JUMP, Motion, motion_at, springs_at_rest
 from impactopt.files.export.smooth import Smoothness, smoothed
 from impactopt.files.output import plain
@@ -336,11 +336,7 @@ def joint_order(robot: Robot, joints: Sequence[str] | None) -> NDArray[np.intp]:
         return np.arange(robot.n)
     own, given = robot.joint_names, list(joints)
     for name in given:
-        if name not in own:
-            raise InputError(
-                f"joints: the robot {robot.name!r} has no joint {name!r}{did_you_mean(name, own)}; "
-                f"there are {', '.join(own)}"
-            )
+        check_choice(f"joints: the robot {robot.name!r} has no joint", name, own)
     for what, names in (
         ("named twice", [name for name in own if given.count(name) > 1]),
         ("left out", [name for name in own if name not in given]),

@@ -27,7 +27,7 @@ from pydantic import (
 )
 
 from impactopt.contact.fields import About, abouts
-from impactopt.errors import did_you_mean, shortened
+from impactopt.errors import check_choice, did_you_mean
 from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
 from impactopt.robots.presets import robot_names
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS
@@ -93,11 +93,7 @@ ALLOWED = frozenset(_NAMES.split())
 
 def _known_robot(name: str) -> str:
     """A preset's name."""
-    if name not in robot_names():
-        near = did_you_mean(name, robot_names())
-        raise ValueError(
-            f"there is no robot {shortened(name)!r}{near}; presets are {', '.join(robot_names())}"
-        )
+    check_choice("there is no robot", name, robot_names())
     return name
 
 

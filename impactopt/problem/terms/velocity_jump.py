@@ -10,8 +10,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import about
-from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
-from impactopt.problem.joint_motion import joint_motion
+from impactopt.problem.block import BlockExpression, BlockRecipe, joint_motion, make_block
 from impactopt.problem.terms.base import Term, of_joints
 from impactopt.problem.violation import Measure
 

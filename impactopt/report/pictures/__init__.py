@@ -14,7 +14,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_choice
 from impactopt.files.output import Record, record_of, write_file
 from impactopt.planning.solution import Solution
 from impactopt.report.pictures.ellipsoid import draw_ellipsoid, ellipsoid
@@ -99,9 +99,7 @@ def plot(
         motion cannot be completed; axes that are no part of a grid, for several panels.
     """
     draws = {"overview": overview, **PICTURES}
-    if what not in draws:
-        near = did_you_mean(what, draws)
-        raise InputError(f"there is no picture {what!r}{near}: there are {', '.join(draws)}")
+    check_choice("there is no picture", what, draws)
     record = record_of(solution, simulation=simulation, replay=replay)
     if not record.completed:
         raise InputError(f"there is no motion to draw: {record.summary['note']}")

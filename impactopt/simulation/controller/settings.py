@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from impactopt.contact.fields import Described, about, abouts
-from impactopt.errors import InputError, check_array, check_whole, did_you_mean
+from impactopt.errors import check_choice, check_whole
 
 __all__ = ["CONTROLLERS", "ControllerSettings", "controller_of"]
 
@@ -126,15 +126,13 @@ class ControllerSettings(Described):
     def __post_init__(self) -> None:
         for f, told in abouts(type(self)):
             value = getattr(self, f.name)
+            name = f"controller: {f.name}"
             if told.choices:
-                if value not in told.choices:
-                    raise InputError(
-                        f"controller: {f.name} is {value!r}; give one of {', '.join(told.choices)}"
-                    )
+                check_choice(name, value, told.choices)
             elif f.name in ("seed", "iterations"):
-                check_whole(f"controller: {f.name}", value, least=int(told.least or 0), most=10**9)
-            elif not told.allows(float(check_array(f"controller: {f.name}", value, ()))):
-                raise InputError(f"controller: {f.name} is {value:g}; give a number {told.range}")
+                check_whole(name, value, least=int(told.least or 0), most=10**9)
+            else:
+                told.checked(name, value)
 
     @property
     def period(self) -> float:
@@ -165,7 +163,5 @@ def controller_of(
         return chosen
     if chosen is None or chosen == "servo":
         return None
-    if chosen != "wbc":
-        meant = did_you_mean(str(chosen), CONTROLLERS)
-        raise InputError(f"unknown controller {chosen!r}{meant}: there are {', '.join(CONTROLLERS)}")
+    check_choice("unknown controller", chosen, CONTROLLERS)
     return settings if settings is not None else ControllerSettings()

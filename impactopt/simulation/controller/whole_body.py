@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
-from impactopt.robots.dynamics import nonlinear_effects
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.clearance import MOST, Clearance
@@ -132,7 +131,7 @@ class HeldDynamics:
         pin.forwardKinematics(model, data, q, v, self._none)
         pin.computeJointJacobians(model, data)
         left[:nv, :nv] = mass_matrix(model, data, q)
-        right[:nv, n] = -nonlinear_effects(self._robot, data, q, v)
+        right[:nv, n] = -self._robot.nonlinear_effects(data, q, v)
         self.places = []
         for k, i in enumerate(self._held):
             rows = slice(nv + 6 * k, nv + 6 * k + 6)

@@ -14,7 +14,7 @@ from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.collision.settings import Effects, JointFriction, Settings, no_bend, servo_settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.contact.friction import check_friction
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_array, check_positive
 from impactopt.robots.robot import Robot
 
 __all__ = ["Forces", "Phase", "ReferenceModel", "converge"]
@@ -164,8 +164,8 @@ class ReferenceModel(CollisionModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _positive("step [s]", self.step)
-        _positive("tolerance", self.tolerance)
+        check_positive("step [s]", self.step)
+        check_positive("tolerance", self.tolerance)
         check_friction("contact_friction", self.contact_friction)
         self._settings(self.kp, self.kd)
 
@@ -216,7 +216,7 @@ class ReferenceModel(CollisionModel):
         ------
         InputError : as of `collide`.
         """
-        tolerance = _positive("tolerance", self.tolerance if tolerance is None else tolerance)
+        tolerance = check_positive("tolerance", self.tolerance if tolerance is None else tolerance)
         q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
         forces, normal = self._forces(v, torque, overrides)
         result, change = self._controlled(q, v, forces, normal, tolerance)
@@ -274,13 +274,6 @@ class ReferenceModel(CollisionModel):
             reference_until=float(values["reference_until"]),
         )
         return forces, values["normal"]
-
-
-def _positive(name: str, value: float) -> float:
-    """A number above zero, or InputError."""
-    if not check_array(name, value, ()) > 0:
-        raise InputError(f"{name}: {value:g}; give a number > 0")
-    return float(value)
 
 
 class _HasImpulse(Protocol):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.settings import REFERENCE_ORDER, no_bend
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_positive
 from impactopt.kinematics.coordinates import StanceCoordinates, independent_rates
 
 __all__ = ["coasting_reference"]
@@ -45,8 +45,7 @@ def coasting_reference(
     """
     c, robot = coordinates, coordinates.robot
     q, v = robot.check_configuration(q), robot.check_velocity(v)
-    if not check_array("until [s]", until, ()) > 0:
-        raise InputError(f"until [s]: {until:g}; give a number > 0")
+    check_positive("until [s]", until)
     if not c.legs:
         return no_bend(robot.n)
     y, legs = c.split(q)

@@ -9,7 +9,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.collision.interface import Collision
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import check_choice
 from impactopt.simulation.pinocchio_robot import FORMS
 from impactopt.simulation.reference.base import Forces, ReferenceModel, converge
 from impactopt.simulation.reference.equations_of_motion import Motion, Run, collision_from
@@ -50,10 +50,7 @@ class FullDynamics(ReferenceModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.form not in FORMS:
-            raise InputError(
-                f"form {self.form!r}{did_you_mean(self.form, FORMS)}; there are {', '.join(FORMS)}"
-            )
+        check_choice("form", self.form, FORMS)
 
     def _controlled(
         self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_choice
 from impactopt.solvers.qp.quadratic_program import QPSolver
 
 
@@ -51,5 +51,4 @@ def check_qp_solver(name: str, known: Iterable[str]) -> None:
     known = sorted(known)
     if name in GONE and name not in known:
         raise InputError(f"qp_solver: {name!r} is no longer supported; give {GONE[name]!r}")
-    if name not in known:
-        raise InputError(f"qp_solver: no {name!r}{did_you_mean(name, known)}; there are: {', '.join(known)}")
+    check_choice("qp_solver", name, known)

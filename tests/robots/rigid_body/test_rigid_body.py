@@ -25,7 +25,6 @@ from support.small_robots import biped
 
 from impactopt.errors import InputError
 from impactopt.robots.actuators import Actuator
-from impactopt.robots.dynamics import generalized_gravity, inverse_dynamics
 from impactopt.robots.rigid_body import RigidBody
 
 VALUES, DERIVATIVES = 1e-12, 1e-10
@@ -152,10 +151,10 @@ def test_springs_add_to_gravity(base: str) -> None:
     expected[6 + knee], expected[6 + elbow] = 50.0 * (angles[knee] - 0.4), 7.0 * angles[elbow]
     data = robot.model.createData()
     np.testing.assert_allclose(
-        inverse_dynamics(robot, data, q, v, a) - pin.rnea(robot.model, data, q, v, a), expected, atol=1e-9
+        robot.inverse_dynamics(data, q, v, a) - pin.rnea(robot.model, data, q, v, a), expected, atol=1e-9
     )
     np.testing.assert_allclose(
-        generalized_gravity(robot, data, q) - pin.computeGeneralizedGravity(robot.model, data, q),
+        robot.generalized_gravity(data, q) - pin.computeGeneralizedGravity(robot.model, data, q),
         expected,
         atol=1e-9,
     )

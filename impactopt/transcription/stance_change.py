@@ -18,7 +18,6 @@ from itertools import pairwise
 import numpy as np
 
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import graded_breaks
 from impactopt.robots.loads import fading
 from impactopt.transcription.builder import Builder
@@ -296,9 +295,8 @@ class Course:
         """The phases beside the one with the blow, for solver variables (n,)."""
         out = []
         for k, phase in self.stands.items():
-            nodes, wrench, b = phase.nodes, phase.wrenches(x), self.builders[k]
+            nodes, wrench = phase.nodes, phase.wrenches(x)
             if nodes[0]:
-                start = static_wrenches(b.coordinates, b.y0, b.legs0)
-                nodes, wrench = np.append(0.0, nodes), np.vstack([start, wrench])
+                nodes, wrench = np.append(0.0, nodes), np.vstack([wrench[:1], wrench])
             out.append(PlannedStand(number=k, spline=phase.spline(x), nodes=nodes, wrench=wrench))
         return tuple(out)

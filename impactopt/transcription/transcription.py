@@ -17,7 +17,6 @@ import numpy as np
 
 from impactopt.codegen.cache import FunctionGroup, cached_groups, model_hash
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.block import BlockExpression
 from impactopt.problem.problem import ImpactProblem
@@ -416,7 +415,8 @@ class Transcription(ContactProgram):
         abort, nodes, wrench = self.abort, self.swing.nodes, self.swing.wrenches(x)
         if nodes[0]:
             nodes = np.append(0.0, nodes)
-            wrench = np.vstack([static_wrenches(self.coordinates, self.y0, self.legs0), wrench])
+            # that of the first node, which the torque limits allow; the reference balances it
+            wrench = np.vstack([wrench[:1], wrench])
         return Plan(
             problem=self.problem,
             swing=self.swing.spline(x),

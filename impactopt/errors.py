@@ -96,7 +96,7 @@ def check_choice(what: str, given: object, known: Iterable[str]) -> None:
     what : begins the message, as "there is no picture".
     """
     names = [*known]
-    if given not in names:
+    if not isinstance(given, str) or given not in names:
         near = did_you_mean(str(given), names)
         raise InputError(f"{what} {shortened(repr(given))}{near}; there are {', '.join(names) or 'none'}")
 

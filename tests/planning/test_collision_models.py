@@ -23,7 +23,7 @@ from impactopt.planning.solution import ModelError
 from impactopt.problem.problem import COLLISIONS, ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.transcription.initial_guess import strike_iterate
+from impactopt.transcription.initial_guess import carried_over, strike_iterate
 from impactopt.transcription.mesh import contact_elements, guessed_shares, place_of
 from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
@@ -44,16 +44,17 @@ IMPULSE, ZMP = 1e-4, 0.1  # relative; [mm]
 def planned(problem: ImpactProblem) -> tuple[StrikeTranscription, PlannedStrike]:
     """The strike of a problem, and its program."""
     t = struck(problem)
-    result = solve_ipm(t.program, strike_iterate(t))
-    assert result.status.usable
-    shares = t.hit.drifted(result.x)
-    if shares is not None:
-        t = StrikeTranscription(
-            problem, t.coordinates, t.functions, contact_elements(problem, shares), shares
-        )
-        result = solve_ipm(t.program, strike_iterate(t))
-        assert result.status.usable and t.hit.drifted(result.x) is None
-    return t, t.decode(result.x)
+    x = strike_iterate(t)
+    for _ in range(3):  # shares of the phases are others at another optimum
+        result = solve_ipm(t.program, x)
+        assert result.status.usable
+        shares = t.hit.drifted(result.x)
+        if shares is None:
+            return t, t.decode(result.x)
+        old, elements = t, contact_elements(problem, shares)
+        t = StrikeTranscription(problem, t.coordinates, t.functions, elements, shares)
+        x = carried_over(t, old, result.x, result.multipliers, result.bound_multipliers)[0]
+    pytest.fail("the shares of the phases do not settle")
 
 
 def alone(strike: PlannedStrike, *, step: float = 1e-3) -> Any:

@@ -100,7 +100,7 @@ def test_a_scenario_comes_as_foreseen(request: pytest.FixtureRequest, who: str, 
     hit = plan.collision
     assert plan.impulse == pytest.approx(sim.impulse, rel=0.01)
     assert abs(plan.impulse / solved.plan.impulse - 1) > 0.03, "it would pass for the expected target too"
-    assert hit.force.max() == pytest.approx(sim.force.max(), rel=0.05)
+    assert hit.force.max() == pytest.approx(sim.peak_force, rel=0.01)
     assert hit.time[-1] == pytest.approx(sim.contact_end - sim.contact_start, rel=0.03)
     assert hit.force[0] == pytest.approx(scenario.damping * LAW.damping * solved.plan.hand_speed)
     # torque and ZMP at the plan's collocation points; torque once the servo's fast start is over

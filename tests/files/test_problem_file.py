@@ -594,6 +594,19 @@ def test_names_of_a_robots_parts_are_looked_up_beside_other_mistakes(tmp_path: P
     assert "5 mistakes" in found  # [contact] is missing
 
 
+def test_soles_of_phases_and_a_wrong_phase_are_named_at_once(tmp_path: Path) -> None:
+    text = PUNCH.with_name("punch_step.toml").read_text(encoding="utf-8").replace("right_hand", "right_hnd")
+    text = text.replace('["left", "right"]', '["lft", "right"]').replace(
+        "[follow]", "[follow]\nintervals = 2"
+    )
+    with pytest.raises(InputError) as caught:
+        read_problem_file(write(tmp_path, text), names=True)
+    found = str(caught.value)
+    assert "did you mean 'right_hand'" in found and "a phase needs 6" in found
+    assert found.count("did you mean 'left'") == 2
+    assert "4 mistakes" in found
+
+
 def test_a_point_out_of_reach_is_one_clear_message(tmp_path: Path) -> None:
     text = message(write(tmp_path, GOOD.replace("[0.6, -0.25, 1.1]", "[3.0, -0.25, 1.1]")))
     assert "out of reach" in text and "right_hand" in text and "problem.toml" in text

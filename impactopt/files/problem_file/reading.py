@@ -405,6 +405,9 @@ def _named(content: File, folder: Path, mistakes: _Collector) -> tuple[Robot | N
         return None, None
     mistakes.attempt(("problem", "striker"), lambda: robot.striker(content.problem.striker))
     mistakes.attempt(("problem", "start"), lambda: content.make_start(robot))
+    for k, phase in enumerate(content.stances or ()):
+        for sole in phase.soles:
+            mistakes.attempt(("stances", k, "soles"), partial(robot.sole, sole))
     stance = mistakes.attempt(("stance", "soles"), lambda: content.make_stance(robot))
     if stance is not None:
         try:
@@ -440,7 +443,7 @@ def _besides(
                 table |= {mistake.meant: value} if mistake.meant and mistake.meant not in table else {}
         places = {mistake.place for mistake in (*mistakes, *further)}
         for section, values in _STAND_INS.items():
-            known = section in data and isinstance(data[section], dict)
+            known = isinstance(rest.get(section), dict) and section in data
             needed = {k: v for k, v in values.items() if not known or (section, k) in places}
             rest[section] = needed | rest.get(section, {})
         model = with_kinds(File, rest)

@@ -474,13 +474,13 @@ class _Collector:
     def __bool__(self) -> bool:
         return bool(self.mistakes)
 
-    def add(self, place: tuple[str, ...], error: InputError, *, first: bool = False) -> None:
+    def add(self, place: Place, error: InputError, *, first: bool = False) -> None:
         sections = max(1, len(place) - 1) if place[:1] != ("terms",) else len(place)
         self.mistakes += [
             Mistake(place=place, sections=sections, text=text, first=first) for text in error.mistakes
         ]
 
-    def attempt(self, place: tuple[str, ...], make: Callable[[], _T]) -> _T | None:
+    def attempt(self, place: Place, make: Callable[[], _T]) -> _T | None:
         """Result of `make`; None, and a mistake at `place`, if it raises an InputError."""
         try:
             return make()

@@ -596,9 +596,7 @@ def test_names_of_a_robots_parts_are_looked_up_beside_other_mistakes(tmp_path: P
 
 def test_soles_of_phases_and_a_wrong_phase_are_named_at_once(tmp_path: Path) -> None:
     text = PUNCH.with_name("punch_step.toml").read_text(encoding="utf-8").replace("right_hand", "right_hnd")
-    text = text.replace('["left", "right"]', '["lft", "right"]').replace(
-        "[follow]", "[follow]\nintervals = 2"
-    )
+    text = text.replace('["left", "right"]', '["lft", "right"]').replace("intervals = 10", "intervals = 2")
     with pytest.raises(InputError) as caught:
         read_problem_file(write(tmp_path, text), names=True)
     found = str(caught.value)

@@ -272,6 +272,17 @@ def test_of_soles_that_change(name: str) -> None:
     check_rows(t.with_apart(rows))
 
 
+def test_of_tendons_while_soles_change() -> None:
+    p = load_problem(PROBLEMS / "kick_talos.toml")
+    tendon = Tendon(
+        name="t", coefficients={"leg_left_4_joint": 0.5, "arm_right_4_joint": 1.0}, lower=-3, upper=2
+    )
+    t = _drawn(dataclasses.replace(p, robot=dataclasses.replace(p.robot, tendons=(tendon,))))
+    own = [o.place.name for o in t.program.origins if "tendon t" in str(o)]
+    assert any(place.startswith("on ") for place in own)
+    check_rows(t)
+
+
 @pytest.mark.parametrize("robot", ["arm", "biped"])
 def test_of_friction_at_the_hit(robot: str) -> None:
     """In the contact and at its first instant, where the servo's torques are variables."""

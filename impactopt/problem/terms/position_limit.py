@@ -32,7 +32,7 @@ class PositionLimit(Term):
         if not lower.size:
             return
         of_y = np.pad(own.matrix[:, c.independent], ((0, 0), (c.base, 0)))
-        for place, (y, legs) in [*program.swing_spots(), *program.follow_spots()]:
+        for place, (y, legs) in program.body_spots():
             program.rows.add(
                 term=self.name,
                 place=place,

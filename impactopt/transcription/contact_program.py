@@ -217,11 +217,16 @@ class ContactProgram(ABC):
     @cached_property
     def program(self) -> StructuredProgram:
         """All of it, for a solver."""
+        objective, quadratic, linear = self._worth
+        if self.apart_rows:  # all that such constraints may couple: solvers' structures serve any of them
+            quadratic = coupled(quadratic, self.body_spots())
         return StructuredProgram(
             self.layout,
             self.blocks,
             self.rows,
-            **self._objective(),
+            objective=objective,
+            quadratic=quadratic,
+            linear=linear,
             determined=by_choice(
                 [*(determined(Turn.LIFTED, g.index(0)) for g, _ in self.builder.lifted), *self._determined()]
             ),
@@ -237,7 +242,7 @@ class ContactProgram(ABC):
         return other
 
     def body_spots(self) -> list[tuple[Place, list[Affine]]]:
-        """Places with coordinates and legs, where bodies are kept apart."""
+        """Places with coordinates and legs, where bodies are kept apart and tendons in their ranges."""
         return [*self.swing_spots(), *self.follow_spots()]
 
     def move_to(self, problem: ImpactProblem, *, anew: bool = True) -> None:
@@ -258,14 +263,7 @@ class ContactProgram(ABC):
                 take(b)
         own = len(self._bare.blocks)
         move_apart(problem, self.blocks[own:], self.apart_rows)
-        self.program.take_numbers(self.layout, self.blocks, self.rows, **self._objective())
-
-    def _objective(self) -> dict[str, Any]:
-        """Objective of the program: affine part, quadratic and linear prices."""
-        objective, quadratic, linear = self._worth
-        if self.apart_rows:  # all that such constraints may couple: solvers' structures serve any of them
-            quadratic = coupled(quadratic, self.body_spots())
-        return {"objective": objective, "quadratic": quadratic, "linear": linear}
+        self.program.take_numbers(self.layout, self.blocks, self.rows)
 
     def with_lifted(self, x: Array) -> Array:
         """The variables (n,) with lifted ones made equal to what they stand for."""

@@ -368,24 +368,20 @@ class StructuredProgram:
         self.g_lower = np.concatenate([np.zeros(0), *rows.lower])
         self.g_upper = np.concatenate([np.zeros(0), *rows.upper])
         self._at: tuple[Array, list[Array]] | None = None  # where functions were last asked for
-        self._take_objective(objective, quadratic, linear)
+        self._c = np.zeros(n)
+        np.add.at(self._c, objective.cols, objective.vals)
+        self._c += linear
+        self._c0, self._Q = float(objective.const.sum()), sp.csc_array(quadratic)
+        self._curvature = self._Q.copy()  # without the zeros of places that clearance may couple
+        self._curvature.eliminate_zeros()
         self.seconds = 0.0
 
-    def take_numbers(
-        self,
-        layout: Layout,
-        blocks: Sequence[Block],
-        rows: Rows,
-        *,
-        objective: Affine,
-        quadratic: sp.spmatrix | sp.sparray,
-        linear: Array,
-    ) -> None:
+    def take_numbers(self, layout: Layout, blocks: Sequence[Block], rows: Rows) -> None:
         """The numbers of another program of the same structure, whose blocks and constraints are the first of
         this one's; the others keep theirs.
 
-        Blocks and constraints touch the same variables, with the same weights: what differs are bounds,
-        constants and parameters.
+        Blocks and constraints touch the same variables, with the same weights, and the objective is the same:
+        what differs are bounds, constants and parameters.
         """
         self.x_lower, self.x_upper = layout.lower, layout.upper
         for mine, other in zip(self.blocks, blocks, strict=False):
@@ -398,16 +394,6 @@ class StructuredProgram:
         constants = np.concatenate([np.zeros(0), *(affine.const for affine in rows.affine)])
         self._rows_const = np.concatenate([constants, self._rows_const[len(constants) :]])
         self._at = None
-        self._take_objective(objective, quadratic, linear)
-
-    def _take_objective(self, affine: Affine, quadratic: sp.spmatrix | sp.sparray, linear: Array) -> None:
-        """affine(x) + 1/2 x'Qx + q'x."""
-        self._c = np.zeros(self.n)
-        np.add.at(self._c, affine.cols, affine.vals)
-        self._c += linear
-        self._c0, self._Q = float(affine.const.sum()), sp.csc_array(quadratic)
-        self._curvature = self._Q.copy()  # without the zeros of places that clearance may couple
-        self._curvature.eliminate_zeros()
 
     def same_numbers(self, other: StructuredProgram) -> bool:
         """True if bounds, constants, weights and parameters equal those of another program, to rounding."""

@@ -199,7 +199,7 @@ def tendons_of(c: Compiled) -> Iterator[Tendon]:
     """Fixed tendons that have a range, and do nothing else."""
     mj = c.mj
     for t in range(mj.ntendon):
-        if _actions(c, t) == ["limited"] and (sum_of := _sum_of(c, t)):
+        if sum_of := _sum_of(c, t):
             low, high = map(float, mj.tendon_range[t])
             yield Tendon(name=c.name("tendon", t), coefficients=sum_of, lower=low, upper=high)
 
@@ -207,7 +207,7 @@ def tendons_of(c: Compiled) -> Iterator[Tendon]:
 def _tendons(c: Compiled) -> Iterator[Tie]:
     for t in range(c.mj.ntendon):
         does, joints = _actions(c, t), _joints_of_tendon(c, t)
-        if does and joints and not (does == ["limited"] and _sum_of(c, t)):
+        if does and joints and not _sum_of(c, t):
             yield Tie(
                 text=f"tendon {c.name('tendon', t)!r} acts on {', '.join(joints)} ({', '.join(does)}), which "
                 "no plan has",
@@ -236,10 +236,12 @@ def _actions(c: Compiled, t: int) -> list[str]:
 
 
 def _sum_of(c: Compiled, t: int) -> dict[str, float]:
-    """Coefficients by joint of a fixed tendon; empty for another one, and for joints that turn without end
-    or are not the robot's.
+    """Coefficients by joint of a fixed tendon that has a range, and does nothing else; empty for another one,
+    and for joints that turn without end or are not the robot's.
     """
     mj, out = c.mj, dict[str, float]()
+    if _actions(c, t) != ["limited"]:
+        return out
     first = int(mj.tendon_adr[t])
     for w in range(first, first + int(mj.tendon_num[t])):
         joint = c.joint.get(int(mj.wrap_objid[w]), 0)

@@ -59,12 +59,12 @@ class Solution(solution.Solution):
         """The plan bent for another ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` or
         ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
 
-        First come quadratic programs about this plan, which find constraints that begin and cease to hold;
-        then the solver goes on from there, with this plan's mesh, and with new constraints where bodies come
-        into each other that have none. ``polish=False``: the first alone. They are quick
-        and within a thousandth of the constraints where status says "acceptable"; other plans of theirs are
-        none. ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and
-        ``time_limit`` are those of `impactopt.solve`.
+        The solver goes on from this plan, with its mesh, and with new constraints where bodies come into each
+        other that have none. ``polish=False``: quadratic programs about this plan in its place, which find
+        constraints that begin and cease to hold. They are quick and within a thousandth of the constraints
+        where status says "acceptable"; other plans of theirs are none. ``refine=True`` refines the mesh too,
+        as `impactopt.solve` does. ``callback``, ``options`` and ``time_limit`` are those of
+        `impactopt.solve`.
 
         Raises
         ------

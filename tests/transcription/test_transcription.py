@@ -291,6 +291,19 @@ def test_reference_velocities_are_those_of_its_positions(solved: Planned) -> Non
         np.testing.assert_allclose(rate, (t.v[k[:-1]] + t.v[k[1:]]) / 2, atol=2e-3 * np.abs(t.v).max())
 
 
+def test_a_motion_begins_with_the_inner_forces_of_its_first_node(biped_plan: Planned) -> None:
+    """Soles that push each other apart do so at rest, too, and what they bear together is the weight."""
+    t, x = biped_plan.transcription, biped_plan.result.x.copy()
+    wrenches = t.swing.w.read(x).copy()
+    wrenches[:, [1, 7]] += [40.0, -40.0]
+    t.swing.w.write(x, wrenches)
+    plain, pushed = biped_plan.plan.trajectory(), t.decode(x).trajectory()
+    np.testing.assert_allclose(pushed.ground[0], plain.ground[0], atol=1e-6)
+    first = pushed.sole_wrench[0, [1, 7]] - plain.sole_wrench[0, [1, 7]]
+    assert first == pytest.approx([40.0, -40.0], rel=0.1)
+    assert np.abs(pushed.torque[0] - plain.torque[0]).max() > 1.0
+
+
 def test_the_servos_reference_coasts_through_the_contact(solved: Planned) -> None:
     """Independent coordinates at their velocity at contact; legs that keep the soles where they are."""
     t, c, model = solved.trajectory, solved.plan.coordinates, solved.problem.robot.model

@@ -196,7 +196,7 @@ def _answers(at: Array, back: Array) -> Array:
 
 _TABLES = tables()
 _AT_NODES, _FROM_NODES = np.asarray(_TABLES["AT_NODES"]), np.asarray(_TABLES["FROM_NODES"])
-# as in native/implicit_bend.h
+# as in native/implicit_remainders.h
 _MOST_ITERATIONS, _CONVERGED = 12, 1e-6
 
 

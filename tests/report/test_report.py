@@ -389,7 +389,9 @@ def test_without_3d_the_plots_still_work(page: Path) -> None:
         "moved": f"({KEY % (PLOT % 0, 'ArrowRight')}, page.clock.time - page.header.tracks[0].contact_start)",
         "value": f"{CHART % 0}.querySelector('.key b').textContent",
     }
-    values = checked(visit(Job(page=page, scripts=tuple(scripts.values())), flags=WITHOUT_3D)[0], scripts)
+    # the note is there before the plots are drawn
+    job = Job(page=page, scripts=tuple(scripts.values()), ready=f"{scripts['charts']} >= 15")
+    values = checked(visit(job, flags=WITHOUT_3D)[0], scripts)
     assert "cannot be shown here: no WebGL 2" in values["note"] and values["charts"] >= 15
     # the view is from 10 ms before the contact of 40 ms to 30 ms after it, a step a hundredth of that
     assert values["moved"] == pytest.approx(0.08 / 100, abs=1e-6)

@@ -342,7 +342,7 @@ class _QP:
         bound = np.where(sides > 0, self._upper, self._lower)[on]
         off[rows[on]] = self._values[on] - bound + self._own[on] / _WEIGHT
         of_free = weights[m:] * of._free
-        condensed = np.concatenate([weights[:m], weights[m:][c.bounded]])[c.rows]
+        condensed = np.concatenate([weights[:m], weights[m:][c.bounded]])[c.remaining]
         try:
             factored = self._newton.factor(
                 self._jacobian,

@@ -13,9 +13,7 @@ from support.small_plans import changed, transcribed
 from support.textbook import CASES, INF, Textbook, assert_optimal
 
 from impactopt import load_problem
-from impactopt.solvers.ipm import IPMOptions, solve_ipm
-from impactopt.solvers.ipm import interior_point as interior
-from impactopt.solvers.ipm import interior_point as search
+from impactopt.solvers.ipm import IPMOptions, interior_point, solve_ipm
 from impactopt.solvers.program import Status
 from impactopt.transcription.initial_guess import first_iterate
 
@@ -127,23 +125,23 @@ def test_a_start_with_multipliers_keeps_to_the_path_from_a_high_barrier_only(bar
 
 
 def test_steps_that_crawl_give_way(monkeypatch):
-    """Every step counts as a crawl here: after a few of them the rows become elastic."""
-    monkeypatch.setattr(search, "_CRAWL", 2.0)
-    monkeypatch.setattr(search, "_PATIENCE", 2)
+    """Every step counts as a crawl here: after a few of them the constraints become elastic."""
+    monkeypatch.setattr(interior_point, "_SHORT_STEP", 2.0)
+    monkeypatch.setattr(interior_point, "_MAX_SHORT_STEPS", 2)
     case = CASES["HS71"]
     result = solve_ipm(case.build(), case.x0)
-    assert next(k for k, r in enumerate(result.history) if r.note == "rows become elastic") == 3
+    assert next(k for k, r in enumerate(result.history) if r.note == "constraints become elastic") == 3
 
 
 def test_what_fails_begins_again_from_the_best_iterate(monkeypatch):
     case = CASES["HS71"]
-    advance, calls = interior.InteriorRun._advance, []
+    advance, calls = interior_point.InteriorRun._advance, []
 
     def failing(self, residual):
         calls.append(self.point.x)
         return Status.FAILED if len(calls) == 4 else advance(self, residual)
 
-    monkeypatch.setattr(interior.InteriorRun, "_advance", failing)
+    monkeypatch.setattr(interior_point.InteriorRun, "_advance", failing)
     program = case.build()
     result = solve_ipm(program, case.x0)
     assert result.status is Status.SOLVED
@@ -152,7 +150,7 @@ def test_what_fails_begins_again_from_the_best_iterate(monkeypatch):
 
 
 def test_what_goes_on_failing_is_said_to_fail(monkeypatch):
-    monkeypatch.setattr(interior.InteriorRun, "_advance", lambda self, residual: Status.FAILED)
+    monkeypatch.setattr(interior_point.InteriorRun, "_advance", lambda self, residual: Status.FAILED)
     case = CASES["HS71"]
     result = solve_ipm(case.build(), case.x0)
     assert result.status is Status.FAILED

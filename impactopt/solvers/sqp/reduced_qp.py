@@ -66,7 +66,7 @@ class Reduction:
         self._found, self._condenser = _structures.pop(self._key)
         found = self._found
         none = np.zeros(0, dtype=np.intp)
-        self.gone: Index = self._equations[np.concatenate([none, *[e.rows.ravel() for e in found]])]
+        self.gone: Index = self._equations[np.concatenate([none, *[e.constraints.ravel() for e in found]])]
         self.variables: Index = np.concatenate([none, *[e.variables.ravel() for e in found]])
         self._place = np.argsort(np.argsort(self.gone))
         self._level = program.g_lower
@@ -136,7 +136,7 @@ class Reduction:
             of_left[self._order] = np.linalg.lstsq(self._R, target, rcond=None)[0]
             y[self.left] = of_left
             dual = dual + self._of_left.T @ of_left
-        of_gone = self._condenser.multipliers(dual, np.zeros(len(self._condenser.left)))
+        of_gone = self._condenser.multipliers(dual, np.zeros(len(self._condenser.remaining_equalities)))
         y[self.gone] = of_gone[self._place]
         return y
 

@@ -418,8 +418,8 @@ class Point:
         return found if isinstance(found, sp.csc_array) else sp.csc_array(found)
 
     @cached_property
-    def rows(self) -> Matrix:
-        """dg/dx by rows, csr_array (m, n)."""
+    def jacobian_csr(self) -> Matrix:
+        """dg/dx as csr_array (m, n)."""
         return self.jacobian.tocsr()
 
     @cached_property

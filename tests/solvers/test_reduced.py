@@ -11,13 +11,12 @@ from benchmarks.solve import planning_program, strike_program
 from support.textbook import INF, Textbook, assert_optimal
 
 import impactopt.solvers.sqp.reduced_qp as reduced_qp_module
-import impactopt.solvers.sqp.reduced_qp as reduction_module
 from impactopt.files.problem_file.names import problem_file
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.program import Determined, Status, TimedProgram
 from impactopt.solvers.qp.registry import make_qp_solver
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.solvers.sqp.reduced_qp import ReducedQP, Reduction, Solved, make_model
+from impactopt.solvers.sqp.reduced_qp import QPStep, ReducedQP, Reduction, make_model
 
 WAYS = {
     "osqp": SQPOptions(qp_solver="osqp"),
@@ -62,7 +61,7 @@ def test_optima_are_those_of_the_whole_program(way: str) -> None:
 
 @pytest.mark.parametrize("way", WAYS)
 def test_matrices_are_sparse_where_many_variables_are_free(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduction_module, "_LARGE", 1)
+    monkeypatch.setattr(reduced_qp_module, "_MAX_DENSE", 1)
     program = chain()
     result = solve_sqp(program, [0.5, 0.0, 0.0, 0.5], options=WAYS[way])
     assert result.status is Status.SOLVED
@@ -72,12 +71,12 @@ def test_matrices_are_sparse_where_many_variables_are_free(way: str, monkeypatch
     reduction.load(point)
     assert sp.issparse(reduction.T)
     assert reduction.T.shape == (4, 2)  # the equality left is a row of the QP
-    assert not reduction.left.size
+    assert not reduction.equalities.size
     np.testing.assert_allclose((point.jacobian @ reduction.T).toarray()[:2], 0, atol=1e-12)
 
 
 def test_a_hessian_that_is_not_convex_is_lifted_and_stays_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduction_module, "_LARGE", 1)
+    monkeypatch.setattr(reduced_qp_module, "_MAX_DENSE", 1)
     bent = Chain(
         4,
         lambda a, b, c, d: ca.cos(3 * a) - 2 * (d - 0.2) ** 2 + c,
@@ -193,9 +192,9 @@ def test_multipliers_of_equalities_make_the_gradient_zero_where_they_can() -> No
     np.testing.assert_allclose(reduction.T.T @ left, reduction.T.T @ point.gradient, atol=1e-12)
 
 
-def _step(beyond: float, radius: float, monkeypatch: pytest.MonkeyPatch) -> Solved:
+def _step(beyond: float, radius: float, monkeypatch: pytest.MonkeyPatch) -> QPStep:
     """Of a QP in which rows are given up that are violated by more than this part of what they can change."""
-    monkeypatch.setattr(reduced_qp_module, "_BEYOND", beyond)
+    monkeypatch.setattr(reduced_qp_module, "_GIVE_UP", beyond)
     program = TimedProgram(chain(bound=1.5))
     point = program.point(np.array([0.5, np.sin(0.5), np.sin(0.5) ** 2 + 0.5, 2.0]))
     reduction = Reduction(program, point.jacobian, Chain.determined)

@@ -109,7 +109,7 @@ class Functions:
         iterations: int,
         seconds_qp: float = np.nan,
     ) -> SolverResult:
-        """Result of a solver that used these functions, at its last point if that is usable, else at the best.
+        """Result of a solver that used these functions: at its last point, or at the best if that failed.
 
         since : clock at the beginning.  An exception of the functions is raised again here.
         """

@@ -244,9 +244,9 @@ def bound_violations(program: NonlinearProgram, x: Vector) -> Vector:
 
 def max_violation(program: NonlinearProgram, x: Vector, g: Vector) -> float:
     """Largest violation of a constraint or a bound at x with g = g(x); inf if any is nan."""
-    rows, bounds = constraint_violations(program, g), bound_violations(program, x)
-    worst = max(float(np.max(rows, initial=0.0)), float(np.max(bounds, initial=0.0)))
-    finite = not (np.isnan(rows).any() or np.isnan(bounds).any())
+    constraints, bounds = constraint_violations(program, g), bound_violations(program, x)
+    worst = max(float(np.max(constraints, initial=0.0)), float(np.max(bounds, initial=0.0)))
+    finite = not (np.isnan(constraints).any() or np.isnan(bounds).any())
     return worst if finite else np.inf
 
 
@@ -335,18 +335,18 @@ _HEADINGS = ("Constraints not met", "Constraints that cannot be met")  # the sec
 
 def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, tolerance: float) -> str:
     """Message of a status: a sentence, then each term's worst violation in words."""
-    rows = worst_violations(program, x, g, tolerance=tolerance, once_a_term=True)
-    if not rows:
+    worst = worst_violations(program, x, g, tolerance=tolerance, once_a_term=True)
+    if not worst:
         return status.message
     # constraints are of order one, so a much smaller violation is only a consequence of the others
-    rows = [violation for violation in rows if violation.amount >= MINOR * rows[0].amount]
-    listed = "; ".join(str(violation) for violation in rows)
+    worst = [violation for violation in worst if violation.amount >= MINOR * worst[0].amount]
+    listed = "; ".join(str(violation) for violation in worst)
     heading = _HEADINGS[status is Status.INFEASIBLE]
     more = int(
         np.sum(~(constraint_violations(program, g) <= tolerance))
         + np.sum(~(bound_violations(program, x) <= tolerance))
     )
-    tail = f"; {more} constraints in all" if more > len(rows) else ""
+    tail = f"; {more} constraints in all" if more > len(worst) else ""
     return f"{status.message} {heading}: {listed}{tail}."
 
 

@@ -205,22 +205,22 @@ def same_shapes(systems: list[Touched]) -> list[list[Touched]]:
     return list(out.values())
 
 
-def elimination_stage(systems: list[Touched], rows: Places, pairs: Places) -> EliminationStage:
+def elimination_stage(systems: list[Touched], J_places: Places, W_places: Places) -> EliminationStage:
     """Elimination stage for systems of one shape.
 
-    rows, pairs : places of the entries of the equalities and of W, as of `number_entries`.
+    J_places, W_places : of the entries of the equalities and of W, as of `number_entries`.
     """
     q, e, t, c, u = (np.array([getattr(s, name) for s in systems]) for name in ("q", "e", "t", "c", "u"))
     i, j = _lower(c.shape[1])
     places = {
-        "qe": rows[q[:, None, :], e[:, :, None]],
-        "qc": rows[q[:, None, :], c[:, :, None]],
-        "te": rows[t[:, :, None], e[:, None, :]],
-        "tc": rows[t[:, :, None], c[:, None, :]],
-        "hee": pairs[e[:, :, None], e[:, None, :]],
-        "heu": pairs[u[:, :, None], e[:, None, :]],
-        "hcc": pairs[c[:, i], c[:, j]],
-        "hcv": pairs[c[:, :, None], u[:, None, c.shape[1] :]],
+        "qe": J_places[q[:, None, :], e[:, :, None]],
+        "qc": J_places[q[:, None, :], c[:, :, None]],
+        "te": J_places[t[:, :, None], e[:, None, :]],
+        "tc": J_places[t[:, :, None], c[:, None, :]],
+        "hee": W_places[e[:, :, None], e[:, None, :]],
+        "heu": W_places[u[:, :, None], e[:, None, :]],
+        "hcc": W_places[c[:, i], c[:, j]],
+        "hcv": W_places[c[:, :, None], u[:, None, c.shape[1] :]],
     }
     numbers = {"q": q, "e": e, "t": t, "u": u, **places}
     return EliminationStage(**{name: np.ascontiguousarray(a, dtype=np.int32) for name, a in numbers.items()})
@@ -242,19 +242,19 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
     found: dict[tuple[tuple[int, ...], int], list[tuple[Index, Index]]] = {}
     for rank, variables in determined:
         columns = [touching[start[v] : start[v + 1]] for v in variables]
-        rows = np.unique(np.concatenate([np.zeros(0, np.intp), *columns]))
-        rows = rows[~taken[rows]][: variables.size]
-        if rows.size < variables.size or not variables.size:
+        equalities = np.unique(np.concatenate([np.zeros(0, np.intp), *columns]))
+        equalities = equalities[~taken[equalities]][: variables.size]
+        if equalities.size < variables.size or not variables.size:
             continue
-        system = np.zeros((rows.size, rows.size), dtype=bool)
+        system = np.zeros((equalities.size, equalities.size), dtype=bool)
         for k, column in enumerate(columns):
             touched[column] = True
-            system[k] = touched[rows]
+            system[k] = touched[equalities]
             touched[column] = False
-        if not _structurally_regular(system.tobytes(), rows.size):
+        if not _structurally_regular(system.tobytes(), equalities.size):
             continue
-        taken[rows] = True
-        found.setdefault((rank, variables.size), []).append((rows, variables))
+        taken[equalities] = True
+        found.setdefault((rank, variables.size), []).append((equalities, variables))
     return [
         Elimination(np.array([r for r, _ in found[key]]), np.array([v for _, v in found[key]]))
         for key in sorted(found)
@@ -333,26 +333,26 @@ class Condenser:
         systems = fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
 
         # places of all entries, fill-in included
-        rows, count = number_entries(*nonzero_entries(touches), touches.shape)
+        J_places, count = number_entries(*nonzero_entries(touches), touches.shape)
         i, j = nonzero_entries(couples)
         i, j = i[i >= j], j[i >= j]
-        pairs, coupled = number_entries(i, j, couples.shape)
+        W_places, coupled = number_entries(i, j, couples.shape)
         self._hessian_places = HessianPlaces(i, j, n)
         self.J, self.W = np.zeros(count + 1), np.zeros(coupled + 1)
-        self._to = rows[own_rows, own_columns]
-        self._diagonal = np.diagonal(pairs).copy()
+        self._to = J_places[own_rows, own_columns]
+        self._diagonal = np.diagonal(W_places).copy()
         self._products: list[Products] = []
         self._adapt(jacobian, hessian, equal, groups)
-        pairs[j, i] = pairs[i, j]
+        W_places[j, i] = W_places[i, j]
         self._stages = [
-            elimination_stage(same, rows, pairs) for found in systems for same in same_shapes(found)
+            elimination_stage(same, J_places, W_places) for found in systems for same in same_shapes(found)
         ]
 
         # what remains
         self.pattern = couples[np.ix_(self.free, self.free)]
         of_left = touches[np.ix_(self._left, self.free)]
         self.remaining_equalities = [
-            (np.flatnonzero(t), rows[k, self.free[t]]) for k, t in zip(self._left, of_left, strict=True)
+            (np.flatnonzero(t), J_places[k, self.free[t]]) for k, t in zip(self._left, of_left, strict=True)
         ]
         for columns, _ in self.remaining_equalities:
             self.pattern[np.ix_(columns, columns)] = True

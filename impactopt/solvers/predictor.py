@@ -242,11 +242,9 @@ class Predictor:
         self._sides = np.sign(own - self._weak).astype(np.int8)
 
     def _bounds(self, program: NonlinearProgram) -> tuple[Vector, Vector]:
-        """Bounds of constraints and variables; infinite for variables that do not move."""
-        lower, upper = (
-            np.where(self._moves, program.x_lower, -np.inf),
-            np.where(self._moves, program.x_upper, np.inf),
-        )
+        """Bounds (m + n,) of constraints and variables; infinite for fixed variables."""
+        lower = np.where(self._moves, program.x_lower, -np.inf)
+        upper = np.where(self._moves, program.x_upper, np.inf)
         return np.concatenate([program.g_lower, lower]), np.concatenate([program.g_upper, upper])
 
     def predict(self, program: NonlinearProgram) -> Prediction | None:
@@ -290,11 +288,13 @@ class _QP:
         self._jacobian: Matrix = program.jacobian(x)
         lower, upper = of._bounds(program)
         values = np.concatenate([g, x])
-        self._off = np.where(of._equal, values - lower, 0.0)
+        self._off = np.where(of._equal, values - lower, 0.0)  # residuals (m + n,) of equalities
         self._off[program.m :] = 0.0
         self._values = values[i]
+        # active constraints keep the slack that the known solution has
         self._lower = lower[i] + np.where(of._sides < 0, of._slack, 0.0)
         self._upper = upper[i] - np.where(of._sides > 0, of._slack, 0.0)
+        # and weakly active ones the multiplier, which is a constant part of the gradient
         self._own = own[i] - of._weak
         self._constant = np.zeros(len(values))
         self._constant[i] = of._weak
@@ -344,6 +344,7 @@ class _QP:
         active = sides != 0
         weights[i[active]] = _WEIGHT
         bound = np.where(sides > 0, self._upper, self._lower)[active]
+        # y = own + weight (linearized value - bound) as weight (J d + off)
         off[i[active]] = self._values[active] - bound + self._own[active] / _WEIGHT
         of_free = weights[m:] * of._free  # a diagonal, as these bounds are no constraints of the condenser
         condensed = np.concatenate([weights[:m], weights[m:][c.bounded]])[c.remaining]

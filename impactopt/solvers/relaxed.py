@@ -23,8 +23,7 @@ _OBJECTIVE_WEIGHT = 1e-3  # over the objective's size: it selects one of many po
 class Relaxation:
     """Bounds that move outward together.
 
-    constraints, variables : their numbers.  unit : distance by which their bounds move if the relaxation is
-    1.
+    constraints, variables : their numbers.  unit : distance by which their bounds move for a relaxation of 1.
     """
 
     constraints: Index
@@ -85,6 +84,8 @@ class RelaxedProgram:
 
     def _number_entries(self, jacobian: Matrix) -> None:
         """Number the Jacobian's entries: each is one of the program's, a 1, or a relaxation's coefficient."""
+        # The same operations as on values, on a matrix of the numbers (from 1 on, as zeros are dropped),
+        # once: an evaluation then only has to pick `known[self._entry]`.
         n, own = self._program.n, jacobian.nnz
         numbers = sp.csc_array(
             (np.arange(1, own + 1), jacobian.indices, jacobian.indptr), shape=jacobian.shape

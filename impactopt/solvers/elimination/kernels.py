@@ -156,6 +156,8 @@ class Kernels:
         """
         for a in stages:
             a.T[:] = J[a.te]
+            # arrays (k, column, row), as LAPACK stores matrices by columns: each B and N is a transposed
+            # matrix
             for i, (B, N) in enumerate(zip(J[a.qe], J[a.qc], strict=True)):
                 lu, pivots, info = la.lapack.dgetrf(B.T)
                 if info:
@@ -179,7 +181,7 @@ class Kernels:
     def forward(self, stages: Sequence[EliminationStage], g: Vector, off: Vector) -> None:
         """Replace d_e in gradient and residual by -(x0 + X d_c), with x0 = B^-1 residual."""
         for a in stages:
-            a.x0[:] = self._solve(a, off[a.q], 0)
+            a.x0[:] = self._solve(a, off[a.q], transposed=0)
             _add(off, a.t, -(a.T @ a.x0[..., None])[..., 0])
             own = g[a.e] - (a.H @ a.x0[..., None])[..., 0]
             _add(g, a.c, -(a.X @ own[..., None])[..., 0])
@@ -200,12 +202,13 @@ class Kernels:
             a.own[:] = v[a.e]
             _add(v, a.c, -(a.X @ a.own[..., None])[..., 0])
         for a in reversed(stages):
-            y[a.q] = -self._solve(a, a.own + (y[a.t][:, None] @ a.T)[:, 0], 1)
+            y[a.q] = -self._solve(a, a.own + (y[a.t][:, None] @ a.T)[:, 0], transposed=1)
 
     def factor(self, p: Panels, values: Vector) -> bool:
         """Replace the panels of L L' by those of L; False: the matrix is not positive definite."""
         size, panels = p.size, _split(p, values)
         for k, panel in enumerate(panels):
+            # diagonal block, rows below it, then their products subtracted from later panels (right-looking)
             own = size[k]
             panel[:own], info = la.lapack.dpotrf(panel[:own], lower=1)
             if info:
@@ -226,6 +229,7 @@ class Kernels:
         every = np.arange(p.start[-1])
         under = [np.concatenate([every[:0], *[every[blocks[i]] for i in below]]) for below in p.below]
         panels = _split(p, values)
+        # L, then its transpose, block by block
         for panel, own, rows in zip(panels, blocks, under, strict=True):
             size = own.stop - own.start
             x[own] = la.blas.dtrsm(1.0, panel[:size], x[own], lower=1)
@@ -236,7 +240,8 @@ class Kernels:
         return x
 
     @staticmethod
-    def _solve(a: EliminationStage, right: Stack, transposed: int) -> Stack:
+    def _solve(a: EliminationStage, right: Stack, *, transposed: int) -> Stack:
+        """B^-1, or B^-T, times right (k, r)."""
         found = [
             la.lapack.dgetrs(lu.T, p, b, trans=transposed)[0]
             for lu, p, b in zip(a.lu, a.pivots, right, strict=True)
@@ -335,7 +340,8 @@ class CompiledKernels(Kernels):
         for a in stages:
             k, nt, nc = a.tc.shape
             r, nu = a.q.shape[1], a.u.shape[1]
-            spread = nc * max(nc + 1, nu)  # of the products that are added to W
+            # scratch of one system: the largest of what eliminate, reduce, and the operations on vectors need
+            spread = nc * max(nc + 1, nu)
             work = np.zeros(max(nt * nc, r * (nu + nc) + max(r * nu, spread), r + max(nt, nc, nu)) + 1)
             within = _runs(a.hcc.ravel(), np.arange(k)[:, None] * a.hcc.shape[1] + _rows_of_triangle(nc))
             beyond = _runs(a.hcv.transpose(0, 2, 1).ravel(), np.arange(k * (nu - nc) if nc else 0) * nc)
@@ -347,7 +353,7 @@ class CompiledKernels(Kernels):
     @staticmethod
     def _panels(p: Panels) -> tuple[Any, ...]:
         size = p.size
-        rest = int((p.height - size).max(initial=0))
+        rest = int((p.height - size).max(initial=0))  # most rows below a diagonal block
         first = np.cumsum([0, *[len(b) for b in p.below]]).astype(np.int32)
         below = np.concatenate([np.zeros(0, np.int32), *p.below])
         work = np.zeros(rest * max(rest, p.start[-1]) + 1)
@@ -356,7 +362,7 @@ class CompiledKernels(Kernels):
 
     @staticmethod
     def _groups(products: Sequence[Products]) -> tuple[Any, ...]:
-        none = [np.zeros(0, np.int32)]
+        none = [np.zeros(0, np.int32)]  # as np.concatenate takes no empty list
         columns = [p.values.shape[1] for p in products]
         before = np.cumsum([0, *[p.to.size for p in products]])
         rows = [

@@ -81,10 +81,8 @@ class Reduction:
         remaining[self.eliminated] = False
         self.sparse = not dense and self.free.size > _MAX_DENSE
         by_null_space = remaining & equal & (not self.sparse)
-        self.equalities, self.others = (
-            np.flatnonzero(by_null_space),
-            np.flatnonzero(remaining & ~by_null_space),
-        )
+        self.equalities = np.flatnonzero(by_null_space)
+        self.others = np.flatnonzero(remaining & ~by_null_space)
         self.bounded = np.flatnonzero(np.isfinite(program.x_lower) | np.isfinite(program.x_upper))
         self._n = program.n
 
@@ -372,14 +370,14 @@ def make_model(program: TimedProgram, options: SQPOptions, reduction: Reduction)
 # The reach of a constraint is how much a step inside the radius can change it. A QP begins with the
 # constraints within this fraction of their reach of being violated, the worst two for each of its variables.
 _NEAR_FRACTION, _MAX_NEAR = 0.1, 2
-# Violated constraints are added in so many rounds, at least so many at once.
+# Constraints of which a QP's solution violates more than this are added, in so many rounds, so many at least.
 _MISSED_VIOLATION, _MAX_ROUNDS, _MIN_ADDED = 1e-7, 12, 15
-_ELASTIC_VIOLATION = 1e-9  # at t = 0, of a constraint that the QP may leave violated
+_ELASTIC_VIOLATION = 1e-9  # violation at t = 0 from which a constraint is elastic
 _GIVE_UP = 0.5  # fraction of the reach; a constraint that is violated by more is given up (see `solve`)
-_SLACK_CURVATURE = 1e-4  # relative to the price
+_SLACK_CURVATURE = 1e-4  # relative to the price: the dual active-set method needs a positive definite P
 _PRICE_MARGIN = 2.0  # price over a known multiplier
 _ACTIVE_MULTIPLIER = 1e-4  # of a normalized constraint that counts as active
-# Longest normal step, relative to the radius. Only a careful one, and one of a restoration phase, is
+# Longest normal step, relative to the radius: only careful ones, and those of a restoration phase, are
 # shortened.
 _MAX_NORMAL, _MAX_CAREFUL_NORMAL = 1e4, 0.8
 
@@ -405,7 +403,7 @@ class QPStep:
 
 
 class ReducedQP:
-    """Solves reduced QPs one after the other, each from the active set of the last.
+    """Reduced QPs, each solved by a `QPSolver` from the active set of the last one.
 
     careful : whether normal steps are shortened to the radius, too.
     """
@@ -420,6 +418,7 @@ class ReducedQP:
     def guess_active_set(self, y: Vector, z: Vector) -> None:
         """Take multipliers from elsewhere as the guess of the active set."""
         reduction = self._reduction
+        # multipliers of the normalized constraints; of a guess, whose scale is unknown, those of the program
         self._unit = np.concatenate([y[reduction.others], z[reduction.bounded]])
 
     def active(self, point: Point) -> Matrix:
@@ -487,10 +486,11 @@ class ReducedQP:
         upper = np.concatenate([(p.g_upper - after)[others] / scale, (p.x_upper - x)[bounded]])
         prices = price * np.concatenate([p.weights[others] * scale, np.ones(bounded.size)])
         reach = radius * abs(every).sum(axis=1)
-        off = np.maximum(lower, -upper)
+        off = np.maximum(lower, -upper)  # violation at t = 0; negative: distance to the bound
         given_up = (off > _ELASTIC_VIOLATION) & (
             (off > _GIVE_UP * reach) | (np.abs(self._unit) > 0.99 * prices)
         )
+        # working set: the most violated, relative to the reach, and those of the last QP
         less_urgent = np.argsort(-off / np.maximum(reach, 1e-12))[_MAX_NEAR * T.shape[1] :]
         working = off > -_NEAR_FRACTION * reach
         working[less_urgent] = False
@@ -502,7 +502,8 @@ class ReducedQP:
             lost_multipliers = np.where(lower > 0, -prices, prices)[lost]
             slope = slope0 + every[lost].T @ lost_multipliers
             qp = _elastic_qp(model.B, slope, every[which], lower[which], upper[which], radius, prices[which])
-            # initial guess of the slacks' multipliers: zero for a slack that is not
+            # Initial guess. A slack is stationary: its constraint's |multiplier| plus that of its own bound
+            # is the price; the latter is 0, and the slack positive, if the former has reached the price.
             elastic = np.concatenate(
                 [which[lower[which] > _ELASTIC_VIOLATION], which[upper[which] < -_ELASTIC_VIOLATION]]
             )
@@ -522,7 +523,7 @@ class ReducedQP:
             unit[which], unit[lost] = found.y, lost_multipliers
             values = np.concatenate([(point.jacobian @ step)[others] / scale, step[bounded]])
             beyond = np.maximum(lower - values, values - upper)
-            # a given-up constraint that is met strictly belongs into the QP after all
+            # a given-up constraint that is met strictly goes back into the working set
             met = given_up & (np.where(lower > 0, lower - values, values - upper) < -_MISSED_VIOLATION)
             missed = np.where(working | given_up, 0.0, beyond)
             if missed.max(initial=0.0) <= _MISSED_VIOLATION and not met.any():
@@ -565,7 +566,7 @@ def _elastic_qp(
     dense = isinstance(A, np.ndarray)
     if k:
         sign = np.where(np.arange(k) < below.size, 1.0, -1.0)
-        curvature = _SLACK_CURVATURE * prices[elastic]  # the dual method needs a positive definite P
+        curvature = _SLACK_CURVATURE * prices[elastic]
         c = np.concatenate([c, prices[elastic]])
         if dense:
             S = np.zeros((lower.size, k))

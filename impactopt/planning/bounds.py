@@ -29,7 +29,7 @@ from impactopt.problem.terms import (
     TorqueLimit,
     VelocityLimit,
 )
-from impactopt.solvers.program import constraint_violations
+from impactopt.solvers.program import row_violations
 from impactopt.solvers.relaxed import Relaxation
 from impactopt.transcription.layout import Row
 from impactopt.transcription.transcription import Transcription
@@ -226,7 +226,7 @@ def _fields(t: Transcription, x: Array, term: Term, chosen: Chosen) -> Iterator[
     written = f"[terms.{snake_case(kind)}] " if type(term) in TERMS else f"{kind}."
     allowed = {field.name: about for field, about in abouts(type(term))}
     rows = _rows(t, chosen).tolist()
-    off = constraint_violations(t.program, t.program.constraints(x))
+    off = row_violations(t.program, t.program.constraints(x))
     worst = max(rows, key=lambda i: off[i], default=None)
     where = ""
     if worst is not None and off[worst] > MET:
@@ -285,7 +285,7 @@ def _where_met(off: Callable[[float], float], old: float) -> float | None:
 
 def _off(t: Transcription, x: Array, chosen: Chosen, *, torques: bool = False) -> float:
     rows = _rows(t, chosen)
-    off = constraint_violations(t.program, t.program.constraints(x))[rows].max(initial=0.0)
+    off = row_violations(t.program, t.program.constraints(x))[rows].max(initial=0.0)
     if torques:
         j = _torques(t)
         beyond = np.maximum(t.program.x_lower[j] - x[j], x[j] - t.program.x_upper[j])

@@ -476,10 +476,10 @@ class StructuredProgram:
         return out
 
     # ------------------------------------------------------------------ names
-    def constraint_name(self, i: int) -> str:
+    def row_name(self, i: int) -> str:
         return str(self.origins[i])
 
-    def constraint_group(self, i: int) -> tuple[str, str]:
+    def row_group(self, i: int) -> tuple[str, str]:
         """Its term and place: the constraints that one message stands for."""
         return self.origins[i].term, self.origins[i].place.name
 

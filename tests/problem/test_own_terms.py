@@ -166,7 +166,7 @@ def test_a_strike_takes_what_says_something_of_it(arm_transcription: Transcripti
     t = changed(arm_transcription, **own)
     strike = StrikeTranscription(t.problem, t.coordinates, t.functions)
     assert [o.name for o, _ in strike.objectives] == ["impulse"]
-    names = [strike.program.constraint_name(i) for i in range(strike.program.m)]
+    names = [strike.program.row_name(i) for i in range(strike.program.m)]
     assert [name for name in names if name.startswith("ceiling")] == [
         "ceiling, contact, hand",
         "ceiling, after contact, hand",
@@ -197,9 +197,7 @@ def test_a_subclass_of_one_of_the_packages_is_that_one(arm_transcription: Transc
     look = {"frame": "elbow", "axis": (0, 0, 1)}
     mine = program(Stare(**look), Weak(), effort=Thrift())
     same = program(Gaze(**look, angle=0.3), TorqueLimit(fraction=0.5), effort=Effort(weight=3.0))
-    assert [mine.constraint_name(i) for i in range(mine.m)] == [
-        same.constraint_name(i) for i in range(same.m)
-    ]
+    assert [mine.row_name(i) for i in range(mine.m)] == [same.row_name(i) for i in range(same.m)]
     x = np.random.default_rng(0).normal(size=mine.n)
     np.testing.assert_array_equal(mine.constraints(x), same.constraints(x))
     assert mine.objective(x) == same.objective(x)
@@ -293,9 +291,7 @@ def test_mistakes_in_rows_are_told_where_they_are_made(arm_transcription: Transc
         return changed(arm_transcription, terms=(Wrong(height=1.0),)).program
 
     Wrong.rows = [("a", 0)]
-    assert program().constraint_name(program().m - 1) == "ceiling, a", (
-        "a number is as good as an array of one"
-    )
+    assert program().row_name(program().m - 1) == "ceiling, a", "a number is as good as an array of one"
     for attribute, value, words in (
         ("rows", [("ab", np.zeros(1, dtype=int))], "ceiling: outputs are 1, components 2"),
         ("rows", [("a", 0), ("b", 0)], "in two constraints, ceiling, a and ceiling, b: "),

@@ -68,7 +68,7 @@ class Textbook:
         self.evaluations["hessian"] += 1
         return _csc(self._hessian(x, sigma, multipliers))
 
-    def constraint_name(self, i):
+    def row_name(self, i):
         return f"row {i + 1}"
 
     def variable_name(self, j):

@@ -173,7 +173,7 @@ def test_slopes_of_programs_with_such_rows_agree_with_differences(programs: Any,
 def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any, name: str) -> None:
     """By coal, whose distance theirs is less by what is rounded; where bodies are in each other, at most."""
     t, x = programs[name]
-    names = [t.program.constraint_name(i) for i in range(t.program.m)]
+    names = [t.program.row_name(i) for i in range(t.program.m)]
     g, spots, bodies = t.program.constraints(x), spots_of(t, x), t.problem.bodies
     for row, held in t.apart_rows.items():
         k = spots.names.index(row.place)

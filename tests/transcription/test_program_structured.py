@@ -211,7 +211,7 @@ def test_rows_without_bounds_are_dropped_and_the_others_keep_their_names() -> No
     program = StructuredProgram(
         layout, [], rows, objective=Affine.constant(0.0), quadratic=sp.csr_array((3, 3)), linear=np.zeros(3)
     )
-    assert [program.constraint_name(i) for i in range(program.m)] == [
+    assert [program.row_name(i) for i in range(program.m)] == [
         "torque limit, swing, node 7, hip",
         "torque limit, swing, node 7, ankle",
         "no place",
@@ -243,7 +243,7 @@ def test_dropped_rows_of_a_block_leave_the_others_in_place() -> None:
     x = np.array([2.0, 3.0, 5.0])
     np.testing.assert_array_equal(program.constraints(x), [25 + 2, 4 + 5])
     np.testing.assert_array_equal(program.jacobian(x).toarray(), [[1, 0, 10], [4, 0, 1]])
-    assert program.constraint_name(1) == "square, c"
+    assert program.row_name(1) == "square, c"
 
 
 def test_a_block_takes_as_many_inputs_as_it_has() -> None:

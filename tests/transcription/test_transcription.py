@@ -78,7 +78,7 @@ def test_jacobian_and_hessian_agree_with_differences(transcription: Transcriptio
 
 def test_every_row_and_every_variable_has_a_name_of_its_own(transcription: Transcription) -> None:
     program = transcription.program
-    for count, name in ((program.m, program.constraint_name), (program.n, program.variable_name)):
+    for count, name in ((program.m, program.row_name), (program.n, program.variable_name)):
         names = [name(i) for i in range(count)]
         assert all(names)
         assert len(set(names)) == count
@@ -86,7 +86,7 @@ def test_every_row_and_every_variable_has_a_name_of_its_own(transcription: Trans
 
 def test_names_say_what_where_and_which(biped_transcription: Transcription) -> None:
     program = biped_transcription.program
-    rows = [program.constraint_name(i) for i in range(program.m)]
+    rows = [program.row_name(i) for i in range(program.m)]
     problem = biped_transcription.problem
     for term in (TorqueLimit, VelocityLimit, ContactWrenchCone, Incidence):
         assert any(row.startswith(problem.term(term).name) for row in rows)

@@ -27,7 +27,7 @@ from impactopt.solvers.program import (
     Status,
     Vector,
     complementarity,
-    constraint_violations,
+    row_violations,
     stationarity,
 )
 from impactopt.solvers.qp.registry import make_qp_solver
@@ -406,7 +406,7 @@ class ReducedRun(Run[SQPOptions]):
         """
         if self._restoration is None:
             return False
-        violated = constraint_violations(self.program, self.point.g) > self.options.violation_tolerance
+        violated = row_violations(self.program, self.point.g) > self.options.violation_tolerance
         steepest = float((self.program.weights * self.point.row_norms)[violated].sum())
         reduction = self.point.violation - qp_step.linear_violation
         return reduction <= _STATIONARY * qp_step.longest * steepest

@@ -85,7 +85,7 @@ class ActiveSystem:
     Attributes
     ----------
     x, y, z : of the solution, as of `impactopt.solvers.program.SolverResult`.
-    rows (m,), bounds (n,) : side at which each constraint and each variable is active; 1 for equalities.
+    rows (m,), bounds (n,) : side at which each constraint and variable is active; 1 for equalities.
     """
 
     def __init__(

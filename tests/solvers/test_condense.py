@@ -1,4 +1,4 @@
-"""Condensed Newton systems against the whole ones, solved densely."""
+"""Condensed Newton systems against the full ones, solved densely."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NONE = np.zeros(9, dtype=bool)
 
 
 def chained(seed, systems=4, own=2, shared=3):
-    """Jacobian, Hessian and eliminations: each system's rows touch its own variables and the shared ones."""
+    """Jacobian, Hessian, eliminations: each system's equalities contain its own and the shared variables."""
     rng = np.random.default_rng(seed)
     n = systems * own + shared
     J = np.zeros((systems * own + 5, n))
@@ -28,7 +28,7 @@ def chained(seed, systems=4, own=2, shared=3):
         J[mine, mine] = rng.normal(size=(own, own)) + 3 * np.eye(own)
         J[mine, systems * own :] = rng.normal(size=(own, shared))
     J[systems * own :, systems * own :] = rng.normal(size=(5, shared))
-    J[systems * own, :own] = rng.normal(size=own)  # rows that touch what is eliminated
+    J[systems * own, :own] = rng.normal(size=own)  # constraints that contain eliminated variables
     J[systems * own + 1, own : 2 * own] = rng.normal(size=own)
     H = rng.normal(size=(n, n))
     H = H @ H.T + np.eye(n)
@@ -46,7 +46,7 @@ def algebra(request):
     return request.param()
 
 
-# systems of any few rows, of six, and of so many that C leaves them to BLAS
+# systems of few equalities, of six, and of so many that C leaves them to BLAS
 @given(
     seed=st.integers(0, 10**6),
     own=st.sampled_from([2, 6, 8, 9]),
@@ -71,7 +71,7 @@ def test_the_condensed_step_is_the_whole_one(algebra, seed, own, hard, indefinit
     newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
     assert newton.factor(J, H, diagonal, lambda _: weights.copy(), hard=hard)
     step, y = newton.solve(gradient, residual)
-    # the same, whole: equalities J_e d = -r_e, other rows y = w (J d + r), stationarity
+    # the full system: equalities J_e d = -r_e, other constraints y = w (J d + r), stationarity
     rows = np.vstack([J.toarray(), np.eye(n)[[0]]])
     softness = np.zeros(c.m)
     softness[c.remaining] = 1.0 / weights
@@ -83,7 +83,7 @@ def test_the_condensed_step_is_the_whole_one(algebra, seed, own, hard, indefinit
     exact = np.linalg.solve(system, -np.concatenate([gradient, residual]))
     np.testing.assert_allclose(step, exact[:n], atol=1e-8 * (1 + np.abs(exact).max()))
     np.testing.assert_allclose(y, exact[n:], atol=1e-8 * (1 + np.abs(exact).max()))
-    # inertia: as many negative eigenvalues as rows, however the Hessian curves
+    # inertia: as many negative eigenvalues as constraints, also if the Hessian is indefinite
     hard_rows = np.flatnonzero(softness == 0.0)
     Z = la.null_space(rows[hard_rows])
     soft = np.setdiff1d(np.arange(c.m), hard_rows)

@@ -97,44 +97,6 @@ class Functions:
         """Discard the values at the last point."""
         self._known = {}
 
-    def ended(
-        self,
-        status: Status,
-        x: Vector,
-        multipliers: Vector,
-        bound_multipliers: Vector,
-        *,
-        message: str,
-        since: float,
-        iterations: int,
-        seconds_qp: float = np.nan,
-    ) -> SolverResult:
-        """Result of a solver that used these functions: at its last point, or at the best if that failed.
-
-        since : clock at the beginning.  An exception of the functions is raised again here.
-        """
-        if self.error is not None:
-            raise self.error
-        status = Status.TIME_LIMIT if self.out_of_time else status
-        if not status.usable and self.best.x is not None:
-            x = self.best.x
-        program, seconds = self.program, time.perf_counter() - since
-        g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
-        return SolverResult(
-            x=x,
-            multipliers=multipliers,
-            bound_multipliers=bound_multipliers,
-            objective=float(program.objective(x)),
-            status=status,
-            iterations=iterations,
-            seconds=seconds,
-            seconds_functions=self.seconds,
-            seconds_qp=seconds_qp,
-            max_violation=max_violation(program, x, g),
-            kkt=stationarity(gradient, jacobian, multipliers, bound_multipliers),
-            message="out of time" if self.out_of_time else message,
-        )
-
     def objective(self, x: Vector) -> Any:
         value = self._at(x, "objective", self.program.objective)
         self._consider()
@@ -394,7 +356,7 @@ def _result(
         and violation > functions.tolerance
         and is_stationary_violation(program, x, g, jacobian)
     ):
-        status = Status.INFEASIBLE  # a restoration phase that fails there often has no other status
+        status = Status.INFEASIBLE  # IPOPT's restoration phase often fails at such points
     message = explain(program, status, x, g, tolerance=functions.tolerance)
     if status is Status.FAILED:
         message += f" IPOPT: {outcome.replace('_', ' ')}."

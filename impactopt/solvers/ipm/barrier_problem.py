@@ -327,7 +327,7 @@ _KAPPA_MU, _KAPPA_EPSILON, _THETA_MU = 0.2, 30.0, 1.3
 _KAPPA_EPSILON_WARM, _MIN_BARRIER_OF_PATH = 1e4, 5e-3
 # The paper's values: elastic constraints have to show that no point meets them.
 _KAPPA_EPSILON_ELASTIC, _THETA_MU_ELASTIC = 10.0, 1.5
-# Times complementarity_tolerance: mu is not lowered below the first, and never to less than the second.
+# Times complementarity_tolerance: mu is lowered while it is above the first, and to the second at least.
 _SUFFICIENT_BARRIER, _MIN_BARRIER = 0.6, 0.3
 # Times mu: weight of the step's own square, |d|^2 / 2. Without it, directions that the objective does not
 # determine (an idle arm) wander towards bounds.

@@ -187,7 +187,7 @@ _RESTORED_VIOLATION = (
     1e-3  # the minimization of the violation ends below this, as hard constraints are faster
 )
 _MAX_CHANGES = 12  # of the aim
-_MIN_BARRIER = 1e-4  # after a change of the aim, as the iterate is no solution of the new problem
+_MIN_BARRIER = 1e-4  # after a change of the aim
 # Iterations with elastic constraints that are met. Without this limit, three of two hundred nails ended at
 # the iteration limit.
 _MAX_MET_ITERATIONS = 20
@@ -287,7 +287,7 @@ class ElasticPhase:
         return Status.FAILED if met else Status.INFEASIBLE
 
 
-_MAX_MULTIPLIER = 1e12  # larger ones mean that there are none: the constraints' gradients are dependent
+_MAX_MULTIPLIER = 1e12  # larger ones mean that none exist at the iterate
 # From the best iterate, after a failure: with them a strike of the seven-joint arm is solved from all of 20
 # initial guesses.
 _MAX_RESTARTS = 2
@@ -389,7 +389,7 @@ class InteriorRun(Run[IPMOptions]):
         self._search.reset_filter()
 
     def _back_to_best(self) -> bool:
-        """Move to the best iterate, without multipliers, as these may have caused the failure.
+        """Move to the best iterate, with new multipliers, as the old ones may have led to the failure.
 
         False if the present point is the best.
         """

@@ -66,14 +66,16 @@ class Reduction:
         self._empty = sp.csc_array((program.n, program.n))
         self._key = _key(equations, determined)
         if self._key not in _structures:
-            _structures[self._key] = _structure(equations, self._empty, all_equal, determined)
-        self._found, self._condenser = _structures.pop(self._key)
-        found = self._found
+            eliminations = find_eliminations(equations, all_equal, determined)
+            none_bounded = np.zeros(program.n, dtype=bool)
+            condenser = Condenser(equations, self._empty, eliminations, all_equal, none_bounded, kernels())
+            _structures[self._key] = eliminations, condenser
+        self._eliminations, self._condenser = _structures.pop(self._key)
         none = np.zeros(0, dtype=np.intp)
         self.eliminated: Index = self._equations[
-            np.concatenate([none, *[e.constraints.ravel() for e in found]])
+            np.concatenate([none, *[e.constraints.ravel() for e in self._eliminations]])
         ]
-        self.variables: Index = np.concatenate([none, *[e.variables.ravel() for e in found]])
+        self.variables: Index = np.concatenate([none, *[e.variables.ravel() for e in self._eliminations]])
         self._place = np.argsort(np.argsort(self.eliminated))  # the condenser lists them in ascending order
         self._level = program.g_lower
         self.free = np.setdiff1d(np.arange(program.n), self.variables)
@@ -88,7 +90,7 @@ class Reduction:
 
     def release(self) -> None:
         """Put the structure into the cache, for the next program that has it."""
-        _structures[self._key] = self._found, self._condenser
+        _structures[self._key] = self._eliminations, self._condenser
         while len(_structures) > _CACHE_SIZE:
             _structures.popitem(last=False)
 
@@ -174,14 +176,6 @@ class Reduction:
 
 
 _structures: OrderedDict[bytes, tuple[list[Elimination], Condenser]] = OrderedDict()
-
-
-def _structure(
-    equations: Matrix, empty: Matrix, all_equal: npt.NDArray[np.bool_], determined: Sequence[Determined]
-) -> tuple[list[Elimination], Condenser]:
-    found = find_eliminations(equations, all_equal, determined)
-    none_bounded = np.zeros(equations.shape[1], dtype=bool)
-    return found, Condenser(equations, empty, found, all_equal, none_bounded, kernels())
 
 
 def _key(equations: Matrix, determined: Sequence[Determined]) -> bytes:

@@ -1,10 +1,10 @@
 """Condensation of Newton systems: equalities that determine variables are solved for these first.
 
-Constraints determine most of the thousands of variables of a motion's program: the closed legs give the leg
-joints for a pose of the base, the equation of motion a sole's wrench, the beginning of a collision its
-motion. An elimination names such constraints and variables, in many small systems; all systems of one shape
-are treated together. What remains is a Newton system in the free variables (Nocedal and Wright 2006, section
-15.3: elimination of variables), with the same solution: nothing is approximated.
+Equalities determine most of the thousands of variables of a motion's program. Leg joints follow from the
+base's pose, as the legs are closed; a sole's wrench follows from the equation of motion; the motion during a
+collision follows from its initial state. An elimination lists such equalities and variables as many small
+systems of one shape, which are treated together. A Newton system in the free variables remains (Nocedal and
+Wright 2006, section 15.3: elimination of variables). It has the same solution: nothing is approximated.
 
 The analysis of the patterns is here, once for each structure; the arithmetic is in `kernels`.
 """
@@ -106,8 +106,8 @@ def _independent(
 class RowGroups(NamedTuple):
     """Groups of the Jacobian's rows; all rows of a group have the same columns, p of them in every group.
 
-    columns (g, p) : of each group.  counts (g,) : of its rows.  rows (k,) : numbers, one group after the
-    other.
+    columns (g, p) : of each group.  counts (g,) : number of its rows.
+    rows (k,) : numbers of the rows, one group after the other.
     values (k, p) : places of the rows' values in the Jacobian's data.
     """
 
@@ -119,11 +119,12 @@ class RowGroups(NamedTuple):
 
 def group_rows(jacobian: Matrix, rows: Index) -> list[RowGroups]:
     """Groups of these rows of a csc matrix, for each number of columns; empty rows are left out."""
+    # the same pattern by rows, with the places of the values in the csc data as its values
     numbered = sp.csc_array((np.arange(jacobian.nnz), jacobian.indices, jacobian.indptr), jacobian.shape)
     by_rows = numbered.tocsr()
     by_rows.sort_indices()
     start, columns, at = by_rows.indptr, by_rows.indices, by_rows.data.astype(np.int32)
-    # a group is the rows with the same bytes of column numbers
+    # rows with the same bytes of column numbers form a group
     touched, ends = columns.tobytes(), (columns.itemsize * start).tolist()
     groups: dict[bytes, int] = {}
     group = np.array([groups.setdefault(touched[ends[i] : ends[i + 1]], len(groups)) for i in rows.tolist()])
@@ -135,6 +136,7 @@ def group_rows(jacobian: Matrix, rows: Index) -> list[RowGroups]:
     size_of = sizes[group[order]]
     out = []
     for p in dict.fromkeys(sizes[sizes > 0].tolist()):
+        # groups with p columns, and their rows
         chosen, same, every = np.flatnonzero(sizes == p), rows[order[size_of == p]], np.arange(p)
         own = columns[start[rows[first[chosen]]][:, None] + every].astype(np.intp)
         out.append(RowGroups(own, counts[chosen], same, at[start[same][:, None] + every]))
@@ -233,8 +235,9 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
     """Eliminations of the variables that a program declares as determined by equalities.
 
     Each set of variables takes the first equalities that contain one of them and are not taken yet. If there
-    are too few, or their pattern is singular, the variables stay free.  equal (m,) : which constraints are
-    equalities.
+    are too few, or their pattern is singular, the variables stay free.
+
+    equal (m,) : which constraints are equalities.
     """
     touches = jacobian.tocsc()
     start, touching = touches.indptr, touches.indices
@@ -285,12 +288,10 @@ class Condenser:
     eliminated : numbers of the constraints that are eliminated.
     remaining, free : numbers of the constraints and variables that remain.
     equal : which of the remaining constraints are equalities: indices into `remaining`.
-    bounded : eliminated variables with a bound, which are constraints with the numbers from the program's m
-        on.
+    bounded : eliminated variables with a bound; these bounds are constraints after those of the program.
     remaining_equalities : the free variables in each, as indices into `free`, and the places of their
         coefficients in `J`.
-    free_entries : places of the free variables' entries in the result of `reduce`, and their rows and
-        columns.
+    free_entries : places in `W` of the entries of free variables, and their rows and columns.
     pattern (f, f) : entries of the condensed Hessian, with those that a remaining equality couples.
     J, W : values of the equalities and of the condensed Hessian; the first value of each is zero.
     """
@@ -321,7 +322,7 @@ class Condenser:
         self.free = np.setdiff1d(np.arange(n), variables)
 
         # symbolic elimination, with dense masks
-        own = number[jacobian.indices]
+        own = number[jacobian.indices]  # of each entry: the number of its equality, -1: of an inequality
         own_rows, own_columns = own[own >= 0], _columns(jacobian)[own >= 0]
         touches = np.zeros((int(equal.sum()), n), dtype=bool)
         touches[own_rows, own_columns] = True
@@ -343,6 +344,7 @@ class Condenser:
         self._diagonal = np.diagonal(W_places).copy()
         self._products: list[Products] = []
         self._adapt(jacobian, hessian, equal, groups)
+        # stages name entries in either triangle
         W_places[j, i] = W_places[i, j]
         self._stages = [
             elimination_stage(same, J_places, W_places) for found in systems for same in same_shapes(found)
@@ -475,8 +477,8 @@ class Condenser:
     def multipliers(self, dual: Vector, y: Vector) -> Vector:
         """Multipliers of the eliminated constraints, which make the eliminated variables stationary.
 
-        dual (n,) : gradient of the Lagrangian without the equalities.  y (l,) : multipliers of the remaining
-        ones.
+        dual (n,) : gradient of the Lagrangian without the equalities.
+        y (l,) : multipliers of the remaining equalities.
         """
         v, out = dual.copy(), np.zeros(self._equations.size)
         out[self._left] = y

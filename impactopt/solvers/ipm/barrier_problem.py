@@ -276,8 +276,8 @@ class SearchStart:
 class Filter:
     """Pairs (theta, phi); a later point has to be better than each of them in one of the two.
 
-    theta_min : violation from which on steps may be for the objective.  theta_max : largest violation of a
-    point.
+    theta_min : largest violation of an iterate from which a step may be for the objective.
+    theta_max : largest violation of a point.
     """
 
     theta_min: float

@@ -183,9 +183,7 @@ def _is_acceptable(pairs: Filter, start: SearchStart, length: float, trial: Tria
 # Elastic constraints that stall are made hard again if the violation is below this, or below this fraction of
 # the violation at which its minimization began: all but met, hard constraints often get there.
 _HARD_VIOLATION, _HARD_FRACTION = 1e-2, 1e-2
-_RESTORED_VIOLATION = (
-    1e-3  # the minimization of the violation ends below this, as hard constraints are faster
-)
+_RESTORED_VIOLATION = 1e-3  # ends a minimization of the violation: from there hard constraints are faster
 _MAX_CHANGES = 12  # of the aim
 _MIN_BARRIER = 1e-4  # after a change of the aim
 # Iterations with elastic constraints that are met. Without this limit, three of two hundred nails ended at

@@ -49,8 +49,7 @@ class ActiveSetSolver:
         status = method.run(guess, self._max_iterations, deadline)
         x, unit = method.x(), method.multipliers()
         if status is QPStatus.SOLVED:
-            # The method's factors lose digits with the condition of P; the KKT system of its active set does
-            # not.
+            # the factors lose digits with the condition of P, the KKT system of the active set does not
             active = method.active
             target = np.where(method.signs > 0, upper[active], lower[active])
             refined = solve_equality_qp(P, qp.q, C[active], target)
@@ -76,8 +75,7 @@ class _DualActiveSet:
 
     Attributes
     ----------
-    active, signs : the active set: numbers of constraints, and +1 for the upper bound or -1 for the lower
-        one.
+    active, signs : numbers of the active constraints; +1 at the upper bound, -1 at the lower one.
     iterations : constraints added or dropped.
     """
 

@@ -55,12 +55,9 @@ _ARMIJO = 1e-4
 _OBJECTIVE_VIOLATION = 1e-2  # below this violation a step may be for the objective
 _OBJECTIVE_MARGIN = 0.1  # by how much the objective has to be less for each unit of a point's violation
 
-# Progress of an attempt
 _PATIENCE = 40  # iterations without progress
-_LESS_VIOLATION, _LESS_OBJECTIVE = (
-    0.97,
-    1e-3,
-)  # progress: a fraction of the violation; relative to the objective
+# Progress: violation over the least so far; decrease of the objective, relative.
+_LESS_VIOLATION, _LESS_OBJECTIVE = 0.97, 1e-3
 _RESTORED = 0.1  # fraction of the violation at which a restoration phase began, at which it ends
 _STATIONARY = 1e-3  # relative slope of the violation below which no step reduces it
 _PRICE_DELAY = 3  # iterations after which constraints that stay elastic get twice the price
@@ -116,9 +113,7 @@ class ReducedRun(Run[SQPOptions]):
         self._radius = self._widest = self.options.radius
         self._price, self._price_iteration = self.options.price, 0
         self._unlimited_patience = self._stalls = self._qp_solved = False
-        self._restoration: float | None = (
-            None  # violation at which the restoration phase began; None: no such
-        )
+        self._restoration: float | None = None  # violation where it began; None: no restoration phase
 
     def iterate(self) -> Status:
         """Run attempt after attempt from the initial guess, until one finds a solution."""
@@ -334,8 +329,8 @@ class ReducedRun(Run[SQPOptions]):
     def _update_radius(self, accepted: Accepted) -> None:
         """Double the radius after a full step; after a shortened one, set it to little more than that step.
 
-        It grows beyond the attempt's radius, to the option's, if the constraints are nearly met or behave as
-        predicted.
+        It grows beyond the attempt's radius, to the option's, if the constraints are nearly met or, in a
+        restoration phase, if the violation falls as predicted.
         """
         if accepted.length == 1.0:
             near = self.point.violation < _OBJECTIVE_VIOLATION

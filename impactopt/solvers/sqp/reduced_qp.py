@@ -502,11 +502,8 @@ class ReducedQP:
                 [which[lower[which] > _ELASTIC_VIOLATION], which[upper[which] < -_ELASTIC_VIOLATION]]
             )
             of_slacks = np.minimum(np.abs(unit[elastic]) - prices[elastic], 0.0)
-            start = (
-                np.concatenate([guess, np.zeros(elastic.size)]),
-                unit[which],
-                np.concatenate([np.zeros(guess.size), of_slacks]),
-            )
+            x0 = np.concatenate([guess, np.zeros(elastic.size)])
+            start = x0, unit[which], np.concatenate([np.zeros(guess.size), of_slacks])
             found = self._solver.solve(qp, start=start, time_limit=time_limit) if qp.n else _no_variables(qp)
             iterations += found.iterations
             if not found.usable:

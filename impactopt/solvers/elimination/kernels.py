@@ -171,7 +171,8 @@ class Kernels:
         for a in stages:
             a.H[:], a.G[:] = W[a.hee], W[a.heu]
             G, nc = -a.G, a.X.shape[1]
-            # W_cc += C + C' with C = X (H X' / 2 - G'): half of the symmetric term in each of the two
+            # W_cc += C + C' with C = X (H X' / 2 - G'), as each of the two has half of the symmetric term;
+            # W_cv += C_v for the other variables in u (formulas with the arrays, in which X is transposed)
             G[:, :nc] += 0.5 * a.X @ a.H
             C = a.X @ G.swapaxes(1, 2)
             i, j = np.tril_indices(nc)
@@ -183,6 +184,7 @@ class Kernels:
         for a in stages:
             a.x0[:] = self._solve(a, off[a.q], transposed=0)
             _add(off, a.t, -(a.T @ a.x0[..., None])[..., 0])
+            # g_c -= X (g_e - H x0), g_u -= G x0
             own = g[a.e] - (a.H @ a.x0[..., None])[..., 0]
             _add(g, a.c, -(a.X @ own[..., None])[..., 0])
             _add(g, a.u, -(a.G @ a.x0[..., None])[..., 0])
@@ -198,6 +200,7 @@ class Kernels:
         v : gradient of the Lagrangian without equalities, which is overwritten.  y : multipliers of the
         remaining equalities, to which those of the eliminated ones are added.
         """
+        # forward: the gradient by c, with e replaced; backward: B' y_q = -(v_e + T' y_t) makes e stationary
         for a in stages:
             a.own[:] = v[a.e]
             _add(v, a.c, -(a.X @ a.own[..., None])[..., 0])

@@ -1,4 +1,4 @@
-"""IPOPT on a numeric program, through the IPOPT that CasADi's wheel carries; functions that it calls."""
+"""IPOPT for numeric programs, by the library in CasADi's wheel, and the callbacks that it evaluates."""
 
 from __future__ import annotations
 
@@ -34,29 +34,30 @@ from impactopt.solvers.program import (
 
 
 class Pattern:
-    """The sparsity pattern of a matrix evaluated again and again, and its values in CasADi's order."""
+    """Sparsity pattern of a matrix, and its values in CasADi's order."""
 
     def __init__(self, matrix: Matrix, *, upper: bool = False):
+        """upper : the upper triangle only."""
         matrix = _canonical(matrix)
         self._shape, self._indptr, self._indices = matrix.shape, matrix.indptr.copy(), matrix.indices.copy()
-        self._kept: npt.NDArray[np.intp] | None = None
+        self._upper: npt.NDArray[np.intp] | None = None
         if upper:
             columns = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
-            self._kept = np.flatnonzero(matrix.indices <= columns)
+            self._upper = np.flatnonzero(matrix.indices <= columns)
 
     def casadi(self) -> Any:
         full = ca.Sparsity(*self._shape, self._indptr.tolist(), self._indices.tolist())
-        return full if self._kept is None else ca.triu(full)
+        return full if self._upper is None else ca.triu(full)
 
     def values(self, matrix: Matrix) -> Vector:
         if not self._same(matrix):
-            matrix = _canonical(matrix)  # unsorted or with duplicates: the slow way
+            matrix = _canonical(matrix)  # unsorted or with duplicates
             if not self._same(matrix):
                 raise InputError(
                     "a derivative of the program changed its sparsity pattern; keep structural zeros explicit"
                 )
         values: Vector = matrix.data
-        return values if self._kept is None else values[self._kept]
+        return values if self._upper is None else values[self._upper]
 
     def _same(self, matrix: Matrix) -> bool:
         return np.array_equal(matrix.indices, self._indices) and np.array_equal(matrix.indptr, self._indptr)
@@ -71,7 +72,7 @@ def _canonical(matrix: Matrix) -> Matrix:
 
 
 class Functions:
-    """The program's functions, timed and evaluated once a point; when to stop; the best point seen."""
+    """Timed functions of a program, each evaluated once a point; the best point, and requests to stop."""
 
     jacobian_pattern: Pattern
     hessian_pattern: Pattern
@@ -86,54 +87,15 @@ class Functions:
         self._known: dict[str, Any] = {}
 
     def start(self, x0: Vector) -> None:
-        """Consider the start, so that there is an iterate to give back whatever comes."""
+        """Consider the initial guess, so that there always is an iterate to return."""
         x0 = np.clip(x0, self.program.x_lower, self.program.x_upper)
         self.best.consider(x0, float(self.program.objective(x0)), self.program.constraints(x0))
         if self.best.x is None:
             self.best.x = x0
 
     def release(self) -> None:
-        """Forget the last point and its matrices."""
+        """Discard the values at the last point."""
         self._known = {}
-
-    def ended(
-        self,
-        status: Status,
-        x: Vector,
-        multipliers: Vector,
-        bound_multipliers: Vector,
-        *,
-        message: str,
-        since: float,
-        iterations: int,
-        seconds_qp: float = np.nan,
-    ) -> SolverResult:
-        """Result of a solver that was given these functions, re-evaluated here: its last point, or the best
-        point seen if that is no solution.
-
-        since : the clock when it began.  Raises what was raised in the functions.
-        """
-        if self.error is not None:
-            raise self.error
-        status = Status.TIME_LIMIT if self.out_of_time else status
-        if not status.usable and self.best.x is not None:
-            x = self.best.x
-        program, seconds = self.program, time.perf_counter() - since
-        g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
-        return SolverResult(
-            x=x,
-            multipliers=multipliers,
-            bound_multipliers=bound_multipliers,
-            objective=float(program.objective(x)),
-            status=status,
-            iterations=iterations,
-            seconds=seconds,
-            seconds_functions=self.seconds,
-            seconds_qp=seconds_qp,
-            max_violation=max_violation(program, x, g),
-            kkt=stationarity(gradient, jacobian, multipliers, bound_multipliers),
-            message="out of time" if self.out_of_time else message,
-        )
 
     def objective(self, x: Vector) -> Any:
         value = self._at(x, "objective", self.program.objective)
@@ -156,7 +118,7 @@ class Functions:
         return self.hessian_pattern.values(matrix)
 
     def kkt(self, x: Vector, multipliers: Vector, bound_multipliers: Vector) -> float:
-        """Scaled stationarity where the derivatives at x are at hand, else nan."""
+        """Scaled stationarity if the derivatives at x are known, else nan."""
         known = self._known if np.array_equal(x, self._x) else {}
         if "gradient" not in known or ("jacobian" not in known and self.program.m):
             return np.nan
@@ -187,7 +149,7 @@ class Functions:
 
 
 class IterationCallback:
-    """IPOPT's iteration callback: keeps the history and tells the caller."""
+    """IPOPT's iteration callback: records the history and calls the progress callback."""
 
     def __init__(self, functions: Functions, callback: Callback | None, start: float):
         self._functions, self._callback, self._start = functions, callback, start
@@ -215,10 +177,10 @@ class IterationCallback:
 
 
 class BufferFunction(ca.Callback):
-    """A CasADi function whose outputs, one Python function each, are written straight into CasADi's buffers.
+    """CasADi function whose outputs, one Python function each, are written into CasADi's buffers.
 
-    What is raised in there cannot pass through CasADi: it is kept in `functions.error`, and from then on
-    every output is nan until IPOPT gives up, which is at once.
+    Exceptions cannot pass through CasADi. The first one is kept in `Functions.error`, and all later outputs
+    are nan, on which IPOPT ends at once.
     """
 
     def __init__(self, name: str, inputs: Mapping[str, Any], outputs: Mapping[str, Any], *functions: Any):
@@ -264,7 +226,7 @@ class BufferFunction(ca.Callback):
             try:
                 out[:] = function(*inputs) if len(self._functions) == 1 else function(inputs[0])
             except (ArithmeticError, np.linalg.LinAlgError):
-                out[:] = np.nan  # not defined here: IPOPT shortens its step
+                out[:] = np.nan  # undefined at this point: IPOPT shortens its step
             except BaseException as error:
                 owner.error = error
                 out[:] = stopping
@@ -272,7 +234,7 @@ class BufferFunction(ca.Callback):
 
 
 IPOPT_DEFAULTS: Mapping[str, Any] = {
-    # none is read: an ipopt.opt in the working directory could load libraries and write files
+    # no file: an ipopt.opt in the working directory could load libraries and write files
     "option_file_name": "",
     "print_level": 0,
     "sb": "yes",
@@ -282,15 +244,14 @@ IPOPT_DEFAULTS: Mapping[str, Any] = {
     "constr_viol_tol": 1e-6,
     # Constraints are scaled when they are transcribed; IPOPT's own scaling would loosen the large ones only.
     "nlp_scaling_method": "none",
-    # Starts are rough but not far off: a large first barrier would only push them away
-    # (half the iterations).
+    # Initial guesses are rough but near a solution; a larger barrier pushes them away (twice the iterations).
     "mu_strategy": "monotone",
     "mu_init": 3e-2,
     "acceptable_tol": 1e-4,
     "acceptable_constr_viol_tol": 1e-5,
     "acceptable_iter": 8,
 }
-"""What `solve_ipopt` gives IPOPT unless told otherwise."""
+"""Default options of `solve_ipopt`, by IPOPT's names."""
 
 _STATUS = {
     "Solve_Succeeded": Status.SOLVED,
@@ -319,13 +280,13 @@ def solve_ipopt(
     Parameters
     ----------
     program : the program.
-    x0 : start (n,).
+    x0 : initial guess (n,).
     options : IPOPT's options by their own names, over `IPOPT_DEFAULTS`;
         `hessian_approximation="limited-memory"` makes the program's Hessian unnecessary.
     callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
     time_limit : wall time [s].
-    multipliers, bound_multipliers : start of the multipliers (m,), (n,); set `warm_start_init_point="yes"`
-        and a small `mu_init` for IPOPT to use them.
+    multipliers, bound_multipliers : initial guess of the multipliers (m,), (n,); IPOPT uses them with
+        `warm_start_init_point="yes"` and a small `mu_init`.
 
     Returns
     -------
@@ -395,7 +356,7 @@ def _result(
         and violation > functions.tolerance
         and is_stationary_violation(program, x, g, jacobian)
     ):
-        status = Status.INFEASIBLE  # the restoration phase often ends so
+        status = Status.INFEASIBLE  # IPOPT's restoration phase often fails at such points
     message = explain(program, status, x, g, tolerance=functions.tolerance)
     if status is Status.FAILED:
         message += f" IPOPT: {outcome.replace('_', ' ')}."
@@ -421,7 +382,7 @@ def _result(
 def _build(
     functions: Functions, progress: IterationCallback, x0: Vector, settings: Mapping[str, Any]
 ) -> tuple[Any, list[Any]]:
-    """The nlpsol object, and what has to stay alive as long as it does."""
+    """CasADi's nlpsol object, and the callbacks, which have to live as long as it does."""
     program = functions.program
     n, m = program.n, program.m
     column, none = ca.Sparsity.dense, ca.Sparsity.dense(0, 1)
@@ -470,9 +431,9 @@ def _build(
 
 @functools.cache
 def _one_blas_thread() -> None:
-    """Keep the OpenBLAS that CasADi's wheel carries to one thread.
+    """Limit the OpenBLAS in CasADi's wheel to one thread.
 
-    On MUMPS's small fronts a second one gains nothing, and while it waits it spins: half of the processor
+    For MUMPS's small fronts a second one gains nothing, and it spins while it waits: half of the processor
     time was the system's.
     """
     for library in Path(ca.__file__).parent.glob("libcasadi-tp-openblas.so*"):

@@ -22,9 +22,9 @@ class SolverOptions:
     acceptable_tolerance : kkt_tolerance of the status ACCEPTABLE, if no step helps.
     max_iterations : most iterations.
     time_limit : [s]; then the best iterate is returned.
-    price : first price of violations; it rises by itself.
+    price : initial price of violations, which rises if necessary.
     price_max : largest price of violations.
-    second_order_correction : corrects refused steps for the constraints' curvature.
+    second_order_correction : whether to correct refused steps for the constraints' curvature.
     """
 
     violation_tolerance: float = 1e-6
@@ -37,7 +37,7 @@ class SolverOptions:
     second_order_correction: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be meant.
+        """Check types and ranges.
 
         Raises
         ------
@@ -66,9 +66,9 @@ class IPMOptions(SolverOptions):
     Attributes
     ----------
     complementarity_tolerance : largest product of a multiplier and the distance to its bound at a solution.
-    barrier : first barrier parameter of an initial guess without multipliers.
-    barrier_warm : the same of one with multipliers; below 5e-3 it falls at once near a solution.
-    push : how far the initial guess is moved inside its bounds; one with multipliers no farther than its
+    barrier : initial barrier parameter for an initial guess without multipliers.
+    barrier_warm : the same with multipliers; below 5e-3 it falls at once near a solution.
+    push : distance by which the initial guess is moved inside its bounds; with multipliers at most the
         barrier.
     """
 
@@ -94,7 +94,7 @@ class SQPOptions(SolverOptions):
     radius: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be meant, as `SolverOptions` does."""
+        """Check names, then as `SolverOptions` does."""
         check_qp_solver(self.qp_solver, QP_SOLVERS)
         check_choice("hessian", self.hessian, HESSIANS)
         super().__post_init__()

@@ -1,12 +1,14 @@
-"""Parametric steps: a solution's active set, and the solution for changed parameters by a few QPs.
+"""Parametric sensitivity steps, with a solution's active set, and predictions for changed parameters by QPs.
 
-Where active constraints are independent, their multipliers are not zero and the second-order condition holds,
+If active constraints are independent, their multipliers are not zero, and the second-order condition holds,
 the solution is a smooth function of a parameter, by the implicit function theorem (Fiacco, "Introduction to
-sensitivity and stability analysis in nonlinear programming", 1983, ch. 3). Where the active set changes, each
-QP has the changed program's constraints made linear, and the known solution's Hessian. Its active set is
-found by Newton's method on its augmented Lagrangian, with exact line searches: constraints that begin to hold
-and constraints that let go are no matter (Hermans, Themelis, Patrinos, "QPALM: a Newton-type proximal
-augmented Lagrangian method for quadratic programs", CDC 2019).
+sensitivity and stability analysis in nonlinear programming", 1983, ch. 3). `ActiveSystem` solves its
+equations.
+
+If the active set changes, `Predictor` solves a few QPs, with the changed program's linearized constraints and
+the known solution's Hessian. A QP's active set is found by Newton's method on its augmented Lagrangian with
+exact line searches, in which constraints may become active and inactive (Hermans, Themelis, Patrinos, "QPALM:
+a Newton-type proximal augmented Lagrangian method for quadratic programs", CDC 2019).
 """
 
 from __future__ import annotations
@@ -27,26 +29,26 @@ from impactopt.solvers.run import threads
 
 __all__ = ["ActiveSystem", "Change", "Offset", "Prediction", "Predictor"]
 
-Side = npt.NDArray[np.int8]
-# on the diagonal of constraints, against zero pivots by dependent ones. The first is best where multipliers
-# are large, the other where a constraint touches nothing
-_ROUNDING = (1e-14, 1e-10)
+Sides = npt.NDArray[np.int8]  # 1: at the upper bound, -1: at the lower one, 0: at none
+# Subtracted from the diagonal of constraints, against zero pivots by dependent ones. The first suits large
+# multipliers, the other constraints without any nonzero derivative.
+_REGULARIZATIONS = (1e-14, 1e-10)
 _SINGULAR = (
     "the active constraints of this solution are linearly dependent: its KKT system is singular; solve the "
     "changed problem from it, with solve(problem, start=solution)"
 )
-_REFINEMENTS = 5  # of a solution: they remove the error of what `_ROUNDING` adds to the diagonal
-_LEFT = 1e-8  # of what is given: what a step may leave of the equations
-_SOFT = 1e4  # slack over multiplier: what gives way more is at no bound
-_TINY = 1e-9  # a multiplier that is nothing
+_REFINEMENTS = 5  # of a solution: they remove the error of the regularization
+_MAX_RESIDUAL = 1e-8  # of a step's equations, relative to the right-hand side
+_MAX_SOFTNESS = 1e4  # slack over multiplier; a constraint with more is not active
+_MIN_MULTIPLIER = 1e-9  # of an active constraint
 
 
 @dataclass(frozen=True, kw_only=True)
 class Offset:
     """Residual of a solution's KKT conditions in a program with other parameters.
 
-    dual (n,) : grad f + J'y + z.  rows (m,) : g minus the bound that each constraint is at, where it is at
-    one.
+    dual (n,) : grad f + J'y + z.
+    rows (m,) : g minus the bound at which each constraint is active; 0 if it is inactive.
     variables (n,) : likewise of x.
     """
 
@@ -75,33 +77,33 @@ class Change:
 
 
 class ActiveSystem:
-    """Factored once:  [H A'; A -S] with the constraints and bounds A that a solution is at, or near by.
+    """KKT system [H A'; A -S] of a solution, with its active constraints and bounds A; factored once.
 
-    S is the slack of an inequality over its multiplier, as of an interior-point method: it lets go of
-    constraints that hardly hold, and is nothing for those that do.
+    S is the slack of an inequality over its multiplier, its softness, as in an interior-point method: large
+    for a weakly active constraint, which the step may leave, and close to 0 for others.
 
     Attributes
     ----------
     x, y, z : of the solution, as of `impactopt.solvers.program.SolverResult`.
-    proximal : curvature more of every variable, for steps that leave alone what hardly matters.
-    rows (m,), bounds (n,) : 1 where it is near the upper bound, -1 the lower one, 0 none; equalities 1.
+    rows (m,), bounds (n,) : side at which each constraint and variable is active; 1 for equalities.
     """
 
     def __init__(
         self, program: NonlinearProgram, x: Vector, y: Vector, z: Vector, *, proximal: float = 0.0
     ) -> None:
+        """proximal : added to the diagonal of H, so that a step moves variables little that hardly matter."""
         self.x, self.y, self.z = x, y, z
         g = program.constraints(x)
-        self.rows, self._soft_rows = _at(g, program.g_lower, program.g_upper, y)
-        self.bounds, self._soft_bounds = _at(x, program.x_lower, program.x_upper, z)
+        self.rows, self._soft_rows = _active_sides(g, program.g_lower, program.g_upper, y)
+        self.bounds, self._soft_bounds = _active_sides(x, program.x_lower, program.x_upper, z)
         n = program.n
         self._rows, self._bounds = np.flatnonzero(self.rows), np.flatnonzero(self.bounds)
         jacobian = sp.csr_array(program.jacobian(x))[self._rows]
-        held = sp.csr_array(
+        active_bounds = sp.csr_array(
             (np.ones(len(self._bounds)), (np.arange(len(self._bounds)), self._bounds)),
             shape=(len(self._bounds), n),
         )
-        A = sp.vstack([jacobian, held])
+        A = sp.vstack([jacobian, active_bounds])
         H = sp.csc_array(program.hessian(x, 1.0, y))
         if proximal:
             H = sp.csc_array(H + proximal * sp.eye_array(n))
@@ -110,17 +112,17 @@ class ActiveSystem:
         self._matrix = sp.csc_array(sp.block_array([[H, A.T], [A, sp.diags_array(-soft)]]))
         self._factors: dict[float, Any] = {}
 
-    def _factor(self, rounding: float) -> Any:
-        """LU of the system, with a little on the diagonal of the constraints; kept."""
-        if rounding not in self._factors:
+    def _factor(self, regularization: float) -> Any:
+        """LU factors of the regularized system, cached."""
+        if regularization not in self._factors:
             n = len(self.x)
-            shift = np.concatenate([np.zeros(n), np.full(self._matrix.shape[0] - n, -rounding)])
+            shift = np.concatenate([np.zeros(n), np.full(self._matrix.shape[0] - n, -regularization)])
             try:
-                found = splu(sp.csc_matrix(self._matrix + sp.diags_array(shift)))
+                factor = splu(sp.csc_matrix(self._matrix + sp.diags_array(shift)))
             except RuntimeError as error:
                 raise InputError(_SINGULAR) from error
-            self._factors[rounding] = found
-        return self._factors[rounding]
+            self._factors[regularization] = factor
+        return self._factors[regularization]
 
     def offset(self, program: NonlinearProgram, at: Change | None = None) -> Offset:
         """KKT residual of a program with other parameters, and the same variables and constraints.
@@ -131,29 +133,30 @@ class ActiveSystem:
         x, g = point.x, program.constraints(point.x)
         return Offset(
             dual=np.asarray(program.gradient(x) + program.jacobian(x).T @ point.y + point.z),
-            rows=_off(g, program.g_lower, program.g_upper, self.rows) - self._soft_rows * (point.y - self.y),
-            variables=_off(x, program.x_lower, program.x_upper, self.bounds)
+            rows=_bound_residual(g, program.g_lower, program.g_upper, self.rows)
+            - self._soft_rows * (point.y - self.y),
+            variables=_bound_residual(x, program.x_lower, program.x_upper, self.bounds)
             - self._soft_bounds * (point.z - self.z),
         )
 
     def step(self, offset: Offset) -> Change:
-        """The Newton step that makes up for an offset; or, for a slope of it, minus that of the solution.
+        """Newton step that removes an offset; for an offset's derivative, that of the solution.
 
         Raises
         ------
         InputError : the active constraints are linearly dependent.
         """
         given = -np.concatenate([offset.dual, offset.rows[self._rows], offset.variables[self._bounds]])
-        for rounding in _ROUNDING:
-            factor = self._factor(rounding)
+        for regularization in _REGULARIZATIONS:
+            factor = self._factor(regularization)
             found = factor.solve(given)
             for _ in range(_REFINEMENTS):
-                left = given - self._matrix @ found
-                if np.abs(left).max(initial=0.0) <= 1e-13 * np.abs(given).max(initial=0.0):
+                residual = given - self._matrix @ found
+                if np.abs(residual).max(initial=0.0) <= 1e-13 * np.abs(given).max(initial=0.0):
                     break
-                found = found + factor.solve(left)
-            left = np.abs(given - self._matrix @ found).max(initial=0.0)
-            if left <= _LEFT * max(float(np.abs(given).max(initial=0.0)), 1e-12):
+                found = found + factor.solve(residual)
+            largest = np.abs(given - self._matrix @ found).max(initial=0.0)
+            if largest <= _MAX_RESIDUAL * max(float(np.abs(given).max(initial=0.0)), 1e-12):
                 break
         else:
             raise InputError(_SINGULAR)
@@ -163,38 +166,38 @@ class ActiveSystem:
         return Change(x=found[:n], y=y, z=z)
 
 
-def _at(values: Vector, lower: Vector, upper: Vector, multipliers: Vector) -> tuple[Side, Vector]:
-    """Bound that each value is at, or near; and its slack over its multiplier."""
+def _active_sides(values: Vector, lower: Vector, upper: Vector, multipliers: Vector) -> tuple[Sides, Vector]:
+    """Side at which each value is active, and its softness: slack over multiplier, 0 for equalities."""
     gap = np.abs(np.where(multipliers > 0, upper - values, values - lower))
     size = np.abs(multipliers)
     equal = lower == upper
-    at = equal | ((size > _TINY) & (gap < _SOFT * size))
-    soft = np.zeros(len(values))
-    near = at & ~equal
-    soft[near] = gap[near] / size[near]
-    return np.where(at, np.where(equal, 1, np.sign(multipliers)), 0).astype(np.int8), soft
+    active = equal | ((size > _MIN_MULTIPLIER) & (gap < _MAX_SOFTNESS * size))
+    softness = np.zeros(len(values))
+    unequal = active & ~equal
+    softness[unequal] = gap[unequal] / size[unequal]
+    return np.where(active, np.where(equal, 1, np.sign(multipliers)), 0).astype(np.int8), softness
 
 
-def _off(values: Vector, lower: Vector, upper: Vector, at: Side) -> Vector:
-    bound = np.where(at > 0, upper, lower)
+def _bound_residual(values: Vector, lower: Vector, upper: Vector, sides: Sides) -> Vector:
+    bound = np.where(sides > 0, upper, lower)
     out = np.zeros(len(values))
-    out[at != 0] = (values - bound)[at != 0]
+    out[sides != 0] = (values - bound)[sides != 0]
     return out
 
 
-Sides = npt.NDArray[np.int8]
-_WEIGHT = 1e6  # of the augmented Lagrangian: a constraint is off by a multiplier's change over it
-_WEAK = 1e-4  # multiplier of a constraint that hardly holds
-_PROXIMAL = 1e-2  # curvature more of every variable, so that what hardly matters stays
-_STEPS, _SETS = 5, 20  # QPs, and active sets of each
-_SHORT, _JAMMED = 0.1, 5  # so many line searches that are so short: it stalls
-_ENOUGH = 1e-4  # of constraints: no more QPs
+_WEIGHT = 1e6  # of the augmented Lagrangian: it violates a constraint by its multiplier's change over this
+_WEAK_MULTIPLIER = 1e-4  # below: the constraint is weakly active
+_PROXIMAL = 1e-2  # on the Hessian's diagonal, so that variables that hardly matter stay
+_MAX_QPS, _MAX_ACTIVE_SETS = 5, 20  # QPs of a prediction, active sets of a QP
+_SHORT_STEP, _MAX_SHORT_STEPS = 0.1, 5  # a QP with so many short line searches stalls
+_SUFFICIENT_VIOLATION = 1e-4  # no further QP is solved below it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """Variables (n,), multipliers of rows (m,) and bounds (n,), by how much constraints or bounds are off at
-    most, and after how many QPs.
+    """Predicted solution: variables (n,), multipliers of constraints (m,) and bounds (n,).
+
+    violation : largest violation of a constraint or bound.  steps : number of QPs.
     """
 
     x: Vector
@@ -205,14 +208,14 @@ class Prediction:
 
 
 class Predictor:
-    """Predicts from one solution of a program: x (n,), y (m,) and z (n,) as of
-    `impactopt.solvers.program.SolverResult`.
+    """Predictor of solutions for changed parameters, from a known solution.
 
-    A solver leaves it with slack at constraints that hold, and with small multipliers at those that do not.
-    Both are kept, so that numbers that do not change give back the solution itself.
+    A solver ends with some slack at active constraints, and with small multipliers of inactive ones. Both are
+    kept, so that the prediction for unchanged parameters is the solution itself.
     """
 
     def __init__(self, program: NonlinearProgram, x: Vector, y: Vector, z: Vector) -> None:
+        """x (n,), y (m,), z (n,) : as of `impactopt.solvers.program.SolverResult`."""
         self.x, self.y, self.z = x, y, z
         jacobian, self._hessian = program.jacobian(x), program.hessian(x, 1.0, y).copy()
         self._moves = program.x_upper - program.x_lower > 1e-12
@@ -225,37 +228,35 @@ class Predictor:
             bounded=bounded,
             moves=self._moves,
         )
-        # variables whose bounds are no rows of the condenser
+        # free variables with bounds: these are not among the condenser's constraints
         self._free = np.zeros(program.n, dtype=bool)
         self._free[self._newton.condenser.free] = bounded[self._newton.condenser.free]
         lower, upper = self._bounds(program)
         self._equal = lower == upper
         limited = np.isfinite(lower) | np.isfinite(upper)
-        self._inequal = rows = np.flatnonzero(~self._equal & limited)
-        values, own = np.concatenate([program.constraints(x), x])[rows], np.concatenate([y, z])[rows]
-        self._weak = np.where(np.abs(own) < _WEAK, own, 0.0)
-        slack = np.maximum(np.where(own > 0, upper[rows] - values, values - lower[rows]), 0.0)
-        self._slack = np.where(self._weak == own, 0.0, slack)
+        self._unequal = i = np.flatnonzero(~self._equal & limited)  # inequalities, and bounds of variables
+        values, own = np.concatenate([program.constraints(x), x])[i], np.concatenate([y, z])[i]
+        self._weak = np.where(np.abs(own) < _WEAK_MULTIPLIER, own, 0.0)  # multipliers that stay constant
+        slack = np.maximum(np.where(own > 0, upper[i] - values, values - lower[i]), 0.0)
+        self._slack = np.where(self._weak == own, 0.0, slack)  # of active constraints, which stays
         self._sides = np.sign(own - self._weak).astype(np.int8)
 
     def _bounds(self, program: NonlinearProgram) -> tuple[Vector, Vector]:
-        """Bounds of constraints and variables; infinite for variables that do not move."""
-        lower, upper = (
-            np.where(self._moves, program.x_lower, -np.inf),
-            np.where(self._moves, program.x_upper, np.inf),
-        )
+        """Bounds (m + n,) of constraints and variables; infinite for fixed variables."""
+        lower = np.where(self._moves, program.x_lower, -np.inf)
+        upper = np.where(self._moves, program.x_upper, np.inf)
         return np.concatenate([program.g_lower, lower]), np.concatenate([program.g_upper, upper])
 
     def predict(self, program: NonlinearProgram) -> Prediction | None:
         """Prediction for the same program with other parameters; None if a QP's active set is not found.
 
-        QP after QP from where the one before led, while constraints are off and it helps.
+        Each QP is linearized at the last one's solution; they end if constraints are met, or not met better.
         """
         found: Prediction | None = None
         x, y, z, sides = self.x, self.y, self.z, self._sides
         g = program.constraints(x)
         with threads().limit(limits=1, user_api="blas"):
-            for k in range(_STEPS):
+            for k in range(_MAX_QPS):
                 if not np.isfinite(g).all():
                     break
                 qp = _QP(self, program, x, g, np.concatenate([y, z]))
@@ -267,66 +268,69 @@ class Predictor:
                 if found is not None and not violation < found.violation:
                     break
                 found = Prediction(x=x, y=y, z=z, violation=violation, steps=k + 1)
-                if violation <= _ENOUGH:
+                if violation <= _SUFFICIENT_VIOLATION:
                     break
         return found
 
 
 class _QP:
-    """Minimize 1/2 d'Hd + q'd with all constraints and bounds made linear at x.
+    """Minimize 1/2 d'Hd + q'd with all constraints and bounds linearized at x.
 
     Attributes
     ----------
-    d : the step (n,).  sides : of inequalities, 1 where the upper bound holds, -1 the lower one, 0 none.
+    d : the step (n,).  sides : at which the inequalities are active.
     """
 
     def __init__(self, of: Predictor, program: NonlinearProgram, x: Vector, g: Vector, own: Vector) -> None:
+        """g (m,) : constraints at x.  own (m + n,) : multipliers of constraints and bounds."""
         self._of, self._newton = of, of._newton
-        self._m, rows = program.m, of._inequal
+        self._m, i = program.m, of._unequal
         self._jacobian: Matrix = program.jacobian(x)
         lower, upper = of._bounds(program)
         values = np.concatenate([g, x])
-        self._off = np.where(of._equal, values - lower, 0.0)
+        self._off = np.where(of._equal, values - lower, 0.0)  # residuals (m + n,) of equalities
         self._off[program.m :] = 0.0
-        self._values = values[rows]
-        self._lower = lower[rows] + np.where(of._sides < 0, of._slack, 0.0)
-        self._upper = upper[rows] - np.where(of._sides > 0, of._slack, 0.0)
-        self._own = own[rows] - of._weak
+        self._values = values[i]
+        # active constraints keep the slack that the known solution has
+        self._lower = lower[i] + np.where(of._sides < 0, of._slack, 0.0)
+        self._upper = upper[i] - np.where(of._sides > 0, of._slack, 0.0)
+        # and weakly active ones the multiplier, which is a constant part of the gradient
+        self._own = own[i] - of._weak
         self._constant = np.zeros(len(values))
-        self._constant[rows] = of._weak
+        self._constant[i] = of._weak
         self._gradient = program.gradient(x)
-        self._q = self._gradient + self._pulled(self._constant)
+        self._q = self._gradient + self._transposed_product(self._constant)
         self.d, self.sides = np.zeros(len(x)), of._sides
 
-    def _pulled(self, multipliers: Vector) -> Vector:
+    def _transposed_product(self, multipliers: Vector) -> Vector:
+        """J'y + z (n,) for multipliers (m + n,)."""
         out: Vector = self._jacobian.T @ multipliers[: self._m] + multipliers[self._m :]
         return out
 
     def solve(self, sides: Sides) -> bool:
-        """Iterates from an active set (as of `sides`) towards the solution's; true if it gets there."""
-        rows, short = self._of._inequal, 0
-        at = np.zeros(len(rows))
-        for k in range(_SETS):
+        """Find the solution's active set by Newton steps from another one; False if they stall."""
+        i, short = self._of._unequal, 0
+        at = np.zeros(len(i))  # change of the inequalities' linearized values by d
+        for k in range(_MAX_ACTIVE_SETS):
             d = self._step(sides)
             if d is None or not np.isfinite(d).all():
                 return False
-            moved = np.concatenate([self._jacobian @ d, d])[rows]
-            # later steps end where the augmented Lagrangian is least: full ones may jump between active sets
-            # for ever
-            part = 1.0 if not k else self._length(d - self.d, at, moved - at)
-            short += part < _SHORT
-            if short == _JAMMED:
+            moved = np.concatenate([self._jacobian @ d, d])[i]
+            # later steps minimize the augmented Lagrangian: full ones may cycle between active sets
+            length = 1.0 if not k else self._length(d - self.d, at, moved - at)
+            short += length < _SHORT_STEP
+            if short == _MAX_SHORT_STEPS:
                 return False
-            self.d, at = self.d + part * (d - self.d), at + part * (moved - at)
-            new = np.sign(self._pull(at)).astype(np.int8)
+            self.d, at = self.d + length * (d - self.d), at + length * (moved - at)
+            new = np.sign(self._inequality_multipliers(at)).astype(np.int8)
             settled = bool((new == sides).all())
             self.sides = sides = new
             if settled:
                 break
         return True
 
-    def _pull(self, at: Vector) -> Vector:
-        """Multipliers of inequalities whose linear values have changed by ``at``."""
+    def _inequality_multipliers(self, at: Vector) -> Vector:
+        """Augmented Lagrangian's multipliers of inequalities whose linearized values changed by ``at``."""
         values, weight = self._values + at, _WEIGHT
         above = self._own + weight * (values - self._upper)
         below = self._own + weight * (values - self._lower)
@@ -334,21 +338,22 @@ class _QP:
         return out
 
     def _step(self, sides: Sides) -> Vector | None:
-        """The minimum where these sides hold, and its multipliers."""
-        c, of, m, rows = self._newton.condenser, self._of, self._m, self._of._inequal
+        """Minimum (n,) of the augmented Lagrangian for an active set; None if it cannot be factored."""
+        c, of, m, i = self._newton.condenser, self._of, self._m, self._of._unequal
         weights, off = np.zeros(len(self._off)), self._off.copy()
-        on = sides != 0
-        weights[rows[on]] = _WEIGHT
-        bound = np.where(sides > 0, self._upper, self._lower)[on]
-        off[rows[on]] = self._values[on] - bound + self._own[on] / _WEIGHT
-        of_free = weights[m:] * of._free
-        condensed = np.concatenate([weights[:m], weights[m:][c.bounded]])[c.rows]
+        active = sides != 0
+        weights[i[active]] = _WEIGHT
+        bound = np.where(sides > 0, self._upper, self._lower)[active]
+        # y = own + weight (linearized value - bound) as weight (J d + off)
+        off[i[active]] = self._values[active] - bound + self._own[active] / _WEIGHT
+        of_free = weights[m:] * of._free  # a diagonal, as these bounds are no constraints of the condenser
+        condensed = np.concatenate([weights[:m], weights[m:][c.bounded]])[c.remaining]
         try:
             factored = self._newton.factor(
                 self._jacobian,
                 of._hessian,
                 of_free[c.free],
-                lambda more: condensed,
+                lambda shift: condensed,
                 hard=True,
                 proximal=_PROXIMAL,
             )
@@ -366,22 +371,26 @@ class _QP:
         return d
 
     def _length(self, step: Vector, at: Vector, along: Vector) -> float:
-        """Step length that minimizes the augmented Lagrangian along a step, 1 at most."""
-        hessian, more = self._of._hessian, _PROXIMAL + self._newton.shift
-        linear = float((self._q + hessian @ self.d + more * self.d) @ step)
-        square = float(step @ (hessian @ step) + more * (step @ step))
+        """Step length that minimizes the augmented Lagrangian along a step (n,), 1 at most.
 
-        def slope(part: float) -> float:
-            return linear + part * square + float(self._pull(at + part * along) @ along)
+        at, along : the inequalities' linearized values, and their change by the step.
+        """
+        hessian, shift = self._of._hessian, _PROXIMAL + self._newton.shift
+        linear = float((self._q + hessian @ self.d + shift * self.d) @ step)
+        square = float(step @ (hessian @ step) + shift * (step @ step))
+
+        def slope(length: float) -> float:
+            multipliers = self._inequality_multipliers(at + length * along)
+            return linear + length * square + float(multipliers @ along)
 
         if slope(1.0) <= 0 or slope(0.0) >= 0:
             return 1.0
         return float(brentq(slope, 0.0, 1.0, xtol=1e-6))
 
     def multipliers(self) -> tuple[Vector, Vector]:
-        """Multipliers of constraints (m,) and bounds (n,), as of the last active set."""
+        """Multipliers of constraints (m,) and bounds (n,) for the last active set."""
         found = self._y + self._constant
         y, z = found[: self._m], found[self._m :].copy()
-        held = ~self._of._moves
-        z[held] = -(self._gradient + self._jacobian.T @ y + self._of._hessian @ self.d)[held]
+        fixed = ~self._of._moves
+        z[fixed] = -(self._gradient + self._jacobian.T @ y + self._of._hessian @ self.d)[fixed]
         return y, z

@@ -1,6 +1,7 @@
-"""Interface of nonlinear programs and of solver results, and the points at which a program is evaluated.
+"""Interface of nonlinear programs and of solver results; violations, optimality, and evaluated points.
 
-The border between the symbolic and the numeric half of the package: everything below it is NumPy and SciPy.
+It is the border between the symbolic and the numeric half of the package: the solvers use NumPy and SciPy
+only.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ Matrix = Any  # scipy.sparse.csc_array; SciPy ships no types
 
 
 class Determined(NamedTuple):
-    """Variables, by number, that equality constraints of their own determine; those of lower rank go first.
+    """Variables, by number, that equalities determine; those of lower rank are eliminated first.
 
-    A program may have a sequence ``determined`` of them. Where constraints would do for several, what stands
-    first there takes those that stand first.
+    A program may declare a sequence ``determined`` of them. Each takes the first equalities that contain its
+    variables and are not taken by one before it.
     """
 
     rank: tuple[int, ...]
@@ -38,14 +39,14 @@ class NonlinearProgram(Protocol):
     """Minimize f(x) subject to g_lower <= g(x) <= g_upper and x_lower <= x <= x_upper.
 
     Equal bounds make an equality; +-inf means no bound. Shapes: x (n,), g (m,). The Lagrangian is
-    L = f + multipliers . g + bound_multipliers . x, so that a multiplier is positive where an upper bound
-    holds and negative where a lower one does.
+    L = f + multipliers . g + bound_multipliers . x, so that a multiplier is positive if an upper bound is
+    active and negative if a lower one is.
 
     Attributes
     ----------
     n, m : number of variables and of constraints.
     x_lower, x_upper : bounds of the variables (n,).
-    g_lower, g_upper : bounds of the rows (m,).
+    g_lower, g_upper : bounds of the constraints (m,).
     """
 
     n: int
@@ -86,24 +87,20 @@ class NonlinearProgram(Protocol):
 
 @runtime_checkable
 class SpokenProgram(NonlinearProgram, Protocol):
-    """A program that tells its violated constraints as a person reads them."""
+    """Program that describes violations of its constraints in words."""
 
     def row_group(self, i: int) -> tuple[str, str]:
-        """Term and place of constraint i: of the constraints of a term at a place one message stands for
-        all.
-        """
+        """Term and node of constraint i; a message has only the worst constraint of each such group."""
         ...
 
     def describe_violation(self, i: int, x: Vector, amount: float) -> tuple[str, str]:
-        """Row i at x ("torque limit, swing at 0.61 s, elbow") and the amount ("12 % over its limit")."""
+        """Constraint i at x ("torque limit, swing at 0.61 s, elbow") and amount ("12 % over its limit")."""
         ...
 
 
 @dataclass(frozen=True)
 class Violation:
-    """Violated constraint or bound: its name, the violation in words, and the amount in the constraint's own
-    unit.
-    """
+    """Violated constraint or bound: its name, the violation in words, and the scaled amount."""
 
     what: str
     by: str
@@ -113,11 +110,11 @@ class Violation:
         return f"{self.what}: {self.by}"
 
 
-MINOR = 0.01  # of the worst constraint's violation: what a message leaves out
+MINOR = 0.01  # fraction of the worst violation; messages leave out less than that
 
 
 class Status(enum.Enum):
-    """Status that a solver ended with."""
+    """Status with which a solver ended."""
 
     SOLVED = "solved"
     ACCEPTABLE = "acceptable"
@@ -155,13 +152,13 @@ class IterationRecord:
 
     Attributes
     ----------
-    iteration : number, from 0 (the start).
+    iteration : number, from 0 (the initial guess).
     objective : f(x).
     max_violation : largest violation of a constraint or a bound, in the units of the constraints.
-    kkt : scaled stationarity (see `stationarity`); nan where the solver does not know it.
-    step : largest absolute entry of the step that led here.
-    seconds : time since the start of the solve [s].
-    note : a few words of the solver's own: trust region, QP iterations, second-order correction.
+    kkt : scaled stationarity (see `stationarity`); nan if the solver does not have it.
+    step : largest absolute entry of the step to this iterate.
+    seconds : time since the solve began [s].
+    note : remark of the solver: barrier, step length, QP iterations, second-order correction.
     """
 
     iteration: int
@@ -179,21 +176,21 @@ Callback = Callable[[IterationRecord], Any]
 
 @dataclass(frozen=True, kw_only=True)
 class SolverResult:
-    """The iterate a solver ended with; the best one if it did not converge.
+    """Last iterate of a solver, or the best one if it did not converge.
 
     Attributes
     ----------
     x : variables (n,).
-    multipliers : of the rows (m,), positive where an upper bound holds.
+    multipliers : of the constraints (m,), positive if an upper bound is active.
     bound_multipliers : of the variables' bounds (n,), likewise.
     objective : f(x).
     status : how it ended.
     iterations : number of iterations.
-    seconds : wall time; seconds_functions: of that in the program's functions; seconds_qp: of that in the QP
-        solver.
+    seconds : wall time.  seconds_functions : of that in the program's functions.  seconds_qp : of that in QPs
+        or Newton systems.
     max_violation : largest violation of a constraint or a bound, in the units of the constraints.
     kkt : scaled stationarity (see `stationarity`).
-    message : a sentence, with the constraints that cannot be met by name where there are any.
+    message : a sentence, with the names of violated constraints if there are any.
     history : one record an iteration.
     """
 
@@ -213,7 +210,7 @@ class SolverResult:
 
 
 def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
-    """Check bounds and start once, before a solver sees them, and give the start as float64 (n,).
+    """Check bounds and initial guess before a solve; returns the initial guess as float64 (n,).
 
     Raises
     ------
@@ -224,7 +221,7 @@ def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
     for kind, size, name in sides:
         lower = check_array(f"{kind}_lower", getattr(program, f"{kind}_lower"), (size,), finite=False)
         upper = check_array(f"{kind}_upper", getattr(program, f"{kind}_upper"), (size,), finite=False)
-        # The comparison is written so that NaN fails it too.
+        # ~(a <= b), as NaN fails that too
         bad = np.flatnonzero(~((lower <= upper) & (lower < np.inf) & (upper > -np.inf)))
         if bad.size:
             i = int(bad[0])
@@ -247,9 +244,9 @@ def bound_violations(program: NonlinearProgram, x: Vector) -> Vector:
 
 def max_violation(program: NonlinearProgram, x: Vector, g: Vector) -> float:
     """Largest violation of a constraint or a bound at x with g = g(x); inf if any is nan."""
-    rows, bounds = row_violations(program, g), bound_violations(program, x)
-    worst = max(float(np.max(rows, initial=0.0)), float(np.max(bounds, initial=0.0)))
-    finite = not (np.isnan(rows).any() or np.isnan(bounds).any())
+    constraints, bounds = row_violations(program, g), bound_violations(program, x)
+    worst = max(float(np.max(constraints, initial=0.0)), float(np.max(bounds, initial=0.0)))
+    finite = not (np.isnan(constraints).any() or np.isnan(bounds).any())
     return worst if finite else np.inf
 
 
@@ -264,7 +261,7 @@ def stationarity(gradient: Vector, jacobian: Matrix, multipliers: Vector, bound_
 
 
 def scaled_residual(residual: Vector, multipliers: Vector, bound_multipliers: Vector) -> float:
-    """`stationarity` of what is left of grad f + J' y + z."""
+    """`stationarity` for a known residual grad f + J' y + z (n,)."""
     total = multipliers.size + bound_multipliers.size
     mean = (np.abs(multipliers).sum() + np.abs(bound_multipliers).sum()) / max(total, 1)
     return float(np.max(np.abs(residual), initial=0.0) / (max(100.0, mean) / 100.0))
@@ -273,13 +270,13 @@ def scaled_residual(residual: Vector, multipliers: Vector, bound_multipliers: Ve
 def complementarity(
     program: NonlinearProgram, x: Vector, g: Vector, multipliers: Vector, bound_multipliers: Vector
 ) -> float:
-    """Largest |multiplier| x distance to the bound it belongs to; |multiplier| where there is none."""
+    """Largest |multiplier| x distance to its bound; |multiplier| if that bound does not exist."""
     value = np.concatenate([g, x])
     lower = np.concatenate([program.g_lower, program.x_lower])
     upper = np.concatenate([program.g_upper, program.x_upper])
     y = np.concatenate([multipliers, bound_multipliers])
     gap = np.where(y > 0, np.abs(upper - value), np.abs(value - lower))
-    gap[np.isinf(gap)] = 1.0  # its sign is wrong by its size: one of 1e-8 is rounding
+    gap[np.isinf(gap)] = 1.0  # a multiplier of the wrong sign counts by its size: one of 1e-8 is rounding
     return float(np.max(np.abs(y[y != 0]) * gap[y != 0], initial=0.0))
 
 
@@ -288,13 +285,15 @@ def is_stationary_violation(
 ) -> bool:
     """True if no small step reduces the violation 1/2 |v|^2 of the constraints: a locally infeasible point.
 
-    True if the gradient J' v, without the part that only the variables' bounds hold, is small beside |J||v|.
+    The criterion: the gradient J' v, projected on the variables' bounds, is small relative to |J||v|.
     """
     v = np.maximum(g - program.g_upper, 0.0) - np.maximum(program.g_lower - g, 0.0)
     slope = jacobian.T @ v
     margin = 1e-6 * (1.0 + np.abs(x))
-    held = ((x >= program.x_upper - margin) & (slope < 0)) | ((x <= program.x_lower + margin) & (slope > 0))
-    slope = np.where(held, 0.0, slope)
+    at_bound = ((x >= program.x_upper - margin) & (slope < 0)) | (
+        (x <= program.x_lower + margin) & (slope > 0)
+    )
+    slope = np.where(at_bound, 0.0, slope)
     row_norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
     return bool(np.linalg.norm(slope) <= tolerance * max(float(row_norms @ np.abs(v)), 1e-300))
 
@@ -308,25 +307,25 @@ def worst_rows(
     count: int = 5,
     once_a_term: bool = False,
 ) -> list[Violation]:
-    """Violations beyond the tolerance, largest first.
+    """Violations beyond the tolerance, largest first, ``count`` at most.
 
-    Only the worst one of each term's constraints at a node; ``once_a_term``: of all its constraints.
+    Of a term's constraints at a node only the worst is listed; with ``once_a_term``, of all its constraints.
     """
     violations = np.concatenate([row_violations(program, g), bound_violations(program, x)])
     violations = np.where(np.isnan(violations), np.inf, violations)
     m, out, seen = program.m, list[Violation](), set[tuple[str, str]]()
-    spoken = program if isinstance(program, SpokenProgram) else None
+    described = program if isinstance(program, SpokenProgram) else None
     for i in np.argsort(-violations, kind="stable").tolist():
         amount = float(violations[i])
         if not amount > tolerance or len(out) == count:
             break
         what, by = f"bound of {program.variable_name(i - m)}" if i >= m else "", f"by {amount:.3g}"
-        if i < m and spoken is not None:
-            term, place = spoken.row_group(i)
+        if i < m and described is not None:
+            term, place = described.row_group(i)
             if (group := (term, "" if once_a_term else place)) in seen:
                 continue
             seen.add(group)
-            what, by = spoken.describe_violation(i, x, amount)
+            what, by = described.describe_violation(i, x, amount)
         out.append(Violation(what or program.row_name(i), by, amount))
     return out
 
@@ -335,33 +334,31 @@ _HEADINGS = ("Constraints not met", "Constraints that cannot be met")  # the sec
 
 
 def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, tolerance: float) -> str:
-    """The status as a sentence, followed by what is violated, in words: where each term is worst."""
-    rows = worst_rows(program, x, g, tolerance=tolerance, once_a_term=True)
-    if not rows:
+    """Message of a status: a sentence, then each term's worst violation in words."""
+    worst = worst_rows(program, x, g, tolerance=tolerance, once_a_term=True)
+    if not worst:
         return status.message
-    # constraints are of order one, so what is off by so much less only follows from the others
-    rows = [violation for violation in rows if violation.amount >= MINOR * rows[0].amount]
-    listed = "; ".join(str(violation) for violation in rows)
+    # constraints are of order one, so a much smaller violation is only a consequence of the others
+    worst = [violation for violation in worst if violation.amount >= MINOR * worst[0].amount]
+    listed = "; ".join(str(violation) for violation in worst)
     heading = _HEADINGS[status is Status.INFEASIBLE]
     more = int(
         np.sum(~(row_violations(program, g) <= tolerance))
         + np.sum(~(bound_violations(program, x) <= tolerance))
     )
-    tail = f"; {more} constraints in all" if more > len(rows) else ""
+    tail = f"; {more} constraints in all" if more > len(worst) else ""
     return f"{status.message} {heading}: {listed}{tail}."
 
 
 def without_violations(message: str) -> str:
-    """A result's message as far as `explain` has not listed what is violated."""
+    """A result's message without the violations that `explain` lists."""
     for heading in _HEADINGS:
         message = message.partition(f" {heading}: ")[0]
     return message
 
 
 class BestIterate:
-    """Keeps the best point a solver has seen: least violation; among points that meet the constraints, least
-    f.
-    """
+    """Best point of a solve: least violation, then least objective."""
 
     def __init__(self, program: NonlinearProgram, tolerance: float):
         self._program, self._tolerance = program, tolerance
@@ -371,7 +368,7 @@ class BestIterate:
         self.violation = np.inf
 
     def consider(self, x: Vector, objective: float, g: Vector) -> bool:
-        """Keep (x, f, g) if it is better than what is kept; points that are not finite never are."""
+        """Keep (x, f, g) if it is better than the best so far and finite; True if so."""
         if not (np.isfinite(objective) and np.isfinite(g).all()):
             return False
         violation = max_violation(self._program, x, g)
@@ -384,7 +381,7 @@ class BestIterate:
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """f and g at x, and their derivatives, evaluated when first asked for."""
+    """f and g at x, and their derivatives, which are evaluated when first used."""
 
     x: Vector
     objective: float
@@ -418,8 +415,8 @@ class Point:
         return found if isinstance(found, sp.csc_array) else sp.csc_array(found)
 
     @cached_property
-    def rows(self) -> Matrix:
-        """dg/dx by rows, csr_array (m, n)."""
+    def jacobian_csr(self) -> Matrix:
+        """dg/dx as csr_array (m, n)."""
         return self.jacobian.tocsr()
 
     @cached_property
@@ -430,22 +427,22 @@ class Point:
 
     @cached_property
     def violation(self) -> float:
-        """Weighted sum of the violations of the rows; inf where not finite."""
+        """Weighted sum of the constraints' violations; inf if not finite."""
         return float(self.program.weights @ row_violations(self.program, self.g)) if self.finite else np.inf
 
     @cached_property
     def max_violation(self) -> float:
-        """Largest violation of a row or a bound."""
+        """Largest violation of a constraint or a bound."""
         return max_violation(self.program, self.x, self.g)
 
 
 class TimedProgram:
-    """A program that adds up the seconds spent in its functions, and weighs its rows.
+    """A program whose function evaluations are timed, with weights of its constraints.
 
     Attributes
     ----------
     seconds : spent in the program's functions.
-    weights : of the rows in the merit function (m,).
+    weights : of the constraints in the merit function (m,).
     """
 
     def __init__(self, program: NonlinearProgram):
@@ -465,7 +462,7 @@ class TimedProgram:
     hessian: Callable[[Vector, float, Vector], Matrix]
 
     def point(self, x: Vector) -> Point:
-        """Evaluate f and g; where they cannot be computed (ArithmeticError, LinAlgError) they are nan."""
+        """Evaluate f and g; nan if they cannot be computed (ArithmeticError, LinAlgError)."""
         try:
             objective, g = float(self.objective(x)), np.asarray(self.constraints(x), dtype=np.float64)
         except (ArithmeticError, np.linalg.LinAlgError):
@@ -473,11 +470,11 @@ class TimedProgram:
         return Point(x=x, objective=objective, g=g, program=self)
 
     def unknown(self, x: Vector) -> Point:
-        """The point before anything is evaluated."""
+        """Point without values: nothing is evaluated."""
         return Point(x=x, objective=np.nan, g=np.full(self.m, np.nan), program=self)
 
     def weigh(self, point: Point) -> None:
-        """Weigh rows whose gradient is longer than 1 by its length, so that a price suits all rows alike."""
+        """Set the weights to 1 over the gradients' norms, 1 at most: one price suits all constraints."""
         self.weights = 1.0 / np.clip(point.row_norms, 1.0, 1e6)
 
     def _timed(self, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,6 +1,6 @@
-"""A program some of whose bounds may give way, as little as possible: what it takes to meet all others.
+"""Relaxed program: selected bounds may move, by the least total amount that meets all constraints.
 
-Each relaxation moves a set of bounds together, by one variable of its own. What is minimized is their sum (an
+Each relaxation moves a set of bounds together, by one variable of its own. The sum of these is minimized (an
 l1 penalty of bounds, Nocedal and Wright 2006, section 17.2), which leaves most of them at zero.
 """
 
@@ -16,46 +16,42 @@ import scipy.sparse as sp
 from impactopt.solvers.program import Determined, Matrix, NonlinearProgram, Vector
 
 Index = npt.NDArray[np.intp]
-# weight of the program's own objective, over its size: of many points with the least relaxation, it picks one
-_KEEP = 1e-3
+_OBJECTIVE_WEIGHT = 1e-3  # over the objective's size: it selects one of many points of least relaxation
 
 
 @dataclass(frozen=True, eq=False)
 class Relaxation:
-    """Bounds that move together, outward.
+    """Bounds that move outward together.
 
-    rows, variables : whose bounds, by their numbers.  unit : how far they move where its variable is one.
+    constraints, variables : their numbers.  unit : distance by which their bounds move for a relaxation of 1.
     """
 
-    rows: Index
+    constraints: Index
     variables: Index
     unit: float = 1.0
 
 
 class RelaxedProgram:
-    """Minimize the sum of how far bounds move, subject to all of a program's constraints; a
-    `NonlinearProgram`.
+    """`NonlinearProgram` that minimizes the sum of relaxations, subject to a program's relaxed constraints.
 
-    Its variables are the program's (n,), and behind them one for each relaxation, >= 0. Its constraints are
-    the program's (m,), and behind them the lower sides of relaxed constraints and the bounds of relaxed
-    variables.
-
-    x : (n,) somewhere: patterns of derivatives are taken from there, and the size of the objective.
+    Its variables are the program's (n,), then one for each relaxation, >= 0. Its constraints are the
+    program's (m,), then the lower sides of relaxed constraints and the bounds of relaxed variables.
     """
 
     def __init__(self, program: NonlinearProgram, relaxations: Sequence[Relaxation], x: Vector) -> None:
+        """x (n,) : a point, for the patterns of derivatives and the size of the objective."""
         self._program, self._more = program, len(relaxations)
         n, m = program.n, program.m
         self.determined: tuple[Determined, ...] = tuple(getattr(program, "determined", ()))
-        self._weight = _KEEP / max(1.0, abs(program.objective(x)))
+        self._weight = _OBJECTIVE_WEIGHT / max(1.0, abs(program.objective(x)))
         x_lower, x_upper = program.x_lower.copy(), program.x_upper.copy()
         upper, lower = program.g_upper.copy(), program.g_lower.copy()
         sources, lows, highs = [np.arange(m)], list[Vector](), list[Vector]()
-        # constraints, their relaxation, and its coefficient in them
+        # constraints, number of their relaxation, and its coefficient in them
         coupled: list[tuple[Index, int, float]] = []
         size = m
         for k, relaxed in enumerate(relaxations):
-            i, j, unit = relaxed.rows, relaxed.variables, relaxed.unit
+            i, j, unit = relaxed.constraints, relaxed.variables, relaxed.unit
             # A constraint with both bounds cannot move both by one coefficient: its lower side becomes a
             # constraint of its own, as bounds of variables do.
             both = np.isfinite(lower[i]) & np.isfinite(upper[i])
@@ -74,7 +70,7 @@ class RelaxedProgram:
                 highs.append(high[bounded])
                 size += count
             lower[i[both]], x_lower[j], x_upper[j] = -np.inf, -np.inf, np.inf
-        # of each constraint: one of the program's, or m + variable
+        # number of the program's constraint, or m + number of the variable, for each constraint
         self._source = np.concatenate(sources)
         self.n, self.m = n + self._more, size
         self.g_lower, self.g_upper = np.concatenate([lower, *lows]), np.concatenate([upper, *highs])
@@ -87,29 +83,29 @@ class RelaxedProgram:
         self._number_entries(program.jacobian(x))
 
     def _number_entries(self, jacobian: Matrix) -> None:
-        """Sources of the Jacobian's entries: the program's entries, a one, or the coupling's weights."""
+        """Number the Jacobian's entries: each is one of the program's, a 1, or a relaxation's coefficient."""
+        # The same operations as on values, on a matrix of the numbers (from 1 on, as zeros are dropped),
+        # once: an evaluation then only has to pick `known[self._entry]`.
         n, own = self._program.n, jacobian.nnz
-        theirs = sp.csc_array(
+        numbers = sp.csc_array(
             (np.arange(1, own + 1), jacobian.indices, jacobian.indptr), shape=jacobian.shape
         ).tocsr()
         ones = sp.csr_array((np.full(n, own + 1), (np.arange(n), np.arange(n))), shape=(n, n))
         weights = self._coupling.copy()
         self._weights = weights.data
         weights.data = own + 2 + np.arange(weights.nnz)
-        picked = sp.csr_array(sp.vstack([theirs, ones]))[self._source]
+        picked = sp.csr_array(sp.vstack([numbers, ones]))[self._source]
         numbered = sp.csc_array(sp.hstack([picked, weights]))
         numbered.sort_indices()
         self._entry = numbered.data - 1
         self._indices, self._indptr = (a.astype(np.int32) for a in (numbered.indices, numbered.indptr))
 
     def sizes(self, x: Vector) -> Vector:
-        """Relaxation of each group of bounds, in its unit; x : variables of this program."""
+        """Relaxations, in their units, for variables x of this program."""
         return np.asarray(x[self._program.n :])
 
     def start(self, x: Vector, room: float) -> Vector:
-        """Variables of this program with the program's (n,): bounds have moved as far as it takes, and some
-        room.
-        """
+        """Initial guess from the program's variables (n,): relaxations that meet all, and some room more."""
         whole = np.concatenate([x, np.zeros(self._more)])
         g = self.constraints(whole)
         short = np.maximum(np.maximum(self.g_lower - g, g - self.g_upper), 0.0)

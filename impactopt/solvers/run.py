@@ -1,4 +1,4 @@
-"""Base class of one solve by a solver of our own, and the history that it reports."""
+"""Base class of one solve by a solver of our own, its report, and the interface of a watch."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from impactopt.solvers.program import (
 
 
 class Report:
-    """Keeps time, the history and the best iterate, and tells the caller.
+    """Time, history and best iterate of a solve; calls the progress callback.
 
     Attributes
     ----------
-    seconds_qp : spent in QPs; the run adds to it.
+    seconds_qp : spent in QPs or Newton systems; the run adds to it.
     best : the best iterate.
     """
 
@@ -55,11 +55,11 @@ class Report:
         return len(self._history)
 
     def elapsed(self) -> float:
-        """Seconds since the start."""
+        """Seconds since the solve began."""
         return time.perf_counter() - self._began
 
     def iteration(self, point: Point, kkt: float, note: str) -> bool:
-        """Record an iteration and tell the caller; True if the caller wants to stop."""
+        """Record an iteration and call the callback; True if that requests a stop."""
         self.best.consider(point.x, point.objective, point.g)
         step = 0.0 if self._last is None else float(np.max(np.abs(point.x - self._last.x), initial=0.0))
         self._last = point
@@ -78,12 +78,12 @@ class Report:
     def result(
         self, status: Status, program: TimedProgram, point: Point, y: Vector, z: Vector
     ) -> SolverResult:
-        """The result with that status: at the point if it is a solution, else at the best iterate."""
+        """Result with a status: at the point if it is a solution, else at the best iterate."""
         if not status.usable and self.best.x is not None:
             point = program.point(self.best.x)
         message = explain(self._program, status, point.x, point.g, tolerance=self._tolerance)
         if status is Status.FAILED:
-            message += _why(point)
+            message += _failure_reason(point)
         return SolverResult(
             x=point.x,
             multipliers=y,
@@ -101,11 +101,11 @@ class Report:
         )
 
 
-def _why(point: Point) -> str:
+def _failure_reason(point: Point) -> str:
     if not point.finite:
-        return " The program's functions are not finite there; start elsewhere."
+        return " The program's functions are not finite there; give another initial guess."
     if not point.differentiable:
-        return " The program's derivatives are not finite there; start elsewhere."
+        return " The program's derivatives are not finite there; give another initial guess."
     return " No step makes progress: wrong derivatives, bad scaling, or a QP solver that fails."
 
 
@@ -114,16 +114,21 @@ _Options = TypeVar("_Options", bound=SolverOptions)
 
 @cache
 def threads() -> ThreadpoolController:
-    """Controller of BLAS's threads, which small matrices do not need: a second one only waits, and takes the
-    processor. Cached, as finding the loaded libraries takes as long as a QP.
+    """Controller of BLAS's threads, to limit them to one.
+
+    Small matrices need no second thread: it only waits, and occupies a processor while it does. The
+    controller is cached, as finding the loaded libraries takes as long as a QP.
     """
     return ThreadpoolController()
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """State in which a solve was left: its barrier, and the slacks of rows (m,) and of variables' bounds
-    (n,), what has none its own value. NaN: of a row that is new.
+    """State of an interior-point solve that was ended early, from which another one continues.
+
+    barrier : parameter mu.
+    rows (m,) : slacks of the constraints, or their values if they have none; NaN for a new constraint.
+    bounds (n,) : likewise of the variables' bounds.
     """
 
     barrier: float
@@ -132,25 +137,26 @@ class Path:
 
 
 class Watch(Protocol):
-    """One who knows more of a program than it says: constraints that it will need, once iterates come near
-    to what they forbid.
+    """Monitor of the iterates for lazy constraints, which a program needs once iterates come near them.
+
+    It may end a solve, so that these constraints are added, and limit steps until then.
     """
 
     def lacks(self, x: Vector) -> bool:
-        """True if an iterate (n,) asks for constraints that the program has not."""
+        """True if the program lacks constraints that an iterate (n,) needs: the solve ends."""
 
     def leave(self, path: Path) -> None:
-        """Take the state in which the solve is left for that."""
+        """Receive the state in which the solve ended for that."""
 
     def limit(self, x: Vector, step: Vector, most: float) -> float:
-        """The part of a step (n,) from an iterate (n,), ``most`` at most, that may be taken."""
+        """Largest permitted length, ``most`` at most, of a step (n,) from an iterate (n,)."""
 
 
 class Run(ABC, Generic[_Options]):
-    """One solve: the program and the point that it has come to, with its multipliers.
+    """One solve: the program, the present point, and its multipliers.
 
     x0 : initial guess (n,); moved into the variables' bounds, where every iterate stays.
-    y, z : guess of the multipliers of constraints (m,) and of bounds (n,); None: there is none.
+    y, z : initial guess of the multipliers of constraints (m,) and of bounds (n,); None: zero.
 
     Attributes
     ----------
@@ -189,7 +195,7 @@ class Run(ABC, Generic[_Options]):
 
     @abstractmethod
     def iterate(self) -> Status:
-        """Run from the initial guess until a status is reached."""
+        """Iterate from the initial guess; the status that ends it."""
 
     def _out_of_time(self) -> bool:
         return self.options.time_limit is not None and self.report.elapsed() > self.options.time_limit

@@ -11,6 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from benchmarks.peer_result import peer_result
 from impactopt.solvers.ipopt import BufferFunction, Functions, IterationCallback, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
@@ -59,7 +60,7 @@ def solve_sqpmethod(
         outcome = str(error).strip().splitlines()[-1]
     iterations = max(len(progress.history) - 1, 0)
     how: dict[str, Any] = {"message": outcome, "since": began, "iterations": iterations}
-    return functions.ended(_STATUS.get(outcome, Status.FAILED), x, y, z, seconds_qp=seconds_qp, **how)
+    return peer_result(functions, _STATUS.get(outcome, Status.FAILED), x, y, z, seconds_qp=seconds_qp, **how)
 
 
 def _build(functions: Functions, progress: IterationCallback, x0: Vector, qp: str) -> tuple[Any, list[Any]]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.peer_result import peer_result
 from impactopt.errors import missing_package
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS, Functions, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
@@ -50,7 +51,8 @@ def solve_pounce(program: NonlinearProgram, x0: Vector, time_limit: float) -> So
     for name, value in _OF_IPOPT.items():
         problem.add_option(name, value)
     x, found = problem.solve(x0.copy())
-    return functions.ended(
+    return peer_result(
+        functions,
         _STATUS.get(int(found["status"]), Status.FAILED),
         np.asarray(x),
         np.asarray(found["mult_g"]),

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.peer_result import peer_result
 from impactopt.errors import missing_package
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS, Functions, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
@@ -67,7 +68,8 @@ def solve_uno(program: NonlinearProgram, x0: Vector, time_limit: float, *, prese
     solver.set_termination_callback(lambda *_iterate: functions.stopped())
     found = solver.optimize(_model(unopy, functions, x0))
     ended, point = found.optimization_status.name, found.solution_status.name
-    return functions.ended(
+    return peer_result(
+        functions,
         _STATUS.get(point if ended == "SUCCESS" else ended, Status.FAILED),
         np.array(found.primal_solution),
         np.array(found.constraint_dual_solution),

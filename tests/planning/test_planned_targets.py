@@ -266,7 +266,7 @@ def test_what_determines_no_variables_of_its_own_is_where_and_when(target: Targe
         np.zeros(program.n, dtype=bool),
         Kernels(),
     )
-    left = {program.row_name(int(i)).split(",")[0] for i in condenser.rows[condenser.equal]}
+    left = {program.row_name(int(i)).split(",")[0] for i in condenser.remaining[condenser.equal]}
     turn = {"end of compression"} if target.turns else set()
     assert left == {"hit point", "separation", *target.guards, *turn}
 

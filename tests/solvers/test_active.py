@@ -57,7 +57,7 @@ def solved(p: Nearest) -> tuple[Vector, Vector, Vector]:
 
 @pytest.mark.parametrize("u", [0.3, 5.0], ids=["held", "free"])
 @pytest.mark.parametrize("change", [(0.01, 0, 0, 0), (0, 0.02, 0, 0), (0, 0, 0.03, 0), (0, 0, 0, -0.01)])
-def test_a_step_is_the_way_to_the_changed_solution(u: float, change: tuple[float, ...]) -> None:
+def test_a_step_leads_to_the_changed_solution(u: float, change: tuple[float, ...]) -> None:
     """Linear-quadratic: the step is exact while the active set stays."""
     numbers = np.array([2.0, 1.0, 1.5, u])
     old, new = Nearest(*numbers), Nearest(*(numbers + change))
@@ -70,8 +70,8 @@ def test_a_step_is_the_way_to_the_changed_solution(u: float, change: tuple[float
     assert (system.bounds != 0).tolist() == [u < 1.0, False]
 
 
-def test_a_bound_that_hardly_holds_lets_go() -> None:
-    """A multiplier of 1e-6 with a slack as large is of an interior-point method's end, and holds nothing."""
+def test_a_weakly_active_bound_is_left() -> None:
+    """A multiplier of 1e-6 with a slack as large, where an interior-point method ends, is no active bound."""
     p = Nearest(2.0, 1.0, 1.5, 1.25 + 1e-4)
     x, y, _ = solved(p)
     system = ActiveSystem(p, x, y, np.array([1e-6, 0.0]))
@@ -86,7 +86,7 @@ def test_a_bound_that_hardly_holds_lets_go() -> None:
 )
 @pytest.mark.parametrize("u", [1.2, 1.3], ids=["was held", "was free"])
 def test_a_prediction_finds_the_changed_active_set(u: float, numbers: tuple[float, ...]) -> None:
-    """From a bound that holds to one that does not, and back; but for the proximal hundredth of a step."""
+    """From an active bound to an inactive one, and back; but for the proximal hundredth of a step."""
     old, new = Nearest(2.0, 1.0, 1.5, u), Nearest(*numbers)
     found = Predictor(old, *solved(old)).predict(new)
     assert found is not None and found.violation < 1e-5
@@ -98,8 +98,8 @@ def test_a_prediction_finds_the_changed_active_set(u: float, numbers: tuple[floa
     assert (found.z[0] > 1e-6) == (z[0] > 0)
 
 
-def test_numbers_that_do_not_change_predict_the_solution() -> None:
-    """Slack at a bound that holds and a small multiplier of one that does not are an interior point's."""
+def test_unchanged_parameters_predict_the_solution() -> None:
+    """With the slack of an active bound and the multiplier of an inactive one of an interior point."""
     p = Nearest(2.0, 1.0, 1.5, 1.0)
     x = np.array([1.0 - 1e-3, 0.5 + 1e-3])
     y = p.aim[1] - x[1]

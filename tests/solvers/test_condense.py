@@ -1,4 +1,4 @@
-"""Condensed Newton systems against the whole ones, solved densely."""
+"""Condensed Newton systems against the full ones, solved densely."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NONE = np.zeros(9, dtype=bool)
 
 
 def chained(seed, systems=4, own=2, shared=3):
-    """Jacobian, Hessian and eliminations: each system's rows touch its own variables and the shared ones."""
+    """Jacobian, Hessian, eliminations: each system's equalities contain its own and the shared variables."""
     rng = np.random.default_rng(seed)
     n = systems * own + shared
     J = np.zeros((systems * own + 5, n))
@@ -28,7 +28,7 @@ def chained(seed, systems=4, own=2, shared=3):
         J[mine, mine] = rng.normal(size=(own, own)) + 3 * np.eye(own)
         J[mine, systems * own :] = rng.normal(size=(own, shared))
     J[systems * own :, systems * own :] = rng.normal(size=(5, shared))
-    J[systems * own, :own] = rng.normal(size=own)  # rows that touch what is eliminated
+    J[systems * own, :own] = rng.normal(size=own)  # constraints that contain eliminated variables
     J[systems * own + 1, own : 2 * own] = rng.normal(size=own)
     H = rng.normal(size=(n, n))
     H = H @ H.T + np.eye(n)
@@ -46,7 +46,7 @@ def algebra(request):
     return request.param()
 
 
-# systems of any few rows, of six, and of so many that C leaves them to BLAS
+# systems of few equalities, of six, and of so many that C leaves them to BLAS
 @given(
     seed=st.integers(0, 10**6),
     own=st.sampled_from([2, 6, 8, 9]),
@@ -60,21 +60,21 @@ def test_the_condensed_step_is_the_whole_one(algebra, seed, own, hard, indefinit
     if indefinite:
         H = sp.csc_array(H - 60 * sp.diags_array(1.0 * (np.arange(n) == n - 1)))
     equal = np.zeros(m, dtype=bool)
-    equal[eliminations[0].rows.ravel()] = equal[m - 5] = True
+    equal[eliminations[0].constraints.ravel()] = equal[m - 5] = True
     bounded = np.zeros(n, dtype=bool)
     bounded[[0, n - 1]] = True
     c = Condenser(J, H, eliminations, equal, bounded, algebra)
     assert c.bounded.tolist() == [0]
-    assert c.rows[c.equal].tolist() == [m - 5]
+    assert c.remaining[c.equal].tolist() == [m - 5]
     gradient, residual = rng.normal(size=n), rng.normal(size=c.m)
-    weights, diagonal = 0.1 + rng.random(c.rows.size), rng.random(c.free.size)
+    weights, diagonal = 0.1 + rng.random(c.remaining.size), rng.random(c.free.size)
     newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
     assert newton.factor(J, H, diagonal, lambda _: weights.copy(), hard=hard)
     step, y = newton.solve(gradient, residual)
-    # the same, whole: equalities J_e d = -r_e, other rows y = w (J d + r), stationarity
+    # the full system: equalities J_e d = -r_e, other constraints y = w (J d + r), stationarity
     rows = np.vstack([J.toarray(), np.eye(n)[[0]]])
     softness = np.zeros(c.m)
-    softness[c.rows] = 1.0 / weights
+    softness[c.remaining] = 1.0 / weights
     if hard:
         softness[m - 5] = 0.0
     whole = H.toarray() + newton.shift * np.eye(n)
@@ -83,7 +83,7 @@ def test_the_condensed_step_is_the_whole_one(algebra, seed, own, hard, indefinit
     exact = np.linalg.solve(system, -np.concatenate([gradient, residual]))
     np.testing.assert_allclose(step, exact[:n], atol=1e-8 * (1 + np.abs(exact).max()))
     np.testing.assert_allclose(y, exact[n:], atol=1e-8 * (1 + np.abs(exact).max()))
-    # inertia: as many negative eigenvalues as rows, however the Hessian curves
+    # inertia: as many negative eigenvalues as constraints, also if the Hessian is indefinite
     hard_rows = np.flatnonzero(softness == 0.0)
     Z = la.null_space(rows[hard_rows])
     soft = np.setdiff1d(np.arange(c.m), hard_rows)
@@ -94,10 +94,10 @@ def test_the_condensed_step_is_the_whole_one(algebra, seed, own, hard, indefinit
 def test_a_variable_that_is_held_does_not_move(algebra):
     J, H, eliminations, rng = chained(3)
     equal, bounded = np.zeros(J.shape[0], dtype=bool), np.zeros(J.shape[1], dtype=bool)
-    equal[eliminations[0].rows.ravel()] = True
+    equal[eliminations[0].constraints.ravel()] = True
     c = Condenser(J, H, eliminations, equal, bounded, algebra)
     newton = NewtonSystem(c, np.array([1]), algebra)
-    assert newton.factor(J, H, np.zeros(c.free.size), lambda _: np.ones(c.rows.size), hard=True)
+    assert newton.factor(J, H, np.zeros(c.free.size), lambda _: np.ones(c.remaining.size), hard=True)
     step, _ = newton.solve(rng.normal(size=J.shape[1]), rng.normal(size=c.m))
     assert step[c.free[1]] == 0.0
     assert np.abs(step).min(initial=1.0, where=np.arange(step.size) != c.free[1]) > 0.0
@@ -109,10 +109,10 @@ def test_a_steep_hessian_costs_no_digits(algebra, seed):
     J, H, eliminations, rng = chained(seed)
     (m, n), equal = J.shape, np.zeros(J.shape[0], dtype=bool)
     H = sp.csc_array(H + 1e7 * sp.diags_array(1.0 * (np.arange(n) == n - 1)))
-    equal[eliminations[0].rows.ravel()] = equal[m - 5 : m - 3] = True
+    equal[eliminations[0].constraints.ravel()] = equal[m - 5 : m - 3] = True
     c = Condenser(J, H, eliminations, equal, np.zeros(n, dtype=bool), algebra)
     newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
-    assert newton.factor(J, H, np.zeros(c.free.size), lambda _: np.ones(c.rows.size), hard=True)
+    assert newton.factor(J, H, np.zeros(c.free.size), lambda _: np.ones(c.remaining.size), hard=True)
     gradient, residual = rng.normal(size=n), rng.normal(size=m)
     step, y = newton.solve(gradient, residual)
     np.testing.assert_allclose(gradient + H @ step + newton.shift * step + J.T @ y, 0, atol=1e-11)
@@ -132,17 +132,21 @@ def test_a_structure_serves_programs_with_other_inequalities(ties):
     systems, bounded = [], np.zeros(n, dtype=bool)
     for matrix, before in ((J, 0), (more, 1)):
         equal = np.zeros(matrix.shape[0], dtype=bool)
-        equal[before + eliminations[0].rows.ravel()] = equal[before + m - 5] = True
+        equal[before + eliminations[0].constraints.ravel()] = equal[before + m - 5] = True
         given = {"determined": determined, "equal": equal, "bounded": bounded, "moves": ~bounded}
         systems.append(acquire(matrix, H, **given))
         release(systems[-1])
     assert (systems[0] is systems[1]) is not ties
     newton, c = systems[1], systems[1].condenser
-    weights, gradient, residual = 0.1 + rng.random(c.rows.size), rng.normal(size=n), rng.normal(size=m + 2)
+    weights, gradient, residual = (
+        0.1 + rng.random(c.remaining.size),
+        rng.normal(size=n),
+        rng.normal(size=m + 2),
+    )
     assert newton.factor(more, H, np.zeros(c.free.size), lambda _: weights.copy(), hard=True)
     step, y = newton.solve(gradient, residual)
     softness = np.zeros(m + 2)
-    softness[c.rows] = 1.0 / weights
+    softness[c.remaining] = 1.0 / weights
     softness[equal] = 0.0
     dense = more.toarray()
     system = np.block([[H.toarray() + newton.shift * np.eye(n), dense.T], [dense, -np.diag(softness)]])
@@ -158,7 +162,7 @@ def test_systems_that_are_tied_to_each_other_go_one_after_the_other(algebra, tie
     J, H, eliminations, rng = chained(5)
     (m, n), dense, curved = J.shape, J.toarray(), H.toarray()
     equal = np.zeros(m, dtype=bool)
-    equal[eliminations[0].rows.ravel()] = True
+    equal[eliminations[0].constraints.ravel()] = True
     row = m - 1
     for one, two in ((0, 2), (2, 4), (0, 6)):  # of the first and the second system, and so on
         if tie == "hessian":
@@ -172,12 +176,12 @@ def test_systems_that_are_tied_to_each_other_go_one_after_the_other(algebra, tie
     J, H = sp.csc_array(dense), sp.csc_array(curved)
     c = Condenser(J, H, eliminations, equal, np.zeros(n, dtype=bool), algebra)
     newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
-    weights = 0.1 + rng.random(c.rows.size)
+    weights = 0.1 + rng.random(c.remaining.size)
     assert newton.factor(J, H, np.zeros(c.free.size), lambda _: weights.copy(), hard=True)
     gradient, residual = rng.normal(size=n), rng.normal(size=m)
     step, y = newton.solve(gradient, residual)
     softness = np.zeros(m)
-    softness[c.rows] = 1.0 / weights
+    softness[c.remaining] = 1.0 / weights
     softness[equal] = 0.0
     system = np.block([[curved + newton.shift * np.eye(n), dense.T], [dense, -np.diag(softness)]])
     exact = np.linalg.solve(system, -np.concatenate([gradient, residual]))
@@ -194,7 +198,7 @@ def test_variables_without_rows_of_their_own_stay_free():
         Determined((1,), np.array([1])),
     ]
     (found,) = find_eliminations(J, equal, wanted)
-    assert (found.rows.tolist(), found.variables.tolist()) == ([[0]], [[1]])
+    assert (found.constraints.tolist(), found.variables.tolist()) == ([[0]], [[1]])
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 150), wide=st.integers(0, 2))
@@ -236,7 +240,7 @@ def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra, bip
     assert c.eliminated.size == sum(w.variables.size for w in wanted)
     assert c.equal.size < 60  # of the hundreds there are
     newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
-    weights = 10.0 ** rng.uniform(-6, 6, size=c.rows.size)
+    weights = 10.0 ** rng.uniform(-6, 6, size=c.remaining.size)
     assert newton.factor(J, H, np.zeros(c.free.size), lambda _: weights.copy(), hard=True)
     gradient, residual = p.gradient(x), 1e-3 * rng.normal(size=p.m)
     d, multipliers = newton.solve(gradient, residual)
@@ -245,6 +249,6 @@ def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra, bip
     np.testing.assert_allclose(dual, 0, atol=1e-9 * size)
     off = (J @ d + residual)[equal]
     np.testing.assert_allclose(off, 0, atol=1e-8 * np.abs(d).max())
-    soft = np.setdiff1d(c.rows, np.flatnonzero(equal))
-    expected = weights[~np.isin(c.rows, np.flatnonzero(equal))] * (J @ d + residual)[soft]
+    soft = np.setdiff1d(c.remaining, np.flatnonzero(equal))
+    expected = weights[~np.isin(c.remaining, np.flatnonzero(equal))] * (J @ d + residual)[soft]
     np.testing.assert_allclose(multipliers[soft], expected, atol=1e-9 * size)

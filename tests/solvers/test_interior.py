@@ -1,4 +1,4 @@
-"""How the interior-point way of the SQP gets on where a row, a crawl or a failure is in its way."""
+"""Interior-point method: bent steps, the watch, warm starts, short steps, restarts, elastic constraints."""
 
 from __future__ import annotations
 
@@ -13,15 +13,13 @@ from support.small_plans import changed, transcribed
 from support.textbook import CASES, INF, Textbook, assert_optimal
 
 from impactopt import load_problem
-from impactopt.solvers.ipm import IPMOptions, solve_ipm
-from impactopt.solvers.ipm import interior_point as interior
-from impactopt.solvers.ipm import interior_point as search
+from impactopt.solvers.ipm import IPMOptions, interior_point, solve_ipm
 from impactopt.solvers.program import Status
 from impactopt.transcription.initial_guess import first_iterate
 
 
 def projection(wanted):
-    """The point of the positive orthant, which is rows, next to the one that is wanted."""
+    """Projection of a point onto the positive orthant, whose bounds are constraints."""
     return Textbook(
         len(wanted),
         lambda *x: ca.sumsqr(ca.vertcat(*x) - wanted) / 2,
@@ -29,8 +27,8 @@ def projection(wanted):
     )
 
 
-def test_a_slack_that_stops_a_step_alone_stops_alone():
-    """Row 0 is next to its bound and drawn far beyond it; all other rows have a way to go."""
+def test_one_slack_does_not_stop_a_step():
+    """Constraint 0 is close to its bound and would be violated; all others are far from theirs."""
     wanted = np.array([-50.0, *np.full(19, 5.0)])
     start = np.array([0.02, *np.ones(19)])
     program = projection(wanted)
@@ -38,7 +36,7 @@ def test_a_slack_that_stops_a_step_alone_stops_alone():
     result = solve_ipm(program, start, callback=lambda r: distances.append(r.step))
     assert result.status is Status.SOLVED
     assert "bent" in result.history[1].note
-    assert distances[1] > 1.0  # as without row 0; along the straight step it would be 0.1
+    assert distances[1] > 1.0  # as without constraint 0; a step that is not bent would be 0.1
     np.testing.assert_allclose(result.x, np.maximum(wanted, 0.0), atol=1e-5)
     assert_optimal(program, result)
 
@@ -46,7 +44,7 @@ def test_a_slack_that_stops_a_step_alone_stops_alone():
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=25, deadline=None)
 def test_bent_steps_lead_to_the_same_optimum(seed):
-    """Of a convex program, which has one."""
+    """A convex program has one optimum."""
     rng = np.random.default_rng(seed)
     wanted, start = rng.normal(size=12), 0.02 + rng.random(12)
     # near a bound that all but holds, the barrier leaves a distance of the root of this
@@ -55,8 +53,8 @@ def test_bent_steps_lead_to_the_same_optimum(seed):
     np.testing.assert_allclose(result.x, np.maximum(wanted, 0.0), atol=1e-4)
 
 
-class Watching:
-    """Has a run left at its iterate of a number, and halves all its steps."""
+class HalvingWatch:
+    """Watch that ends a solve at an iterate of this number, and halves all steps."""
 
     def __init__(self, at: int) -> None:
         self.at, self.asked, self.path = at, [], None
@@ -72,19 +70,19 @@ class Watching:
         return 0.5 * most
 
 
-def test_a_run_that_is_left_goes_on_as_it_would_have():
-    """With its slacks, multipliers and barrier: what two bounds of one variable share is all that is lost."""
+def test_a_solve_that_was_ended_early_is_continued():
+    """Slacks, multipliers and barrier are kept; only the split of a multiplier between two bounds is lost."""
     wanted = np.array([-1.0, 0.5, 2.0, 5.0])
-    program, start, whole = projection(wanted), np.ones(4), Watching(-1)
+    program, start, whole = projection(wanted), np.ones(4), HalvingWatch(-1)
     solved = solve_ipm(program, start, watch=whole)
     assert solved.status is Status.SOLVED
     lengths = np.abs(np.diff(whole.asked[:3], axis=0)).max(axis=1)
-    assert lengths[0] <= 0.5 * np.abs(wanted - 1.0).max(), "steps are as short as who watches wants them"
-    first = Watching(3)
+    assert lengths[0] <= 0.5 * np.abs(wanted - 1.0).max(), "the watch limits the step"
+    first = HalvingWatch(3)
     left = solve_ipm(program, start, watch=first)
     assert left.status is Status.ACCEPTABLE and left.iterations == 3
     np.testing.assert_array_equal(left.x, whole.asked[3])
-    on = Watching(-1)
+    on = HalvingWatch(-1)
     again = solve_ipm(
         program,
         left.x,
@@ -100,8 +98,8 @@ def test_a_run_that_is_left_goes_on_as_it_would_have():
     np.testing.assert_allclose(again.x, solved.x, atol=1e-6)
 
 
-def test_rows_far_off_are_not_bent():
-    """Where a row is off by more than one, a step is as straight as ever."""
+def test_steps_are_not_bent_while_constraints_are_far_off():
+    """One constraint is violated by more than one."""
     wanted = np.array([-1.0, *np.full(19, 5.0)])
     start = np.array([-3.0, *np.ones(19)])
     result = solve_ipm(projection(wanted), start)
@@ -110,8 +108,8 @@ def test_rows_far_off_are_not_bent():
 
 
 @pytest.mark.parametrize(("barrier", "follows"), [(1e-2, True), (1e-3, False)])
-def test_a_start_with_multipliers_keeps_to_the_path_from_a_high_barrier_only(barrier, follows):
-    """From multipliers of another optimum: a barrier that is low is given up at once, for what is near."""
+def test_warm_starts_follow_the_central_path_from_a_high_barrier_only(barrier, follows):
+    """With multipliers of another optimum: a low barrier falls at once."""
     old = solve_ipm(projection(np.full(12, -1.0)), np.ones(12))
     program = projection(np.linspace(-2.0, 2.0, 12))
     result = solve_ipm(
@@ -126,24 +124,24 @@ def test_a_start_with_multipliers_keeps_to_the_path_from_a_high_barrier_only(bar
     np.testing.assert_allclose(result.x, np.maximum(np.linspace(-2.0, 2.0, 12), 0.0), atol=1e-3)
 
 
-def test_steps_that_crawl_give_way(monkeypatch):
-    """Every step counts as a crawl here: after a few of them the rows become elastic."""
-    monkeypatch.setattr(search, "_CRAWL", 2.0)
-    monkeypatch.setattr(search, "_PATIENCE", 2)
+def test_many_short_steps_count_as_none(monkeypatch):
+    """Every step counts as short here: after a few of them the constraints become elastic."""
+    monkeypatch.setattr(interior_point, "_SHORT_STEP", 2.0)
+    monkeypatch.setattr(interior_point, "_MAX_SHORT_STEPS", 2)
     case = CASES["HS71"]
     result = solve_ipm(case.build(), case.x0)
-    assert next(k for k, r in enumerate(result.history) if r.note == "rows become elastic") == 3
+    assert next(k for k, r in enumerate(result.history) if r.note == "constraints become elastic") == 3
 
 
-def test_what_fails_begins_again_from_the_best_iterate(monkeypatch):
+def test_a_failure_restarts_from_the_best_iterate(monkeypatch):
     case = CASES["HS71"]
-    advance, calls = interior.InteriorRun._advance, []
+    advance, calls = interior_point.InteriorRun._advance, []
 
     def failing(self, residual):
         calls.append(self.point.x)
         return Status.FAILED if len(calls) == 4 else advance(self, residual)
 
-    monkeypatch.setattr(interior.InteriorRun, "_advance", failing)
+    monkeypatch.setattr(interior_point.InteriorRun, "_advance", failing)
     program = case.build()
     result = solve_ipm(program, case.x0)
     assert result.status is Status.SOLVED
@@ -151,16 +149,16 @@ def test_what_fails_begins_again_from_the_best_iterate(monkeypatch):
     assert [r.note for r in result.history].count("again from the best iterate") == 1
 
 
-def test_what_goes_on_failing_is_said_to_fail(monkeypatch):
-    monkeypatch.setattr(interior.InteriorRun, "_advance", lambda self, residual: Status.FAILED)
+def test_repeated_failures_end_the_solve(monkeypatch):
+    monkeypatch.setattr(interior_point.InteriorRun, "_advance", lambda self, residual: Status.FAILED)
     case = CASES["HS71"]
     result = solve_ipm(case.build(), case.x0)
     assert result.status is Status.FAILED
     assert len(result.history) <= 3
 
 
-def test_elastic_rows_that_are_met_do_not_keep_it_from_an_end():
-    """Nails in woods of which the first two ended at the iteration limit, with rows elastic and met."""
+def test_elastic_constraints_that_are_met_become_hard_again():
+    """Nails in wood: the first two once ended at the iteration limit, with constraints elastic and met."""
     problem = load_problem("arm_planar")
     base = transcribed(problem)
     for resistance in (568.1043576449156, 569.6147318929434, 789.978655):

@@ -12,7 +12,7 @@ from impactopt.solvers.program import Status
 
 
 def test_directions_that_nothing_decides_are_left_alone():
-    # y enters no row and no objective: without the term its curvature is zero, and a shift is needed
+    # y enters no constraint and no objective: without the term its curvature is zero, and a shift is needed
     program = Textbook(2, lambda x, y: ca.exp(x) - x + 0.0 * y, lambda x, y: [(0.5, x, INF)])
     result = solve_ipm(program, [2.0, 7.0])
     assert result.status is Status.SOLVED

@@ -34,7 +34,7 @@ def qp(P, q, A=None, lower=(), upper=(), x_lower=-INF, x_upper=INF):
 
 
 def random_qp(seed, n, rows, equalities):
-    """A feasible QP with rows of very different norms, some without a lower or an upper bound, some equal."""
+    """Feasible QP with gradients of very different norms, some bounds missing, some equal."""
     rng = np.random.default_rng(seed)
     F = rng.normal(size=(n, n))
     A = rng.normal(size=(rows, n)) * 10 ** rng.uniform(-2, 2, size=(rows, 1))
@@ -128,7 +128,7 @@ def test_the_right_guess_needs_no_iteration():
         qp(np.eye(2), [0, 0], [[1, 1]], [3], [INF], x_upper=1),
         qp(np.eye(3), [0, 0, 0], [[1, 1, 0], [2, 2, 0]], [1, 3], [1, 3]),
     ],
-    ids=["parallel rows", "three rows", "row and bounds", "equalities"],
+    ids=["parallel", "three", "constraint and bounds", "equalities"],
 )
 def test_infeasible_qps_are_a_status(name, problem):
     assert make_qp_solver(name).solve(problem).status is QPStatus.INFEASIBLE
@@ -195,11 +195,11 @@ def test_large_sparse_qps_are_solved_to_the_tolerance(make):
 
 def test_residuals_are_those_of_the_kkt_conditions():
     problem = qp([[2, 0], [0, 2]], [1, 0], [[3, 4]], [-INF], [5], x_lower=-1)
-    # 3*1 + 4*1 = 7 is 2 above 5: 0.4 of a unit row; P x + q + A'y + z = (2 + 1 + 3, 2 + 4 - 1)
+    # 3*1 + 4*1 = 7 is 2 above 5: 0.4 of a normalized constraint; P x + q + A'y + z = (2 + 1 + 3, 2 + 4 - 1)
     primal, dual, gap = problem.residuals(np.ones(2), np.array([1.0]), np.array([0.0, -1.0]))
     assert primal == pytest.approx(0.4)
     assert dual == pytest.approx(6)
-    assert gap == pytest.approx(2)  # both: 5 (per unit row) * 0.4, and 1 * 2
+    assert gap == pytest.approx(2)  # both: 5 (normalized) * 0.4, and 1 * 2
 
 
 def test_unknown_solvers_are_named():

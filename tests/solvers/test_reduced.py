@@ -1,4 +1,4 @@
-"""The SQP in the variables that nothing determines: the same optima, whatever solves its QPs."""
+"""Reduced SQP: optima with each QP solver and Hessian, elimination, models, given-up constraints, weights."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from benchmarks.solve import planning_program, strike_program
 from support.textbook import INF, Textbook, assert_optimal
 
 import impactopt.solvers.sqp.reduced_qp as reduced_qp_module
-import impactopt.solvers.sqp.reduced_qp as reduction_module
 from impactopt.files.problem_file.names import problem_file
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.program import Determined, Status, TimedProgram
 from impactopt.solvers.qp.registry import make_qp_solver
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.solvers.sqp.reduced_qp import ReducedQP, Reduction, Solved, make_model
+from impactopt.solvers.sqp.reduced_qp import QPStep, ReducedQP, Reduction, make_model
 
 WAYS = {
     "osqp": SQPOptions(qp_solver="osqp"),
@@ -27,7 +26,7 @@ WAYS = {
 
 
 class Chain(Textbook):
-    """x1 = sin x0 and x2 = x1^2 + x0 follow from x0; a row couples them with x3."""
+    """x1 = sin x0 and x2 = x1^2 + x0 are determined by x0; an equality couples them with x3."""
 
     determined = (
         Determined((0,), np.array([1])),
@@ -62,7 +61,7 @@ def test_optima_are_those_of_the_whole_program(way: str) -> None:
 
 @pytest.mark.parametrize("way", WAYS)
 def test_matrices_are_sparse_where_many_variables_are_free(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduction_module, "_LARGE", 1)
+    monkeypatch.setattr(reduced_qp_module, "_MAX_DENSE", 1)
     program = chain()
     result = solve_sqp(program, [0.5, 0.0, 0.0, 0.5], options=WAYS[way])
     assert result.status is Status.SOLVED
@@ -71,13 +70,13 @@ def test_matrices_are_sparse_where_many_variables_are_free(way: str, monkeypatch
     reduction = Reduction(TimedProgram(program), point.jacobian, Chain.determined)
     reduction.load(point)
     assert sp.issparse(reduction.T)
-    assert reduction.T.shape == (4, 2)  # the equality left is a row of the QP
-    assert not reduction.left.size
+    assert reduction.T.shape == (4, 2)  # the remaining equality is a constraint of the QP
+    assert not reduction.equalities.size
     np.testing.assert_allclose((point.jacobian @ reduction.T).toarray()[:2], 0, atol=1e-12)
 
 
 def test_a_hessian_that_is_not_convex_is_lifted_and_stays_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reduction_module, "_LARGE", 1)
+    monkeypatch.setattr(reduced_qp_module, "_MAX_DENSE", 1)
     bent = Chain(
         4,
         lambda a, b, c, d: ca.cos(3 * a) - 2 * (d - 0.2) ** 2 + c,
@@ -112,7 +111,7 @@ def test_quasi_newton_steps_learn_how_the_equalities_bend() -> None:
 
 
 def test_a_kink_is_no_curvature_to_learn() -> None:
-    """Where slopes jump between two points that are all but one, quasi-Newton steps keep what they know."""
+    """The gradient jumps between two points that nearly coincide: the BFGS matrix stays."""
     bent = Chain(
         4,
         lambda a, b, c, d: c + 0.5 * (a**2 + d**2) + ca.if_else(a > 0.3, 5 * (a - 0.3), 0),
@@ -132,7 +131,7 @@ def test_a_kink_is_no_curvature_to_learn() -> None:
     np.testing.assert_allclose(learned[1], learned[0], atol=1e-6)
 
 
-def test_iterates_follow_the_curve_of_what_rows_determine() -> None:
+def test_iterates_follow_the_curve_of_determined_variables() -> None:
     curve = lambda a: 0.3 * a**2  # noqa: E731
 
     class Curve(Textbook):
@@ -162,14 +161,14 @@ def test_osqp_solves_an_arm(kind: str) -> None:
     assert found.kkt < 1e-4
 
 
-def test_rows_that_cannot_be_met_are_said_so() -> None:
+def test_infeasible_programs_are_not_usable() -> None:
     result = solve_sqp(chain(bound=-5.0), [0.5, 0.0, 0.0, 0.5], options=WAYS["osqp"])
     assert not result.status.usable
     assert result.status in (Status.INFEASIBLE, Status.FAILED)
     assert result.max_violation > 1e-3
 
 
-def test_steps_keep_what_rows_determine() -> None:
+def test_basis_and_normal_step_meet_the_equalities() -> None:
     program = TimedProgram(chain())
     point = program.point(np.array([0.5, 0.1, -0.2, 0.5]))
     reduction = Reduction(program, point.jacobian, Chain.determined)
@@ -193,9 +192,9 @@ def test_multipliers_of_equalities_make_the_gradient_zero_where_they_can() -> No
     np.testing.assert_allclose(reduction.T.T @ left, reduction.T.T @ point.gradient, atol=1e-12)
 
 
-def _step(beyond: float, radius: float, monkeypatch: pytest.MonkeyPatch) -> Solved:
-    """Of a QP in which rows are given up that are violated by more than this part of what they can change."""
-    monkeypatch.setattr(reduced_qp_module, "_BEYOND", beyond)
+def _step(beyond: float, radius: float, monkeypatch: pytest.MonkeyPatch) -> QPStep:
+    """Step of a QP that gives up constraints violated by more than this fraction of their reach."""
+    monkeypatch.setattr(reduced_qp_module, "_GIVE_UP", beyond)
     program = TimedProgram(chain(bound=1.5))
     point = program.point(np.array([0.5, np.sin(0.5), np.sin(0.5) ** 2 + 0.5, 2.0]))
     reduction = Reduction(program, point.jacobian, Chain.determined)
@@ -210,12 +209,12 @@ def _step(beyond: float, radius: float, monkeypatch: pytest.MonkeyPatch) -> Solv
 
 
 @pytest.mark.parametrize("radius", [0.1, 10.0])
-def test_rows_that_are_given_up_cost_what_elastic_ones_do(
+def test_given_up_constraints_cost_as_much_as_elastic_ones(
     radius: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     elastic, given_up = (_step(beyond, radius, monkeypatch) for beyond in (1e9, 0.0))
     assert elastic.elastic == 1
-    # inside a wide radius the row can be met: it comes back
+    # inside a wide radius the constraint can be met: it returns to the working set
     assert given_up.elastic == (radius > 1)
     np.testing.assert_allclose(given_up.d, elastic.d, atol=1e-6)
     assert given_up.linear_violation == pytest.approx(elastic.linear_violation, abs=1e-6)
@@ -233,7 +232,7 @@ def test_a_structure_is_kept_for_the_next_program_that_has_it() -> None:
 
 
 class Geared(Textbook):
-    """x1 follows from x0; a row bounds x0, and changes ten thousand times as fast with what x1 is off by."""
+    """x0 determines x1; a constraint on x0 changes ten thousand times as fast with the residual of x1."""
 
     determined = (Determined((0,), np.array([1])),)
 
@@ -248,7 +247,7 @@ def geared(price: float = 1.0) -> Geared:
     )
 
 
-def test_rows_count_by_what_the_free_variables_change_and_by_their_multipliers() -> None:
+def test_weights_follow_total_gradients_and_multipliers() -> None:
     program = TimedProgram(geared())
     point = program.point(np.array([0.2, 0.2]))
     reduction = Reduction(program, point.jacobian, Geared.determined)
@@ -261,7 +260,7 @@ def test_rows_count_by_what_the_free_variables_change_and_by_their_multipliers()
     assert program.weights[1] * 100.0 > 300.0
 
 
-def test_a_violated_row_of_a_long_gradient_is_met_at_once() -> None:
+def test_a_violated_constraint_with_a_long_gradient_is_met_at_once() -> None:
     violations: list[float] = []
     result = solve_sqp(
         geared(price=10.0),

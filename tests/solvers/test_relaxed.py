@@ -1,4 +1,4 @@
-"""Bounds that give way by as little as it takes: closed forms, and derivatives against differences."""
+"""Relaxed programs: least relaxations in closed form, derivatives against finite differences."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_derivatives_are_those_of_differences() -> None:
     def slope(z: np.ndarray) -> np.ndarray:
         return relaxed.gradient(z) + relaxed.jacobian(z).T @ y
 
-    rows = (relaxed.constraints(x + h * d) - relaxed.constraints(x - h * d)) / (2 * h)
-    np.testing.assert_allclose(relaxed.jacobian(x) @ d, rows, atol=1e-8)
+    along_g = (relaxed.constraints(x + h * d) - relaxed.constraints(x - h * d)) / (2 * h)
+    np.testing.assert_allclose(relaxed.jacobian(x) @ d, along_g, atol=1e-8)
     curved = (slope(x + h * d) - slope(x - h * d)) / (2 * h)
     np.testing.assert_allclose(relaxed.hessian(x, 1.0, y) @ d, curved, atol=1e-8)
     along = (relaxed.objective(x + h * d) - relaxed.objective(x - h * d)) / (2 * h)
@@ -68,7 +68,7 @@ def test_bounds_move_as_far_as_they_have_to(relaxations: list[Relaxation], sizes
     np.testing.assert_allclose(relaxed.sizes(result.x), sizes, atol=2e-3)
 
 
-def test_both_sides_of_a_row_give_way() -> None:
+def test_both_sides_of_a_constraint_are_relaxed() -> None:
     program = Textbook(1, lambda x: x, lambda x: [(-1.0, x, 1.0)], lower=3.0, upper=INF)
     for sign in (1.0, -1.0):
         program.x_lower, program.x_upper = (np.array([v]) for v in ((3.0, INF) if sign > 0 else (-INF, -3.0)))

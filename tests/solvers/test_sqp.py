@@ -100,8 +100,8 @@ def test_second_order_correction_cures_the_maratos_effect():
     assert full.iterations < without.iterations
 
 
-def test_rows_come_in_only_when_they_are_needed():
-    # the farthest point of a polygon of 300 sides in a direction: a corner, found with few of the rows
+def test_constraints_enter_only_when_needed():
+    # the farthest point of a polygon of 300 sides in a direction: a corner, found with few of the constraints
     angles = np.linspace(0, 2 * np.pi, 300, endpoint=False)
     program = Textbook(
         2,
@@ -111,10 +111,10 @@ def test_rows_come_in_only_when_they_are_needed():
     result = solve_sqp(program, [0.1, 0.2], options=SQPOptions(qp_solver="active_set"))
     assert result.status is Status.SOLVED
     assert_optimal(program, result)
-    assert all(int(record.note.split("rows ")[1].split()[0]) < 100 for record in result.history[1:])
+    assert all(int(record.note.split("constraints ")[1].split()[0]) < 100 for record in result.history[1:])
 
 
-def test_infeasible_programs_name_the_rows():
+def test_infeasible_programs_name_the_constraints():
     program, x0 = infeasible()
     for options in WAYS.values():
         result = solve_by(program, x0, options)

@@ -91,7 +91,7 @@ def test_the_sqp_on_convex_qps(name):
 # ---------------------------------------------------------------- degenerate ones
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", DEPENDENT)
-def test_dependent_rows(name, way):
+def test_dependent_constraints(name, way):
     case = DEPENDENT[name]
     program = case.build()
     result = solve_by(program, case.x0, WAYS[way])
@@ -113,14 +113,14 @@ def test_optima_without_multipliers_are_approached(name, way):
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", INFEASIBLE)
-def test_rows_that_contradict_each_other_are_named(name, way):
-    case, rows = INFEASIBLE[name]
+def test_infeasible_constraints_are_named(name, way):
+    case, constraints = INFEASIBLE[name]
     result = solve_by(case.build(), case.x0, WAYS[way])
     assert result.status is Status.INFEASIBLE
     listed = result.message.split("Constraints that cannot be met: ")[1].split("; ")
     named = {part.split(":")[0] for part in listed}
     assert named
-    assert named <= set(rows)
+    assert named <= set(constraints)
 
 
 @pytest.mark.parametrize("way", WAYS)

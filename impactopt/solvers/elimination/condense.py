@@ -1,10 +1,12 @@
-"""Newton systems made smaller: equalities that determine variables of their own are solved for them first.
+"""Condensation of Newton systems: equalities that determine variables are solved for these first.
 
-A motion's program has thousands of variables that rows determine by themselves: leg joints follow from the
-base's pose by the closed legs, a sole's wrench from the equation of motion, a collision's motion from its
-beginning. An elimination names such rows and variables, system by system; all systems of one shape are
-treated together. What is left is a Newton system in the free variables (Nocedal and Wright 2006, section
-15.3: elimination of variables), with the same solution: nothing is approximated.
+Equalities determine most of the thousands of variables of a motion's program. Leg joints follow from the
+base's pose, as the legs are closed; a sole's wrench follows from the equation of motion; the motion during a
+collision follows from its initial state. An elimination lists such equalities and variables as many small
+systems of one shape, which are treated together. A Newton system in the free variables remains (Nocedal and
+Wright 2006, section 15.3: elimination of variables). It has the same solution: nothing is approximated.
+
+The analysis of the patterns is here, once for each structure; the arithmetic is in `kernels`.
 """
 
 from __future__ import annotations
@@ -19,25 +21,27 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-from impactopt.solvers.elimination.kernels import EliminationStep, Index, Kernels, Places, Products
+from impactopt.solvers.elimination.kernels import EliminationStage, Index, Kernels, Places, Products
 from impactopt.solvers.program import Determined, Matrix, Vector
 
 
 class Elimination(NamedTuple):
-    """Systems of one shape: equality rows (k, r), and the variables (k, r) that each system's rows determine.
+    """Systems of one shape: equalities (k, r), and the variables (k, r) that those of each system determine.
 
-    Those that a row or the Hessian ties to each other are eliminated one after the other, all else at once.
+    Systems coupled by a constraint or by the Hessian are eliminated one after the other, all others at once.
     """
 
-    rows: Index
+    constraints: Index
     variables: Index
 
 
 class Touched(NamedTuple):
-    """Rows and variables of one system.
+    """Constraints and variables of one system.
 
-    q, e : its rows and variables; t : other equality rows that these variables touch; c : variables that its
-    rows touch; u : c, and behind them those that only the Hessian couples to e.
+    q, e : its equalities, and the variables that they determine.
+    t : other equalities that contain variables of e.
+    c : other variables in the equalities q.
+    u : c, then the variables that only the Hessian couples to e.
     """
 
     q: Index
@@ -48,17 +52,19 @@ class Touched(NamedTuple):
 
 
 def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> list[list[Touched]]:
-    """Mark what becomes nonzero on the way, and find what each system touches.
+    """Symbolic elimination: mark the fill-in, in place, and list what each system touches.
 
-    The systems of each list of those that come out can be eliminated at once, list after list.
+    touches : which variables each equality contains.  couples (n, n) : which variables the Hessian couples.
+
+    The systems of each list that is returned can be eliminated at once, list after list.
     """
     row_left, column_left = np.ones(touches.shape[0], dtype=bool), np.ones(touches.shape[1], dtype=bool)
-    touched_by = np.ascontiguousarray(touches.T)  # the same, as columns are looked at as often as rows
+    touched_by = np.ascontiguousarray(touches.T)  # a copy, as columns are read as often as rows
     out = []
     for elimination in eliminations:
         waiting = list(zip(*elimination, strict=True))
         while waiting:
-            systems, waiting = _apart(waiting, touched_by, couples, row_left)
+            systems, waiting = _independent(waiting, touched_by, couples, row_left)
             for q, e in systems:
                 row_left[q] = column_left[e] = False
             found = []
@@ -68,6 +74,7 @@ def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> lis
                 more = couples[e].any(axis=0) & column_left
                 more[c] = False
                 u = np.concatenate([c, np.flatnonzero(more)])
+                # e is replaced by a function of c: in the equalities t, and in the Hessian
                 for rows, columns in ((t, c), (t, e), (q, e)):
                     touches[rows[:, None], columns] = touched_by[columns[:, None], rows] = True
                 couples[e[:, None], e] = couples[c[:, None], u] = couples[u[:, None], c] = True
@@ -76,11 +83,13 @@ def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> lis
     return out
 
 
-_Systems = list[tuple[Index, Index]]  # rows and variables of each
+_Systems = list[tuple[Index, Index]]  # equalities and variables of each
 
 
-def _apart(systems: _Systems, touched_by: Any, couples: Any, row_left: Any) -> tuple[_Systems, _Systems]:
-    """Systems that nothing ties to one before them, and the others."""
+def _independent(
+    systems: _Systems, touched_by: Any, couples: Any, row_left: Any
+) -> tuple[_Systems, _Systems]:
+    """Systems that neither a constraint nor the Hessian couples to one before them, and the others."""
     rows, variables = np.zeros(touched_by.shape[1], dtype=bool), np.zeros(touched_by.shape[0], dtype=bool)
     now, later = _Systems(), _Systems()
     for q, e in systems:
@@ -94,11 +103,12 @@ def _apart(systems: _Systems, touched_by: Any, couples: Any, row_left: Any) -> t
     return now, later
 
 
-class Alike(NamedTuple):
-    """Groups of rows, each of which touches the same columns, as many as those of the other groups.
+class RowGroups(NamedTuple):
+    """Groups of the Jacobian's rows; all rows of a group have the same columns, p of them in every group.
 
-    columns (g, p) : of each group; counts (g,) : its rows; rows (k,) : of one group after the other; values
-    (k, p) : where their numbers stand in the data.
+    columns (g, p) : of each group.  counts (g,) : number of its rows.
+    rows (k,) : numbers of the rows, one group after the other.
+    values (k, p) : places of the rows' values in the Jacobian's data.
     """
 
     columns: Index
@@ -107,12 +117,14 @@ class Alike(NamedTuple):
     values: Places
 
 
-def by_pattern(jacobian: Matrix, rows: Index) -> list[Alike]:
-    """All of these rows that touch any column; the data are those of a csc."""
+def group_rows(jacobian: Matrix, rows: Index) -> list[RowGroups]:
+    """Groups of these rows of a csc matrix, for each number of columns; empty rows are left out."""
+    # the same pattern by rows, with the places of the values in the csc data as its values
     numbered = sp.csc_array((np.arange(jacobian.nnz), jacobian.indices, jacobian.indptr), jacobian.shape)
     by_rows = numbered.tocsr()
     by_rows.sort_indices()
     start, columns, at = by_rows.indptr, by_rows.indices, by_rows.data.astype(np.int32)
+    # rows with the same bytes of column numbers form a group
     touched, ends = columns.tobytes(), (columns.itemsize * start).tolist()
     groups: dict[bytes, int] = {}
     group = np.array([groups.setdefault(touched[ends[i] : ends[i + 1]], len(groups)) for i in rows.tolist()])
@@ -124,19 +136,23 @@ def by_pattern(jacobian: Matrix, rows: Index) -> list[Alike]:
     size_of = sizes[group[order]]
     out = []
     for p in dict.fromkeys(sizes[sizes > 0].tolist()):
+        # groups with p columns, and their rows
         chosen, same, every = np.flatnonzero(sizes == p), rows[order[size_of == p]], np.arange(p)
         own = columns[start[rows[first[chosen]]][:, None] + every].astype(np.intp)
-        out.append(Alike(own, counts[chosen], same, at[start[same][:, None] + every]))
+        out.append(RowGroups(own, counts[chosen], same, at[start[same][:, None] + every]))
     return out
 
 
-def entries(matrix: Any) -> tuple[Index, Index]:
+def nonzero_entries(matrix: Any) -> tuple[Index, Index]:
     """np.nonzero, which takes twice as long for two dimensions as for one."""
     return np.divmod(np.flatnonzero(matrix), matrix.shape[1])
 
 
-def numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
-    """Places of the entries (i, j) in a matrix, counted from 1; the others have 0. And how many there are."""
+def number_entries(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
+    """Places of the entries (i, j) of a matrix, from 1 on, 0 for all others; and the number of entries.
+
+    Place 0 of the values is a zero, so that entries outside the pattern need no special case.
+    """
     out = np.zeros(shape, dtype=np.int32)
     out[i, j] = np.arange(1, i.size + 1)
     return out, i.size
@@ -145,11 +161,11 @@ def numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
 _lower = functools.cache(np.tril_indices)
 
 
-class Pairs:
-    """Places of the entries of W's lower triangle (i, j), counted from 1.
+class HessianPlaces:
+    """Places, from 1 on, of the entries (i, j) of the lower triangle of W, the condensed Hessian.
 
-    They take a search in half a million entries. Programs that grow by a few rows ask for the same ones
-    again, so those of each pattern of a row are kept.
+    Each look-up is a search in half a million entries. Programs that grow by a few constraints repeat the
+    same ones, so those of each row pattern are cached.
     """
 
     def __init__(self, i: Index, j: Index, n: int) -> None:
@@ -159,13 +175,13 @@ class Pairs:
         self._of_matrix: tuple[Index, Index, Places] | None = None
 
     def at(self, i: Index, j: Index) -> Places:
-        """Places (k,) of entries (k,); 0: there is none."""
+        """Places (k,) of entries (k,); 0 for entries outside the pattern."""
         wanted = i.astype(np.int64) * self._n + j
         found = np.searchsorted(self._keys, wanted).clip(max=self._keys.size - 1)
         return np.where(self._keys[found] == wanted, found + 1, 0).astype(np.int32)
 
     def of_rows(self, columns: Index) -> Places:
-        """Places (k, p (p + 1) / 2) of the products of the numbers of rows with columns (k, p)."""
+        """Places (k, p (p + 1) / 2) of the outer products of rows with these columns (k, p)."""
         i, j = _lower(columns.shape[1])
         keys, ends = columns.tobytes(), range(0, columns.nbytes + 1, max(columns[:1].nbytes, 1))
         names = [keys[one:two] for one, two in itertools.pairwise(ends)]
@@ -175,56 +191,53 @@ class Pairs:
         return np.array([self._of_row[name] for name in names])
 
     def of_matrix(self, lower: Index, matrix: Matrix) -> Places:
-        """Places of a csc's entries, of which ``lower`` are in the lower triangle."""
-        known, pattern = self._of_matrix, (matrix.indices, matrix.indptr)
-        if known is None or not all(map(np.array_equal, known[:2], pattern)):
+        """Places of those entries of a csc matrix that ``lower`` selects from its lower triangle."""
+        cached, pattern = self._of_matrix, (matrix.indices, matrix.indptr)
+        if cached is None or not all(map(np.array_equal, cached[:2], pattern)):
             found = self.at(matrix.indices[lower], _columns(matrix)[lower])
-            known = self._of_matrix = matrix.indices.copy(), matrix.indptr.copy(), found
-        return known[2]
+            cached = self._of_matrix = matrix.indices.copy(), matrix.indptr.copy(), found
+        return cached[2]
 
 
-def products(pairs: Pairs, groups: Sequence[Alike]) -> list[Products]:
-    """Places of the products of each row's numbers."""
-    return [
-        Products(counts=counts, rows=rows.astype(np.int32), values=values, to=pairs.of_rows(columns))
-        for columns, counts, rows, values in groups
-    ]
-
-
-def shapes(systems: list[Touched]) -> list[list[Touched]]:
-    """Systems of one elimination that touch as many variables and rows as each other."""
+def same_shapes(systems: list[Touched]) -> list[list[Touched]]:
+    """Systems of one elimination, by the numbers of constraints and variables that they touch."""
     out: dict[tuple[int, int, int], list[Touched]] = {}
     for s in systems:
         out.setdefault((s.c.size, s.u.size, s.t.size), []).append(s)
     return list(out.values())
 
 
-def stage(systems: list[Touched], rows: Places, pairs: Places) -> EliminationStep:
-    """Systems of one shape; rows, pairs : places of the entries of equalities and W, as of `numbered`."""
+def elimination_stage(systems: list[Touched], J_places: Places, W_places: Places) -> EliminationStage:
+    """Elimination stage for systems of one shape.
+
+    J_places, W_places : of the entries of the equalities and of W, as of `number_entries`.
+    """
     q, e, t, c, u = (np.array([getattr(s, name) for s in systems]) for name in ("q", "e", "t", "c", "u"))
     i, j = _lower(c.shape[1])
     places = {
-        "qe": rows[q[:, None, :], e[:, :, None]],
-        "qc": rows[q[:, None, :], c[:, :, None]],
-        "te": rows[t[:, :, None], e[:, None, :]],
-        "tc": rows[t[:, :, None], c[:, None, :]],
-        "hee": pairs[e[:, :, None], e[:, None, :]],
-        "heu": pairs[u[:, :, None], e[:, None, :]],
-        "hcc": pairs[c[:, i], c[:, j]],
-        "hcv": pairs[c[:, :, None], u[:, None, c.shape[1] :]],
+        "qe": J_places[q[:, None, :], e[:, :, None]],
+        "qc": J_places[q[:, None, :], c[:, :, None]],
+        "te": J_places[t[:, :, None], e[:, None, :]],
+        "tc": J_places[t[:, :, None], c[:, None, :]],
+        "hee": W_places[e[:, :, None], e[:, None, :]],
+        "heu": W_places[u[:, :, None], e[:, None, :]],
+        "hcc": W_places[c[:, i], c[:, j]],
+        "hcv": W_places[c[:, :, None], u[:, None, c.shape[1] :]],
     }
     numbers = {"q": q, "e": e, "t": t, "u": u, **places}
-    return EliminationStep(**{name: np.ascontiguousarray(a, dtype=np.int32) for name, a in numbers.items()})
+    return EliminationStage(**{name: np.ascontiguousarray(a, dtype=np.int32) for name, a in numbers.items()})
 
 
 Mask = npt.NDArray[np.bool_]
 
 
 def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determined]) -> list[Elimination]:
-    """The eliminations for variables that a program says are determined by rows of their own.
+    """Eliminations of the variables that a program declares as determined by equalities.
 
-    Each gets the first equality rows that touch it and are not taken yet; where there are not enough, or they
-    do not determine it by their pattern, it stays free. equal (m,): which rows are equalities.
+    Each set of variables takes the first equalities that contain one of them and are not taken yet. If there
+    are too few, or their pattern is singular, the variables stay free.
+
+    equal (m,) : which constraints are equalities.
     """
     touches = jacobian.tocsc()
     start, touching = touches.indptr, touches.indices
@@ -232,19 +245,19 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
     found: dict[tuple[tuple[int, ...], int], list[tuple[Index, Index]]] = {}
     for rank, variables in determined:
         columns = [touching[start[v] : start[v + 1]] for v in variables]
-        rows = np.unique(np.concatenate([np.zeros(0, np.intp), *columns]))
-        rows = rows[~taken[rows]][: variables.size]
-        if rows.size < variables.size or not variables.size:
+        equalities = np.unique(np.concatenate([np.zeros(0, np.intp), *columns]))
+        equalities = equalities[~taken[equalities]][: variables.size]
+        if equalities.size < variables.size or not variables.size:
             continue
-        system = np.zeros((rows.size, rows.size), dtype=bool)
+        system = np.zeros((equalities.size, equalities.size), dtype=bool)
         for k, column in enumerate(columns):
             touched[column] = True
-            system[k] = touched[rows]
+            system[k] = touched[equalities]
             touched[column] = False
-        if not _determines(system.tobytes(), rows.size):
+        if not _structurally_regular(system.tobytes(), equalities.size):
             continue
-        taken[rows] = True
-        found.setdefault((rank, variables.size), []).append((rows, variables))
+        taken[equalities] = True
+        found.setdefault((rank, variables.size), []).append((equalities, variables))
     return [
         Elimination(np.array([r for r, _ in found[key]]), np.array([v for _, v in found[key]]))
         for key in sorted(found)
@@ -252,34 +265,35 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
 
 
 @functools.lru_cache(maxsize=256)
-def _determines(pattern: bytes, size: int) -> bool:
-    """True if a square system with this pattern can be regular: most systems have that of another."""
+def _structurally_regular(pattern: bytes, size: int) -> bool:
+    """True if a square matrix with this pattern can be regular; cached, as most systems share a pattern."""
     system = sp.csr_matrix(np.frombuffer(pattern, dtype=bool).reshape(size, size))
     return bool((maximum_bipartite_matching(system) >= 0).all())
 
 
 def _columns(matrix: Matrix) -> Index:
-    """Column of each entry of a csc."""
+    """Column of each entry of a csc matrix."""
     return np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
 
 
 class Condenser:
-    """Eliminates, for matrices whose patterns do not change.
+    """Elimination of variables from Newton systems with fixed patterns.
 
-    Rows are those of the program, and behind them one for each eliminated variable that has a bound. Those
-    that are no equalities are not eliminated from: they enter the Hessian, W = H + J' diag(w) J, before it.
+    Its constraints are those of the program, then the bounds of eliminated variables. Inequalities are not
+    eliminated: they enter the Hessian, W = H + J' diag(w) J, before the elimination.
 
     Attributes
     ----------
-    eliminated : numbers of the rows that are gone.
-    rows, free : numbers of the rows and variables that are left.
-    equal : which of the rows left are equalities: numbers into `rows`.
-    bounded : eliminated variables with a bound, each a row of its own from number m on.
-    m, n : number of rows with those of `bounded`, and of variables.
-    left : of each equality left the free variables that it touches, and places of these numbers in `J`.
-    at_free : places of the numbers of free variables in what `reduce` gives, and their rows and columns.
-    pattern : which of the free variables W couples (f, f), once all is eliminated, with those that an
-        equality left touches.
+    m, n : number of constraints, with those of `bounded`, and of variables.
+    eliminated : numbers of the constraints that are eliminated.
+    remaining, free : numbers of the constraints and variables that remain.
+    equal : which of the remaining constraints are equalities: indices into `remaining`.
+    bounded : eliminated variables with a bound; these bounds are constraints after those of the program.
+    remaining_equalities : the free variables in each, as indices into `free`, and the places of their
+        coefficients in `J`.
+    free_entries : places in `W` of the entries of free variables, and their rows and columns.
+    pattern (f, f) : entries of the condensed Hessian, with those that a remaining equality couples.
+    J, W : values of the equalities and of the condensed Hessian; the first value of each is zero.
     """
 
     def __init__(
@@ -291,69 +305,86 @@ class Condenser:
         bounded: Mask,
         kernels: Kernels,
     ):
-        """Patterns of the Jacobian (m, n) and the Hessian (n, n), csc; equal (m,): which rows are equalities;
-        bounded (n,): variables with a finite bound.
+        """Patterns of the Jacobian (m, n) and the Hessian (n, n), csc.
+
+        equal (m,) : which constraints are equalities.  bounded (n,) : variables with a finite bound.
         """
         m, n = jacobian.shape
         self._kernels, self.n = kernels, n
-        number = np.full(m, -1)  # of an equality among them
+        number = np.full(m, -1)  # of an equality among the equalities
         number[equal] = np.arange(int(equal.sum()))
-        gone = np.concatenate([np.zeros(0, np.intp), *[e.variables.ravel() for e in eliminations]])
-        taken = np.concatenate([np.zeros(0, np.intp), *[e.rows.ravel() for e in eliminations]])
-        self._taken = np.sort(number[taken])
+        none = np.zeros(0, dtype=np.intp)
+        variables = np.concatenate([none, *[e.variables.ravel() for e in eliminations]])
+        constraints = np.concatenate([none, *[e.constraints.ravel() for e in eliminations]])
+        self._taken = np.sort(number[constraints])
         self._left = np.setdiff1d(np.arange(int(equal.sum())), self._taken)
-        self.bounded = np.sort(gone[bounded[gone]])
-        self.free = np.setdiff1d(np.arange(n), gone)
+        self.bounded = np.sort(variables[bounded[variables]])
+        self.free = np.setdiff1d(np.arange(n), variables)
 
-        own = number[jacobian.indices]
+        # symbolic elimination, with dense masks
+        own = number[jacobian.indices]  # of each entry: the number of its equality, -1: of an inequality
         own_rows, own_columns = own[own >= 0], _columns(jacobian)[own >= 0]
         touches = np.zeros((int(equal.sum()), n), dtype=bool)
         touches[own_rows, own_columns] = True
-        groups = by_pattern(jacobian, np.flatnonzero(~equal))
+        groups = group_rows(jacobian, np.flatnonzero(~equal))
         couples = np.eye(n, dtype=bool)
         couples[hessian.indices, _columns(hessian)] = True
         for group in groups:
             couples[group.columns[:, :, None], group.columns[:, None, :]] = True
         systems = fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
 
-        rows, count = numbered(*entries(touches), touches.shape)
-        i, j = entries(couples)
+        # places of all entries, fill-in included
+        J_places, count = number_entries(*nonzero_entries(touches), touches.shape)
+        i, j = nonzero_entries(couples)
         i, j = i[i >= j], j[i >= j]
-        pairs, coupled = numbered(i, j, couples.shape)
-        self._pairs = Pairs(i, j, n)
+        W_places, coupled = number_entries(i, j, couples.shape)
+        self._hessian_places = HessianPlaces(i, j, n)
         self.J, self.W = np.zeros(count + 1), np.zeros(coupled + 1)
-        self._to = rows[own_rows, own_columns]
-        self._diagonal = np.diagonal(pairs).copy()
+        self._to = J_places[own_rows, own_columns]
+        self._diagonal = np.diagonal(W_places).copy()
         self._products: list[Products] = []
-        self._take(jacobian, hessian, equal, groups)
-        pairs[j, i] = pairs[i, j]
-        self._stages = [stage(same, rows, pairs) for found in systems for same in shapes(found)]
+        self._adapt(jacobian, hessian, equal, groups)
+        # stages name entries in either triangle
+        W_places[j, i] = W_places[i, j]
+        self._stages = [
+            elimination_stage(same, J_places, W_places) for found in systems for same in same_shapes(found)
+        ]
+
+        # what remains
         self.pattern = couples[np.ix_(self.free, self.free)]
         of_left = touches[np.ix_(self._left, self.free)]
-        self.left = [
-            (np.flatnonzero(t), rows[k, self.free[t]]) for k, t in zip(self._left, of_left, strict=True)
+        self.remaining_equalities = [
+            (np.flatnonzero(t), J_places[k, self.free[t]]) for k, t in zip(self._left, of_left, strict=True)
         ]
-        for columns, _ in self.left:
+        for columns, _ in self.remaining_equalities:
             self.pattern[np.ix_(columns, columns)] = True
-        none = np.zeros(0, dtype=np.intp)
-        at = (np.concatenate([none, *[one[k] for one in self.left]]) for k in (0, 1))
-        self._of_left = np.repeat(np.arange(len(self.left)), of_left.sum(axis=1)), *at
+        at = (np.concatenate([none, *[one[k] for one in self.remaining_equalities]]) for k in (0, 1))
+        self._A_entries = np.repeat(np.arange(self._left.size), of_left.sum(axis=1)), *at
         place = np.full(n, -1)
         place[self.free] = np.arange(self.free.size)
         inside = (place[i] >= 0) & (place[j] >= 0)
-        self.at_free = (np.flatnonzero(inside) + 1).astype(np.int32), place[i[inside]], place[j[inside]]
+        self.free_entries = (np.flatnonzero(inside) + 1).astype(np.int32), place[i[inside]], place[j[inside]]
 
-    def take(self, jacobian: Matrix, hessian: Matrix, equal: Mask) -> bool:
-        """Be that of matrices with other patterns but the same equalities; False: these rows or this Hessian
-        couple variables that nothing has coupled yet, and all stays as it was.
+    def adapt(self, jacobian: Matrix, hessian: Matrix, equal: Mask) -> bool:
+        """Adapt to matrices with the same equalities and other inequalities.
+
+        False, and no change, if these matrices couple variables that the pattern of W does not couple.
         """
-        return self._take(jacobian, hessian, equal, by_pattern(jacobian, np.flatnonzero(~equal)))
+        return self._adapt(jacobian, hessian, equal, group_rows(jacobian, np.flatnonzero(~equal)))
 
-    def _take(self, jacobian: Matrix, hessian: Matrix, equal: Mask, groups: Sequence[Alike]) -> bool:
-        found = products(self._pairs, groups)
+    def _adapt(self, jacobian: Matrix, hessian: Matrix, equal: Mask, groups: Sequence[RowGroups]) -> bool:
+        found = [
+            Products(
+                counts=group.counts,
+                rows=group.rows.astype(np.int32),
+                values=group.values,
+                to=self._hessian_places.of_rows(group.columns),
+            )
+            for group in groups
+        ]
         row, column = hessian.indices, _columns(hessian)
         lower = np.flatnonzero(row >= column)
-        to = self._pairs.of_matrix(lower, hessian)
+        to = self._hessian_places.of_matrix(lower, hessian)
         if not (to.all() and all(p.to.all() for p in found)):
             return False
         self._kernels.forget(self._products)
@@ -364,17 +395,17 @@ class Condenser:
         self._equations = np.flatnonzero(equal)
         self.eliminated = self._equations[self._taken]
         self.m = equal.size + self.bounded.size
-        self.rows = np.setdiff1d(np.arange(self.m), self.eliminated)
-        self.equal = np.searchsorted(self.rows, self._equations[self._left])
+        self.remaining = np.setdiff1d(np.arange(self.m), self.eliminated)
+        self.equal = np.searchsorted(self.remaining, self._equations[self._left])
         return True
 
-    # ------------------------------------------------------------------ numbers
+    # ------------------------------------------------------------------ values
     def load(self, jacobian: Matrix, hessian: Matrix) -> None:
-        """Take new values, with the patterns given at first, and eliminate in the equalities.
+        """Take the values of matrices with the known patterns, and eliminate in the equalities.
 
         Raises
         ------
-        LinAlgError : rows do not determine their variables.
+        LinAlgError : constraints do not determine their variables.
         """
         self._jacobian, self._hessian = (
             np.ascontiguousarray(a.data, dtype=float) for a in (jacobian, hessian)
@@ -386,24 +417,24 @@ class Condenser:
 
     @property
     def A(self) -> Vector:
-        """Jacobian of the equalities left, by the free variables (l, f)."""
-        out = np.zeros((len(self.left), self.free.size))
-        rows, columns, at = self._of_left
+        """Jacobian (l, f) of the remaining equalities by the free variables."""
+        out = np.zeros((self._left.size, self.free.size))
+        rows, columns, at = self._A_entries
         out[rows, columns] = self.J[at]
         return out
 
     @property
     def curvature(self) -> Vector:
-        """Curvature of the Hessian, along the free variables (f,)."""
+        """Diagonal (f,) of the Hessian for the free variables, before the elimination."""
         out = np.zeros(self.n)
         at, variables = self._curved
         out[variables] = self._hessian[at]
         return out[self.free]
 
     def reduce(self, weights: Vector, diagonal: Vector) -> Vector:
-        """H + diag(diagonal) + J' diag(weights) J, eliminated from: its values, to be read by `at_free`.
+        """Values of W = H + diag(diagonal) + J' diag(weights) J after the elimination; see `free_entries`.
 
-        weights (m,) of the rows: those of equalities play no part; diagonal (n,).
+        weights (m,) of the constraints: those of equalities have no effect.  diagonal (n,).
         """
         self.W[:] = 0.0
         where, to = self._own_hessian
@@ -416,42 +447,42 @@ class Condenser:
         return self.W
 
     def forward(self, gradient: Vector, residual: Vector) -> tuple[Vector, Vector]:
-        """Gradient by the free variables (f,) and residual of the equalities left (l,), where the step meets
-        those eliminated.
+        """Gradient (f,) by the free variables, and residual (l,) of the remaining equalities.
 
-        gradient : (n,) of what belongs to W; residual (m,).
+        gradient : (n,), of the quadratic model with W.  residual : (m,).  Both results are for a step of the
+        eliminated variables that meets the eliminated equalities while no free variable moves.
         """
         g, off = gradient.copy(), residual[self._equations]
         self._kernels.forward(self._stages, g, off)
         return g[self.free], off[self._left]
 
     def expand(self, step: Vector) -> Vector:
-        """The step of all variables (n,) for one of the free ones (f,), after `forward`."""
+        """Step (n,) of all variables for one of the free ones (f,), after `forward` with a residual."""
         d = np.zeros(self.n)
         d[self.free] = step
         self._kernels.expand(self._stages, d)
         return d
 
     def particular(self, residual: Vector) -> Vector:
-        """The step (n,) with which the eliminated equalities are met and no free variable moves; residual
-        (m,)."""
+        """Step (n,) that meets the eliminated equalities while no free variable moves; residual (m,)."""
         self.forward(np.zeros(self.n), residual)
         return self.expand(np.zeros(self.free.size))
 
     def expand_basis(self, Z: np.ndarray) -> None:
-        """Steps of eliminated variables for those of the free ones, each a column of Z (n, k), in place."""
-        # backwards: what a system determines may depend on variables that later ones determine
+        """Set the steps of eliminated variables for those of the free ones: columns of Z (n, k)."""
+        # backwards: the variables of a system may depend on those of later ones
         for a in reversed(self._stages):
             Z[a.e] = -(a.X.swapaxes(1, 2) @ Z[a.c])
 
     def multipliers(self, dual: Vector, y: Vector) -> Vector:
-        """Multipliers of the eliminated rows.
+        """Multipliers of the eliminated constraints, which make the eliminated variables stationary.
 
-        dual (n,) : gradient of the Lagrangian without the equalities; y (l,) : multipliers of those left.
+        dual (n,) : gradient of the Lagrangian without the equalities.
+        y (l,) : multipliers of the remaining equalities.
         """
         v, out = dual.copy(), np.zeros(self._equations.size)
         out[self._left] = y
         self._kernels.multipliers(self._stages, v, out)
-        everything = np.zeros(self.m)
-        everything[self._equations] = out
-        return everything[self.eliminated]
+        of_all = np.zeros(self.m)
+        of_all[self._equations] = out
+        return of_all[self.eliminated]

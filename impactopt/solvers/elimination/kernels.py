@@ -1,6 +1,6 @@
-"""Small dense algebra of condensed Newton systems, in NumPy, and the same in C (`native/newton.c`).
+"""Kernels of condensed Newton systems: small dense algebra in NumPy, and the same in C (`native/newton.c`).
 
-The NumPy runs where there is no compiler, on the same arrays.
+NumPy is used if there is no compiler, with the same arrays.
 """
 
 from __future__ import annotations
@@ -22,24 +22,32 @@ from impactopt.solvers.program import Vector
 Index = npt.NDArray[np.intp]
 Places = npt.NDArray[np.int32]
 Stack = npt.NDArray[np.float64]
+_SINGULAR = "constraints do not determine their variables"
 
 
 @dataclass(eq=False, kw_only=True)
-class EliminationStep:
-    """Systems (k) of one shape, r rows each: where their numbers stand, and what eliminating them found.
+class EliminationStage:
+    """Systems (k) of one shape, with r equalities each: places of their values, and results.
 
-    Places of what is not there point to the number in front of all others, which is zero.
+    The stages of a structure are eliminated one after the other. In each system, with the equalities
+    B d_e + N d_c + residual = 0, the variables e become d_e = -(x0 + X d_c). Places of entries outside the
+    pattern are 0, where the value is zero.
 
     Attributes
     ----------
-    q, e (k, r), t (k, nt) : numbers of the equalities, of the variables they determine, of other equalities
-        that these touch; u (k, nu) : of the variables that rows or Hessian couple to e, first those, nc, that
-        the rows touch.
-    qe (k, column, row), qc (k, nc, r), te (k, nt, r), tc (k, nt, nc) : places in the equalities' values.
-    hee (k, r, r), heu (k, nu, r), hcv (k, nc, nu - nc) : places in the values of W's lower triangle; hcc (k,
-        nc (nc + 1) / 2) : of the lower triangle of the variables that the rows touch.
-    lu, pivots : factors of B = the part qe. X (k, nc, r) : of B^-1 N, transposed. T (k, nt, r) : part te.
-    H (k, r, r), G (k, nu, r) : parts hee and heu. x0 (k, r) : B^-1 residual. own (k, r) : a gradient's part.
+    q, e (k, r) : numbers of the equalities, and of the variables that they determine.
+    t (k, nt) : other equalities that contain these variables.
+    u (k, nu) : variables that a constraint or the Hessian couples to e; first the nc variables c that are in
+        the equalities q.
+    qe (k, column, row), qc (k, nc, r), te (k, nt, r), tc (k, nt, nc) : places in the equalities' values,
+        named by rows and columns.
+    hee (k, r, r), heu (k, nu, r), hcv (k, nc, nu - nc) : places in the values of W's lower triangle; v are
+        the variables in u that are not in c.
+    hcc (k, nc (nc + 1) / 2) : of the lower triangle of the variables c.
+    lu, pivots : factors of B, the part qe.
+    X (k, nc, r) : B^-1 N, transposed.
+    T (k, nt, r), H (k, r, r), G (k, nu, r) : parts te, hee and heu.
+    x0 (k, r) : B^-1 residual.  own (k, r) : gradient by e.
     """
 
     q: Places
@@ -73,18 +81,19 @@ class EliminationStep:
 
     @property
     def c(self) -> Places:
-        """Numbers (k, nc) of the variables that the rows touch."""
+        """Numbers (k, nc) of the other variables in the equalities q."""
         return self.u[:, : self.X.shape[1]]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Products:
-    """Groups (g,) of rows that touch the same p columns.
+    """Outer products of the Jacobian's rows, in groups (g,) of rows with the same p columns.
 
     Attributes
     ----------
-    counts (g,) : of each group its rows.  rows (k,), values (k, p) : rows, one group after the other, and
-        places of their values.  to (g, p (p + 1) / 2) : places of products of two, a row's lower triangle.
+    counts (g,) : number of rows of each group.
+    rows (k,), values (k, p) : rows, one group after the other, and the places of their values.
+    to (g, p (p + 1) / 2) : places of the products in W, row by row of the lower triangle.
     """
 
     counts: Index
@@ -95,14 +104,18 @@ class Products:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Panels:
-    """The lower triangle of a matrix in blocks: of each block of columns, one dense matrix of the blocks of
-    rows that are not zero, by columns.
+    """Layout of a block Cholesky factor.
+
+    For each block of columns, its panel has the nonzero blocks of rows of the lower triangle, as one dense
+    matrix that is stored by columns.
 
     Attributes
     ----------
-    start : of each block, and the end; at : where its panel begins in the values, and the end.
-    height : rows of the panel. below : of each block, blocks of rows under the diagonal. row_at (block,
-        panel) : the row of a panel at which a block begins, -1: it is not in there.
+    start : first variable of each block, and the end.
+    at : place in the values at which each panel begins, and the end.
+    height : number of rows of each panel.
+    below : blocks of rows under the diagonal of each panel.
+    row_at (block, panel) : row of a panel at which a block begins; -1 if the panel lacks the block.
     """
 
     start: Places
@@ -113,7 +126,7 @@ class Panels:
 
     @property
     def size(self) -> Places:
-        """Rows of each block."""
+        """Number of variables of each block."""
         return np.diff(self.start)
 
 
@@ -121,7 +134,7 @@ class Kernels:
     """Kernels in NumPy."""
 
     def forget(self, thing: Any) -> None:
-        """No operation will be asked for with this list of steps or products any more."""
+        """Discard what was derived from this list of stages or products, which is no longer used."""
 
     def copy(self, values: Vector, source: Places, to: Vector, places: Places) -> None:
         """to[places] = values[source]"""
@@ -134,8 +147,8 @@ class Kernels:
             i, j = np.tril_indices(part.shape[1])
             _add(W, np.repeat(p.to, p.counts, axis=0), weights[p.rows][:, None] * part[:, i] * part[:, j])
 
-    def eliminate(self, stages: Sequence[EliminationStep], J: Vector) -> None:
-        """X = B^-1 N, and the other equalities' values with the step -X d_c in place of d_e.
+    def eliminate(self, stages: Sequence[EliminationStage], J: Vector) -> None:
+        """Compute X = B^-1 N, and replace d_e in the other equalities by -X d_c.
 
         Raises
         ------
@@ -143,51 +156,62 @@ class Kernels:
         """
         for a in stages:
             a.T[:] = J[a.te]
+            # arrays (k, column, row), as LAPACK stores matrices by columns: each B and N is a transposed
+            # matrix
             for i, (B, N) in enumerate(zip(J[a.qe], J[a.qc], strict=True)):
                 lu, pivots, info = la.lapack.dgetrf(B.T)
                 if info:
-                    raise np.linalg.LinAlgError("rows do not determine their variables")
+                    raise np.linalg.LinAlgError(_SINGULAR)
                 a.lu[i], a.pivots[i] = lu.T, pivots
                 a.X[i] = la.lapack.dgetrs(lu, pivots, N.T)[0].T
             _add(J, a.tc, -(a.T @ a.X.swapaxes(1, 2)))
 
-    def reduce(self, stages: Sequence[EliminationStep], W: Vector) -> None:
-        """W with -X d_c in place of d_e."""
+    def reduce(self, stages: Sequence[EliminationStage], W: Vector) -> None:
+        """Replace d_e in the quadratic form of W by -X d_c."""
         for a in stages:
             a.H[:], a.G[:] = W[a.hee], W[a.heu]
             G, nc = -a.G, a.X.shape[1]
+            # W_cc += C + C' with C = X (H X' / 2 - G'), as each of the two has half of the symmetric term;
+            # W_cv += C_v for the other variables in u (formulas with the arrays, in which X is transposed)
             G[:, :nc] += 0.5 * a.X @ a.H
             C = a.X @ G.swapaxes(1, 2)
             i, j = np.tril_indices(nc)
             _add(W, a.hcc, C[:, i, j] + C[:, j, i])
             _add(W, a.hcv, C[:, :, nc:])
 
-    def forward(self, stages: Sequence[EliminationStep], g: Vector, off: Vector) -> None:
-        """Gradient and residual with d_e = -(x0 + X d_c)."""
+    def forward(self, stages: Sequence[EliminationStage], g: Vector, off: Vector) -> None:
+        """Replace d_e in gradient and residual by -(x0 + X d_c), with x0 = B^-1 residual."""
         for a in stages:
-            a.x0[:] = self._solve(a, off[a.q], 0)
+            a.x0[:] = self._solve(a, off[a.q], transposed=0)
             _add(off, a.t, -(a.T @ a.x0[..., None])[..., 0])
+            # g_c -= X (g_e - H x0), g_u -= G x0
             own = g[a.e] - (a.H @ a.x0[..., None])[..., 0]
             _add(g, a.c, -(a.X @ own[..., None])[..., 0])
             _add(g, a.u, -(a.G @ a.x0[..., None])[..., 0])
 
-    def expand(self, stages: Sequence[EliminationStep], d: Vector) -> None:
-        """d_e of all stages, the last one first."""
+    def expand(self, stages: Sequence[EliminationStage], d: Vector) -> None:
+        """Set d_e of all stages, the last stage first."""
         for a in reversed(stages):
             d[a.e] = -a.x0 - (d[a.c][:, None] @ a.X)[:, 0]
 
-    def multipliers(self, stages: Sequence[EliminationStep], v: Vector, y: Vector) -> None:
-        """Multipliers of the stages' rows, from a gradient, which is spent, and those of the other rows."""
+    def multipliers(self, stages: Sequence[EliminationStage], v: Vector, y: Vector) -> None:
+        """Set the multipliers of the eliminated equalities.
+
+        v : gradient of the Lagrangian without equalities, which is overwritten.  y : multipliers of the
+        remaining equalities, to which those of the eliminated ones are added.
+        """
+        # forward: the gradient by c, with e replaced; backward: B' y_q = -(v_e + T' y_t) makes e stationary
         for a in stages:
             a.own[:] = v[a.e]
             _add(v, a.c, -(a.X @ a.own[..., None])[..., 0])
         for a in reversed(stages):
-            y[a.q] = -self._solve(a, a.own + (y[a.t][:, None] @ a.T)[:, 0], 1)
+            y[a.q] = -self._solve(a, a.own + (y[a.t][:, None] @ a.T)[:, 0], transposed=1)
 
     def factor(self, p: Panels, values: Vector) -> bool:
-        """The panels of L in place of those of L L'; False: the matrix is not positive definite."""
+        """Replace the panels of L L' by those of L; False: the matrix is not positive definite."""
         size, panels = p.size, _split(p, values)
         for k, panel in enumerate(panels):
+            # diagonal block, rows below it, then their products subtracted from later panels (right-looking)
             own = size[k]
             panel[:own], info = la.lapack.dpotrf(panel[:own], lower=1)
             if info:
@@ -203,11 +227,12 @@ class Kernels:
         return True
 
     def solve(self, p: Panels, values: Vector, x: Stack) -> Stack:
-        """(L L')^-1 x for columns (n, k)."""
+        """(L L')^-1 x for columns (n, k), in place."""
         blocks = [slice(a, b) for a, b in zip(p.start[:-1], p.start[1:], strict=True)]
         every = np.arange(p.start[-1])
         under = [np.concatenate([every[:0], *[every[blocks[i]] for i in below]]) for below in p.below]
         panels = _split(p, values)
+        # L, then its transpose, block by block
         for panel, own, rows in zip(panels, blocks, under, strict=True):
             size = own.stop - own.start
             x[own] = la.blas.dtrsm(1.0, panel[:size], x[own], lower=1)
@@ -218,7 +243,8 @@ class Kernels:
         return x
 
     @staticmethod
-    def _solve(a: EliminationStep, right: Stack, transposed: int) -> Stack:
+    def _solve(a: EliminationStage, right: Stack, *, transposed: int) -> Stack:
+        """B^-1, or B^-T, times right (k, r)."""
         found = [
             la.lapack.dgetrs(lu.T, p, b, trans=transposed)[0]
             for lu, p, b in zip(a.lu, a.pivots, right, strict=True)
@@ -226,12 +252,13 @@ class Kernels:
         return np.array(found)
 
 
-def _add(to: Vector, where: Places, what: Stack) -> None:
-    """Add numbers; places may repeat."""
-    np.add.at(to, where.ravel(), what.ravel())
+def _add(to: Vector, places: Places, values: Stack) -> None:
+    """Add values; places may repeat."""
+    np.add.at(to, places.ravel(), values.ravel())
 
 
 def _split(p: Panels, values: Vector) -> list[Stack]:
+    """Each panel as a view (height, width) of the values."""
     return [values[a:b].reshape(-1, h).T for a, b, h in zip(p.at[:-1], p.at[1:], p.height, strict=True)]
 
 
@@ -247,7 +274,7 @@ _ROUTINES = (
 
 
 def kernels() -> Kernels:
-    """The kernels in C where there is a compiler, or else in NumPy."""
+    """Kernels in C if there is a compiler, else in NumPy."""
     library = _library()
     return Kernels() if library is None else CompiledKernels(library)
 
@@ -263,7 +290,7 @@ def _library() -> Any:
 
 
 def _pointer(module: Any, name: str) -> int:
-    """The address of one of SciPy's BLAS and LAPACK routines, which come in capsules for Cython's sake."""
+    """Address of one of SciPy's BLAS and LAPACK routines, which it exports to Cython as capsules."""
     api, capsule = ctypes.pythonapi, module.__pyx_capi__[name]
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
@@ -271,22 +298,23 @@ def _pointer(module: Any, name: str) -> int:
     return int(api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule)))
 
 
-_OF_STAGES = (
+# Fields of the structs `stage` and `panels` of newton.c, in their order there.
+_STAGE_ARRAYS = (
     *("q", "e", "t", "u", "qe", "qc", "te", "tc", "hee", "heu"),
     *("lu", "pivots", "X", "T", "H", "G", "x0", "own"),
 )
-_OF_PANELS = ("size", "height", "first", "below", "row_at", "start", "at")
+_PANEL_ARRAYS = ("size", "height", "first", "below", "row_at", "start", "at")
 
 
 class _Stage(ctypes.Structure):
     _fields_ = (
         *[(name, ctypes.c_int64) for name in ("k", "r", "nt", "nc", "nu")],
-        *[(name, ctypes.c_void_p) for name in (*_OF_STAGES, "work", "hcc", "hcv")],
+        *[(name, ctypes.c_void_p) for name in (*_STAGE_ARRAYS, "work", "hcc", "hcv")],
     )
 
 
 class _Panels(ctypes.Structure):
-    _fields_ = ("count", ctypes.c_int64), *[(name, ctypes.c_void_p) for name in (*_OF_PANELS, "work")]
+    _fields_ = ("count", ctypes.c_int64), *[(name, ctypes.c_void_p) for name in (*_PANEL_ARRAYS, "work")]
 
 
 class CompiledKernels(Kernels):
@@ -294,38 +322,41 @@ class CompiledKernels(Kernels):
 
     def __init__(self, library: Any):
         self._c = library
-        self._made: dict[int, tuple[Any, Any]] = {}
+        self._cached: dict[int, tuple[Any, Any]] = {}
 
-    # ------------------------------------------------------------------ what C needs to know
-    def _of(self, thing: Any, make: Callable[[Any], Any]) -> Any:
-        """Arguments that C takes for a thing, made once, and kept with it and with what it points to."""
-        found = self._made.get(id(thing))
+    # ------------------------------------------------------------------ arguments of the C functions
+    def _arguments(self, thing: Any, make: Callable[[Any], Any]) -> Any:
+        """Arguments of C for a list of stages, products or panels, made once."""
+        # The thing is kept with them, so that its id is not given to another one, nor the memory that C
+        # points to be freed.
+        found = self._cached.get(id(thing))
         if found is None:
-            found = self._made[id(thing)] = thing, make(thing)
+            found = self._cached[id(thing)] = thing, make(thing)
         return found[1]
 
     def forget(self, thing: Any) -> None:
-        self._made.pop(id(thing), None)
+        self._cached.pop(id(thing), None)
 
     @staticmethod
-    def _all(stages: Sequence[EliminationStep]) -> tuple[Any, ...]:
-        made, keep = [], []
+    def _stages(stages: Sequence[EliminationStage]) -> tuple[Any, ...]:
+        structs, keep = [], []
         for a in stages:
             k, nt, nc = a.tc.shape
             r, nu = a.q.shape[1], a.u.shape[1]
-            spread = nc * max(nc + 1, nu)  # of products of variables that rows touch, and of others
+            # scratch of one system: the largest of what eliminate, reduce, and the operations on vectors need
+            spread = nc * max(nc + 1, nu)
             work = np.zeros(max(nt * nc, r * (nu + nc) + max(r * nu, spread), r + max(nt, nc, nu)) + 1)
             within = _runs(a.hcc.ravel(), np.arange(k)[:, None] * a.hcc.shape[1] + _rows_of_triangle(nc))
             beyond = _runs(a.hcv.transpose(0, 2, 1).ravel(), np.arange(k * (nu - nc) if nc else 0) * nc)
-            arrays = [*[getattr(a, name) for name in _OF_STAGES], work, within, beyond]
-            made.append(_Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in arrays]))
+            arrays = [*[getattr(a, name) for name in _STAGE_ARRAYS], work, within, beyond]
+            structs.append(_Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in arrays]))
             keep.append(arrays)
-        return (_Stage * len(made))(*made), ctypes.c_int64(len(made)), keep
+        return (_Stage * len(structs))(*structs), ctypes.c_int64(len(structs)), keep
 
     @staticmethod
     def _panels(p: Panels) -> tuple[Any, ...]:
         size = p.size
-        rest = int((p.height - size).max(initial=0))
+        rest = int((p.height - size).max(initial=0))  # most rows below a diagonal block
         first = np.cumsum([0, *[len(b) for b in p.below]]).astype(np.int32)
         below = np.concatenate([np.zeros(0, np.int32), *p.below])
         work = np.zeros(rest * max(rest, p.start[-1]) + 1)
@@ -334,7 +365,7 @@ class CompiledKernels(Kernels):
 
     @staticmethod
     def _groups(products: Sequence[Products]) -> tuple[Any, ...]:
-        none = [np.zeros(0, np.int32)]
+        none = [np.zeros(0, np.int32)]  # as np.concatenate takes no empty list
         columns = [p.values.shape[1] for p in products]
         before = np.cumsum([0, *[p.to.size for p in products]])
         rows = [
@@ -360,36 +391,39 @@ class CompiledKernels(Kernels):
         self._c.newton_copy(*arrays, ctypes.c_int64(source.size))
 
     def add_products(self, products: Sequence[Products], values: Vector, weights: Vector, W: Vector) -> None:
-        groups, parts, work = self._of(products, self._groups)
+        groups, parts, work = self._arguments(products, self._groups)
         self._c.newton_products(groups, *map(address, [*parts, values, weights, W, work]))
 
-    def eliminate(self, stages: Sequence[EliminationStep], J: Vector) -> None:
-        if self._c.newton_eliminate(*self._of(stages, self._all)[:2], address(J)):
-            raise np.linalg.LinAlgError("rows do not determine their variables")
+    def eliminate(self, stages: Sequence[EliminationStage], J: Vector) -> None:
+        if self._c.newton_eliminate(*self._arguments(stages, self._stages)[:2], address(J)):
+            raise np.linalg.LinAlgError(_SINGULAR)
 
-    def reduce(self, stages: Sequence[EliminationStep], W: Vector) -> None:
-        self._c.newton_reduce(*self._of(stages, self._all)[:2], address(W))
+    def reduce(self, stages: Sequence[EliminationStage], W: Vector) -> None:
+        self._c.newton_reduce(*self._arguments(stages, self._stages)[:2], address(W))
 
-    def forward(self, stages: Sequence[EliminationStep], g: Vector, off: Vector) -> None:
-        self._c.newton_forward(*self._of(stages, self._all)[:2], address(g), address(off))
+    def forward(self, stages: Sequence[EliminationStage], g: Vector, off: Vector) -> None:
+        self._c.newton_forward(*self._arguments(stages, self._stages)[:2], address(g), address(off))
 
-    def expand(self, stages: Sequence[EliminationStep], d: Vector) -> None:
-        self._c.newton_expand(*self._of(stages, self._all)[:2], address(d))
+    def expand(self, stages: Sequence[EliminationStage], d: Vector) -> None:
+        self._c.newton_expand(*self._arguments(stages, self._stages)[:2], address(d))
 
-    def multipliers(self, stages: Sequence[EliminationStep], v: Vector, y: Vector) -> None:
-        self._c.newton_multipliers(*self._of(stages, self._all)[:2], address(v), address(y))
+    def multipliers(self, stages: Sequence[EliminationStage], v: Vector, y: Vector) -> None:
+        self._c.newton_multipliers(*self._arguments(stages, self._stages)[:2], address(v), address(y))
 
     def factor(self, p: Panels, values: Vector) -> bool:
-        return not self._c.newton_cholesky(self._of(p, self._panels)[0], address(values))
+        return not self._c.newton_cholesky(self._arguments(p, self._panels)[0], address(values))
 
     def solve(self, p: Panels, values: Vector, x: Stack) -> Stack:
         shape = (ctypes.c_int64(x.shape[0]), ctypes.c_int64(x.shape[1]))
-        self._c.newton_solve(self._of(p, self._panels)[0], address(values), address(x), *shape)
+        self._c.newton_solve(self._arguments(p, self._panels)[0], address(values), address(x), *shape)
         return x
 
 
 def _runs(places: Places, first: Index) -> Places:
-    """Places in runs of neighbours (runs, 2): the first and how many; a run begins at each of ``first``."""
+    """Runs (count, 2) of consecutive places: the first one and the length; each of ``first`` begins a run.
+
+    C adds a run without looking up each place.
+    """
     begins = np.append(True, places[1:] != places[:-1] + 1)[: places.size]
     begins[first.ravel()] = True
     at = np.flatnonzero(begins)
@@ -398,6 +432,6 @@ def _runs(places: Places, first: Index) -> Places:
 
 @functools.cache
 def _rows_of_triangle(n: int) -> Index:
-    """Beginnings of the rows of a lower triangle."""
+    """Index at which each row of a lower triangle begins."""
     i = np.arange(n)
     return i * (i + 1) // 2

@@ -1,13 +1,15 @@
-"""Barrier problem: a program while mu keeps its variables off their bounds; elastic rows; the filter.
+"""Barrier problem of the interior-point method: its iterate, error, Newton step and trial points; the filter.
 
-Rows are those that `Condenser` leaves; g - s = 0 for an inequality row with its slack s. Here are its
-residual, its error, its barrier function, the Newton step and what a part of that leads to. Which step is
-taken is the line search's business, when rows may be violated that of the elastic phase (`interior_point`).
-An elastic row = p - n with p, n >= 0 under the barrier, and price (p + n) in the objective.
+The barrier problem is the program with logarithmic barriers, of weight mu, in place of bounds. An inequality
+g becomes g - s = 0 with a bounded slack s. Its constraints are those that `Condenser` leaves. The line search
+and the elastic phase, which decide on steps and on violations, are in `interior_point`.
+
+An elastic constraint is g - s = p - n with p, n >= 0 under the barrier, and price (p + n) in the objective.
 
 Source: Waechter and Biegler, On the implementation of an interior-point filter line-search algorithm for
 large-scale nonlinear programming, Mathematical Programming 106, 2006; equation numbers are that paper's.
-Elastic rows: section 3.3.1, whose restoration phase does this without the objective; the filter: section 2.3.
+Elastic constraints: section 3.3.1, whose restoration phase has them without the objective; the filter:
+section 2.3.
 """
 
 from __future__ import annotations
@@ -22,16 +24,16 @@ from impactopt.solvers.options import IPMOptions
 from impactopt.solvers.program import Determined, Point, TimedProgram, Vector, scaled_residual
 from impactopt.solvers.run import Path
 
-_SAFEGUARD = 1e10  # multipliers stay within this factor of mu / distance (eq. 16)
+_KAPPA_SIGMA = 1e10  # multipliers of bounds stay within this factor of mu / distance (eq. 16)
 
 
 class Bounded:
-    """Values v (k,) strictly between bounds, which may be infinite.
+    """Values v (k,) strictly between bounds, which may be infinite, and the multipliers of these bounds.
 
     Attributes
     ----------
     values : v.
-    below, above : multipliers of the lower and the upper bound, 0 where there is none.
+    below, above : multipliers of the lower and the upper bound, >= 0; 0 if there is no bound.
     """
 
     def __init__(
@@ -45,27 +47,27 @@ class Bounded:
         mu: float,
         kept: bool = False,
     ):
-        """values : moved inside by `push`, relative to the bound and to the room between both (section 3.6).
+        """values : moved inside by `push`, relative to the bound and to the distance of both (section 3.6).
 
         multipliers (k,) : positive at the upper bound, negative at the lower; each gets mu / distance at
-        least.  kept : only where it has none.
+        least.  kept : only if it is zero there.
         """
-        # 1 where there is a bound, else 0; and the bound, else 0
+        # 1 where there is a bound, else 0; and the bound, else 0: arithmetic instead of masks
         self._has_lower, self._has_upper = np.isfinite(lower).astype(float), np.isfinite(upper).astype(float)
         self._lower = np.where(self._has_lower > 0, lower, 0.0)
         self._upper = np.where(self._has_upper > 0, upper, 0.0)
-        self._take(self._inside(values, push))
+        self._set(self._pushed_inside(values, push))
         low, high = mu / self._to_lower, mu / self._to_upper
         if kept:
             low, high = np.where(multipliers < 0, 0.0, low), np.where(multipliers > 0, 0.0, high)
         self.below = self._has_lower * np.maximum(-multipliers, low)
         self.above = self._has_upper * np.maximum(multipliers, high)
 
-    def _take(self, values: Vector) -> None:
+    def _set(self, values: Vector) -> None:
         self.values = values
         self._to_lower, self._to_upper = self._distances(values)
 
-    def _inside(self, values: Vector, push: float) -> Vector:
+    def _pushed_inside(self, values: Vector, push: float) -> Vector:
         has_lower, has_upper, low, high = self._has_lower > 0, self._has_upper > 0, self._lower, self._upper
         room = np.where(has_lower & has_upper, push * (high - low), np.inf)
         least = low + np.minimum(push * np.maximum(1.0, np.abs(low)), room)
@@ -73,7 +75,7 @@ class Bounded:
         return np.clip(values, np.where(has_lower, least, -np.inf), np.where(has_upper, most, np.inf))
 
     def _distances(self, values: Vector) -> tuple[Vector, Vector]:
-        """Distances to both bounds; 1 where there is none."""
+        """Distances to both bounds; 1 where there is none, whose logarithm is 0."""
         return (
             self._has_lower * (values - self._lower) + (1.0 - self._has_lower),
             self._has_upper * (self._upper - values) + (1.0 - self._has_upper),
@@ -81,7 +83,7 @@ class Bounded:
 
     @property
     def multiplier(self) -> Vector:
-        """Multipliers of both bounds together: positive where the upper one holds."""
+        """Multipliers of both bounds together: positive if the upper one is active."""
         return self.above - self.below
 
     @property
@@ -94,22 +96,22 @@ class Bounded:
         return float(self.below.sum() + self.above.sum())
 
     def barrier(self, values: Vector) -> float:
-        """- sum of the logarithms of the distances to the bounds."""
+        """- sum of the logarithms of the distances to the bounds; inf outside."""
         low, high = self._distances(values)
         if low.min(initial=1.0) <= 0.0 or high.min(initial=1.0) <= 0.0:
             return np.inf
         return -float(np.log(low).sum() + np.log(high).sum())
 
-    def slope(self, mu: float) -> Vector:
+    def barrier_gradient(self, mu: float) -> Vector:
         """Gradient of mu times the barrier."""
         out: Vector = mu * (self._has_upper / self._to_upper - self._has_lower / self._to_lower)
         return out
 
-    def stiffness(self) -> Vector:
-        """Part that the multipliers add to the Hessian's diagonal (eq. 13)."""
+    def hessian_diagonal(self) -> Vector:
+        """Sigma of eq. 13, multiplier over distance: the diagonal that the bounds add to the Hessian."""
         return self.below / self._to_lower + self.above / self._to_upper
 
-    def off(self, mu: float) -> float:
+    def complementarity_error(self, mu: float) -> float:
         """Largest |multiplier x distance - mu|."""
         gaps = (
             self.below * self._to_lower - mu * self._has_lower,
@@ -117,44 +119,47 @@ class Bounded:
         )
         return max(float(np.abs(g).max(initial=0.0)) for g in gaps)
 
-    def longest(self, step: Vector, keep: float) -> float:
-        """The longest part <= 1 of a step that leaves 1 - keep of every distance (eq. 15a)."""
+    def max_length(self, step: Vector, tau: float) -> float:
+        """Largest step length <= 1 that leaves 1 - tau of every distance (eq. 15a)."""
         return min(
-            longest(self._to_lower, self._has_lower * step, keep),
-            longest(self._to_upper, -self._has_upper * step, keep),
+            fraction_to_boundary(self._to_lower, self._has_lower * step, tau),
+            fraction_to_boundary(self._to_upper, -self._has_upper * step, tau),
         )
 
-    def short_of_bounds(self, values: Vector, keep: float) -> Vector:
-        """New values, each moved to where it takes no more than a part `keep` of its distance to a bound."""
-        least = np.where(self._has_lower > 0, self.values - keep * self._to_lower, -np.inf)
-        most = np.where(self._has_upper > 0, self.values + keep * self._to_upper, np.inf)
+    def clipped(self, values: Vector, fraction: float) -> Vector:
+        """New values, each clipped so that it uses at most a fraction of its present distance to a bound."""
+        least = np.where(self._has_lower > 0, self.values - fraction * self._to_lower, -np.inf)
+        most = np.where(self._has_upper > 0, self.values + fraction * self._to_upper, np.inf)
         return np.clip(values, least, most)
 
-    def dual_step(self, step: Vector, mu: float, keep: float) -> tuple[Vector, Vector, float]:
-        """Both multipliers' steps for a step of the values, eq. 12, and the longest part of them, eq. 15b."""
+    def dual_step(self, step: Vector, mu: float, tau: float) -> tuple[Vector, Vector, float]:
+        """Steps of both multipliers for a step of the values (eq. 12), and their largest length (eq. 15b)."""
         below = (mu * self._has_lower - self.below * step) / self._to_lower - self.below
         above = (mu * self._has_upper + self.above * step) / self._to_upper - self.above
-        return below, above, min(longest(self.below, below, keep), longest(self.above, above, keep))
+        length = min(
+            fraction_to_boundary(self.below, below, tau), fraction_to_boundary(self.above, above, tau)
+        )
+        return below, above, length
 
     def move(self, values: Vector, below: Vector, above: Vector, mu: float) -> None:
-        """Take new values, and multipliers kept near mu / distance."""
-        self._take(values)
+        """Take new values and multipliers; these are kept near mu / distance (eq. 16)."""
+        self._set(values)
         low, high = mu / self._to_lower, mu / self._to_upper
-        self.below = self._has_lower * np.clip(below, low / _SAFEGUARD, low * _SAFEGUARD)
-        self.above = self._has_upper * np.clip(above, high / _SAFEGUARD, high * _SAFEGUARD)
+        self.below = self._has_lower * np.clip(below, low / _KAPPA_SIGMA, low * _KAPPA_SIGMA)
+        self.above = self._has_upper * np.clip(above, high / _KAPPA_SIGMA, high * _KAPPA_SIGMA)
 
 
-def longest(room: Vector, step: Vector, keep: float) -> float:
-    """The longest part <= 1 of a step that leaves 1 - keep of the room that it shrinks."""
+def fraction_to_boundary(distance: Vector, step: Vector, tau: float) -> float:
+    """Largest step length <= 1 that uses at most the fraction tau of each distance (eq. 15)."""
     shrinks = step < 0.0
-    return min(1.0, float((keep * room[shrinks] / -step[shrinks]).min(initial=1.0)))
+    return min(1.0, float((tau * distance[shrinks] / -step[shrinks]).min(initial=1.0)))
 
 
-_LEAST = 1e-14  # of the price: no multiplier is nearer to it
+_MIN_PRICE_DISTANCE = 1e-14  # relative to the price; multipliers this near to it differ by rounding only
 
 
 class Elastic:
-    """Excess p and lack n of all rows (k,), eliminated from the Newton system.
+    """Excess p and shortfall n of all constraints (k,); the Newton system does not contain them.
 
     Attributes
     ----------
@@ -162,9 +167,9 @@ class Elastic:
     """
 
     def __init__(self, residual: Vector, price: float, mu: float):
-        """residual (k,) of the rows."""
+        """residual (k,) of the constraints: p - n."""
         self.price = price
-        # on the central path for p - n = residual (eq. 33)
+        # p and n minimize the barrier problem for p - n = residual (eq. 33)
         half = (mu - self.price * residual) / (2.0 * self.price)
         root = np.sqrt(half**2 + mu * residual / (2.0 * self.price))
         with np.errstate(divide="ignore", invalid="ignore"):  # two forms, each where it does not cancel
@@ -173,169 +178,183 @@ class Elastic:
         self._p = np.maximum(residual + self._n, mu / (2e3 * self.price))
 
     def clip(self, y: Vector) -> Vector:
-        """Multipliers moved strictly inside the price."""
+        """Multipliers moved strictly inside (-price, price)."""
         return np.clip(y, -0.9 * self.price, 0.9 * self.price)
 
     def residual(self, residual: Vector) -> Vector:
-        """Part of a residual that is neither excess nor lack."""
+        """Residual of the elastic constraints: that of the hard ones without p - n."""
         return residual - self._p + self._n
 
-    def largest(self) -> float:
-        """The largest violation of a row."""
+    def max_violation(self) -> float:
+        """Largest violation of a constraint."""
         return float(np.abs(self._p - self._n).max(initial=0.0))
 
     def compliance(self, y: Vector, mu: float) -> tuple[Vector, Vector]:
-        """Compliance of a row per unit of multiplier, and the offset that goes with it."""
-        # p (price - y) = mu and n (price + y) = mu, linearized, give the steps of p and n as in `step`. Put
-        # into J d + r = (p + dp) - (n + dn), they leave J d + (r - p + n) + offset = give y_new.
-        zp, zn = self._below_price(y)
-        give = self._p / zp + self._n / zn
-        return give, give * y - (mu / zp - self._p) + (mu / zn - self._n)
+        """Compliance of each constraint, per unit of multiplier, and the offset that goes with it."""
+        # p (price - y) = mu and n (price + y) = mu, linearized, give the steps of p and n as in `set_step`.
+        # Put into J d + r = (p + dp) - (n + dn), they leave J d + (r - p + n) + offset = compliance y_new.
+        zp, zn = self._price_distances(y)
+        compliance = self._p / zp + self._n / zn
+        return compliance, compliance * y - (mu / zp - self._p) + (mu / zn - self._n)
 
-    def _below_price(self, y: Vector) -> tuple[Vector, Vector]:
-        """Distance of the multipliers below the price, and above its opposite: more than rounding."""
-        least = _LEAST * self.price
+    def _price_distances(self, y: Vector) -> tuple[Vector, Vector]:
+        """Distance of the multipliers from the price and from -price; more than rounding."""
+        least = _MIN_PRICE_DISTANCE * self.price
         return np.maximum(self.price - y, least), np.maximum(self.price + y, least)
 
-    def step(self, new: Vector, y: Vector, mu: float) -> None:
-        """Find the steps of p and n for new multipliers."""
-        dy, (zp, zn) = new - y, self._below_price(y)
+    def set_step(self, y_new: Vector, y: Vector, mu: float) -> None:
+        """Compute the steps of p and n for new multipliers."""
+        dy, (zp, zn) = y_new - y, self._price_distances(y)
         self._dp = (mu - self._p * zp + self._p * dy) / zp
         self._dn = (mu - self._n * zn - self._n * dy) / zn
 
-    def longest(self, keep: float) -> float:
-        """The longest part <= 1 of the steps of p and n that keeps them positive."""
-        return min(longest(self._p, self._dp, keep), longest(self._n, self._dn, keep))
+    def max_length(self, tau: float) -> float:
+        """Largest length <= 1 of the steps of p and n that keeps them positive."""
+        return min(fraction_to_boundary(self._p, self._dp, tau), fraction_to_boundary(self._n, self._dn, tau))
 
-    def longest_dual(self, new: Vector, y: Vector, keep: float) -> float:
-        """The longest part <= 1 of the multipliers' step that keeps them below the price."""
-        return min(longest(self.price - y, y - new, keep), longest(self.price + y, new - y, keep))
+    def max_dual_length(self, y_new: Vector, y: Vector, tau: float) -> float:
+        """Largest length <= 1 of the multipliers' step that keeps them below the price."""
+        return min(
+            fraction_to_boundary(self.price - y, y - y_new, tau),
+            fraction_to_boundary(self.price + y, y_new - y, tau),
+        )
 
-    def moved(self, length: float) -> tuple[Vector, Vector]:
-        """p and n after a part of their steps."""
+    def after(self, length: float) -> tuple[Vector, Vector]:
+        """p and n after a step of this length."""
         return self._p + length * self._dp, self._n + length * self._dn
 
     def cost(self, p: Vector, n: Vector, mu: float) -> float:
-        """Part that p and n add to the barrier function."""
+        """Contribution of p and n to the barrier function."""
         return float(self.price * (p + n).sum() - mu * (np.log(p).sum() + np.log(n).sum()))
 
-    def now(self, mu: float) -> float:
-        """Part that they add now."""
+    def current_cost(self, mu: float) -> float:
+        """`cost` of the present p and n."""
         return self.cost(self._p, self._n, mu)
 
-    def slope(self, mu: float) -> float:
-        """Its slope along the steps."""
+    def cost_slope(self, mu: float) -> float:
+        """Slope of `cost` along the steps."""
         return float((self.price - mu / self._p) @ self._dp + (self.price - mu / self._n) @ self._dn)
 
-    def take(self, length: float, residual: Vector) -> None:
-        """Move p and n; the larger of the two makes up for what is left of the residual there."""
-        p, n = self.moved(length)
-        left = residual - (p - n)
+    def move(self, length: float, residual: Vector) -> None:
+        """Move p and n; the larger of the two then takes up the rest of the new residual."""
+        p, n = self.after(length)
+        rest = residual - (p - n)
         least = 1e-3 * np.minimum(p, n)
-        self._p = np.where(p >= n, np.maximum(p + left, least), p)
-        self._n = np.where(p >= n, n, np.maximum(n - left, least))
+        self._p = np.where(p >= n, np.maximum(p + rest, least), p)
+        self._n = np.where(p >= n, n, np.maximum(n - rest, least))
 
-    def off(self, y: Vector, mu: float) -> float:
-        """Largest |multiplier x p - mu|, and likewise of n."""
+    def complementarity_error(self, y: Vector, mu: float) -> float:
+        """Largest |p (price - y) - mu| or |n (price + y) - mu|."""
         gaps = np.abs(self._p * (self.price - y) - mu), np.abs(self._n * (self.price + y) - mu)
         return max(float(g.max(initial=0.0)) for g in gaps)
 
 
-_VIOLATION, _OBJECTIVE = 1e-5, 1e-8  # gamma_theta, gamma_phi of eq. 18
-_ARMIJO, _SWITCH, _VIOLATION_POWER, _SLOPE_POWER = 1e-8, 1.0, 1.1, 2.3  # eta, delta, s_theta, s_phi
-_SHORTEST = 0.05  # gamma_alpha of eq. 23
+# Constants of the line search: the paper's names, IPOPT's default values.
+_GAMMA_THETA, _GAMMA_PHI = 1e-5, 1e-8  # eq. 18: sufficient progress in violation, in the barrier function
+_ETA_PHI, _DELTA, _S_THETA, _S_PHI = 1e-8, 1.0, 1.1, 2.3  # eq. 19 and 20
+_GAMMA_ALPHA = 0.05  # eq. 23
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchStart:
-    """Start of a line search: violation theta, barrier function phi and its slope along the step."""
+    """Violation theta, barrier function phi, and its slope along the step, where a line search starts."""
 
     theta: float
     phi: float
     slope: float
 
-    def switches(self, length: float) -> bool:
-        """True if a step of that length is to lessen phi rather than theta (eq. 19)."""
-        return (
-            self.slope < 0.0
-            and length * (-self.slope) ** _SLOPE_POWER > _SWITCH * self.theta**_VIOLATION_POWER
-        )
+    def favors_objective(self, length: float) -> bool:
+        """Switching condition, eq. 19: a step of this length is to reduce phi rather than theta."""
+        return self.slope < 0.0 and length * (-self.slope) ** _S_PHI > _DELTA * self.theta**_S_THETA
 
-    def falls(self, length: float, phi: float) -> bool:
-        """True if phi falls as its slope lets expect: Armijo's condition, eq. 20, but for rounding."""
-        return phi <= self.phi + _ARMIJO * length * self.slope + 1e-13 * abs(self.phi)
+    def is_sufficient_decrease(self, length: float, phi: float) -> bool:
+        """Armijo's condition, eq. 20, with an allowance for rounding."""
+        return phi <= self.phi + _ETA_PHI * length * self.slope + 1e-13 * abs(self.phi)
 
 
 @dataclass
 class Filter:
-    """Pairs (theta, phi) that no later point may be worse than in both."""
+    """Pairs (theta, phi); a later point has to be better than each of them in one of the two.
 
-    least: float
-    most: float
+    theta_min : largest violation of an iterate from which a step may be for the objective.
+    theta_max : largest violation of a point.
+    """
+
+    theta_min: float
+    theta_max: float
     pairs: list[tuple[float, float]] = field(default_factory=list)
 
     @classmethod
-    def around(cls, theta: float) -> Filter:
-        """A filter for a run that starts with this violation (section 3.3)."""
-        return cls(least=1e-4 * max(1.0, theta), most=1e4 * max(1.0, theta))
+    def from_violation(cls, theta: float) -> Filter:
+        """Empty filter for iterates from a point with this violation (section 3.3)."""
+        return cls(theta_min=1e-4 * max(1.0, theta), theta_max=1e4 * max(1.0, theta))
 
-    def shortest(self, at: SearchStart) -> float:
-        """The length below which no step will do (eq. 23)."""
-        length = _VIOLATION
-        if at.slope < 0.0:
-            length = min(length, _OBJECTIVE * at.theta / -at.slope)
-            if at.theta <= self.least:
-                length = min(length, _SWITCH * at.theta**_VIOLATION_POWER / (-at.slope) ** _SLOPE_POWER)
-        return max(_SHORTEST * length, 1e-14)
+    def min_length(self, start: SearchStart) -> float:
+        """Step length below which no acceptable point is expected (eq. 23)."""
+        length = _GAMMA_THETA
+        if start.slope < 0.0:
+            length = min(length, _GAMMA_PHI * start.theta / -start.slope)
+            if start.theta <= self.theta_min:
+                length = min(length, _DELTA * start.theta**_S_THETA / (-start.slope) ** _S_PHI)
+        return max(_GAMMA_ALPHA * length, 1e-14)
 
-    def accepts(self, at: SearchStart, length: float, theta: float, phi: float) -> bool:
-        """True if a trial point is taken (steps A-5.3 and A-5.4)."""
-        if not (np.isfinite(theta) and np.isfinite(phi)) or theta > self.most:
+    def accepts(self, start: SearchStart, length: float, theta: float, phi: float) -> bool:
+        """True if a trial point is acceptable (steps A-5.3 and A-5.4)."""
+        if not (np.isfinite(theta) and np.isfinite(phi)) or theta > self.theta_max:
             return False
         if any(theta >= t and phi >= p for t, p in self.pairs):
             return False
-        # Where a step is to lessen phi, a little less violation is not enough: the iterates would go to a
+        # If a step is to reduce phi, a little less violation is not enough: the iterates could converge to a
         # feasible point that is no optimum.
-        if at.theta <= self.least and at.switches(length):
-            return at.falls(length, phi)
-        return theta <= (1.0 - _VIOLATION) * at.theta or phi <= at.phi - _OBJECTIVE * at.theta
+        if start.theta <= self.theta_min and start.favors_objective(length):
+            return start.is_sufficient_decrease(length, phi)
+        return theta <= (1.0 - _GAMMA_THETA) * start.theta or phi <= start.phi - _GAMMA_PHI * start.theta
 
-    def remember(self, at: SearchStart, length: float, phi: float) -> None:
-        """Augment the filter, but after a step for phi's sake (eq. 22)."""
-        if at.switches(length) and at.falls(length, phi):
+    def augment(self, start: SearchStart, length: float, phi: float) -> None:
+        """Add the pair of a search's start, unless its step reduced the objective (eq. 22)."""
+        if start.favors_objective(length) and start.is_sufficient_decrease(length, phi):
             return
-        pair = (1.0 - _VIOLATION) * at.theta, at.phi - _OBJECTIVE * at.theta
+        pair = (1.0 - _GAMMA_THETA) * start.theta, start.phi - _GAMMA_PHI * start.theta
         self.pairs = [(t, p) for t, p in self.pairs if t < pair[0] or p < pair[1]] + [pair]
 
 
-_FASTER = 0.2  # mu becomes min(0.2 mu, mu^power) (eq. 7)
-# the barrier problem is solved to so many mu (kappa_epsilon); then mu falls with this power: gently and
-# loosely. From multipliers given it falls at once, as the point is near and there is no path to keep to, but
-# from a first barrier so high. Where elastic rows have to show that no point meets them, as in the paper.
-_CLOSE, _POWER, _CLOSE_WARM, _HIGH = 30.0, 1.3, 1e4, 5e-3
-_CLOSE_ELASTIC, _POWER_ELASTIC = 10.0, 1.5
-_FINE, _FINEST = 0.6, 0.3  # times the tolerance: a mu that is small enough, and the least
-_PROXIMAL = 1.0  # times mu: weight of a step's own length, so that what nothing decides does not wander
-_LEFT = 0.1  # times mu: what a step may leave of the equations for it
-_PUSH = 1e-9  # into bounds, of an iterate that was left
-_NEW = 1e-3  # the least distance to its bound of a new row's slack
-_LARGE = 100.0  # mean multiplier from which on residuals are scaled (s_max)
+# The barrier is lowered as soon as the barrier problem's error is below kappa_epsilon mu, to
+# min(kappa_mu mu, mu^theta_mu) (eq. 7). The paper has 10, 0.2, 1.5. Ours lets mu fall more gently, from
+# barrier problems that are solved more loosely (fewer iterations, with the proximal term below).
+_KAPPA_MU, _KAPPA_EPSILON, _THETA_MU = 0.2, 30.0, 1.3
+# With given multipliers the iterate is near a solution, so mu falls at once. Above this initial barrier the
+# neighbour is not as near, and the iterates follow the central path as usual.
+_KAPPA_EPSILON_WARM, _MIN_BARRIER_OF_PATH = 1e4, 5e-3
+# The paper's values: elastic constraints have to show that no point meets them.
+_KAPPA_EPSILON_ELASTIC, _THETA_MU_ELASTIC = 10.0, 1.5
+# Times complementarity_tolerance: mu is lowered while it is above the first, and to the second at least.
+_SUFFICIENT_BARRIER, _MIN_BARRIER = 0.6, 0.3
+# Times mu: weight of the step's own square, |d|^2 / 2. Without it, directions that the objective does not
+# determine (an idle arm) wander towards bounds.
+_PROXIMAL = 1.0
+_NEWTON_TOLERANCE = 0.1  # times mu: largest residual of a Newton step's equations
+_PUSH_CONTINUED = 1e-9  # into bounds, if an earlier solve is continued: its iterate is inside them already
+_MIN_NEW_SLACK = 1e-3  # distance to the lower bound, of a constraint that the earlier solve did not have
+_S_MAX = 100.0  # mean multiplier beyond which errors are scaled (eq. 5 and 6)
 
 
 @dataclass
 class Step:
-    """A Newton step: of all variables, the free ones, the slacks; new multipliers of rows left and gone."""
+    """Newton step d (n,) of all variables, with the free (f,) and the slacks' (i,) parts.
+
+    y : new multipliers of the constraints that remain.  eliminated_y : of the eliminated ones.
+    """
 
     d: Vector
     free: Vector
     slack: Vector
     y: Vector
-    gone: Vector
+    eliminated_y: Vector
 
 
 @dataclass
 class Trial:
-    """A point to try, with its slacks, violation theta and barrier function phi."""
+    """A trial point, with its slacks, violation theta and barrier function phi."""
 
     point: Point
     slack: Vector
@@ -344,16 +363,17 @@ class Trial:
 
 
 class BarrierProblem:
-    """An iterate of the barrier problem, and the steps from it.
+    """Barrier problem at an iterate, and its Newton step.
 
     Attributes
     ----------
-    point : the iterate.  mu : weight of the barrier.  sigma : of the objective; 0 where only the violation
-        counts.
-    x, s : its free variables and its slacks, each with the multipliers of its bounds.
-    y, gone_y : multipliers of the rows left, and of those that are eliminated.
-    elastic : what rows may be violated by; None: they are hard.
-    row_multipliers (m,), bound_multipliers (n,), kkt : of the program, as of the last `take_multipliers`.
+    point : the iterate.  mu : weight of the barrier.  sigma : of the objective; 0 if the violation is
+        minimized alone.
+    x, s : free variables and slacks, each with the multipliers of its bounds.
+    y, eliminated_y : multipliers of the constraints that remain, and of the eliminated ones.
+    elastic : excess and shortfall of the constraints; None if they are hard.
+    constraint_multipliers (m,), bound_multipliers (n,), kkt : of the program, as of the last
+        `update_multipliers`.
     """
 
     def __init__(
@@ -368,12 +388,12 @@ class BarrierProblem:
         path: Path | None = None,
         determined: Sequence[Determined],
     ):
-        """point : moved inside its bounds.  y (m,), z (n,) : multipliers to start from, if it is ``warm``.
+        """point : is moved inside its bounds.  y (m,), z (n,) : initial multipliers, if it is ``warm``.
 
-        path : where they were left.
+        path : state of an earlier solve, to be continued.
         """
         self.program, self.options, self.warm = program, options, warm
-        self._at_once = warm and path is None and options.barrier_warm < _HIGH
+        self._lower_at_once = warm and path is None and options.barrier_warm < _MIN_BARRIER_OF_PATH
         self.sigma = 1.0
         self.mu = options.barrier_warm if warm else options.barrier
         self.mu = self.mu if path is None else path.barrier
@@ -390,13 +410,15 @@ class BarrierProblem:
             moves=moves,
         )
         self._condenser = c = self.newton.condenser
-        lower = np.concatenate([p.g_lower, p.x_lower[c.bounded]])
-        upper = np.concatenate([p.g_upper, p.x_upper[c.bounded]])
-        self._gone, everywhere = lower[c.eliminated], lower
-        lower, upper = lower[c.rows], upper[c.rows]
-        self._unequal, self._level = np.flatnonzero(lower < upper), lower[c.equal]
-        push = options.push if path is None else _PUSH
-        if warm and path is None:  # where multipliers of order one have it
+        # all constraints of the condensed problem: the program's (m,), then bounds of eliminated variables
+        all_lower = np.concatenate([p.g_lower, p.x_lower[c.bounded]])
+        all_upper = np.concatenate([p.g_upper, p.x_upper[c.bounded]])
+        lower, upper = all_lower[c.remaining], all_upper[c.remaining]
+        self._eliminated_level, self._equal_level = all_lower[c.eliminated], lower[c.equal]
+        self._unequal = np.flatnonzero(lower < upper)  # into c.remaining: those with a slack
+        push = options.push if path is None else _PUSH_CONTINUED
+        if warm and path is None:
+            # as far as a bound is whose multiplier is of order one: farther, constraints would be violated
             push = min(push, self.mu)
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
         kept = path is not None
@@ -405,211 +427,220 @@ class BarrierProblem:
         x[c.free] = self.x.values
         self.point = point = point if np.array_equal(x, point.x) else p.point(x)
         multipliers = np.concatenate([y, z[c.bounded]])
-        self.y = multipliers[c.rows]
-        self.gone_y = multipliers[c.eliminated]
-        self.row_multipliers, self.bound_multipliers = y, z
-        rows = self._unequal
-        slacks = self._all(point)
+        self.y = multipliers[c.remaining]
+        self.eliminated_y = multipliers[c.eliminated]
+        self.constraint_multipliers, self.bound_multipliers = y, z
+        slacks = self._values(point)
         if path is not None:
-            left = np.concatenate([path.rows, path.bounds[c.bounded]])
-            least = np.where(np.isfinite(everywhere), everywhere, -np.inf) + _NEW
-            slacks = np.where(np.isnan(left), np.maximum(slacks, least), left)
+            saved = np.concatenate([path.rows, path.bounds[c.bounded]])
+            least = np.where(np.isfinite(all_lower), all_lower, -np.inf) + _MIN_NEW_SLACK
+            slacks = np.where(np.isnan(saved), np.maximum(slacks, least), saved)
         self.s = Bounded(
-            slacks[c.rows][rows],
-            lower[rows],
-            upper[rows],
+            slacks[c.remaining][self._unequal],
+            lower[self._unequal],
+            upper[self._unequal],
             push=push,
-            multipliers=self.y[rows],
+            multipliers=self.y[self._unequal],
             mu=self.mu,
             kept=kept,
         )
         if not warm:
-            # without multipliers from before: one for each bound (section 3.6)
+            # no multipliers are known: one for each bound (section 3.6)
             for values in (self.x, self.s):
                 values.below, values.above = np.sign(values.below), np.sign(values.above)
 
     def release(self) -> None:
-        """Give the Newton system's structure back, for the next program that has it."""
+        """Return the Newton system to the cache, for the next program of the same structure."""
         release(self.newton)
 
     def path(self) -> Path:
-        """State, for a solve that goes on from there."""
-        c, slacks, n = self._condenser, self._all(self.point), self.point.x.copy()
-        slacks[c.rows[self._unequal]] = self.s.values
+        """State of this solve, for one that continues it."""
+        c, slacks, of_variables = self._condenser, self._values(self.point), self.point.x.copy()
+        slacks[c.remaining[self._unequal]] = self.s.values
         m = self.program.m
-        n[c.bounded] = slacks[m:]
-        return Path(self.mu, slacks[:m], n)
+        of_variables[c.bounded] = slacks[m:]
+        return Path(self.mu, slacks[:m], of_variables)
 
-    def _all(self, point: Point) -> Vector:
-        """Values of the program's rows, and of the bounded eliminated variables."""
+    def _values(self, point: Point) -> Vector:
+        """Values of all constraints: the program's, then the bounded eliminated variables."""
         return np.concatenate([point.g, point.x[self._condenser.bounded]])
 
-    # ------------------------------------------------------------------ how far off it is
+    # ------------------------------------------------------------------ residuals and errors
     def residual(self, point: Point, slack: Vector) -> Vector:
-        """Residuals of the rows (m,): eliminated ones and equalities, and inequalities against their
-        slacks."""
-        out, c = self._all(point), self._condenser
-        out[c.eliminated] -= self._gone
-        out[c.rows[c.equal]] -= self._level
-        out[c.rows[self._unequal]] -= slack
+        """Residuals of all constraints (c.m,): g - level of equalities, g - s of inequalities."""
+        out, c = self._values(point), self._condenser
+        out[c.eliminated] -= self._eliminated_level
+        out[c.remaining[c.equal]] -= self._equal_level
+        out[c.remaining[self._unequal]] -= slack
         return out
 
-    def take_multipliers(self) -> None:
-        """Multipliers of the program's rows and bounds, and the dual residual."""
+    def update_multipliers(self) -> None:
+        """Compute the multipliers of the program's constraints and bounds, and the dual residual."""
         p, c, point = self.program, self._condenser, self.point
-        everything = np.zeros(c.m)
-        everything[c.rows], everything[c.eliminated] = self.y, self.gone_y
-        y, z = everything[: p.m], np.zeros(p.n)
+        of_all = np.zeros(c.m)
+        of_all[c.remaining], of_all[c.eliminated] = self.y, self.eliminated_y
+        y, z = of_all[: p.m], np.zeros(p.n)
         z[c.free] = self.x.multiplier
-        z[c.bounded] = everything[p.m :]
+        z[c.bounded] = of_all[p.m :]
         dual = self.sigma * point.gradient + point.jacobian.T @ y + z
-        # what does not move is stationary with whatever multiplier of its bound makes it so
-        held = c.free[self.newton.held]
-        z[held] -= dual[held]
-        dual[held] = 0.0
-        self.row_multipliers, self.bound_multipliers = y, z
+        # a fixed variable is stationary: the multiplier of its bounds is whatever it takes
+        fixed = c.free[self.newton.fixed]
+        z[fixed] -= dual[fixed]
+        dual[fixed] = 0.0
+        self.constraint_multipliers, self.bound_multipliers = y, z
         self._dual = float(np.abs(dual).max(initial=0.0))
         self.kkt = scaled_residual(dual + (1.0 - self.sigma) * point.gradient, y, z)
 
     def error(self, mu: float, residual: Vector) -> float:
-        """The scaled error of the barrier problem (eq. 5), of the multipliers taken."""
+        """Scaled error of the barrier problem (eq. 5), with the multipliers of `update_multipliers`.
+
+        mu = 0 : of the program; in units of kkt_tolerance, so that one comparison checks all tolerances.
+        """
         x, s, c = self.x, self.s, self._condenser
         bounds, count = x.total() + s.total(), max(1, x.bounds + s.bounds)
-        if self.elastic is not None:  # two more bounds a row, whose multipliers add up to twice the price
-            bounds, count = bounds + 2 * self.elastic.price * self.y.size, count + 2 * self.y.size
-        rows = float(np.abs(self.y).sum() + np.abs(self.gone_y).sum())
-        scale = max(_LARGE, (rows + bounds) / (c.m + count)) / _LARGE
-        slack = float(np.abs(self.y[self._unequal] - s.multiplier).max(initial=0.0))
-        off, left = max(x.off(mu), s.off(mu)), residual[c.rows]
         if self.elastic is not None:
-            off, left = max(off, self.elastic.off(self.y, mu)), self.elastic.residual(left)
-        violation = max(float(np.abs(v).max(initial=0.0)) for v in (left, residual[c.eliminated]))
-        off /= max(_LARGE, bounds / count) / _LARGE  # s_c of eq. 6; `scale` is its s_d
-        if not mu:  # in units of the one tolerance that all is compared with
+            # p and n have two more bounds a constraint, whose multipliers add up to twice the price
+            bounds, count = bounds + 2 * self.elastic.price * self.y.size, count + 2 * self.y.size
+        of_constraints = float(np.abs(self.y).sum() + np.abs(self.eliminated_y).sum())
+        s_d = max(_S_MAX, (of_constraints + bounds) / (c.m + count)) / _S_MAX  # eq. 6, as s_c below
+        slack_dual = float(np.abs(self.y[self._unequal] - s.multiplier).max(initial=0.0))
+        off, remaining = max(x.complementarity_error(mu), s.complementarity_error(mu)), residual[c.remaining]
+        if self.elastic is not None:
+            off = max(off, self.elastic.complementarity_error(self.y, mu))
+            remaining = self.elastic.residual(remaining)
+        violation = max(float(np.abs(v).max(initial=0.0)) for v in (remaining, residual[c.eliminated]))
+        off /= max(_S_MAX, bounds / count) / _S_MAX  # s_c
+        if not mu:
             off *= self.options.kkt_tolerance / self.options.complementarity_tolerance
-        return max(max(self._dual, slack) / scale, violation, off)
+        return max(max(self._dual, slack_dual) / s_d, violation, off)
 
     def lower_barrier(self, residual: Vector) -> bool:
-        """Let mu fall as far as the iterate is good enough for; whether it has."""
+        """Lower mu as often as the iterate solves the barrier problem well enough; True if mu changed."""
         tolerance, hard, before = self.options.complementarity_tolerance, self.elastic is None, self.mu
-        close, power = (_CLOSE, _POWER) if hard else (_CLOSE_ELASTIC, _POWER_ELASTIC)
-        if hard and self._at_once:
-            close = _CLOSE_WARM
-        while self.mu > _FINE * tolerance and self.error(self.mu, residual) <= close * self.mu:
-            self.mu = max(_FINEST * tolerance, min(_FASTER * self.mu, self.mu**power))
+        kappa, theta = (_KAPPA_EPSILON, _THETA_MU) if hard else (_KAPPA_EPSILON_ELASTIC, _THETA_MU_ELASTIC)
+        if hard and self._lower_at_once:
+            kappa = _KAPPA_EPSILON_WARM
+        while self.mu > _SUFFICIENT_BARRIER * tolerance and self.error(self.mu, residual) <= kappa * self.mu:
+            self.mu = max(_MIN_BARRIER * tolerance, min(_KAPPA_MU * self.mu, self.mu**theta))
         return self.mu != before
 
-    def soften(self, residual: Vector, price: float) -> None:
-        """Let rows be violated at a price, from now on."""
-        self.elastic = Elastic(residual[self._condenser.rows], price, self.mu)
-        self.y, self.gone_y = self.elastic.clip(self.y), np.zeros_like(self.gone_y)
+    def make_elastic(self, residual: Vector, price: float) -> None:
+        """Permit violations of the constraints at a price, from this iterate on."""
+        self.elastic = Elastic(residual[self._condenser.remaining], price, self.mu)
+        self.y, self.eliminated_y = self.elastic.clip(self.y), np.zeros_like(self.eliminated_y)
 
-    # ------------------------------------------------------------------ the Newton step
+    # ------------------------------------------------------------------ Newton step
     def step(self, residual: Vector) -> Step | None:
-        """The Newton step; None where its matrix cannot be factored."""
+        """Newton step; None if its matrix cannot be factored."""
         point, hard = self.point, self.elastic is None
-        found = self.newton.factor(
+        factored = self.newton.factor(
             point.jacobian,
-            self.program.hessian(point.x, self.sigma, self.row_multipliers),
-            self.x.stiffness(),
+            self.program.hessian(point.x, self.sigma, self.constraint_multipliers),
+            self.x.hessian_diagonal(),
             self._weights,
             hard=hard,
             proximal=_PROXIMAL * self.mu if hard else 0.0,
         )
-        return self.step_again(residual) if found else None
+        return self.step_for(residual) if factored else None
 
-    def _weights(self, more: float) -> Vector:
-        """Weights of the rows (k,), and their offsets: of the slacks' barrier, with more curvature, and of
-        elastic rows.
+    def _weights(self, shift: float) -> Vector:
+        """Weights w (k,) of the constraints that remain, y = w (J d + r + offset); sets the offsets (k,).
+
+        shift : added to the slacks' diagonal, as to that of the variables.  0 : weight of a hard equality,
+        which has no weight.
         """
-        soft, self._offsets = np.zeros(self._condenser.rows.size), np.zeros(self._condenser.rows.size)
-        self._stiffness = self.s.stiffness() + more
-        soft[self._unequal] = 1.0 / self._stiffness
-        self._offsets[self._unequal] = self.s.slope(self.mu) / self._stiffness
+        compliance, self._offsets = np.zeros((2, self._condenser.remaining.size))
+        # A slack's own equation is y = gradient + stiffness ds. With J d + r = ds it becomes
+        # y = stiffness (J d + r + gradient / stiffness): a weight and an offset, and no slack in the matrix.
+        self._stiffness = self.s.hessian_diagonal() + shift
+        compliance[self._unequal] = 1.0 / self._stiffness
+        self._offsets[self._unequal] = self.s.barrier_gradient(self.mu) / self._stiffness
         if self.elastic is not None:
-            give, offset = self.elastic.compliance(self.y, self.mu)
-            soft, self._offsets = soft + give, self._offsets + offset
-        return np.divide(1.0, soft, out=np.zeros_like(soft), where=soft > 0.0)
+            more, offsets = self.elastic.compliance(self.y, self.mu)
+            compliance, self._offsets = compliance + more, self._offsets + offsets
+        return np.divide(1.0, compliance, out=np.zeros_like(compliance), where=compliance > 0.0)
 
-    def step_again(self, residual: Vector) -> Step:
-        """The step for another residual of the rows (m,); the matrix stays."""
+    def step_for(self, residual: Vector) -> Step:
+        """Step for a residual of all constraints (c.m,), with the factored matrix."""
         c = self._condenser
         q, r = self.sigma * self.point.gradient, residual.copy()
-        q[c.free] += self.x.slope(self.mu)
+        q[c.free] += self.x.barrier_gradient(self.mu)
         if self.elastic is not None:
-            r[c.rows] = self.elastic.residual(r[c.rows])
-        # A slack's own equation y = slope + stiffness ds, put into its constraint J d + r = ds, leaves
-        # y = stiffness (J d + r + slope / stiffness): a weight and an offset, and no slack in the matrix.
-        r[c.rows] += self._offsets
-        d, everything = self.newton.solve(q, r, _LEFT * self.mu)
-        y = everything[c.rows]
-        slack = (y[self._unequal] - self.s.slope(self.mu)) / self._stiffness
+            r[c.remaining] = self.elastic.residual(r[c.remaining])
+        r[c.remaining] += self._offsets
+        d, of_all = self.newton.solve(q, r, _NEWTON_TOLERANCE * self.mu)
+        y = of_all[c.remaining]
+        slack = (y[self._unequal] - self.s.barrier_gradient(self.mu)) / self._stiffness
         if self.elastic is not None:
-            self.elastic.step(y, self.y, self.mu)
-        return Step(d, d[c.free], slack, y, everything[c.eliminated])
+            self.elastic.set_step(y, self.y, self.mu)
+        return Step(d, d[c.free], slack, y, of_all[c.eliminated])
 
     # ------------------------------------------------------------------ along a step
     @property
-    def keep(self) -> float:
-        """The part of a distance to a bound that a step may take, at most (tau, eq. 8)."""
+    def tau(self) -> float:
+        """Fraction of the distance to a bound that a step may use (eq. 8)."""
         return max(0.99, 1.0 - self.mu)
 
-    def longest(self, step: Step) -> float:
-        """The longest part of a step, 1 at most, that `keep` allows."""
-        keep = self.keep
-        length = min(self.x.longest(step.free, keep), self.s.longest(step.slack, keep))
-        return length if self.elastic is None else min(length, self.elastic.longest(keep))
+    def max_length(self, step: Step) -> float:
+        """Largest step length <= 1 that the fraction-to-the-boundary rule permits."""
+        tau = self.tau
+        length = min(self.x.max_length(step.free, tau), self.s.max_length(step.slack, tau))
+        return length if self.elastic is None else min(length, self.elastic.max_length(tau))
 
-    def progress(self, step: Step, residual: Vector) -> SearchStart:
-        """Start of a search along a step."""
+    def search_start(self, step: Step, residual: Vector) -> SearchStart:
+        """Violation, barrier function and slope from which a search along a step starts."""
         mu, point = self.mu, self.point
         slope = float(
             self.sigma * (point.gradient @ step.d)
-            + self.x.slope(mu) @ step.free
-            + self.s.slope(mu) @ step.slack
+            + self.x.barrier_gradient(mu) @ step.free
+            + self.s.barrier_gradient(mu) @ step.slack
         )
         phi = self._phi(point, self.s.values)
         if self.elastic is not None:
-            slope, phi = slope + self.elastic.slope(mu), phi + self.elastic.now(mu)
+            slope, phi = slope + self.elastic.cost_slope(mu), phi + self.elastic.current_cost(mu)
         return SearchStart(theta=self._theta(residual), phi=phi, slope=slope)
 
     def _phi(self, point: Point, slack: Vector) -> float:
-        """The barrier function, without what elastic rows add."""
+        """Barrier function, without the cost of elastic constraints."""
         barriers = self.x.barrier(point.x[self._condenser.free]) + self.s.barrier(slack)
         return self.sigma * point.objective + self.mu * barriers
 
-    def _theta(self, residual: Vector, excess: Vector | None = None) -> float:
+    def _theta(self, residual: Vector, violation: Vector | None = None) -> float:
+        """Sum of the residuals' sizes; violation (k,) : p - n of elastic constraints, default the present."""
         c = self._condenser
-        rows = residual[c.rows]
+        remaining = residual[c.remaining]
         if self.elastic is not None:
-            rows = self.elastic.residual(rows) if excess is None else rows - excess
-        return float(np.abs(residual[c.eliminated]).sum() + np.abs(rows).sum())
+            remaining = self.elastic.residual(remaining) if violation is None else remaining - violation
+        return float(np.abs(residual[c.eliminated]).sum() + np.abs(remaining).sum())
 
     def trial(self, step: Step, length: float, slack: Vector | None = None) -> Trial:
-        """The point after a part of a step; slack: those there, if not the step's."""
+        """Trial point at a step length; slack : the slacks there, if not those of the step."""
         point, mu = self.program.point(self.point.x + length * step.d), self.mu
         slack = self.s.values + length * step.slack if slack is None else slack
         if not point.finite:
             return Trial(point, slack, np.inf, np.inf)
         phi = self._phi(point, slack)
-        excess = None
+        violation = None
         if self.elastic is not None:
-            p, n = self.elastic.moved(length)
-            phi, excess = phi + self.elastic.cost(p, n, mu), p - n
-        return Trial(point, slack, self._theta(self.residual(point, slack), excess), phi)
+            p, n = self.elastic.after(length)
+            phi, violation = phi + self.elastic.cost(p, n, mu), p - n
+        return Trial(point, slack, self._theta(self.residual(point, slack), violation), phi)
 
     def move(self, step: Step, trial: Trial, length: float) -> None:
-        """Move to a trial point, and as far along the multipliers' steps as these allow."""
-        x, s, mu, keep = self.x, self.s, self.mu, self.keep
-        below_x, above_x, dual_x = x.dual_step(step.free, mu, keep)
-        below_s, above_s, dual_s = s.dual_step(step.slack, mu, keep)
-        # multipliers of constraints go as far as the variables do, those of bounds as they may (eq. 14)
-        dual, part = min(dual_x, dual_s), length
+        """Move to a trial point, and the multipliers along their steps."""
+        x, s, mu, tau = self.x, self.s, self.mu, self.tau
+        below_x, above_x, dual_x = x.dual_step(step.free, mu, tau)
+        below_s, above_s, dual_s = s.dual_step(step.slack, mu, tau)
+        # the constraints' multipliers move as far as the variables, those of bounds as far as they can (eq.
+        # 14)
+        dual_length, y_length = min(dual_x, dual_s), length
         if self.elastic is not None:
-            part = dual = min(dual, self.elastic.longest_dual(step.y, self.y, keep))
-            self.elastic.take(length, self.residual(trial.point, trial.slack)[self._condenser.rows])
-        self.y = self.y + part * (step.y - self.y)
-        self.gone_y = self.gone_y + part * (step.gone - self.gone_y)
-        x.move(trial.point.x[self._condenser.free], x.below + dual * below_x, x.above + dual * above_x, mu)
-        s.move(trial.slack, s.below + dual * below_s, s.above + dual * above_s, mu)
+            dual_length = min(dual_length, self.elastic.max_dual_length(step.y, self.y, tau))
+            y_length = dual_length
+            self.elastic.move(length, self.residual(trial.point, trial.slack)[self._condenser.remaining])
+        self.y = self.y + y_length * (step.y - self.y)
+        self.eliminated_y = self.eliminated_y + y_length * (step.eliminated_y - self.eliminated_y)
+        free = trial.point.x[self._condenser.free]
+        x.move(free, x.below + dual_length * below_x, x.above + dual_length * above_x, mu)
+        s.move(trial.slack, s.below + dual_length * below_s, s.above + dual_length * above_s, mu)
         self.point = trial.point

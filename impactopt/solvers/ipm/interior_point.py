@@ -1,19 +1,19 @@
-"""Interior-point method: each quadratic model is taken one Newton step towards its solution.
+"""Primal-dual interior-point method that takes one Newton step on each quadratic model.
 
-The QPs of a whole motion have thousands of rows; solving each of them exactly costs more than the functions.
-So the barrier of the rows is kept from one QP to the next, and every QP gets one Newton step: the primal-dual
-interior-point method of Waechter and Biegler (Mathematical Programming 106, 2006), with its filter line
-search (sections 2.3 and 2.4), second-order correction and inertia control. What is ours is that steps are
-bent at slacks, and the Newton system (`newton`): rows that determine variables of their own are eliminated
-first (`condense`), and what is left gets a Cholesky factor.
+The QPs of a whole motion have thousands of constraints; solving each of them exactly costs more than
+evaluating the program. So the barrier is kept from one QP to the next, and every QP gets one Newton step: the
+method of Waechter and Biegler (Mathematical Programming 106, 2006), with its filter line search (sections 2.3
+and 2.4), second-order corrections and inertia control. Two parts are ours: steps are bent at slacks
+(`_bent_step`), and the Newton system (`newton`) is condensed, as equalities that determine variables are
+eliminated first (`condense`).
 
-Where no step is progress any more the rows become elastic: they may be violated at a price (Nocedal and
-Wright 2006, section 18.5). Where rows are met again they are hard again, at a higher price the next time;
-where the price does not bring that about the objective is left out, until the violation is gone or least. So
-an infeasible program ends at a point of least violation.
+If no step makes progress, the constraints become elastic: they may be violated at a price (Nocedal and Wright
+2006, section 18.5). Once they are met they are hard again, and the price is higher the next time. If the
+price does not achieve that, the violation is minimized without the objective. So the method ends at a point
+of least violation if the program is infeasible.
 
-A `BarrierProblem` is what the loop moves, `LineSearch` says how far along a step, and `ElasticPhase` what is
-aimed at where that finds nothing.
+`BarrierProblem` has the iterate and its Newton step, `LineSearch` selects the step length, and `ElasticPhase`
+decides when constraints are hard, when elastic, and when only the violation is minimized.
 """
 
 from __future__ import annotations
@@ -37,237 +37,258 @@ from impactopt.solvers.program import (
 )
 from impactopt.solvers.run import Path, Run, Watch
 
-_CORRECTIONS = 4  # second-order corrections a step, at most
-_WORSE = 0.99  # a correction that leaves more than this part of the violation ends them
-# a step is bent where it gets so many times as far, a slack giving so much of its distance to a bound, and
-# where no row is off, or will be, by more than this
-_LONGER, _SHORT, _BENT = 1.2, 0.9, 1.0
-_CRAWL, _PATIENCE = 1e-2, 20  # so many steps shorter than this, one after the other, are no progress either
-_HELD = 0.2  # a step of which who watches lets less than this part be taken is held back
+_MAX_CORRECTIONS = 4  # p_max of Waechter and Biegler, step A-5.9: second-order corrections of a step
+_KAPPA_SOC = 0.99  # a correction that leaves more than this fraction of the violation is the last (A-5.9)
+_MIN_BENT_GAIN = 1.2  # a step is bent only if that makes it this many times as long
+_BENT_SLACK_FRACTION = 0.9  # of its distance to the bound, that each slack may take in a bent step
+_MAX_BENT_VIOLATION = 1.0  # of any constraint, before and after a bent step
+_SHORT_STEP = 1e-2  # a shorter step length hardly is progress ...
+_MAX_SHORT_STEPS = 20  # ... and more short steps than this in a row count as none
+_HELD_BACK = 0.2  # a step is held back if the watch permits less than this fraction of its length
 
 
-class Found(NamedTuple):
-    """A step that is progress, the point that a part of it leads to, and what to note about it."""
+class AcceptedStep(NamedTuple):
+    """A step that makes progress, the trial point at a step length, and remarks for the history."""
 
     step: Step
     trial: Trial
     length: float
-    note: list[str]
+    remarks: list[str]
 
 
 class LineSearch:
-    """The filter, and how long steps have been short.
+    """Filter line search, which also counts short steps.
 
     Attributes
     ----------
-    held : whether who watches has held the last step back.
+    held_back : whether the watch shortened the last step much.
     """
 
     def __init__(self, watch: Watch | None = None) -> None:
-        """watch : who says how far a step may go."""
+        """watch : limits the length of steps."""
         self._watch = watch
         self._filter: Filter | None = None
-        self._crawled = 0  # iterations of short steps
-        self.held = False
+        self._short_steps = 0  # in a row
+        self.held_back = False
 
-    def forget(self) -> None:
-        """Forget what has been, as the problem is another from here on: its barrier, objective or rows."""
+    def reset_filter(self) -> None:
+        """Discard the filter: its pairs are of another barrier, objective or set of constraints."""
         self._filter = None
 
-    def find(self, problem: BarrierProblem, step: Step, residual: Vector) -> Found | None:
-        """The part of a step that is progress; None where there is none, or has hardly been any for long."""
-        longest = problem.longest(step)
-        most = self._most(problem, step, longest)
-        self.held = most < _HELD * longest
-        longest = min(longest, most)
-        at = problem.progress(step, residual)
+    def find(self, problem: BarrierProblem, step: Step, residual: Vector) -> AcceptedStep | None:
+        """Search along a step for an acceptable point.
+
+        Returns None if there is none, or if steps have been short for too long.
+        """
+        longest = problem.max_length(step)
+        limit = self._limit(problem, step, longest)
+        self.held_back = limit < _HELD_BACK * longest
+        longest = min(longest, limit)
+        start = problem.search_start(step, residual)
         if self._filter is None:
-            self._filter = Filter.around(at.theta)
-        among = self._filter
-        found = _bent(problem, among, step, at, longest, most) or _searched(
-            problem, among, step, at, longest, residual
-        )
-        crawls = found is None or found.length < _CRAWL
-        self._crawled = self._crawled + 1 if crawls else 0
-        if found is None or self._crawled > _PATIENCE:
-            self._crawled = 0
+            self._filter = Filter.from_violation(start.theta)
+        pairs = self._filter
+        accepted = _bent_step(problem, pairs, step, start, longest, limit)
+        if accepted is None:
+            accepted = _backtrack(problem, pairs, step, start, longest, residual)
+        short = accepted is None or accepted.length < _SHORT_STEP
+        self._short_steps = self._short_steps + 1 if short else 0
+        if accepted is None or self._short_steps > _MAX_SHORT_STEPS:
+            self._short_steps = 0
             return None
-        among.remember(at, found.length, found.trial.phi)
-        return found
+        pairs.augment(start, accepted.length, accepted.trial.phi)
+        return accepted
 
-    def _most(self, problem: BarrierProblem, step: Step, longest: float) -> float:
-        """The part of a step that who watches lets it take, bent or not."""
-        most = max(longest, problem.x.longest(step.free, problem.keep))
-        return most if self._watch is None else self._watch.limit(problem.point.x, step.d, most)
+    def _limit(self, problem: BarrierProblem, step: Step, longest: float) -> float:
+        """Largest length that the watch permits; the variables' bounds are respected, slacks may be bent."""
+        limit = max(longest, problem.x.max_length(step.free, problem.tau))
+        return limit if self._watch is None else self._watch.limit(problem.point.x, step.d, limit)
 
 
-def _bent(
-    problem: BarrierProblem, among: Filter, step: Step, at: SearchStart, longest: float, most: float
-) -> Found | None:
-    """The step as far as the bounds of variables let it, where it is slacks that stop it: each of them
-    stops by itself short of its own bound, and what its row is then off by is the next step's to mend.
+def _bent_step(
+    problem: BarrierProblem, pairs: Filter, step: Step, start: SearchStart, longest: float, limit: float
+) -> AcceptedStep | None:
+    """Step as long as the variables' bounds permit, in which every slack stops by itself at its own bound.
 
-    Else one slack of thousands stops all others. Only while no row is far off: it is worth nothing where
-    rows are not about as linear as the step takes them to be.
+    Of thousands of slacks one is always close to its bound and would stop all variables and slacks (TALOS's
+    punch takes 60 iterations with bent steps, 75 without). The constraints whose slacks stopped are violated
+    then; the next steps correct that, which works while the linearization is good, so none may be violated by
+    more than `_MAX_BENT_VIOLATION`.
     """
-    if problem.elastic is not None or problem.point.max_violation > _BENT:
+    if problem.elastic is not None or problem.point.max_violation > _MAX_BENT_VIOLATION:
         return None
-    length = min(most, problem.x.longest(step.free, problem.keep))
-    if length <= _LONGER * longest:
+    length = min(limit, problem.x.max_length(step.free, problem.tau))
+    if length <= _MIN_BENT_GAIN * longest:
         return None
-    slack = problem.s.short_of_bounds(problem.s.values + length * step.slack, _SHORT)
+    slack = problem.s.clipped(problem.s.values + length * step.slack, _BENT_SLACK_FRACTION)
     trial = problem.trial(step, length, slack)
-    fine = trial.point.finite and trial.point.max_violation <= _BENT
-    if not fine or not _accepts(among, at, length, trial):
+    within = trial.point.finite and trial.point.max_violation <= _MAX_BENT_VIOLATION
+    if not within or not _is_acceptable(pairs, start, length, trial):
         return None
-    return Found(step, trial, length, ["bent"])
+    return AcceptedStep(step, trial, length, ["bent"])
 
 
-def _searched(
-    problem: BarrierProblem, among: Filter, step: Step, at: SearchStart, longest: float, residual: Vector
-) -> Found | None:
-    """Along the step, backwards from its longest part; None: no part of it is progress."""
+def _backtrack(
+    problem: BarrierProblem, pairs: Filter, step: Step, start: SearchStart, longest: float, residual: Vector
+) -> AcceptedStep | None:
+    """Halve the step length until the filter accepts the point; None below the least length."""
     length, trials = longest, 0
     while True:
         trials += 1
         trial = problem.trial(step, length)
-        if _accepts(among, at, length, trial):
-            return Found(step, trial, length, [])
+        if _is_acceptable(pairs, start, length, trial):
+            return AcceptedStep(step, trial, length, [])
         # only a first trial with more violation is corrected (step A-5.5): a shorter one is nearly linear
-        if trials == 1 and trial.theta >= at.theta and problem.options.second_order_correction:
-            found = _corrected(problem, among, at, residual, trial, longest)
-            if found is not None:
-                return found
+        if trials == 1 and trial.theta >= start.theta and problem.options.second_order_correction:
+            accepted = _second_order_correction(problem, pairs, start, residual, trial, longest)
+            if accepted is not None:
+                return accepted
         length *= 0.5
-        if length < among.shortest(at):
+        if length < pairs.min_length(start):
             return None
 
 
-def _corrected(
-    problem: BarrierProblem, among: Filter, at: SearchStart, residual: Vector, trial: Trial, longest: float
-) -> Found | None:
-    """Second-order corrections: the step again, with what it left of the rows (section 2.4)."""
+def _second_order_correction(
+    problem: BarrierProblem,
+    pairs: Filter,
+    start: SearchStart,
+    residual: Vector,
+    trial: Trial,
+    longest: float,
+) -> AcceptedStep | None:
+    """Steps for the residual that a refused trial point leaves, while they reduce it (section 2.4)."""
     if problem.elastic is not None:
         return None
-    left, theta = residual, trial.theta
-    for k in range(_CORRECTIONS):
+    corrected_residual, theta = residual, trial.theta
+    for k in range(_MAX_CORRECTIONS):
         if not trial.point.finite:
             break
-        # c_soc = alpha c(x) + c(x + alpha d): the same matrix, another right-hand side (section 2.4)
-        left = longest * left + problem.residual(trial.point, trial.slack)
-        step = problem.step_again(left)
-        trial = problem.trial(step, problem.longest(step))
-        if _accepts(among, at, longest, trial):
-            return Found(step, trial, longest, [f"{k + 1} corrections"])
-        if trial.theta > _WORSE * theta:
+        # c_soc = alpha c(x) + c(x + alpha d) (section 2.4): the same matrix, another right-hand side
+        corrected_residual = longest * corrected_residual + problem.residual(trial.point, trial.slack)
+        step = problem.step_for(corrected_residual)
+        trial = problem.trial(step, problem.max_length(step))
+        if _is_acceptable(pairs, start, longest, trial):
+            return AcceptedStep(step, trial, longest, [f"{k + 1} corrections"])
+        if trial.theta > _KAPPA_SOC * theta:
             break
         theta = trial.theta
     return None
 
 
-def _accepts(among: Filter, at: SearchStart, length: float, trial: Trial) -> bool:
-    return among.accepts(at, length, trial.theta, trial.phi) and trial.point.differentiable
+def _is_acceptable(pairs: Filter, start: SearchStart, length: float, trial: Trial) -> bool:
+    # derivatives are the dearer test, and are needed at the next iterate only
+    return pairs.accepts(start, length, trial.theta, trial.phi) and trial.point.differentiable
 
 
-# violation from which on elastic rows are made hard again where they do not get further, or this part of what
-# it was when nothing else began to count
-_NEAR, _LESS = 1e-2, 1e-2
-_RESTORED = 1e-3  # violation from which on they are where nothing else counted
-_CHANGES = 12  # of what is aimed at, at most
-_AGAIN = 1e-4  # the least barrier after such a change
-_LINGERS = 20  # so many iterations with elastic rows that are met are enough
+# Elastic constraints that stall are made hard again if the violation is below this, or below this fraction of
+# the violation at which its minimization began: all but met, hard constraints often get there.
+_HARD_VIOLATION, _HARD_FRACTION = 1e-2, 1e-2
+_RESTORED_VIOLATION = 1e-3  # ends a minimization of the violation: from there hard constraints are faster
+_MAX_CHANGES = 12  # of the aim
+_MIN_BARRIER = 1e-4  # after a change of the aim
+# Iterations with elastic constraints that are met. Without this limit, three of two hundred nails ended at
+# the iteration limit.
+_MAX_MET_ITERATIONS = 20
 
 
 class ElasticPhase:
-    """Aim of the method, and how long it lasts.
+    """Aim of the method: hard constraints, elastic constraints, or the violation alone.
 
-    Where one of its methods changes that, a line search has to forget what it knows.
+    hard: `problem.elastic` is None. elastic: objective plus price times violation. violation alone: elastic,
+    and `problem.sigma`, the weight of the objective, is 0.
+
+    A method that changes the aim makes the pairs of the line search's filter invalid.
     """
 
     def __init__(self, options: IPMOptions):
         self._options = options
-        self._price = options.price  # of elastic rows
-        self._met = 0  # iterations of elastic rows that are met
-        self._began = 0.0  # violation where only that began to count
+        self._price = options.price  # of elastic constraints
+        self._met_iterations = 0  # in a row, with elastic constraints that are met
+        self._initial_violation = 0.0  # where the minimization of the violation alone began
         self._changes = 0
 
     def begin(self) -> None:
-        """Begin an attempt from a point of its own: the price stays what it has come to."""
+        """Begin an attempt from another point, with the price that the last one ended with."""
         self._changes = 0
 
-    def verdict(self, problem: BarrierProblem) -> Status | None:
-        """Decide at a solution, or where rows are restored: the end, unless rows are violated, or only the
-        violation counted.
+    def conclude(self, problem: BarrierProblem) -> Status | None:
+        """Status at a solution of the present aim; None if the aim has changed and the method has to go on.
+
+        SOLVED only if the constraints are met and the objective was minimized.
         """
         elastic = problem.elastic
-        met = elastic is None or elastic.largest() <= self._options.violation_tolerance
+        met = elastic is None or elastic.max_violation() <= self._options.violation_tolerance
         if met and problem.sigma:
             return Status.SOLVED
-        near = _NEAR if problem.sigma else _RESTORED  # the price may only have been too low
+        # with the objective, a small violation may only mean that the price was too low
+        near = _HARD_VIOLATION if problem.sigma else _RESTORED_VIOLATION
         return self.change_aim(problem, met=met or problem.point.max_violation <= near)
 
-    def restored(self, problem: BarrierProblem) -> bool:
-        """True if the violation, which alone counts, is so small that hard rows get further with it."""
+    def is_restored(self, problem: BarrierProblem) -> bool:
+        """True if the violation is minimized alone and is small enough for hard constraints."""
         elastic = problem.elastic
         if elastic is None or problem.sigma or elastic.price >= self._options.price_max:
             return False
-        return problem.point.max_violation <= _RESTORED
+        return problem.point.max_violation <= _RESTORED_VIOLATION
 
-    def lingers(self, problem: BarrierProblem) -> bool:
-        """True if elastic rows have been met for long, and the rest is left to do: hard rows do it sooner."""
+    def is_met_for_long(self, problem: BarrierProblem) -> bool:
+        """True if elastic constraints have been met for many iterations, which hard ones would not take."""
         met = problem.elastic is not None and problem.point.max_violation <= self._options.violation_tolerance
-        self._met = self._met + 1 if met and problem.sigma else 0
-        return self._met > _LINGERS and self._price < self._options.price_max
+        self._met_iterations = self._met_iterations + 1 if met and problem.sigma else 0
+        return self._met_iterations > _MAX_MET_ITERATIONS and self._price < self._options.price_max
 
     def change_aim(self, problem: BarrierProblem, *, met: bool) -> Status | None:
-        """Go on where elastic rows stall: let only the violation count, until it is gone or least."""
+        """Leave elastic constraints that stall, or end.
+
+        met : whether the constraints are met, or nearly so. They become hard then; else the violation is
+            minimized alone; if it already was, the violation is least, which is the end.
+        """
         assert problem.elastic is not None
         self._changes += 1
-        if self._changes > _CHANGES:
+        if self._changes > _MAX_CHANGES:
             return Status.FAILED
         price = problem.elastic.price
         if met and price < self._options.price_max:
-            problem.elastic, problem.sigma = None, 1.0  # from where rows are met, as if nothing had been
+            problem.elastic, problem.sigma = None, 1.0
             self._price = min(10.0 * price, self._options.price_max)
         elif problem.sigma:
-            problem.sigma, self._began = 0.0, problem.point.max_violation
+            problem.sigma, self._initial_violation = 0.0, problem.point.max_violation
         else:
-            return self._least(problem)
-        problem.mu = max(problem.mu, _AGAIN)
+            return self._least_violation(problem)
+        problem.mu = max(problem.mu, _MIN_BARRIER)
         return None
 
-    def give_way(self, problem: BarrierProblem, residual: Vector) -> str | Status:
-        """Next aim where no step is progress: let rows be violated at a price, or end.
-
-        Text: what has been changed.
-        """
+    def leave_stall(self, problem: BarrierProblem, residual: Vector) -> str | Status:
+        """Next aim if no step makes progress: a remark for the history, or the status that ends the solve."""
         if problem.error(0.0, residual) <= self._options.acceptable_tolerance:
             if problem.elastic is None:
                 return Status.ACCEPTABLE
             if not problem.sigma:  # the violation is least, but for rounding
-                return self.verdict(problem) or "rows are hard again"
+                return self.conclude(problem) or "constraints are hard again"
         point = problem.point
         if problem.elastic is None:
-            problem.soften(residual, self._price)
-            return "rows become elastic"
-        near = point.max_violation <= max(_NEAR, _LESS * self._began)
+            problem.make_elastic(residual, self._price)
+            return "constraints become elastic"
+        near = point.max_violation <= max(_HARD_VIOLATION, _HARD_FRACTION * self._initial_violation)
         if problem.sigma or near:
             end = self.change_aim(problem, met=near)
             if end is not None:
                 return end
-            return "rows are hard again" if problem.elastic is None else "only the violation counts"
+            return "constraints are hard again" if problem.elastic is None else "violation alone"
         if is_stationary_violation(problem.program, point.x, point.g, point.jacobian):
-            return self._least(problem)
+            return self._least_violation(problem)
         return Status.FAILED
 
-    def _least(self, problem: BarrierProblem) -> Status:
-        """The end where the violation is least: a program whose rows are met there is not infeasible."""
+    def _least_violation(self, problem: BarrierProblem) -> Status:
+        """Status at a point of least violation: not infeasible if all constraints are met there."""
         met = problem.point.max_violation <= self._options.violation_tolerance
         return Status.FAILED if met else Status.INFEASIBLE
 
 
-_ABSURD = 1e12  # multipliers beyond this come from rows that have none
-_RESTARTS = 2  # where nothing is progress any more
+_MAX_MULTIPLIER = 1e12  # larger ones mean that none exist at the iterate
+# From the best iterate, after a failure: with them a strike of the seven-joint arm is solved from all of 20
+# initial guesses.
+_MAX_RESTARTS = 2
 
 
 def solve_ipm(
@@ -289,10 +310,10 @@ def solve_ipm(
     x0 : initial guess (n,); moved into the variables' bounds, where every iterate stays.
     options : see `IPMOptions`.
     callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
-    multipliers, bound_multipliers : guess of the multipliers (m,), (n,), from a similar program.
-    watch : asked at every iterate whether the program lacks constraints there, which ends the solve with the
-        status `ACCEPTABLE`, and before every step how far it may go.
-    path : where a solve was left that x0 and the multipliers are of: it goes on as that would have.
+    multipliers, bound_multipliers : initial guess of the multipliers (m,), (n,), from a similar program.
+    watch : may end the solve at an iterate, with the status `ACCEPTABLE`, because the program lacks
+        constraints there; may limit the length of steps.
+    path : state in which an earlier solve ended at x0 with these multipliers; this one continues it.
 
     Returns
     -------
@@ -318,27 +339,27 @@ class InteriorRun(Run[IPMOptions]):
         self.point = self.program.point(self.point.x)
         if not self.point.differentiable:
             return Status.FAILED
-        if self._start_is_solution():
-            self.report.iteration(self.point, self._kkt, "start")
+        if self._initial_guess_is_solution():
+            self.report.iteration(self.point, self._kkt, "initial guess")
             return Status.SOLVED
-        note, restarts = "start", 0
+        remark, restarts = "initial guess", 0
         while True:
             self._begin()
             try:
-                status = self._iterate(note)
+                status = self._iterate(remark)
             finally:
                 self._problem.release()
-            if status is not Status.FAILED or restarts == _RESTARTS or not self._back_to_best():
+            if status is not Status.FAILED or restarts == _MAX_RESTARTS or not self._back_to_best():
                 return status
-            note, restarts = "again from the best iterate", restarts + 1
+            remark, restarts = "again from the best iterate", restarts + 1
 
     @property
     def _warm(self) -> bool:
-        """True if multipliers were given to start from."""
+        """True if multipliers were given."""
         return bool(np.any(self.y) or np.any(self.z))
 
-    def _start_is_solution(self) -> bool:
-        """True if the start with the multipliers given meets all tolerances."""
+    def _initial_guess_is_solution(self) -> bool:
+        """True if the initial guess with the given multipliers meets all tolerances."""
         options, point = self.options, self.point
         self._kkt = stationarity(point.gradient, point.jacobian, self.y, self.z)
         return (
@@ -350,7 +371,7 @@ class InteriorRun(Run[IPMOptions]):
         )
 
     def _begin(self) -> None:
-        """Aim at the objective, from the point and the multipliers that there are."""
+        """Make the barrier problem at the present point and multipliers, with hard constraints."""
         self._problem = BarrierProblem(
             self.program,
             self.options,
@@ -363,11 +384,12 @@ class InteriorRun(Run[IPMOptions]):
         )
         self.point, self._path = self._problem.point, None
         self._phase.begin()
-        self._search.forget()
+        self._search.reset_filter()
 
     def _back_to_best(self) -> bool:
-        """True if there is another point to begin at anew: the best so far, with multipliers and a barrier
-        of its own, as what failed may be the way there.
+        """Move to the best iterate, with new multipliers, as the old ones may have led to the failure.
+
+        False if the present point is the best.
         """
         x = self.report.best.x
         if x is None or np.array_equal(x, self.point.x):
@@ -376,43 +398,44 @@ class InteriorRun(Run[IPMOptions]):
         self.y, self.z = np.zeros_like(self.y), np.zeros_like(self.z)
         return self.point.differentiable
 
-    def _iterate(self, note: str) -> Status:
+    def _iterate(self, remark: str) -> Status:
         problem, phase = self._problem, self._phase
         while self.report.iterations <= self.options.max_iterations:
             residual = problem.residual(self.point, problem.s.values)
-            problem.take_multipliers()
-            self.y, self.z = problem.row_multipliers, problem.bound_multipliers
+            problem.update_multipliers()
+            self.y, self.z = problem.constraint_multipliers, problem.bound_multipliers
             error = problem.error(0.0, residual)
-            if self.report.iteration(self.point, problem.kkt, note):
+            if self.report.iteration(self.point, problem.kkt, remark):
                 return Status.INTERRUPTED
-            if self._lacks():
+            if self._lacks_constraints():
                 return Status.ACCEPTABLE
-            if error <= self.options.kkt_tolerance or phase.restored(problem):
-                verdict = phase.verdict(problem)
-                if verdict is not None:
-                    return verdict
-                self._search.forget()
+            if error <= self.options.kkt_tolerance or phase.is_restored(problem):
+                status = phase.conclude(problem)
+                if status is not None:
+                    return status
+                self._search.reset_filter()
                 continue
-            if phase.lingers(problem):
+            if phase.is_met_for_long(problem):
                 phase.change_aim(problem, met=True)
-                self._search.forget()
+                self._search.reset_filter()
                 continue
             if self._out_of_time():
                 return Status.TIME_LIMIT
             if problem.lower_barrier(residual):
-                self._search.forget()
-            found = self._advance(residual)
-            if isinstance(found, Status):
-                return found
-            note = found
+                self._search.reset_filter()
+            outcome = self._advance(residual)
+            if isinstance(outcome, Status):
+                return outcome
+            remark = outcome
         return Status.ITERATION_LIMIT
 
-    def _lacks(self) -> bool:
-        """True if the program lacks constraints at the iterate.
+    def _lacks_constraints(self) -> bool:
+        """True if the watch finds that the program lacks constraints at the iterate.
 
-        While rows are elastic only those count that hold steps back.
+        While constraints are elastic, it is asked only if it held the last step back: the iterates would
+        otherwise crawl towards a constraint that they do not know of.
         """
-        if self._watch is None or (self._problem.elastic is not None and not self._search.held):
+        if self._watch is None or (self._problem.elastic is not None and not self._search.held_back):
             return False
         if not self._watch.lacks(self.point.x):
             return False
@@ -420,24 +443,24 @@ class InteriorRun(Run[IPMOptions]):
         return True
 
     def _advance(self, residual: Vector) -> str | Status:
-        """Move to the next point; what to note about it, or why there is none."""
+        """Move to the next iterate: a remark for the history, or the status that ends the solve."""
         problem, begin = self._problem, self.report.elapsed()
         step = problem.step(residual)
         self.report.seconds_qp += self.report.elapsed() - begin
-        if step is None or np.abs(step.y).max(initial=0.0) > _ABSURD:
-            return self._give_way(residual)
-        found = self._search.find(problem, step, residual)
-        if found is None:
-            return self._give_way(residual)
-        problem.move(found.step, found.trial, found.length)
+        if step is None or np.abs(step.y).max(initial=0.0) > _MAX_MULTIPLIER:
+            return self._leave_stall(residual)
+        accepted = self._search.find(problem, step, residual)
+        if accepted is None:
+            return self._leave_stall(residual)
+        problem.move(accepted.step, accepted.trial, accepted.length)
         self.point = problem.point
-        words = [f"barrier {problem.mu:.0e}, step {found.length:.2g}", *found.note]
+        remarks = [f"barrier {problem.mu:.0e}, step {accepted.length:.2g}", *accepted.remarks]
         if problem.newton.shift:
-            words.append(f"shift {problem.newton.shift:.0e}")
+            remarks.append(f"shift {problem.newton.shift:.0e}")
         if problem.elastic is not None:
-            words.append(f"rows elastic at {problem.elastic.price:g}")
-        return ", ".join(words)
+            remarks.append(f"constraints elastic at {problem.elastic.price:g}")
+        return ", ".join(remarks)
 
-    def _give_way(self, residual: Vector) -> str | Status:
-        self._search.forget()
-        return self._phase.give_way(self._problem, residual)
+    def _leave_stall(self, residual: Vector) -> str | Status:
+        self._search.reset_filter()
+        return self._phase.leave_stall(self._problem, residual)

@@ -1,4 +1,4 @@
-"""Newton system of one interior-point iteration, condensed; ordering and Cholesky factor of the rest."""
+"""Newton system of one interior-point iteration: condensed, then factored by block Cholesky."""
 
 from __future__ import annotations
 
@@ -12,55 +12,56 @@ import numpy as np
 
 from impactopt.solvers.elimination.condense import Condenser, Mask, find_eliminations
 from impactopt.solvers.elimination.kernels import Index, Kernels, Panels, Places, Products
-from impactopt.solvers.elimination.kernels import kernels as fastest
+from impactopt.solvers.elimination.kernels import kernels as fastest_kernels
 from impactopt.solvers.program import Determined, Matrix, Vector
 
-_WIDEST = 24  # variables of a block that is made of several
-_ZEROS = 0.1  # part of a block's panel that may be zeros, so that it is one block instead of two
+_MAX_MERGED_WIDTH = 24  # variables of a merged block
+_MAX_ZEROS = 0.1  # fraction of zeros that a merged block's panel may have
 
 
 def elimination_blocks(pattern: Any) -> list[Index]:
-    """Variables in blocks, those to be eliminated first in front.
+    """Elimination order in blocks of variables (supernodes), the first to be eliminated in front.
 
-    Variables that touch the same others are one group. The order is found for groups: the one that touches
-    the fewest variables first (minimum degree; Davis, Direct Methods for Sparse Linear Systems, 2006, section
-    7.1). Then groups that touch nearly the same become one block, as a few large products take less time than
-    many small ones.
+    Variables with the same neighbours form a group. Groups are ordered by minimum degree: the one with the
+    fewest neighbours first (Davis, Direct Methods for Sparse Linear Systems, 2006, section 7.1). Then groups
+    with nearly the same neighbours are merged to a block, as a few large products take less time than many
+    small ones.
 
     pattern (n, n) : which entries may be nonzero, symmetric.
     """
-    touches = np.asarray(pattern, dtype=bool) | np.eye(len(pattern), dtype=bool)
+    neighbours = np.asarray(pattern, dtype=bool) | np.eye(len(pattern), dtype=bool)
     members: dict[bytes, list[int]] = {}
-    for i, row in enumerate(np.packbits(touches, axis=1)):
+    for i, row in enumerate(np.packbits(neighbours, axis=1)):
         members.setdefault(row.tobytes(), []).append(i)
     groups = [np.array(same) for same in members.values()]
     first, sizes = (np.array([of(g) for g in groups], dtype=np.intp) for of in (np.min, np.size))
-    order, below = _minimum_degree(touches[np.ix_(first, first)], sizes)
-    blocks = _blocks(order, below, sizes)
-    return [np.concatenate([groups[g] for g in b.groups]) for root in blocks for b in root.in_order()]
+    order, below = _minimum_degree(neighbours[np.ix_(first, first)], sizes)
+    roots = _merged_blocks(order, below, sizes)
+    return [np.concatenate([groups[g] for g in b.groups]) for root in roots for b in root.in_order()]
 
 
-def _minimum_degree(touches: Any, sizes: Index) -> tuple[Index, Any]:
-    """Groups in order, and which others the elimination of each touches (g, g)."""
-    touches, left = touches.copy(), np.ones(sizes.size, dtype=bool)
-    order, below = np.zeros_like(sizes), np.zeros_like(touches)
-    degree = touches @ sizes
+def _minimum_degree(neighbours: Any, sizes: Index) -> tuple[Index, Any]:
+    """Order of the groups (g,), and the later neighbours of each when it is eliminated (g, g)."""
+    neighbours, left = neighbours.copy(), np.ones(sizes.size, dtype=bool)
+    order, below = np.zeros_like(sizes), np.zeros_like(neighbours)
+    degree = neighbours @ sizes
     for i in range(sizes.size):
         k = order[i] = int(np.argmin(np.where(left, degree, np.inf)))
         left[k] = False
-        below[k] = touches[k] & left
+        below[k] = neighbours[k] & left
+        # elimination makes all neighbours of k neighbours of each other
         rows = np.flatnonzero(below[k])
-        touches[np.ix_(rows, rows)] = True
-        degree[rows] = (touches[rows] & left) @ sizes
+        neighbours[np.ix_(rows, rows)] = True
+        degree[rows] = (neighbours[rows] & left) @ sizes
     return order, below
 
 
 @dataclass
 class _Block:
-    """Groups to be eliminated one after the other.
+    """Groups that are eliminated one after the other: a node of the elimination tree.
 
-    below : groups that they touch.  width, height : variables of both.  entries : of the groups' own panels,
-    which are not zero.  children : blocks that have to be eliminated before.
+    below : groups in the rows under the diagonal block.  width, height : variables of both.  entries :
+    nonzero ones of the panel.  children : blocks to be eliminated before.
     """
 
     groups: list[int]
@@ -71,59 +72,59 @@ class _Block:
     children: list[_Block] = field(default_factory=list)
 
     def in_order(self) -> list[_Block]:
-        """This block after all that are below it, without recursion: a long motion's are thousands deep."""
+        """This block after all its descendants; not recursive, as the tree of a long motion is very deep."""
         out, waiting = list[_Block](), [self]
         while waiting:  # parents before their children, and the last child first
             out.append(block := waiting.pop())
             waiting += block.children
         return out[::-1]
 
-    def joined(self, other: _Block, sizes: Index) -> _Block | None:
-        """Panel joined with one that comes after it; None where that would be too many zeros."""
-        width = self.width + other.width
-        below = self.below | other.below
-        below[other.groups] = False
+    def merged(self, later: _Block, sizes: Index) -> _Block | None:
+        """This block and a later one as one; None if that is too wide or has too many zeros."""
+        width = self.width + later.width
+        below = self.below | later.below
+        below[later.groups] = False
         height = int(below @ sizes)
-        entries = self.entries + other.entries
-        if width > _WIDEST or entries < (1.0 - _ZEROS) * _entries(width, height):
+        entries = self.entries + later.entries
+        if width > _MAX_MERGED_WIDTH or entries < (1.0 - _MAX_ZEROS) * _panel_entries(width, height):
             return None
-        groups, children = self.groups + other.groups, self.children + other.children
+        groups, children = self.groups + later.groups, self.children + later.children
         return _Block(groups, below, width, height, entries, children)
 
 
-def _entries(width: int, height: int) -> float:
-    """Number of entries of a panel, with the lower triangle of its own block."""
+def _panel_entries(width: int, height: int) -> float:
+    """Number of entries of a panel, with the lower triangle of its diagonal block."""
     return width * (height + 0.5 * (width + 1))
 
 
-def _blocks(order: Index, below: Any, sizes: Index) -> list[_Block]:
-    """The last of them, with their children."""
+def _merged_blocks(order: Index, below: Any, sizes: Index) -> list[_Block]:
+    """Roots of the elimination tree, after blocks have been merged with their parents and siblings."""
     place = np.empty_like(order)
     place[order] = np.arange(order.size)
-    waiting: dict[int, list[_Block]] = {}  # by the first group that they touch
+    waiting: dict[int, list[_Block]] = {}  # by their parent: the first group below the diagonal
     for k in map(int, order):
         width, height = int(sizes[k]), int(below[k] @ sizes)
-        block = _Block([k], below[k], width, height, _entries(width, height))
-        for child in _of_equal_size(waiting.pop(k, []), sizes):
-            joined = child.joined(block, sizes)
-            if joined is None:
+        block = _Block([k], below[k], width, height, _panel_entries(width, height))
+        for child in _merged_siblings(waiting.pop(k, []), sizes):
+            merged = child.merged(block, sizes)
+            if merged is None:
                 block.children.append(child)
             else:
-                block = joined
-        touched = np.flatnonzero(block.below)
-        parent = int(touched[np.argmin(place[touched])]) if touched.size else -1
+                block = merged
+        later = np.flatnonzero(block.below)
+        parent = int(later[np.argmin(place[later])]) if later.size else -1
         waiting.setdefault(parent, []).append(block)
     return waiting.get(-1, [])
 
 
-def _of_equal_size(blocks: list[_Block], sizes: Index) -> list[_Block]:
-    """Blocks that touch nearly the same, and not each other, as one."""
+def _merged_siblings(blocks: list[_Block], sizes: Index) -> list[_Block]:
+    """Children of one block; those with nearly the same rows below are merged."""
     out: list[_Block] = []
     for block in blocks:
         for i, other in enumerate(out):
-            joined = other.joined(block, sizes)
-            if joined is not None:
-                out[i] = joined
+            merged = other.merged(block, sizes)
+            if merged is not None:
+                out[i] = merged
                 break
         else:
             out.append(block)
@@ -131,27 +132,28 @@ def _of_equal_size(blocks: list[_Block], sizes: Index) -> list[_Block]:
 
 
 class BlockCholesky:
-    """L L' = K for matrices whose pattern does not change.
+    """Cholesky factorization L L' = K of matrices with a fixed pattern.
 
-    Variables come in blocks; of each block of columns the blocks of rows that become nonzero are
-    kept as one panel, so that the work is a few dense products a panel (Davis, Direct Methods for Sparse
-    Linear Systems, 2006, chapter 4: a supernodal factorization).
+    Variables come in blocks. Of each block of columns, the nonzero blocks of rows are stacked in one dense
+    panel, so that the work is a few dense products a panel (Davis, Direct Methods for Sparse Linear Systems,
+    2006, chapter 4: a supernodal factorization).
 
     Attributes
     ----------
-    size : of the array of all panels' numbers.
+    size : number of values of all panels.
     """
 
     def __init__(self, pattern: Any, kernels: Kernels):
-        """pattern: which entries may be nonzero (n, n), symmetric."""
+        """pattern (n, n) : which entries may be nonzero, symmetric."""
         n, self._kernels = pattern.shape[0], kernels
         blocks = elimination_blocks(pattern)
         count, sizes = len(blocks), np.array([b.size for b in blocks], dtype=np.intp)
         self._n, self._order = n, np.concatenate([np.zeros(0, np.intp), *blocks])
-        self._place = np.empty(n, dtype=np.intp)
+        self._place = np.empty(n, dtype=np.intp)  # of each variable in the order
         self._place[self._order] = np.arange(n)
         self._block = np.repeat(np.arange(count), sizes)  # of each place
         start = np.append(0, np.cumsum(sizes))
+        # symbolic factorization: the rows below a block's diagonal couple each other
         i, j = np.nonzero(pattern)
         filled = np.zeros((count, count), dtype=bool)
         filled[self._block[self._place[i]], self._block[self._place[j]]] = True
@@ -160,6 +162,7 @@ class BlockCholesky:
             rows = (np.flatnonzero(filled[k + 1 :, k]) + k + 1).astype(np.int32)
             filled[np.ix_(rows, rows)] = True
             below.append(rows)
+        # layout of the panels: the diagonal block, then the blocks below it
         row_at = np.full((count, count), -1, dtype=np.int32)
         height, at = np.zeros(count, dtype=np.int32), np.zeros(count + 1, dtype=np.intp)
         for k, rows in enumerate(below):
@@ -174,7 +177,7 @@ class BlockCholesky:
         self.size = int(at[-1])
 
     def places(self, i: Index, j: Index) -> Index:
-        """Places of the entries (i, j) of the lower triangle, or (j, i)."""
+        """Places of the entries (i, j) in the values; either triangle may be named."""
         low, high = np.maximum(self._place[i], self._place[j]), np.minimum(self._place[i], self._place[j])
         row, column = self._block[low], self._block[high]
         p = self._panels
@@ -196,53 +199,58 @@ class BlockCholesky:
         return out.reshape(right.shape)
 
 
-_KEPT = 3  # structures
-_PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step
-_RANK = 1e-15  # singular values below this part of the largest are none
-# of a solve, at most, each of which leaves less than this part of what was left: weights of ten decades cost
-# digits
-_ROUNDS, _LESS = 6, 0.5
-_HELD = 1e15  # on the diagonal of variables that must not move
-_FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
-_SMALL = 1e-5  # none is tried before a shift that would be smaller
-_RELATIVE = 0.1  # the first shift is at most this part of the Hessian's largest entry
-_GROW, _GROW_FIRST, _SHRINK = 8.0, 100.0, 3.0  # kappa_w+, its first value, 1 / kappa_w- (same section)
+_CACHE_SIZE = 3  # Newton systems
+_PENALTY = 1e9  # weight of an equality that remains, relative to the curvature along it
+_RANK_TOLERANCE = 1e-15  # relative: smaller singular values of the Schur complement count as zero
+# A step is refined while the residual falls by half, as stiff contacts give weights of ten decades, which
+# cost digits: with one refinement 1e-4 of the dual residual remained, and solves ended as merely acceptable.
+_MAX_REFINEMENTS, _REFINEMENT_FACTOR = 6, 0.5
+_FIXED_WEIGHT = 1e15  # on the diagonal of fixed variables
+# Shift of the Hessian's diagonal: Waechter and Biegler 2006, section 3.1, with its names.
+_SHIFT_FIRST, _SHIFT_MIN, _SHIFT_MAX = 1e-4, 1e-20, 1e20  # delta_w^0, delta_w^min, delta_w^max
+_KAPPA_PLUS, _KAPPA_PLUS_FIRST = 8.0, 100.0  # growth; and of the very first shift
+_DECREASE = 3.0  # 1 / kappa_w^-
+_SHIFT_NEGLIGIBLE = 1e-5  # no shift is tried before a smaller one
+_SHIFT_RELATIVE = 0.1  # to the Hessian's largest entry: the first shift of an iteration is at most that
 
 
 class NewtonSystem:
-    """Minimize q.d + 1/2 d'(H + diag) d with rows y = w (J d + r), and J d + r = 0 for hard equalities.
+    """Minimize q.d + 1/2 d'(H + diag) d with y = w (J d + r) of weighted, J d + r = 0 of hard constraints.
 
-    The rows with weights enter the Hessian, W = H + diag + J' diag(w) J + shift I; then the eliminated
-    equalities are solved for their variables (`Condenser`), and the matrix left gets a Cholesky factor; hard
-    equalities that are left, by their Schur complement. The shift makes that matrix positive definite, and
-    with it the whole system's inertia right. What rounding leaves, all of the system's own equations tell.
+    1. The weighted constraints enter the Hessian, W = H + diag + J' diag(w) J + shift I.
+    2. The eliminated equalities are solved for their variables (`Condenser`).
+    3. The matrix of the free variables gets a Cholesky factor. The shift makes it positive definite, and with
+       it the inertia of the whole system right.
+    4. Hard equalities that remain are met by their Schur complement.
+    5. The step is refined with the residual of the whole system.
 
     Attributes
     ----------
-    condenser : of this system; held : numbers of the free variables that do not move.
+    condenser : of this system.  fixed : numbers of the free variables that do not move.
     shift : the last.
     """
 
-    def __init__(self, condenser: Condenser, held: Index, kernels: Kernels):
-        """held: numbers of the free variables that do not move."""
-        self.condenser, self.held = condenser, held
+    def __init__(self, condenser: Condenser, fixed: Index, kernels: Kernels):
+        """fixed : numbers of the free variables that do not move."""
+        self.condenser, self.fixed = condenser, fixed
         self._matrix = BlockCholesky(condenser.pattern, kernels)
-        self._from, i, j = condenser.at_free
+        self._from, i, j = condenser.free_entries
         places = self._matrix.places
         self._to = places(i, j).astype(np.int32)
         self._diagonal_to = places(np.arange(condenser.free.size), np.arange(condenser.free.size))
+        # products A' diag(w) A of the equalities that remain, one group each
         self._products, self._kernels = [], kernels
-        for row, (columns, at) in enumerate(condenser.left):
+        for number, (columns, at) in enumerate(condenser.remaining_equalities):
             i, j = np.tril_indices(columns.size)
             to = places(columns[i], columns[j]).astype(np.int32)
-            number, once = np.full(1, row, dtype=np.int32), np.ones(1, dtype=np.intp)
-            self._products.append(Products(counts=once, rows=number, values=at[None], to=to[None]))
+            row, once = np.full(1, number, dtype=np.int32), np.ones(1, dtype=np.intp)
+            self._products.append(Products(counts=once, rows=row, values=at[None], to=to[None]))
         self.begin(b"")
 
     def begin(self, key: bytes) -> None:
-        """Forget the shifts of another program; key: of the structure."""
+        """Begin with another program: no shift is known; key : of its structure."""
         self.key = key
-        self._equal = self.condenser.rows[self.condenser.equal]  # numbers of the equalities left
+        self._equal = self.condenser.remaining[self.condenser.equal]  # numbers of the equalities that remain
         self._last = self.shift = 0.0
 
     def factor(
@@ -255,12 +263,18 @@ class NewtonSystem:
         hard: bool,
         proximal: float = 0.0,
     ) -> bool:
-        """Factor, shifted as far as it takes.
+        """Factor the system, with the least shift of a growing sequence that makes it positive definite.
 
-        diagonal : (f,) of the free variables; weights : gives those of the rows left (k,) for more curvature
-        of all variables and slacks: proximal and shift; hard : equalities among them have none.
+        Parameters
+        ----------
+        diagonal : (f,) of the free variables.
+        weights : gives the weights (k,) of the constraints that remain, for a shift of all variables and
+            slacks: proximal plus the shift of the Hessian.
+        hard : whether equalities have no weights and are met exactly.
 
-        False: nothing helps.
+        Returns
+        -------
+        False if no shift suffices, or eliminated constraints do not determine their variables.
         """
         c = self.condenser
         try:
@@ -270,126 +284,129 @@ class NewtonSystem:
         self._jacobian, self._hessian, self._hard = jacobian, hessian, hard
         self._transposed = jacobian.T
         self._A = c.A
-        everywhere = np.zeros(c.n)
-        everywhere[c.free] = diagonal
+        of_all = np.zeros(c.n)
+        of_all[c.free] = diagonal
         penalty = self._penalty() if hard else None
-        self.shift = self._first()
+        self.shift = self._initial_shift()
         while True:
-            more = proximal + self.shift
-            self._diagonal = everywhere + more
+            shift = proximal + self.shift
+            self._diagonal = of_all + shift
             self._weights = np.zeros(c.m)
-            self._weights[c.rows] = weights(more)
+            self._weights[c.remaining] = weights(shift)
             if penalty is not None:
                 self._weights[self._equal] = penalty
             if self._matrix.factor(self._values()):
                 break
-            self.shift = self._next()
-            if self.shift > _MOST:
+            self.shift = self._next_shift()
+            if self.shift > _SHIFT_MAX:
                 return False
         self._last = self.shift or self._last
         if hard and self._equal.size:
             self._spread = self._matrix.solve(self._A.T)
-            # of the Schur complement: pseudo, as rows may depend on each other
-            self._inverse = np.linalg.pinv(self._A @ self._spread, rcond=_RANK)
+            # pseudo-inverse of the Schur complement, as equalities may depend on each other
+            self._inverse = np.linalg.pinv(self._A @ self._spread, rcond=_RANK_TOLERANCE)
         return True
 
     def _penalty(self) -> Vector:
-        """Weights of the equalities left: far above the curvature along them, and no farther."""
-        # The term is constant on steps that meet A d = -off, so it changes none. And a matrix that is
-        # positive definite on A's null space becomes so altogether for a weight that is large enough
-        # (Debreu's lemma): then Cholesky's success says that the inertia is right.
+        """Weights of the equalities that remain: far above the curvature along them, but not farther."""
+        # The term is constant on steps that meet A d = -off, so it changes no step. And a matrix that is
+        # positive definite on A's null space becomes so altogether with a weight that is large enough
+        # (Debreu's lemma): then the success of Cholesky shows that the inertia is right.
         squares = self._A**2
         length = np.maximum(1e-30, squares.sum(axis=1))
         curvature = squares @ np.abs(self.condenser.curvature) / length
         out: Vector = _PENALTY * np.maximum(1.0, curvature) / np.maximum(1.0, length)
         return out
 
-    def _first(self) -> float:
-        """The shift to try first: after an iteration that needed one, a smaller one instead of none."""
-        # The paper tries none first. Where the Hessian was indefinite it mostly still is, and that try costs
-        # a factorization an iteration.
-        shift = self._smaller() if self.shift else 0.0
-        return shift if shift > _SMALL else 0.0
+    def _initial_shift(self) -> float:
+        """Shift to try first: after an iteration that needed one, a smaller one instead of none."""
+        # The paper tries none first. If the Hessian was indefinite it mostly still is, and that try costs a
+        # factorization an iteration.
+        shift = self._decreased_shift() if self.shift else 0.0
+        return shift if shift > _SHIFT_NEGLIGIBLE else 0.0
 
-    def _next(self) -> float:
-        """The shift to try where this one was not enough."""
+    def _next_shift(self) -> float:
+        """Shift to try after one that was too small."""
         if not self.shift:
-            return self._smaller() if self._last else _FIRST
-        return self.shift * (_GROW if self._last else _GROW_FIRST)
+            return self._decreased_shift() if self._last else _SHIFT_FIRST
+        return self.shift * (_KAPPA_PLUS if self._last else _KAPPA_PLUS_FIRST)
 
-    def _smaller(self) -> float:
-        """Than the last; what a far more curved Hessian needed is no guide."""
-        most = _RELATIVE * float(np.abs(self._hessian.data).max(initial=1.0))
-        return min(most, max(_LEAST, self._last / _SHRINK))
+    def _decreased_shift(self) -> float:
+        """Less than the last shift, and in proportion to the Hessian, which may have been far larger then."""
+        most = _SHIFT_RELATIVE * float(np.abs(self._hessian.data).max(initial=1.0))
+        return min(most, max(_SHIFT_MIN, self._last / _DECREASE))
 
     def _values(self) -> Vector:
-        """The matrix as `BlockCholesky` takes it."""
+        """Values of the condensed matrix, in the layout of `BlockCholesky`."""
         c = self.condenser
         values = np.zeros(self._matrix.size)
         W = c.reduce(self._weights, self._diagonal)
         self._kernels.copy(W, self._from, values, self._to)
-        values[self._diagonal_to[self.held]] += _HELD
+        values[self._diagonal_to[self.fixed]] += _FIXED_WEIGHT
         self._kernels.add_products(self._products, c.J, self._weights[self._equal], values)
         return values
 
-    def solve(self, q: Vector, r: Vector, close: float = 0.0) -> tuple[Vector, Vector]:
-        """The step (n,) and the new multipliers (m,) of all rows, for a gradient (n,) and the rows' residuals
-        (m,): what they are off by, with weights.
+    def solve(self, q: Vector, r: Vector, tolerance: float = 0.0) -> tuple[Vector, Vector]:
+        """Solve for the step (n,) and the new multipliers (m,) of all constraints.
 
-        close : what may be left of an equation.
+        q (n,) : gradient.  r (m,) : residuals, with the offsets of weighted constraints.  tolerance :
+        refinement ends if no equation's residual is larger.
         """
         c, w, equal = self.condenser, self._weights.copy(), self._equal
         w[equal] = 0.0
         exact = np.concatenate([c.eliminated, equal]) if self._hard else c.eliminated
-        g, left, worst = q + self._pulled(w * r), r, np.inf
-        d, y, rows = np.zeros(c.n), np.zeros(c.m), np.zeros(c.m)
-        for _ in range(_ROUNDS):
-            more_d, more_y, more_rows, g = self._respond(g, left, w)
-            d, y, rows = d + more_d, y + more_y, rows + more_rows
-            left, hard = np.zeros(c.m), np.zeros(c.m)
-            left[exact] = (rows + r)[exact]
-            hard[c.eliminated], hard[equal] = more_y[c.eliminated], more_y[equal]
-            g += self._pulled(hard)
-            g[c.free[self.held]] = 0.0
+        g, left, worst = q + self._transposed_product(w * r), r, np.inf
+        d, y, change = np.zeros(c.n), np.zeros(c.m), np.zeros(c.m)
+        for _ in range(_MAX_REFINEMENTS):
+            more_d, more_y, more_change, g = self._solve_once(g, left, w)
+            d, y, change = d + more_d, y + more_y, change + more_change
+            # what rounding leaves of the equalities, and of the gradient of the Lagrangian
+            left, of_equalities = np.zeros(c.m), np.zeros(c.m)
+            left[exact] = (change + r)[exact]
+            of_equalities[c.eliminated], of_equalities[equal] = more_y[c.eliminated], more_y[equal]
+            g += self._transposed_product(of_equalities)
+            g[c.free[self.fixed]] = 0.0
             before, worst = worst, max(np.abs(g).max(initial=0.0), np.abs(left).max(initial=0.0))
-            if worst <= close or worst > _LESS * before:
+            if worst <= tolerance or worst > _REFINEMENT_FACTOR * before:
                 break
         return d, y + w * r
 
-    def _respond(self, g: Vector, r: Vector, w: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-        """Step for a gradient and the residuals of equalities; multipliers, of rows with weights w what the
-        step changes; how all rows change; gradient of the Lagrangian without the equalities.
+    def _solve_once(self, g: Vector, r: Vector, w: Vector) -> tuple[Vector, Vector, Vector, Vector]:
+        """Solve the system without refinement, for a gradient (n,) and residuals (m,) of the equalities.
+
+        Returns the step (n,), the multipliers (m,; w J d for weighted constraints), J d (m,), and the
+        gradient of the Lagrangian without the equalities (n,).
         """
         c, equal = self.condenser, self._equal
-        own = self._weights[equal]
+        penalty = self._weights[equal]
         by_free, off = c.forward(g, r)
-        by_free += self._A.T @ (own * off)
-        by_free[self.held] = 0.0
+        by_free += self._A.T @ (penalty * off)
+        by_free[self.fixed] = 0.0
         free = -self._matrix.solve(by_free)
         extra = np.zeros(equal.size)
         if self._hard and equal.size:
             extra = self._inverse @ (self._A @ free + off)
             free -= self._spread @ extra
-        free[self.held] = 0.0
+        free[self.fixed] = 0.0
         d = c.expand(free)
-        rows = np.concatenate([self._jacobian @ d, d[c.bounded]])
-        y = w * rows
-        dual = g + self._hessian @ d + self._diagonal * d + self._pulled(y)
-        # the penalty's pull is a part of these multipliers
-        y[equal] = own * (self._A @ free + off) + extra
+        change = np.concatenate([self._jacobian @ d, d[c.bounded]])
+        y = w * change
+        dual = g + self._hessian @ d + self._diagonal * d + self._transposed_product(y)
+        # the penalty's force is a part of these multipliers
+        y[equal] = penalty * (self._A @ free + off) + extra
         y[c.eliminated] = c.multipliers(dual, y[equal])
-        return d, y, rows, dual
+        return d, y, change, dual
 
-    def _pulled(self, y: Vector) -> Vector:
-        """Gradient of all rows with multipliers (m,)."""
+    def _transposed_product(self, y: Vector) -> Vector:
+        """J' y (n,) for all constraints (m,), those of bounded eliminated variables among them."""
         m = self._jacobian.shape[0]
         out: Vector = self._transposed @ y[:m]
         out[self.condenser.bounded] += y[m:]
         return out
 
 
-# ---------------------------------------------------------------- structures
-_structures: OrderedDict[bytes, NewtonSystem] = OrderedDict()
+# ---------------------------------------------------------------- cache of Newton systems
+_systems: OrderedDict[bytes, NewtonSystem] = OrderedDict()
 
 
 def acquire(
@@ -401,40 +418,43 @@ def acquire(
     bounded: Mask,
     moves: Mask,
 ) -> NewtonSystem:
-    """The system for these patterns, for one who gives it back: its structure takes as long as 10 iterations
-    and serves all programs that differ in their numbers, or in inequalities that couple nothing new.
+    """Newton system for these patterns, for a caller that will `release` it.
 
-    determined : what rows determine; equal (m,): which rows are equalities; bounded, moves (n,): which
-    variables have a finite bound, and which are not fixed.
+    Its analysis takes as long as ten iterations, so systems are cached, for programs that differ in their
+    values only, or in inequalities that couple no other variables.
+
+    determined : variables that constraints determine.  equal (m,) : which constraints are equalities.
+    bounded,
+    moves (n,) : which variables have a finite bound, and which are not fixed.
     """
     mine = equal[jacobian.indices]
     starts = np.append(0, np.cumsum(mine))[jacobian.indptr]
     of_equalities = np.cumsum(equal)[jacobian.indices[mine]], starts
-    known = [variables for _, variables in determined]
-    structure = _digest([rank for rank, _ in determined], *of_equalities, *known, bounded, moves)
+    variables = [variables for _, variables in determined]
+    structure = _digest([rank for rank, _ in determined], *of_equalities, *variables, bounded, moves)
     patterns = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
     key = structure + _digest(None, *patterns, equal)
-    system = _structures.pop(key, None) or _alike(structure, jacobian, hessian, equal)
+    system = _systems.pop(key, None) or _adapted(structure, jacobian, hessian, equal)
     if system is None:
-        algebra = fastest()
+        kernels = fastest_kernels()
         eliminations = find_eliminations(jacobian, equal, determined)
-        condenser = Condenser(jacobian, hessian, eliminations, equal, bounded, algebra)
-        held = np.flatnonzero(~moves[condenser.free])
-        system = NewtonSystem(condenser, held, algebra)
+        condenser = Condenser(jacobian, hessian, eliminations, equal, bounded, kernels)
+        fixed = np.flatnonzero(~moves[condenser.free])
+        system = NewtonSystem(condenser, fixed, kernels)
     system.begin(key)
     return system
 
 
-def _alike(structure: bytes, jacobian: Matrix, hessian: Matrix, equal: Mask) -> NewtonSystem | None:
-    """One with the same equalities, made to be that of these patterns: other inequalities change little."""
-    for key, system in reversed(_structures.items()):
-        if key.startswith(structure) and system.condenser.take(jacobian, hessian, equal):
-            return _structures.pop(key)
+def _adapted(structure: bytes, jacobian: Matrix, hessian: Matrix, equal: Mask) -> NewtonSystem | None:
+    """Cached system with the same equalities, adapted to these inequalities; None if there is none."""
+    for key, system in reversed(_systems.items()):
+        if key.startswith(structure) and system.condenser.adapt(jacobian, hessian, equal):
+            return _systems.pop(key)
     return None
 
 
-def _digest(words: Any, *arrays: Index | Mask) -> bytes:
-    digest = hashlib.sha256(repr(words).encode())
+def _digest(ranks: Any, *arrays: Index | Mask) -> bytes:
+    digest = hashlib.sha256(repr(ranks).encode())
     for array in arrays:
         digest.update(f"{array.dtype} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -442,7 +462,7 @@ def _digest(words: Any, *arrays: Index | Mask) -> bytes:
 
 
 def release(system: NewtonSystem) -> None:
-    """Keep the structure for the next program that has it."""
-    _structures[system.key] = system
-    while len(_structures) > _KEPT:
-        _structures.popitem(last=False)
+    """Put a system into the cache, for the next program of the same structure."""
+    _systems[system.key] = system
+    while len(_systems) > _CACHE_SIZE:
+        _systems.popitem(last=False)

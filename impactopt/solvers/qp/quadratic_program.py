@@ -1,6 +1,6 @@
-"""Quadratic programs: the problem, its solution, the rows' common form, and how an answer is made exact.
+"""Quadratic programs: problem, normalized constraints, solution, and the refinement of approximate solutions.
 
-Source of that: Hintermueller, Ito, Kunisch, SIAM Journal on Optimization 13, 2002.
+Source of the refinement: Hintermueller, Ito, Kunisch, SIAM Journal on Optimization 13, 2002.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class QuadraticProgram:
 
     Attributes
     ----------
-    P : full symmetric, positive semidefinite (n, n): csc_array, or, as A, an array where the QP is small.
+    P : full symmetric, positive semidefinite (n, n): csc_array; or a dense array, as A, if the QP is small.
     q : (n,).
     A : (m, n), as P.
     lower, upper : (m,), equal for equalities, +-inf for none.
@@ -47,25 +47,26 @@ class QuadraticProgram:
 
     @property
     def m(self) -> int:
-        """Number of rows of A; the variables' bounds are not counted."""
+        """Number of constraints: rows of A, without the variables' bounds."""
         return int(self.lower.size)
 
     @property
     def dense(self) -> bool:
-        """True if its matrices are arrays."""
+        """True if its matrices are dense arrays."""
         return isinstance(self.A, np.ndarray)
 
     @cached_property
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """P, and C of `stacked`, as arrays."""
+        """P, and C of `stacked`, as dense arrays."""
         C = self.stacked[0]
         return (self.P, C) if self.dense else (self.P.toarray(), C.toarray())
 
     @cached_property
     def stacked(self) -> tuple[Any, Vector, Vector]:
-        """(C, l, u) with bounds as rows, l <= C x <= u, C = [A; I], rows of norm 1 (zero rows stay zero).
+        """Normalized constraints l <= C x <= u: (C, l, u); C = [A; I] with rows of norm 1, or zero.
 
-        First-order solvers live by the norms of the rows; `row_scale` brings their multipliers back.
+        First-order solvers depend on the norms of the rows. `row_scale` times their multipliers are those of
+        the QP.
         """
         if self.dense:
             C: Any = np.vstack([self.row_scale[: self.m, None] * self.A, np.eye(self.n)])
@@ -87,19 +88,19 @@ class QuadraticProgram:
         return np.concatenate([1.0 / np.where(norms > 1e-12, norms, 1.0), np.ones(self.n)])
 
     def residuals(self, x: Vector, y: Vector, z: Vector) -> tuple[float, float, float]:
-        """Residuals of the optimality (KKT) conditions at x, with multipliers y of the rows, z of the bounds.
+        """Residuals of the KKT conditions at x, with multipliers y of the constraints and z of the bounds.
 
-        Returns the largest violation of a unit row, the largest entry of P x + q + A'y + z, and the largest
-        product of a multiplier (in units of the unit row) and the distance to the bound it belongs to.
+        Returns the largest violation of a normalized constraint, the largest entry of P x + q + A'y + z, and
+        the largest product of a normalized constraint's multiplier and its distance to the bound.
         """
         C, lower, upper = self.stacked
         v = C @ x
         multipliers = np.concatenate([y, z]) / self.row_scale
         primal = np.max(np.maximum(np.maximum(lower - v, v - upper), 0.0), initial=0.0)
         dual = np.max(np.abs(self.P @ x + self.q + C.T @ multipliers), initial=0.0)
-        held = multipliers != 0.0
-        gap = np.where(multipliers > 0, np.abs(upper - v), np.abs(v - lower))[held]
-        return float(primal), float(dual), float(np.max(np.abs(multipliers[held]) * gap, initial=0.0))
+        active = multipliers != 0.0
+        gap = np.where(multipliers > 0, np.abs(upper - v), np.abs(v - lower))[active]
+        return float(primal), float(dual), float(np.max(np.abs(multipliers[active]) * gap, initial=0.0))
 
     def error(self, x: Vector, y: Vector, z: Vector) -> float:
         """The largest of the residuals; those in units of the objective relative to 1 + |q|."""
@@ -108,7 +109,7 @@ class QuadraticProgram:
 
 
 class QPStatus(enum.Enum):
-    """End of a QP solver. INACCURATE: usable, outside the tolerances."""
+    """Status of a QP solver. INACCURATE: usable, outside the tolerances."""
 
     SOLVED = "solved"
     INACCURATE = "inaccurate"
@@ -118,12 +119,12 @@ class QPStatus(enum.Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class QPSolution:
-    """Answer of a QP solver; x, y, z are meaningless unless `usable`.
+    """Solution by a QP solver; x, y, z are meaningless unless `usable`.
 
     Attributes
     ----------
-    x : variables (n,); y: multipliers of the rows (m,); z: of the bounds (n,), positive where the upper bound
-        holds.
+    x : variables (n,).
+    y, z : multipliers of the constraints (m,) and of the bounds (n,), positive if the upper bound is active.
     status : how the solver ended.
     iterations : of the solver.
     """
@@ -141,7 +142,7 @@ class QPSolution:
 
 
 class QPSolver(Protocol):
-    """Solves one QP after the other; may keep factors and settings between them."""
+    """Solver of one QP after the other; may keep factors and settings between them."""
 
     def solve(
         self,
@@ -150,17 +151,17 @@ class QPSolver(Protocol):
         start: tuple[Vector, Vector, Vector] | None = None,
         time_limit: float | None = None,
     ) -> QPSolution:
-        """Solve the QP from the guess (x, y, z). A hard or infeasible QP is a status, no exception."""
+        """Solve the QP from the initial guess (x, y, z); a failure is a status, no exception."""
         ...
 
 
 _DENSE = 400  # up to this many unknowns LAPACK is quicker than a sparse factorization
-_REGULARIZATION = 1e-9
+_REGULARIZATION = 1e-9  # on the diagonal of a KKT system, against dependent constraints
 
 
 @dataclass(frozen=True, kw_only=True)
 class Refined:
-    """A solution, its multipliers of the unit rows of `QuadraticProgram.stacked`, and its error."""
+    """Solution x, multipliers y of the normalized constraints (`QuadraticProgram.stacked`), and its error."""
 
     x: Vector
     y: Vector
@@ -168,27 +169,27 @@ class Refined:
 
 
 def refine(qp: QuadraticProgram, x: Vector, y: Vector, *, rounds: int = 10) -> Refined | None:
-    """Solve the QP with the rows that (x, y) holds active as equalities; correct the set until it stays.
+    """Refine a solution: solve the QP with its active constraints as equalities, until the active set stays.
 
     Parameters
     ----------
     qp : with positive definite P.
     x : approximate solution (n,).
-    y : approximate multipliers of the unit rows of `qp.stacked` (m + n,).
+    y : approximate multipliers of the normalized constraints of `qp.stacked` (m + n,).
     rounds : most corrections of the active set.
 
     Returns
     -------
-    The best point found, or None where no active set gave a system that could be solved.
+    The best point found; None if no active set gave a system that could be solved.
     """
     C, lower, upper = qp.stacked
     rows = C if qp.dense else C.tocsr()
     best: Refined | None = None
     seen: set[bytes] = set()
     for _ in range(rounds):
-        held = active_set(qp, x, y)
-        high, low = held > 0, held < 0
-        key = held.tobytes()
+        sides = active_set(qp, x, y)
+        high, low = sides > 0, sides < 0
+        key = sides.tobytes()
         if key in seen:
             break
         seen.add(key)
@@ -199,7 +200,8 @@ def refine(qp: QuadraticProgram, x: Vector, y: Vector, *, rounds: int = 10) -> R
             break
         x, y = solved[0], np.zeros(lower.size)
         y[active] = solved[1]
-        # A multiplier of the wrong sign leaves the set next time; it does not count as a solution's.
+        # a constraint with a multiplier of the wrong sign is dropped next time; its multiplier is no
+        # solution's
         clipped = np.where(high, np.maximum(y, 0), np.where(low, np.minimum(y, 0), 0))
         clipped = np.where(lower == upper, y, clipped)
         error = qp.error(x, *np.split(clipped * qp.row_scale, [qp.m]))
@@ -209,11 +211,10 @@ def refine(qp: QuadraticProgram, x: Vector, y: Vector, *, rounds: int = 10) -> R
 
 
 def active_set(qp: QuadraticProgram, x: Vector, y: Vector) -> np.ndarray:
-    """Unit rows of `qp.stacked` that (x, y) holds active.
+    """Active set (m + n,) of the normalized constraints of `qp.stacked`, estimated from (x, y).
 
-    +1 at the upper bound (and equalities), -1 at the lower, 0 for the others.
-
-    A row is active where its multiplier pushes harder than its distance to the bound (eq. 2.4 with c = 1).
+    +1 at the upper bound (and equalities), -1 at the lower, 0 for inactive constraints. A constraint is
+    active if its multiplier is larger than its distance to the bound (eq. 2.4 with c = 1).
     """
     C, lower, upper = qp.stacked
     v = C @ x
@@ -222,7 +223,7 @@ def active_set(qp: QuadraticProgram, x: Vector, y: Vector) -> np.ndarray:
 
 
 def solve_equality_qp(P: Matrix, q: Vector, A: Matrix, b: Vector) -> tuple[Vector, Vector] | None:
-    """Minimize 1/2 x'Px + q'x subject to A x = b, also with dependent rows: regularized, then refined."""
+    """Minimize 1/2 x'Px + q'x subject to A x = b, also dependent: x and multipliers; None if singular."""
     n, m = q.size, b.size
     K: Any
     if isinstance(A, np.ndarray):
@@ -244,8 +245,8 @@ def solve_equality_qp(P: Matrix, q: Vector, A: Matrix, b: Vector) -> tuple[Vecto
             solve = spla.splu(sp.csc_matrix(K + sp.diags_array(shift))).solve
         except RuntimeError:  # singular
             return None
-    # The shift makes the system quasidefinite, and with it regular also for dependent rows; refinement with
-    # the true matrix removes what it changes.
+    # The shift makes the system quasidefinite, and so regular also for dependent constraints; refinement with
+    # the true matrix removes its effect.
     s = solve(right)
     for _ in range(5):
         s = s + solve(right - K @ s)

@@ -1,4 +1,4 @@
-"""The QP solvers by name; each is imported when it is asked for."""
+"""Registry of the QP solvers by name; each is imported when it is made."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ QP_SOLVERS: dict[str, Callable[[float], QPSolver]] = {
     "active_set": _active_set,
     "osqp": _osqp,
 }
-"""Name of a QP solver -> what makes one, given the tolerance of its residuals. Add your own here.
-"""
+"""Functions that make a QP solver for a tolerance of its error, by the solver's name. Add your own here."""
 GONE = {"daqp": "osqp", "piqp": "osqp"}
-"""QP solvers that there were, and what to ask for in their place."""
+"""Replacements of QP solvers that are no longer supported."""
 
 
 def make_qp_solver(name: str, tolerance: float = 1e-6) -> QPSolver:
-    """A new QP solver by its name in `QP_SOLVERS`.
+    """Make a QP solver by its name in `QP_SOLVERS`.
 
     Raises
     ------
@@ -42,11 +41,11 @@ def make_qp_solver(name: str, tolerance: float = 1e-6) -> QPSolver:
 
 
 def check_qp_solver(name: str, known: Iterable[str]) -> None:
-    """Refuse names that are not among the known ones.
+    """Check that a name is among the known ones.
 
     Raises
     ------
-    InputError : no such solver, or none any more.
+    InputError : no such solver, or no longer supported.
     """
     known = sorted(known)
     if name in GONE and name not in known:

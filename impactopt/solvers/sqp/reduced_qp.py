@@ -1,9 +1,11 @@
-"""QPs of the reduced SQP: elimination of what rows determine, Hessian of the rest, a step with rows it needs.
+"""Reduced QPs of the SQP: elimination of equalities, model of the Lagrangian, QPs with a working set.
 
-Rows that determine variables of their own (`Determined`) give x_D = x_D(x_F) to first order, as a shooting
-method has by integration; of the free variables x_F only those directions are left that keep the other
-equalities. A QP of thousands of variables becomes one of some dozens, dense, with the same solution.
-Nocedal and Wright 2006, section 15.3.
+Equalities that determine variables (`Determined`) give x_D as a function of the free variables x_F, to first
+order; a shooting method has the same by integration. Of the free variables' steps only those remain that keep
+the other equalities. A QP of thousands of variables becomes a dense one of some dozens, with the same
+solution. Nocedal and Wright 2006, section 15.3.
+
+A step is d = d0 + T t: the normal step d0 meets the equalities, and the QP has the variables t.
 """
 
 from __future__ import annotations
@@ -27,24 +29,26 @@ from impactopt.solvers.program import Determined, Matrix, Point, TimedProgram, V
 from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
 
 Index = npt.NDArray[np.intp]
-_KEPT = 4  # structures
-_LARGE = 300  # free variables: beyond, QPs stay sparse, with the equalities that are left as rows
-_NOTHING = 1e-13  # what rounding leaves of a zero
-_SHORT = 1e-6  # of a row's length: what rounding may leave of it by the free variables
-_RANK = 1e-9  # of the equalities left: what is this much smaller than the largest depends on the others
+_CACHE_SIZE = 4  # structures
+# Free variables up to which QPs are dense. Beyond, a null space of the remaining equalities would couple all
+# instants of a motion, so they are constraints of a sparse QP.
+_MAX_DENSE = 300
+_ZERO = 1e-13  # size of an entry that rounding leaves of a zero
+_MIN_RELATIVE_NORM = 1e-6  # of a gradient by the free variables, relative to that by all: less is rounding
+_RANK_TOLERANCE = 1e-9  # relative: an equality with a smaller pivot depends on the others
 
 
 class Reduction:
-    """Eliminates, for Jacobians whose pattern does not change.
+    """Elimination of equalities, for Jacobians with a fixed pattern.
 
     Attributes
     ----------
-    gone, variables : rows that are eliminated, and the variables that they determine.
-    free : the other variables.  sparse : whether they are many.
-    left : equalities that are left, none where it is sparse.  rows : all others that are not gone.
-    bounded : variables with a bound, whichever they are.
-    T : (n, r) steps of all variables, one a column, that keep the equalities but those in `rows`; r is the
-        size of the QPs; sparse or dense.
+    eliminated, variables : equalities that are eliminated, and the variables that they determine.
+    free : the other variables.  sparse : whether there are more than a dense QP takes.
+    equalities : those that remain; none if it is sparse.  others : all other constraints.
+    bounded : variables with a bound, free or not.
+    T : (n, r) a basis, as columns, of the steps of all variables that keep all equalities but those in
+        `others`; r is the number of variables of the QPs; sparse or dense.
     """
 
     def __init__(
@@ -55,122 +59,123 @@ class Reduction:
         *,
         dense: bool = False,
     ):
-        """jacobian : (m, n) csc, at any point.  dense : never sparse, however many variables are free."""
+        """jacobian : (m, n) csc, at any point.  dense : even if many variables are free."""
         equal = program.g_lower == program.g_upper
-        self._equations, every = np.flatnonzero(equal), np.ones(int(equal.sum()), dtype=bool)
+        self._equations, all_equal = np.flatnonzero(equal), np.ones(int(equal.sum()), dtype=bool)
         equations = self._of_equations(jacobian.tocsr())
         self._empty = sp.csc_array((program.n, program.n))
         self._key = _key(equations, determined)
         if self._key not in _structures:
-            _structures[self._key] = _structure(equations, self._empty, every, determined)
-        self._found, self._condenser = _structures.pop(self._key)
-        found = self._found
+            eliminations = find_eliminations(equations, all_equal, determined)
+            none_bounded = np.zeros(program.n, dtype=bool)
+            condenser = Condenser(equations, self._empty, eliminations, all_equal, none_bounded, kernels())
+            _structures[self._key] = eliminations, condenser
+        self._eliminations, self._condenser = _structures.pop(self._key)
         none = np.zeros(0, dtype=np.intp)
-        self.gone: Index = self._equations[np.concatenate([none, *[e.rows.ravel() for e in found]])]
-        self.variables: Index = np.concatenate([none, *[e.variables.ravel() for e in found]])
-        self._place = np.argsort(np.argsort(self.gone))
+        self.eliminated: Index = self._equations[
+            np.concatenate([none, *[e.constraints.ravel() for e in self._eliminations]])
+        ]
+        self.variables: Index = np.concatenate([none, *[e.variables.ravel() for e in self._eliminations]])
+        self._place = np.argsort(np.argsort(self.eliminated))  # the condenser lists them in ascending order
         self._level = program.g_lower
         self.free = np.setdiff1d(np.arange(program.n), self.variables)
-        here = np.ones(program.m, dtype=bool)
-        here[self.gone] = False
-        self.sparse = not dense and self.free.size > _LARGE
-        apart = here & equal & (not self.sparse)
-        self.left, self.rows = np.flatnonzero(apart), np.flatnonzero(here & ~apart)
+        remaining = np.ones(program.m, dtype=bool)
+        remaining[self.eliminated] = False
+        self.sparse = not dense and self.free.size > _MAX_DENSE
+        by_null_space = remaining & equal & (not self.sparse)
+        self.equalities = np.flatnonzero(by_null_space)
+        self.others = np.flatnonzero(remaining & ~by_null_space)
         self.bounded = np.flatnonzero(np.isfinite(program.x_lower) | np.isfinite(program.x_upper))
         self._n = program.n
 
     def release(self) -> None:
-        """Keep the structure for the next program that has it."""
-        _structures[self._key] = self._found, self._condenser
-        while len(_structures) > _KEPT:
+        """Put the structure into the cache, for the next program that has it."""
+        _structures[self._key] = self._eliminations, self._condenser
+        while len(_structures) > _CACHE_SIZE:
             _structures.popitem(last=False)
 
     def load(self, point: Point) -> None:
-        """Take the Jacobian at a point, by the interior-point method's elimination.
+        """Compute the basis T at a point, with the interior-point method's elimination.
 
         Raises
         ------
-        LinAlgError : rows do not determine their variables there.
+        LinAlgError : constraints do not determine their variables there.
         """
-        equations = self._of_equations(point.rows)
-        self._of_left = point.rows[self.left]
+        equations = self._of_equations(point.jacobian_csr)
+        self._A = point.jacobian_csr[self.equalities]
         self._condenser.load(equations, self._empty)
         Z = np.zeros((self._n, self.free.size))
         Z[self.free, np.arange(self.free.size)] = 1.0
         self._condenser.expand_basis(Z)
         Z = self._Z = _without_zeros(Z) if self.sparse else Z
-        A = self._of_left @ Z
-        if not self.left.size:
-            self._Y, self._R, self._order = np.zeros((self.free.size, 0)), np.zeros((0, 0)), self.left
-            self.T, self._within = Z, None
+        A = self._A @ Z
+        if not self.equalities.size:
+            self._Y, self._R, self._order = np.zeros((self.free.size, 0)), np.zeros((0, 0)), self.equalities
+            self.T, self._null_space = Z, None
             return
+        # A' P = Q R: the first columns of Q span the range of A', the others its null space
         Q, R, self._order = la.qr(A.T, pivoting=True, check_finite=False)
         sizes = np.abs(np.diagonal(R))
-        rank = int((sizes > _RANK * max(float(sizes.max(initial=0.0)), 1e-300)).sum())
+        rank = int((sizes > _RANK_TOLERANCE * max(float(sizes.max(initial=0.0)), 1e-300)).sum())
         self._Y, self._R = Q[:, :rank], R[:rank]
-        self._within = Q[:, rank:]
-        self.T = Z @ self._within
+        self._null_space = Q[:, rank:]
+        self.T = Z @ self._null_space
 
     def _of_equations(self, rows: Matrix) -> Matrix:
         return rows[self._equations].tocsc()
 
     def normal(self, g: Vector) -> Vector:
-        """The step (n,) that meets the linearized equalities, as well as they can be, whose values are g
-        (m,); the shortest of the free variables."""
+        """Normal step (n,): meets the linearized equalities, as well as possible, for values g (m,).
+
+        The free variables' part that the remaining equalities need is the shortest.
+        """
         d = self._condenser.particular((g - self._level)[self._equations])
-        if self.left.size:
-            off = -(g[self.left] - self._level[self.left] + self._of_left @ d)
+        if self.equalities.size:
+            off = -(g[self.equalities] - self._level[self.equalities] + self._A @ d)
             along = np.linalg.lstsq(self._R.T, off[self._order], rcond=None)[0]
             d = d + self._Z @ (self._Y @ along)
         return d
 
     def add_multipliers(self, y: Vector, dual: Vector) -> Vector:
-        """y (m,) with those of the equalities that make grad f + J'y + z zero where equalities can.
+        """y (m,) with the equalities' multipliers that make grad f + J'y + z as small as these can.
 
-        y : of the other rows.  dual (n,) : grad f + J'y + z of these.
+        y : of the other constraints, 0 for equalities.  dual (n,) : grad f + J'y + z with this y.
         """
         y = y.copy()
-        if self.left.size:
-            of_left = np.zeros(self.left.size)
+        if self.equalities.size:
+            of_equalities = np.zeros(self.equalities.size)
             target = -(self._Y.T @ (self._Z.T @ dual))
-            of_left[self._order] = np.linalg.lstsq(self._R, target, rcond=None)[0]
-            y[self.left] = of_left
-            dual = dual + self._of_left.T @ of_left
-        of_gone = self._condenser.multipliers(dual, np.zeros(len(self._condenser.left)))
-        y[self.gone] = of_gone[self._place]
+            of_equalities[self._order] = np.linalg.lstsq(self._R, target, rcond=None)[0]
+            y[self.equalities] = of_equalities
+            dual = dual + self._A.T @ of_equalities
+        of_eliminated = self._condenser.multipliers(dual, np.zeros(len(self._condenser.remaining_equalities)))
+        y[self.eliminated] = of_eliminated[self._place]
         return y
 
     @property
     def basis(self) -> Any:
-        """(n, f) what all variables do with each of the free ones."""
+        """Z (n, f): step of all variables for a unit step of each free one."""
         return self._Z
 
-    def rows_by_free(self, point: Point) -> tuple[Any, Vector]:
-        """`rows` along the columns of `T` (k, r), and their norms (k,) by the free variables: what a row
-        changes with these, those that they determine with them. Its gradient by all variables may be
-        thousands of times as long. 1 for rows that nothing changes.
+    def reduced_jacobian(self, point: Point) -> tuple[Any, Vector]:
+        """Jacobian of `others` along the columns of `T` (k, r), and norms (k,) of the gradients by `free`.
+
+        These gradients are total: the determined variables move too. A gradient by all variables may be
+        thousands of times as long. The norm is 1 for constraints that no free variable changes.
         """
-        own = point.rows[self.rows]
+        own = point.jacobian_csr[self.others]
         by_free = own @ self._Z
         norms, whole = _norms(by_free), _norms(own)
-        norms = np.maximum(norms, _SHORT * whole)
-        along = by_free if self._within is None else by_free @ self._within
+        norms = np.maximum(norms, _MIN_RELATIVE_NORM * whole)
+        along = by_free if self._null_space is None else by_free @ self._null_space
         return along, np.where(norms > 1e-12, norms, 1.0)
 
     def gradient(self, dual: Vector) -> Vector:
-        """(f,) of what the free variables change, those that they determine with them; dual (n,)."""
+        """Total gradient (f,) by the free variables, for a gradient by all variables (n,)."""
         return np.asarray(self._Z.T @ dual)
 
 
 _structures: OrderedDict[bytes, tuple[list[Elimination], Condenser]] = OrderedDict()
-
-
-def _structure(
-    equations: Matrix, empty: Matrix, every: npt.NDArray[np.bool_], determined: Sequence[Determined]
-) -> tuple[list[Elimination], Condenser]:
-    found = find_eliminations(equations, every, determined)
-    nowhere = np.zeros(equations.shape[1], dtype=bool)
-    return found, Condenser(equations, empty, found, every, nowhere, kernels())
 
 
 def _key(equations: Matrix, determined: Sequence[Determined]) -> bytes:
@@ -186,56 +191,61 @@ def _norms(rows: Any) -> Vector:
 
 
 def _without_zeros(Z: np.ndarray) -> Matrix:
-    i, j = np.nonzero(np.abs(Z) > _NOTHING)
+    i, j = np.nonzero(np.abs(Z) > _ZERO)
     return sp.csr_array((Z[i, j], (i, j)), shape=Z.shape)
 
 
-_FLOOR = 1e-5  # least eigenvalue
-# weights of active rows that are tried in making the Hessian convex: they change no step that keeps the rows
-_WEIGHTS = (0.0, 10.0, 1e2, 1e3, 1e4)
-_LEARNED = 1e-3  # least eigenvalue of what BFGS has learned
-_FIRST = 1e-2  # curvature that BFGS begins with
-_STEEPEST = 1e4  # that it learns
-_SHIFT = 1e-4  # least of a sparse Hessian that is not convex
-_STEEP = 0.1  # curvature where only the violation counts
+_MIN_EIGENVALUE = 1e-5  # of a convex Hessian
+# Weights of active constraints that are tried to make the Hessian convex: they change no step along these
+# constraints, while lifted eigenvalues do.
+_ACTIVE_WEIGHTS = (0.0, 10.0, 1e2, 1e3, 1e4)
+_MIN_SHIFT = 1e-4  # of a sparse Hessian that is not convex with a weight
+_INITIAL_CURVATURE = 1e-2  # of BFGS
+_MIN_BFGS_EIGENVALUE = 1e-3
+_MAX_CURVATURE = 1e4  # that BFGS learns: more is a kink between two points
+_RESTORATION_CURVATURE = 0.1  # of the model whose QP reduces the violation alone
 Active = Callable[[], Matrix]
 
 
 @dataclass(frozen=True)
 class ReducedModel:
-    """gradient . d + 1/2 t'Bt of a step d = d0 + T t, B (r, r) positive definite.
+    """Model gradient . d + 1/2 t'Bt of a step d = d0 + T t, with B (r, r) positive definite.
 
-    leads : whether it is of the objective; else of the violation alone.
+    T (n, r), TH (r, n) : T and T'H with the Hessian H; None: H is zero. They and B are dense or sparse, as
+    the reduction is.
+    has_objective : False if it is for the violation alone.
     """
 
-    B: Matrix  # it, T and of_start are dense or sparse, as the reduction is
+    B: Matrix
     gradient: Vector
     T: Matrix
-    of_start: Matrix | None  # T' H (r, n): what d0 adds to the gradient
-    leads: bool = True
+    TH: Matrix | None
+    has_objective: bool = True
 
     def slope(self, d0: Vector) -> Vector:
-        """Gradient by t where the step d0 is made already."""
+        """Gradient (r,) by t at t = 0, after the step d0."""
         out = self.T.T @ self.gradient
-        return np.asarray(out if self.of_start is None else out + self.of_start @ d0)
+        return np.asarray(out if self.TH is None else out + self.TH @ d0)
 
 
 class ModelRule(Protocol):
-    """Makes the model at a point."""
+    """Rule that makes the model at a point."""
 
     def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
-        """Model of the Lagrangian with multipliers y (m,); active: gives the unit rows (a, r) that hold;
-        objective: whether it counts, or the violation alone.
+        """Model of the Lagrangian with multipliers y (m,).
+
+        active : gives the gradients (a, r), along T and of norm 1, of the active constraints.
+        objective : False for a model of the violation alone.
         """
         ...
 
     def forget(self) -> None:
-        """Forget what was learned from earlier points."""
+        """Discard the information of earlier points."""
         ...
 
 
 class ExactModel:
-    """The exact Hessian in these directions, its eigenvalues lifted where active rows leave them negative."""
+    """Exact reduced Hessian, made convex by weights of active constraints, a shift or lifted eigenvalues."""
 
     def __init__(self, program: TimedProgram, reduction: Reduction):
         self._program, self._reduction = program, reduction
@@ -244,70 +254,68 @@ class ExactModel:
     def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
         T = self._reduction.T
         if not objective:
-            return _steep(point, T)
-        # far from a solution multipliers may be anything
-        H = self._program.hessian(point.x, 1.0, y)
-        of_start = T.T @ H
-        B = of_start @ T
-        if self._reduction.sparse:
-            return ReducedModel(self._lifted(0.5 * (B + B.T), active()), point.gradient, T, of_start)
-        return ReducedModel(_convex(0.5 * (B + B.T), active()), point.gradient, T, of_start)
+            return _restoration_model(point, T)
+        TH = T.T @ self._program.hessian(point.x, 1.0, y)
+        B = TH @ T
+        convex = self._shifted if self._reduction.sparse else _convex
+        return ReducedModel(convex(0.5 * (B + B.T), active()), point.gradient, T, TH)
 
     def forget(self) -> None:
         self._shift = 0.0
 
-    def _lifted(self, B: Matrix, active: Matrix) -> Matrix:
-        """B with a weight of active rows, and a multiple of the identity, that make it convex and keep it
-        sparse."""
-        rows, identity = active.T @ active, sp.eye_array(B.shape[0], format="csc")
-        for weight in _WEIGHTS[:2]:
-            if _is_convex(made := B + weight * rows):
+    def _shifted(self, B: Matrix, active: Matrix) -> Matrix:
+        """Sparse B made convex by a weight of active constraints and, if necessary, a shift."""
+        square, identity = active.T @ active, sp.eye_array(B.shape[0], format="csc")
+        for weight in _ACTIVE_WEIGHTS[:2]:
+            if _is_convex(weighted := B + weight * square):
                 self._shift /= 3.0
-                return made
-        self._shift = max(self._shift / 3.0, _SHIFT)
-        while not _is_convex(lifted := made + self._shift * identity):
+                return weighted
+        self._shift = max(self._shift / 3.0, _MIN_SHIFT)
+        while not _is_convex(shifted := weighted + self._shift * identity):
             self._shift *= 4.0
-        return lifted
+        return shifted
 
 
 class BFGSModel:
-    """Powell's damped update of the reduced Hessian in the free variables (Nocedal, Wright 2006, 18.3)."""
+    """Powell's damped BFGS approximation of the reduced Hessian (Nocedal, Wright 2006, section 18.3)."""
 
     def __init__(self, reduction: Reduction):
         self._reduction = reduction
         self.forget()
 
     def forget(self) -> None:
-        self._B = _FIRST * np.eye(self._reduction.free.size)
+        self._B = _INITIAL_CURVATURE * np.eye(self._reduction.free.size)
         self._last: tuple[Point, np.ndarray] | None = None
 
     def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
         reduction = self._reduction
         if not objective:
-            return _steep(point, reduction.T)
+            return _restoration_model(point, reduction.T)
         if self._last is None or self._last[0] is not point:
             if self._last is not None:
                 self._update(point, y)
             self._last = point, reduction.basis
         free = reduction.T[reduction.free]
-        of_start = np.zeros((free.shape[1], reduction.T.shape[0]))
-        of_start[:, reduction.free] = free.T @ self._B
-        B = of_start @ reduction.T
+        TH = np.zeros((free.shape[1], reduction.T.shape[0]))
+        TH[:, reduction.free] = free.T @ self._B
+        B = TH @ reduction.T
         values, vectors = la.eigh(0.5 * (B + B.T), check_finite=False)
-        B = (vectors * np.maximum(values, _LEARNED)) @ vectors.T
-        return ReducedModel(B, point.gradient, reduction.T, of_start)
+        B = (vectors * np.maximum(values, _MIN_BFGS_EIGENVALUE)) @ vectors.T
+        return ReducedModel(B, point.gradient, reduction.T, TH)
 
     def _update(self, point: Point, y: Vector) -> None:
-        """Update with multipliers that are the same at both points: of rows, and of equalities that determine
-        nothing, which steps have to follow as they bend. What the others determine is in the gradients."""
+        """Update from the change of the Lagrangian's gradient since the last point, for fixed multipliers.
+
+        The eliminated equalities have none: their curvature is in the total gradients by the free variables.
+        """
         assert self._last is not None
         before, basis = self._last
         reduction = self._reduction
-        only = np.zeros_like(y)
-        only[reduction.rows], only[reduction.left] = y[reduction.rows], y[reduction.left]
+        own_y = y.copy()
+        own_y[reduction.eliminated] = 0.0
         step = (point.x - before.x)[reduction.free]
-        change = reduction.gradient(point.gradient + point.jacobian.T @ only)
-        change = change - basis.T @ (before.gradient + before.jacobian.T @ only)
+        change = reduction.gradient(point.gradient + point.jacobian.T @ own_y)
+        change = change - basis.T @ (before.gradient + before.jacobian.T @ own_y)
         Bs = self._B @ step
         sBs, sy = float(step @ Bs), float(step @ change)
         if sBs < 1e-16:
@@ -316,34 +324,36 @@ class BFGSModel:
         # s'r is 0.2 s'Bs, so that B stays positive definite
         theta = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
         r = theta * change + (1.0 - theta) * Bs
-        if float(r @ r) > _STEEPEST * float(step @ r):
-            return  # a kink between the two points, and no curvature
+        if float(r @ r) > _MAX_CURVATURE * float(step @ r):
+            return
         self._B = self._B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(step @ r)
 
 
 def _is_convex(B: Matrix) -> bool:
     try:
-        la.cholesky(B.toarray() - _FLOOR * np.eye(B.shape[0]), overwrite_a=True, check_finite=False)
+        la.cholesky(B.toarray() - _MIN_EIGENVALUE * np.eye(B.shape[0]), overwrite_a=True, check_finite=False)
     except la.LinAlgError:
         return False
     return True
 
 
 def _convex(B: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """B with the least weight of active rows that makes it convex; else eigenvalues are lifted."""
-    rows, floor = active.T @ active, _FLOOR * np.eye(len(B))
-    for weight in _WEIGHTS if len(active) else _WEIGHTS[:1]:
-        made = B + weight * rows
+    """Dense B made convex by the least sufficient weight of active constraints, or by lifted eigenvalues."""
+    square, least = active.T @ active, _MIN_EIGENVALUE * np.eye(len(B))
+    for weight in _ACTIVE_WEIGHTS if len(active) else _ACTIVE_WEIGHTS[:1]:
+        weighted = B + weight * square
         with contextlib.suppress(la.LinAlgError):
-            la.cholesky(made - floor, check_finite=False)
-            return np.asarray(made)
-    values, vectors = la.eigh(B + _WEIGHTS[1] * rows, check_finite=False)
-    return np.asarray((vectors * np.maximum(values, _FLOOR)) @ vectors.T)
+            la.cholesky(weighted - least, check_finite=False)
+            return np.asarray(weighted)
+    values, vectors = la.eigh(B + _ACTIVE_WEIGHTS[1] * square, check_finite=False)
+    return np.asarray((vectors * np.maximum(values, _MIN_EIGENVALUE)) @ vectors.T)
 
 
-def _steep(point: Point, T: Matrix) -> ReducedModel:
-    B = _STEEP * (sp.eye_array(T.shape[1], format="csc") if sp.issparse(T) else np.eye(T.shape[1]))
-    return ReducedModel(B, np.zeros_like(point.gradient), T, None, leads=False)
+def _restoration_model(point: Point, T: Matrix) -> ReducedModel:
+    B = _RESTORATION_CURVATURE * (
+        sp.eye_array(T.shape[1], format="csc") if sp.issparse(T) else np.eye(T.shape[1])
+    )
+    return ReducedModel(B, np.zeros_like(point.gradient), T, None, has_objective=False)
 
 
 def make_model(program: TimedProgram, options: SQPOptions, reduction: Reduction) -> ModelRule:
@@ -351,39 +361,45 @@ def make_model(program: TimedProgram, options: SQPOptions, reduction: Reduction)
     return ExactModel(program, reduction) if options.hessian == "exact" else BFGSModel(reduction)
 
 
-# part of the way that a row can change, within which it is in the QP from the start; rows for each direction
-_NEAR, _NEAREST = 0.1, 2
-_MISSED, _ROUNDS, _MORE = 1e-7, 12, 15  # violation of a row left out; times rows are added; so many at least
-_SLACK_CURVATURE = 1e-4  # of the price
-_ABOVE = 2.0  # times a multiplier that is known: a price
-_ACTIVE = 1e-4  # multiplier of a unit row that holds
-_SOFT = 1e-9  # violation where t = 0 of rows that may stay violated
-_BEYOND = 0.5  # of the way that a row can change inside the radius: what is violated by more is given up
-# parts of the radius that a step towards the equalities may be long: it is shortened with the rest, but where
-# only the violation counts
-_LARGEST, _CAREFUL = 1e4, 0.8
+# The reach of a constraint is how much a step inside the radius can change it. A QP begins with the
+# constraints within this fraction of their reach of being violated, the worst two for each of its variables.
+_NEAR_FRACTION, _MAX_NEAR = 0.1, 2
+# Constraints of which a QP's solution violates more than this are added, in so many rounds, so many at least.
+_MISSED_VIOLATION, _MAX_ROUNDS, _MIN_ADDED = 1e-7, 12, 15
+_ELASTIC_VIOLATION = 1e-9  # violation at t = 0 from which a constraint is elastic
+_GIVE_UP = 0.5  # fraction of the reach; a constraint that is violated by more is given up (see `solve`)
+_SLACK_CURVATURE = 1e-4  # relative to the price: the dual active-set method needs a positive definite P
+_PRICE_MARGIN = 2.0  # price over a known multiplier
+_ACTIVE_MULTIPLIER = 1e-4  # of a normalized constraint that counts as active
+# Longest normal step, relative to the radius: only careful ones, and those of a restoration phase, are
+# shortened.
+_MAX_NORMAL, _MAX_CAREFUL_NORMAL = 1e4, 0.8
 
 
 @dataclass(frozen=True)
-class Solved:
-    """A step d (n,); multipliers y (m,) and z (n,) of all but the equalities; what the linearized rows are
-    off by; rows of the QP, and those elastic; iterations of its solver; largest entry of the step that keeps
-    the equalities."""
+class QPStep:
+    """Solution of a reduced QP.
+
+    d (n,) : step.  y (m,), z (n,) : multipliers, 0 for equalities.
+    linear_violation : weighted violation of the linearized constraints.
+    constraints, elastic : number of constraints in the QP, and of elastic ones among them.
+    iterations : of the QP solver.  longest : largest entry of t.
+    """
 
     d: Vector
     y: Vector
     z: Vector
     linear_violation: float
-    rows: int
+    constraints: int
     elastic: int
     iterations: int
     longest: float
 
 
 class ReducedQP:
-    """Solves them one after the other.
+    """Reduced QPs, each solved by a `QPSolver` from the active set of the last one.
 
-    careful : whether no step is longer than the radius, those towards the equalities among them.
+    careful : whether normal steps are shortened to the radius, too.
     """
 
     careful = False
@@ -391,39 +407,43 @@ class ReducedQP:
     def __init__(self, program: TimedProgram, reduction: Reduction, solver: QPSolver):
         self._program, self._reduction, self._solver = program, reduction, solver
         self._at: Point | None = None
-        self.start_from(np.zeros(program.m), np.zeros(program.n))
+        self.guess_active_set(np.zeros(program.m), np.zeros(program.n))
 
-    def start_from(self, y: Vector, z: Vector) -> None:
+    def guess_active_set(self, y: Vector, z: Vector) -> None:
         """Take multipliers from elsewhere as the guess of the active set."""
         reduction = self._reduction
-        self._unit = np.concatenate([y[reduction.rows], z[reduction.bounded]])
+        # multipliers of the normalized constraints; of a guess, whose scale is unknown, those of the program
+        self._unit = np.concatenate([y[reduction.others], z[reduction.bounded]])
 
     def active(self, point: Point) -> Matrix:
-        """Rows (a, r) of what held in the last QP, in the directions that are left; of all variables their
-        gradients would be one long, as those that cease to hold are not to be held by the model's curvature.
+        """Gradients (a, r), along T, of the constraints that were active in the last QP.
+
+        Their norms by all variables are 1: along T they may be small, so that the model's curvature does not
+        hold on to constraints that cease to be active.
         """
-        every, which = self._rows(point), np.flatnonzero(np.abs(self._unit) > _ACTIVE)
-        own = self._norms / point.row_norms[self._reduction.rows]
+        every, which = self._gradients(point), np.flatnonzero(np.abs(self._unit) > _ACTIVE_MULTIPLIER)
+        own = self._norms / point.row_norms[self._reduction.others]
         return sp.diags_array(np.append(own, np.ones(every.shape[0] - own.size))[which]) @ every[which]
 
     def weigh(self, point: Point, y: Vector, price: float) -> None:
-        """Weigh rows in the merit function, so that a price suits all alike.
+        """Set the weights of constraints in the merit function, so that one price suits all.
 
-        By what the free variables change them, if that is less than all do: rows of gears change ten thousand
-        times as fast with accelerations, which other rows determine. And by known multipliers y (m,), which a
-        price has to exceed.
+        A constraint weighs by its change with the free variables if that is less than with all: gear
+        constraints change ten thousand times as fast with accelerations, which other constraints determine.
+        And by its known multiplier in y (m,), which the price has to exceed.
         """
-        self._rows(point)
+        self._gradients(point)
         self._program.weigh(point)
-        weights, rows = self._program.weights, self._reduction.rows
+        weights, others = self._program.weights, self._reduction.others
         by_free = 1.0 / np.clip(self._norms, 1.0, 1e6)
-        weights[rows] = np.maximum(np.maximum(weights[rows], by_free), _ABOVE * np.abs(y[rows]) / price)
+        known = _PRICE_MARGIN * np.abs(y[others]) / price
+        weights[others] = np.maximum(np.maximum(weights[others], by_free), known)
 
-    def _rows(self, point: Point) -> Matrix:
-        """Unit rows (k, r): those that are not eliminated, then of the bounds."""
+    def _gradients(self, point: Point) -> Matrix:
+        """Gradients (k, r) along T of the normalized constraints: `others`, then the bounds."""
         if self._at is not point:
             reduction = self._reduction
-            own, self._norms = reduction.rows_by_free(point)
+            own, self._norms = reduction.reduced_jacobian(point)
             bounds, self._at = reduction.T[reduction.bounded], point
             if reduction.sparse:
                 self._every = sp.vstack([sp.diags_array(1.0 / self._norms) @ own, bounds], "csr")
@@ -440,98 +460,116 @@ class ReducedQP:
         radius: float,
         price: float,
         time_limit: float | None,
-    ) -> Solved | None:
-        """The step where rows are g (m,) and have the point's slopes; None if the QP solver fails."""
-        p, reduction, every = self._program, self._reduction, self._rows(point)
-        rows, bounded, T = reduction.rows, reduction.bounded, reduction.T
+    ) -> QPStep | None:
+        """Step for constraints with values g (m,) and the point's Jacobian; None if the QP solver fails.
+
+        Each round solves a QP with a working set of constraints, then adds those that its solution violates.
+        A constraint that no step inside the radius can meet, or whose multiplier was at its price, is given
+        up: its violation is linear in t then, so that its price is a part of the gradient, without a slack.
+        """
+        p, reduction, every = self._program, self._reduction, self._gradients(point)
+        others, bounded, T = reduction.others, reduction.bounded, reduction.T
         d0 = reduction.normal(g)
-        longest = (_CAREFUL if self.careful or not model.leads else _LARGEST) * radius
+        shortened = self.careful or not model.has_objective
+        longest = (_MAX_CAREFUL_NORMAL if shortened else _MAX_NORMAL) * radius
         d0 *= min(1.0, longest / max(float(np.abs(d0).max(initial=0.0)), 1e-300))
+        # bounds of the normalized constraints on t, and the price of violating them
         after, scale = g + point.jacobian @ d0, self._norms
         x = point.x + d0
-        lower = np.concatenate([(p.g_lower - after)[rows] / scale, (p.x_lower - x)[bounded]])
-        upper = np.concatenate([(p.g_upper - after)[rows] / scale, (p.x_upper - x)[bounded]])
-        prices = price * np.concatenate([p.weights[rows] * scale, np.ones(bounded.size)])
-        reach = radius * abs(every).sum(axis=1)  # how much a row can change
-        off = np.maximum(lower, -upper)
-        soft = off > _SOFT
-        # A constraint that no step inside the radius can meet, or whose multiplier was at its price, is given
-        # up: its violation is linear in t then, so its price is a part of the gradient, without a slack.
-        lost = soft & ((off > _BEYOND * reach) | (np.abs(self._unit) > 0.99 * prices))
-        late = np.argsort(-off / np.maximum(reach, 1e-12))[_NEAREST * T.shape[1] :]
-        working = off > -_NEAR * reach
-        working[late] = False
+        lower = np.concatenate([(p.g_lower - after)[others] / scale, (p.x_lower - x)[bounded]])
+        upper = np.concatenate([(p.g_upper - after)[others] / scale, (p.x_upper - x)[bounded]])
+        prices = price * np.concatenate([p.weights[others] * scale, np.ones(bounded.size)])
+        reach = radius * abs(every).sum(axis=1)
+        off = np.maximum(lower, -upper)  # violation at t = 0; negative: distance to the bound
+        given_up = (off > _ELASTIC_VIOLATION) & (
+            (off > _GIVE_UP * reach) | (np.abs(self._unit) > 0.99 * prices)
+        )
+        # working set: the most violated, relative to the reach, and those of the last QP
+        less_urgent = np.argsort(-off / np.maximum(reach, 1e-12))[_MAX_NEAR * T.shape[1] :]
+        working = off > -_NEAR_FRACTION * reach
+        working[less_urgent] = False
         working |= np.abs(self._unit) > 1e-9
         slope0, unit, iterations = model.slope(d0), self._unit, 0
         guess = np.zeros(T.shape[1])
-        for _ in range(_ROUNDS):
-            which, given_up = np.flatnonzero(working & ~lost), np.flatnonzero(lost)
-            dear = np.where(lower > 0, -prices, prices)[given_up]
-            slope = slope0 + every[given_up].T @ dear
-            qp = _elastic(model.B, slope, every[which], lower[which], upper[which], radius, prices[which])
-            priced = np.concatenate([which[lower[which] > _SOFT], which[upper[which] < -_SOFT]])
-            held = np.minimum(np.abs(unit[priced]) - prices[priced], 0.0)  # of slacks that are zero
-            start = (
-                np.concatenate([guess, np.zeros(priced.size)]),
-                unit[which],
-                np.concatenate([np.zeros(guess.size), held]),
+        for _ in range(_MAX_ROUNDS):
+            which, lost = np.flatnonzero(working & ~given_up), np.flatnonzero(given_up)
+            lost_multipliers = np.where(lower > 0, -prices, prices)[lost]
+            slope = slope0 + every[lost].T @ lost_multipliers
+            qp = _elastic_qp(model.B, slope, every[which], lower[which], upper[which], radius, prices[which])
+            # Initial guess. A slack is stationary: its constraint's |multiplier| plus that of its own bound
+            # is the price; the latter is 0, and the slack positive, if the former has reached the price.
+            elastic = np.concatenate(
+                [which[lower[which] > _ELASTIC_VIOLATION], which[upper[which] < -_ELASTIC_VIOLATION]]
             )
-            found = self._solver.solve(qp, start=start, time_limit=time_limit) if qp.n else _decided(qp)
+            of_slacks = np.minimum(np.abs(unit[elastic]) - prices[elastic], 0.0)
+            x0 = np.concatenate([guess, np.zeros(elastic.size)])
+            start = x0, unit[which], np.concatenate([np.zeros(guess.size), of_slacks])
+            found = self._solver.solve(qp, start=start, time_limit=time_limit) if qp.n else _no_variables(qp)
             iterations += found.iterations
             if not found.usable:
                 return None
             guess = found.x[: T.shape[1]]
             step = T @ guess
             unit = np.zeros(lower.size)
-            unit[which], unit[given_up] = found.y, dear
-            values = np.concatenate([(point.jacobian @ step)[rows] / scale, step[bounded]])
+            unit[which], unit[lost] = found.y, lost_multipliers
+            values = np.concatenate([(point.jacobian @ step)[others] / scale, step[bounded]])
             beyond = np.maximum(lower - values, values - upper)
-            back = lost & (np.where(lower > 0, lower - values, values - upper) < -_MISSED)
-            missed = np.where(working | lost, 0.0, beyond)
-            if missed.max(initial=0.0) <= _MISSED and not back.any():
+            # a given-up constraint that is met strictly goes back into the working set
+            met = given_up & (np.where(lower > 0, lower - values, values - upper) < -_MISSED_VIOLATION)
+            missed = np.where(working | given_up, 0.0, beyond)
+            if missed.max(initial=0.0) <= _MISSED_VIOLATION and not met.any():
                 break
-            lost &= ~back
-            working |= back
-            worst = np.argsort(-missed)[: max(_MORE, missed.size // 10)]
+            given_up &= ~met
+            working |= met
+            worst = np.argsort(-missed)[: max(_MIN_ADDED, missed.size // 10)]
             working[worst[missed[worst] > 0]] = True
         self._unit = unit
         d, y, z = d0 + step, np.zeros(p.m), np.zeros(p.n)
-        y[rows], z[bounded] = unit[: rows.size] / scale, unit[rows.size :]
-        linear = float(p.weights @ row_violations(p, g + point.jacobian @ d))
-        return Solved(
-            d, y, z, linear, which.size, qp.n - guess.size, iterations, float(np.abs(guess).max(initial=0.0))
+        y[others], z[bounded] = unit[: others.size] / scale, unit[others.size :]
+        return QPStep(
+            d,
+            y,
+            z,
+            linear_violation=float(p.weights @ row_violations(p, g + point.jacobian @ d)),
+            constraints=which.size,
+            elastic=qp.n - guess.size,
+            iterations=iterations,
+            longest=float(np.abs(guess).max(initial=0.0)),
         )
 
 
-def _decided(qp: QuadraticProgram) -> QPSolution:
-    """The solution of a QP without variables: the equalities leave no direction."""
+def _no_variables(qp: QuadraticProgram) -> QPSolution:
+    """Solution of a QP without variables: the equalities leave no direction."""
     return QPSolution(x=qp.q, y=np.zeros(qp.m), z=qp.q, status=QPStatus.SOLVED, iterations=0)
 
 
-def _elastic(
+def _elastic_qp(
     B: Matrix, c: Vector, A: Matrix, lower: Vector, upper: Vector, radius: float, prices: Vector
 ) -> QuadraticProgram:
-    """The QP in (t, s), s >= 0 at a price: A t + s >= lower where t = 0 is below, A t - s <= upper above."""
-    below, above = np.flatnonzero(lower > _SOFT), np.flatnonzero(upper < -_SOFT)
+    """QP in (t, s), |t| <= radius: A t + s >= lower where t = 0 is below, A t - s <= upper where it is above.
+
+    The slacks s >= 0 of the constraints violated at t = 0 cost their price.
+    """
+    below, above = np.flatnonzero(lower > _ELASTIC_VIOLATION), np.flatnonzero(upper < -_ELASTIC_VIOLATION)
     elastic = np.concatenate([below, above])
     k, n = elastic.size, c.size
     box = np.full(n, radius)
-    small = isinstance(A, np.ndarray)
+    dense = isinstance(A, np.ndarray)
     if k:
         sign = np.where(np.arange(k) < below.size, 1.0, -1.0)
-        bend = _SLACK_CURVATURE * prices[elastic]  # as the dual method needs a positive definite P
+        curvature = _SLACK_CURVATURE * prices[elastic]
         c = np.concatenate([c, prices[elastic]])
-        if small:
+        if dense:
             S = np.zeros((lower.size, k))
             S[elastic, np.arange(k)] = sign
-            A, B = np.hstack([A, S]), la.block_diag(B, np.diag(bend))
+            A, B = np.hstack([A, S]), la.block_diag(B, np.diag(curvature))
         else:
             S = sp.csc_array((sign, (elastic, np.arange(k))), shape=(lower.size, k))
-            A, B = sp.hstack([sp.csc_array(A), S]), sp.block_diag([B, sp.diags_array(bend)])
+            A, B = sp.hstack([sp.csc_array(A), S]), sp.block_diag([B, sp.diags_array(curvature)])
     return QuadraticProgram(
-        P=B if small else sp.csc_array(B),
+        P=B if dense else sp.csc_array(B),
         q=c,
-        A=A if small else sp.csc_array(A),
+        A=A if dense else sp.csc_array(A),
         lower=lower,
         upper=upper,
         x_lower=np.concatenate([-box, np.zeros(k)]),

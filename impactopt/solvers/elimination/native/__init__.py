@@ -1,1 +1,1 @@
-"""C for the SQP's linear algebra."""
+"""C kernels of the elimination."""

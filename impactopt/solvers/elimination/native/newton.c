@@ -1,7 +1,7 @@
-/* The small dense algebra of condensed Newton systems; kernels.py says what each function is for.
+/* Kernels of condensed Newton systems: small dense algebra. The functions are those of class Kernels in kernels.py.
 
-   Matrices lie by columns, as BLAS and LAPACK want them: an array (k, a, b) of NumPy's is k matrices of b rows
-   and a columns. Places of what is not there point to the number in front of all others, which is zero. */
+   Matrices are stored by columns, as in BLAS and LAPACK: an array (k, a, b) of NumPy is k matrices of b rows and a
+   columns. Places of entries outside a pattern are 0, where the value is zero. */
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -32,12 +32,12 @@ EXPORT void newton_setup(void **f) {
     getrf = (getrf_t *)f[4], getrs = (getrs_t *)f[5], potrf = (potrf_t *)f[6];
 }
 
-/* `length` places, one after the other from `place` on */
+/* `length` consecutive places, from `place` on */
 typedef struct {
     int32_t place, length;
 } run;
 
-/* Add n numbers to W, run by run; the run after them. */
+/* Add n values to W, run by run; returns the run after them. */
 static inline const run *scatter(const run *to, int n, const double *restrict numbers, double *restrict W) {
     for (int j = 0; j < n; j += to++->length) {
         double *places = W + to->place;
@@ -46,14 +46,14 @@ static inline const run *scatter(const run *to, int n, const double *restrict nu
     return to;
 }
 
-/* One stage: k systems of r rows, nt other rows, nc and nu variables touched. */
+/* Class EliminationStage: k systems of r equalities; nt other equalities, nc and nu variables that they touch. */
 typedef struct {
     int64_t k, r, nt, nc, nu;
     int32_t *q, *e, *t, *u, *qe, *qc, *te, *tc, *hee, *heu;
     double *lu;
     int32_t *pivots;
     double *X, *T, *H, *G, *x0, *own, *work;
-    const run *hcc, *hcv; /* of all systems, row by row of the lower triangle, and variable by variable */
+    const run *hcc, *hcv; /* runs of all systems: row by row of the lower triangle, and variable by variable */
 } stage;
 
 static void take(const double *from, const int32_t *at, int64_t count, double *to) {
@@ -66,7 +66,7 @@ EXPORT void newton_copy(const double *values, const int32_t *source, double *to,
 }
 
 /* ---------------------------------------------------------------- matrices */
-/* sums (n) of four rows (m) or fewer, each times a factor */
+/* Add to sums (n) the first entries of up to four rows (m), each times its factor. */
 static inline void add_rows(double *restrict sums, int n, int count, const double *f, const double *v, int m) {
     const double *v1 = v + m, *v2 = v1 + m, *v3 = v2 + m;
     if (count == 1)
@@ -79,9 +79,9 @@ static inline void add_rows(double *restrict sums, int n, int count, const doubl
         for (int j = 0; j < n; ++j) sums[j] += f[0] * v[j] + f[1] * v1[j] + f[2] * v2[j] + f[3] * v3[j];
 }
 
-/* Rows of groups, one after the other: g rows over p columns; runs of W's places of the products of two, row
-   by row of their lower triangle. work: the rows of a group that have a weight, these weights, and the sums of
-   one row of products. */
+/* Class Products: groups of g rows with p columns; `to` has the runs of W's places, row by row of the lower triangle
+   of the outer products. work: the rows of a group whose weight is not zero, these weights, and the sums of one row
+   of products. */
 EXPORT void newton_products(int64_t groups, const int32_t *g, const int32_t *p, const int32_t *rows,
                             const int32_t *values, const run *to, const double *J, const double *weights,
                             double *W, double *work) {
@@ -107,11 +107,11 @@ EXPORT void newton_products(int64_t groups, const int32_t *g, const int32_t *p, 
     }
 }
 
-/* Products of a few rows: a call of BLAS would take longer than they do. */
+/* Systems of so few equalities have loops of their own: a call of BLAS takes longer than such a product. */
 #define FEW 8
 
-/* rows (r, n) of a matrix that lies by columns */
-static void turn(const double *columns, int r, int n, double *rows) {
+/* Copy a matrix (r, n) that is stored by columns to one that is stored by rows. */
+static void transpose(const double *columns, int r, int n, double *rows) {
     for (int i = 0; i < n; ++i)
         for (int p = 0; p < r; ++p) rows[p * n + i] = columns[i * r + p];
 }
@@ -120,14 +120,14 @@ static void add(double *restrict to, double factor, const double *restrict from,
     for (int i = 0; i < n; ++i) to[i] += factor * from[i];
 }
 
-/* rows (r, n) become those of B^-1 times them, for the factors of B as getrf leaves them */
+/* Replace rows (r, n) by B^-1 times them; lu, pivots: the factors of B from getrf. */
 static void solve_few(const double *lu, const int32_t *pivots, int r, int n, double *rows) {
     for (int p = 0; p < r; ++p) {
         double *one_row = rows + p * n, *other = rows + (pivots[p] - 1) * n;
         if (one_row != other)
             for (int i = 0; i < n; ++i) {
-                double held = one_row[i];
-                one_row[i] = other[i], other[i] = held;
+                double swapped = one_row[i];
+                one_row[i] = other[i], other[i] = swapped;
             }
     }
     for (int p = 0; p < r; ++p)
@@ -157,9 +157,9 @@ static int eliminate(stage *a, double *J) {
             if (nt) gemm("T", "N", &nc, &nt, &r, &one, X, &r, T, &r, &zero, a->work, &nc);
             for (int64_t i = 0; i < nt * nc; ++i) J[to[i]] -= a->work[i];
         } else {
-            turn(X, r, nc, rows);
+            transpose(X, r, nc, rows);
             solve_few(lu, pivots, r, nc, rows);
-            turn(rows, nc, r, X);
+            transpose(rows, nc, r, X);
             for (int t = 0; t < nt; ++t) {
                 memset(sums, 0, sizeof(double) * nc);
                 for (int p = 0; p < r; ++p) add(sums, T[t * r + p], rows + p * nc, nc);
@@ -175,7 +175,7 @@ typedef struct {
     const run *cc, *cv;
 } targets;
 
-/* W += C + C' for the variables that rows touch, C for the others, C = X' G */
+/* W += C + C' for the variables c, which are in the equalities, W += C for the others; C = X' G. */
 static targets spread(const stage *a, targets to, double *X, double *G, double *C, double *W) {
     int r = a->r, nc = a->nc, nv = a->nu - nc;
     gemm("T", "N", &nc, &nc, &r, &one, G, &r, X, &r, &zero, C, &nc);
@@ -190,7 +190,7 @@ static targets spread(const stage *a, targets to, double *X, double *G, double *
     return to;
 }
 
-/* the same for rows (r, nc) and (r, nu) of X and G, of which there are few */
+/* The same for few equalities, with X (r, nc) and G (r, nu) stored by rows. */
 static inline __attribute__((always_inline)) targets spread_rows(const stage *a, targets to, int r,
                                                                  const double *restrict X, const double *restrict G,
                                                                  double *restrict sums, double *restrict W) {
@@ -219,7 +219,7 @@ static inline __attribute__((always_inline)) targets spread_rows(const stage *a,
 }
 
 static targets spread_few(const stage *a, targets to, const double *X, const double *G, double *sums, double *W) {
-    if (a->r == 6) /* a leg, a wrench: loops of a length that the compiler knows */
+    if (a->r == 6) /* a leg, a wrench: the compiler unrolls loops of a constant length */
         return spread_rows(a, to, 6, X, G, sums, W);
     return spread_rows(a, to, a->r, X, G, sums, W);
 }
@@ -238,8 +238,8 @@ static void reduce(stage *a, double *W) {
             gemm("N", "N", &r, &nc, &r, &half, H, &r, X, &r, &one, G, &r);
             to = spread(a, to, X, G, more, W);
         } else {
-            turn(X, r, nc, more);
-            turn(own, r, nu, G);
+            transpose(X, r, nc, more);
+            transpose(own, r, nu, G);
             for (int i = 0; i < r * nu; ++i) G[i] = -G[i];
             for (int p = 0; p < r; ++p)
                 for (int q = 0; q < r; ++q) add(G + p * nu, 0.5 * H[q * r + p], more + q * nc, nc);
@@ -249,8 +249,8 @@ static void reduce(stage *a, double *W) {
 }
 
 /* ---------------------------------------------------------------- vectors */
-/* to[at] -= M' v for a matrix of r rows and n columns */
-static void pull(int r, int n, double *M, double *v, double *to, const int32_t *at, double *work) {
+/* to[at] -= M' v for a matrix of r rows and n columns. */
+static void subtract_transposed(int r, int n, double *M, double *v, double *to, const int32_t *at, double *work) {
     if (!n) return;
     gemv("T", &r, &n, &one, M, &r, v, &unit, &zero, work, &unit);
     for (int i = 0; i < n; ++i) to[at[i]] -= work[i];
@@ -264,11 +264,11 @@ static void forward(stage *a, double *g, double *off) {
         const int32_t *u = a->u + k * nu;
         take(off, a->q + k * r, r, x0);
         getrs("N", &r, &unit, a->lu + k * r * r, &r, a->pivots + k * r, x0, &r, &info);
-        pull(r, nt, a->T + k * nt * r, x0, off, a->t + k * nt, work);
+        subtract_transposed(r, nt, a->T + k * nt * r, x0, off, a->t + k * nt, work);
         take(g, a->e + k * r, r, own);
         gemv("N", &r, &r, &minus, a->H + k * r * r, &r, x0, &unit, &one, own, &unit);
-        pull(r, nc, X, own, g, u, work);
-        pull(r, nu, a->G + k * nu * r, x0, g, u, work);
+        subtract_transposed(r, nc, X, own, g, u, work);
+        subtract_transposed(r, nu, a->G + k * nu * r, x0, g, u, work);
     }
 }
 
@@ -283,15 +283,17 @@ static void expand(stage *a, double *d) {
     }
 }
 
+/* Multipliers, first pass: the part of the gradient v by the eliminated variables. */
 static void own_duals(stage *a, double *v) {
     int r = a->r, nc = a->nc;
     double *own = a->own;
     for (int64_t k = 0; k < a->k; ++k, own += r) {
         take(v, a->e + k * r, r, own);
-        pull(r, nc, a->X + k * nc * r, own, v, a->u + k * a->nu, a->work);
+        subtract_transposed(r, nc, a->X + k * nc * r, own, v, a->u + k * a->nu, a->work);
     }
 }
 
+/* Multipliers, second pass, last stage first: B^-T of that part and of the other equalities' multipliers. */
 static void duals(stage *a, double *y) {
     int r = a->r, nt = a->nt, info;
     double *sum = a->work, *others = sum + r;
@@ -304,7 +306,7 @@ static void duals(stage *a, double *y) {
     }
 }
 
-/* ---------------------------------------------------------------- all stages, one after the other */
+/* ---------------------------------------------------------------- entry points: all stages in turn */
 EXPORT int newton_eliminate(stage *a, int64_t stages, double *J) {
     int info = 0;
     for (int64_t i = 0; i < stages && !info; ++i) info = eliminate(a + i, J);
@@ -328,10 +330,10 @@ EXPORT void newton_multipliers(stage *a, int64_t stages, double *v, double *y) {
     for (int64_t i = stages - 1; i >= 0; --i) duals(a + i, y);
 }
 
-/* ---------------------------------------------------------------- the factor of what is left */
-/* Panels of a block Cholesky factor: `size` of each block, its `height`, where its panel begins in the values
-   (`at`); `below` lists the blocks of rows under the diagonal of each, from `first` on; row_at (count, count):
-   at which row of a panel a block begins. */
+/* ---------------------------------------------------------------- Cholesky factor of the condensed matrix */
+/* Class Panels: `size` of each block, `height` of its panel, `at` which place its values begin; `below` lists the
+   blocks of rows under each diagonal block, from `first` on; row_at (count, count): row of a panel at which a block
+   begins. */
 typedef struct {
     int64_t count;
     const int32_t *size, *height, *first, *below, *row_at, *start;
@@ -365,7 +367,7 @@ EXPORT int newton_cholesky(panels *p, double *values) {
     return 0;
 }
 
-/* x (n, columns), by columns, becomes K^-1 x; work: height x columns */
+/* Replace x (n, columns) by K^-1 x. p->work: height times columns. */
 EXPORT void newton_solve(panels *p, double *values, double *x, int64_t n, int64_t columns) {
     int nx = n, nrhs = columns;
     for (int64_t k = 0; k < p->count; ++k) {

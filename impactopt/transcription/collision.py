@@ -23,7 +23,7 @@ from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, FORCE_SCALE, typical_state
-from impactopt.transcription.contact_guess import blow, coasted, effective_mass
+from impactopt.transcription.contact_guess import coasted, effective_mass, guessed_contact
 from impactopt.transcription.contact_state import (
     Contact,
     ContactEnd,
@@ -610,7 +610,7 @@ class Collision(ContactNumbers, Collocated):
         place = np.array([s.place for s in self.stages])
         phase = np.array([s.phase for s in self.stages])
         mass, speed = effective_mass(c, p.strikers, p.normal, y, legs, rates)
-        found = blow(*self.alone(), mass, speed, phase, place, p.planned_touches)
+        found = guessed_contact(*self.alone(), mass, speed, phase, place, p.planned_touches)
         times = np.clip(found.durations, *np.transpose([layout.bounds(group) for group in self.T]))
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)

@@ -20,8 +20,8 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import ApartRow, Held, add_apart_rows, coupled, move_apart
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE
-from impactopt.transcription.contact_set import Hit
-from impactopt.transcription.contact_state import ContactEnd, DrivePoint, still
+from impactopt.transcription.contact_set import ContactSet
+from impactopt.transcription.contact_state import ContactEnd, DrivePoint, joint_motion_slots
 from impactopt.transcription.frozen_collision import InstantImpact
 from impactopt.transcription.layout import (
     Affine,
@@ -66,7 +66,7 @@ class ContactProgram(ABC):
     apart_rows : clearance constraints, in the order of their rows, which are the last.
     """
 
-    def __init__(self, builder: Builder, hit: Hit) -> None:
+    def __init__(self, builder: Builder, hit: ContactSet) -> None:
         self.builder, self.hit = builder, hit
         self.problem, self.coordinates, self.robot = builder.problem, builder.coordinates, builder.robot
         self.functions, self.y0, self.legs0 = builder.functions, builder.y0, builder.legs0
@@ -151,7 +151,7 @@ class ContactProgram(ABC):
     @cached_property
     def _points(self) -> list[DrivePoint]:
         nodes = [
-            DrivePoint(place, torque, still(y, y1, y2, T, legs))
+            DrivePoint(place, torque, joint_motion_slots(y, y1, y2, T, legs))
             for place, torque, (y, y1, y2, legs, _, T) in self._nodes()
         ]
         return [*nodes, *self.hit.drives()]
@@ -161,8 +161,7 @@ class ContactProgram(ABC):
         contacts that last.
         """
         nodes = [(place, slots[4]) for place, slots in self._node_slots()]
-        lasting = [c for c in self.hit.collisions if isinstance(c, Collision)]
-        return [*nodes, *(found for collision in lasting for found in collision.wrenches())]
+        return [*nodes, *(found for collision in self.hit.lasting for found in collision.wrenches())]
 
     def first_instants(self) -> list[tuple[Place, Index]]:
         """First instants of damped contacts, of a program with a term that looks at them.
@@ -257,7 +256,7 @@ class ContactProgram(ABC):
         builders = [self._bare] if self._bare is self.builder else [self._bare, self.builder]
         for b in builders:
             b.problem = problem
-        self.hit.renew(anew=anew)
+        self.hit.update_parameters(anew=anew)
         for b in builders:
             for take in b.followers:
                 take(b)

@@ -20,7 +20,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
 from impactopt.transcription.contact_program import ContactProgram
-from impactopt.transcription.contact_set import Hit, approaches
+from impactopt.transcription.contact_set import ContactSet, approaches
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting, switches
 from impactopt.transcription.layout import Affine, Array, Index
 from impactopt.transcription.mesh import GEAR, CollocationPoint, Elements, halved, lagrange
@@ -128,7 +128,9 @@ class _Again:
         self._of, b = t.hit, Builder(t.problem, t.coordinates, t.functions)
         given = ContactState(*(Affine.constant(e.evaluate(x)) for e in t.hit.contact.state))
         self._builder = b
-        self.hit = Hit(b, Contact(given, *add_coasting(b)), halved(t.hit.elements), t.hit.shares, after=False)
+        self.hit = ContactSet(
+            b, Contact(given, *add_coasting(b)), halved(t.hit.elements), t.hit.shares, after=False
+        )
         self.hit.add_rows()
         # a plan has no law where contact ends, as force is zero there; here it is what it comes to
         last = len(self.hit.stages) - 1
@@ -287,7 +289,7 @@ def carry_contact(new: Collision, old: Collision, into: Array, x: Array) -> None
         of_old = np.vstack([getattr(old, name).read(x), at_contact])
         getattr(new, name).write(into, weights @ of_old)
     loose = _weights(new.stages, old.stages, known=False)[:, :-1]
-    for mine, its in zip(new.loose(), old.loose(), strict=True):
+    for mine, its in zip(new.groups_without_start(), old.groups_without_start(), strict=True):
         mine.write(into, loose @ its.read(x))
     for integral, rate in new.integrated():
         u = rate.read(into)
@@ -295,7 +297,7 @@ def carry_contact(new: Collision, old: Collision, into: Array, x: Array) -> None
         for i, s in enumerate(new.stages):  # by their constraints, which are linear
             d[i] = s.quadrature @ u[list(s.members)] + (0.0 if s.new_phase else d[s.previous])
         integral.write(into, d)
-    for mine, its in zip(new.held_over(), old.held_over(), strict=True):
+    for mine, its in zip(new.kept_groups(), old.kept_groups(), strict=True):
         mine.write(into, its.read(x))
 
 

@@ -16,7 +16,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.contact_conditions import add_balance, add_touch_rows
+from impactopt.transcription.contact_conditions import add_balance, add_conditions
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
@@ -57,7 +57,7 @@ class StrikeTranscription(ContactProgram):
         (torque,) = add_nodes(b, [node], ["contact"])
         self._node = node
         self.hit.add_feedforward_rows(torque)
-        add_touch_rows(b, state)
+        add_conditions(b, state)
         self.hit.add_rows()
         self._add_after(fastest)
         if c.legs:

@@ -26,7 +26,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import SeparationBlock
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import typical_state
-from impactopt.transcription.contact_conditions import add_balance, add_clearance, add_touch_rows
+from impactopt.transcription.contact_conditions import add_balance, add_clearance, add_conditions
 from impactopt.transcription.contact_program import BodyState, ContactProgram
 from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, add_coasting
@@ -167,7 +167,7 @@ class Transcription(ContactProgram):
         self.follows = [self.follow] if self.abort is None else [self.follow, self.abort]
         self.torques: list[Affine] = []
         self._add_motions()
-        add_touch_rows(b, contact.state)
+        add_conditions(b, contact.state)
         add_clearance(b, self.swing, self.follow, self.hit.expected.target_state)
         self.hit.add_rows()
         self._add_links()

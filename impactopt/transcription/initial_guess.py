@@ -20,7 +20,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves
 from impactopt.transcription.contact_program import ContactProgram
-from impactopt.transcription.contact_refinement import carry_contact, same_places
+from impactopt.transcription.contact_refinement import map_contact, same_places
 from impactopt.transcription.layout import Array, Group, Row
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase
@@ -222,7 +222,7 @@ def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: 
             state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
             mine.guess_model(new, *state)
         elif t.hit.elements != old.hit.elements:
-            carry_contact(mine, its, new, x)
+            map_contact(mine, its, new, x)
     if len(t.hit.first) != len(old.hit.first):
         state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
         for first in t.hit.first:

@@ -17,7 +17,13 @@ from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.clearance import ApartRow, Held, add_apart_rows, coupled, move_apart
+from impactopt.transcription.clearance import (
+    ClearanceKey,
+    SeparatingDirection,
+    add_clearance_constraints,
+    coupled,
+    move_bodies,
+)
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE
 from impactopt.transcription.contact_set import ContactSet
@@ -72,7 +78,7 @@ class ContactProgram(ABC):
         self.functions, self.y0, self.legs0 = builder.functions, builder.y0, builder.legs0
         self.angular_momentum: Group | None = None
         self.objectives: list[tuple[Objective, Quantity]] = []
-        self.apart_rows: Mapping[ApartRow, Held] = {}
+        self.apart_rows: Mapping[ClearanceKey, SeparatingDirection] = {}
 
     # ------------------------------------------------------------------ for terms and objectives
     @property
@@ -231,12 +237,12 @@ class ContactProgram(ABC):
             ),
         )
 
-    def with_apart(self: Program, rows: Mapping[ApartRow, Held]) -> Program:
+    def with_apart(self: Program, rows: Mapping[ClearanceKey, SeparatingDirection]) -> Program:
         """The same program with just these clearance constraints."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
         other.builder = self._bare.copy()
-        order = add_apart_rows(other.builder, self.body_spots(), rows)
+        order = add_clearance_constraints(other.builder, self.body_spots(), rows)
         other.apart_rows = {name: rows[name] for name in order}
         return other
 
@@ -261,7 +267,7 @@ class ContactProgram(ABC):
             for take in b.followers:
                 take(b)
         own = len(self._bare.blocks)
-        move_apart(problem, self.blocks[own:], self.apart_rows)
+        move_bodies(problem, self.blocks[own:], self.apart_rows)
         self.program.take_numbers(self.layout, self.blocks, self.rows)
 
     def with_lifted(self, x: Array) -> Array:

@@ -36,7 +36,7 @@ from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
-from impactopt.transcription.clearance import ApartRow, Chain, chain_between
+from impactopt.transcription.clearance import Chain, ClearanceKey, chain_between
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -121,7 +121,7 @@ def test_a_chain_takes_a_point_to_where_pinocchio_does(name: str) -> None:
             else:
                 z, before, frame = posed.z(chain, body.rotation), body.inverse(), body
             there = frame.actInv(posed.data.oMi[one].act(centre))
-            np.testing.assert_allclose(taken(chain, z, chain.numbers(before), centre), there, atol=1e-9)
+            np.testing.assert_allclose(taken(chain, z, chain.parameters(before), centre), there, atol=1e-9)
 
 
 def test_only_the_joints_between_two_links_are_in_their_chain() -> None:
@@ -197,7 +197,7 @@ def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any,
     assert len(t.apart_rows) == t.program.m - len(without(t).program.origins)
 
 
-def pieces(bodies: Any, row: ApartRow) -> tuple[Any, Any]:
+def pieces(bodies: Any, row: ClearanceKey) -> tuple[Any, Any]:
     """As coal has them."""
     if row.other < 0:
         return bodies.links.of_joint[row.joint][row.number].shape, bodies.world[-1 - row.other].shape

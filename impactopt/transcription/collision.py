@@ -83,8 +83,8 @@ class FirstInstant:
         slots = [state.y, state.legs, self.contact.u0[0], self.change[0], self.w[0], self.f[0]]
         law, robot = np.array([*self.law.values()]), b.robot
         before = np.array([float(b.problem.target.speed_before())])
-        numbers = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
-        return slots, np.concatenate([*numbers, friction_parameters(b.problem)])
+        parameters = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
+        return slots, np.concatenate([*parameters, friction_parameters(b.problem)])
 
     def add_rows(self, at: int) -> None:
         """Add the constraints.  at : index of the first output of this instance of the block ``first``."""
@@ -240,10 +240,12 @@ class Collocated:
                 out += [[*times, *(part[k : k + 1] for part in parts)] for k in range(integral.size)]
         return out
 
-    def _slots(self, group: Group, i: int, start: Affine, *, anew: bool = False) -> tuple[Affine, Affine]:
+    def _slots(
+        self, group: Group, i: int, start: Affine, *, each_phase: bool = False
+    ) -> tuple[Affine, Affine]:
         """Value and slope d/ds of a collocated group at stage i.
 
-        start : value at contact.  anew : the group has this value at the beginning of each phase.
+        start : value at contact.  each_phase : the group has this value at the beginning of each phase.
         """
         s = self.stages[i]
         # Slope of the polynomial through the element's beginning and its stages, by the inverse of Radau's A
@@ -252,7 +254,7 @@ class Collocated:
         slope = Affine.zeros(group.size)
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + group[m] * w
-        begins = s.previous < 0 or (anew and s.new_phase)
+        begins = s.previous < 0 or (each_phase and s.new_phase)
         before = start if begins else group[s.previous]
         return group[i], slope + before * s.start
 
@@ -375,7 +377,7 @@ class Collision(ContactParameters, Collocated):
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in range(len(self.phases))]
         self.forceless = np.array([self.phases[s.phase].apart for s in stages])
         self.forceless[[i for i, f in zip(self.end, self.phases, strict=True) if f.end == SEPARATION]] = True
-        self._named = named = f"{scenario.name}: " if scenario is not None else ""
+        self._prefix = prefix = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
         self.mass = mass
         self.update_parameters()
@@ -384,11 +386,12 @@ class Collision(ContactParameters, Collocated):
         n, self._switches = len(stages), switches(p.law)
 
         def add(name: str, size: int, **options: Any) -> Group:
-            return b.layout.add(named + name, n, size, **options)
+            """Add variables at every stage."""
+            return b.layout.add(prefix + name, n, size, **options)
 
         longest = p.contact_duration[1]
         self.T = [
-            b.duration(f"{named}{phase.name} duration", (least, longest), 0.01)
+            b.duration(f"{prefix}{phase.name} duration", (least, longest), 0.01)
             for phase, least in zip(self.phases, self.shortest, strict=True)
         ]
         self._add_reference(n)
@@ -406,10 +409,10 @@ class Collision(ContactParameters, Collocated):
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
         joined = len(self.phases) - 2
-        self.joined = b.layout.add(f"{named}travel in compression", joined, b.ny, labels=c.labels)
-        self.joined_x = b.layout.add(f"{named}target travel in compression", joined, 1)
+        self.joined = b.layout.add(f"{prefix}travel in compression", joined, b.ny, labels=c.labels)
+        self.joined_x = b.layout.add(f"{prefix}target travel in compression", joined, 1)
         count = int(after is not None)
-        self.after = b.layout.add(f"{named}position after contact", count, b.ny, **(after or {}))
+        self.after = b.layout.add(f"{prefix}position after contact", count, b.ny, **(after or {}))
 
     def _least_force(self, guarded: bool) -> Any:
         """Lower bound of the forces at the stages [N]: zero where law or target might make bodies pull."""
@@ -424,8 +427,8 @@ class Collision(ContactParameters, Collocated):
     def _add_reference(self, count: int) -> None:
         """Add variables of the coasting reference: angles and rates of its legs, at ``count`` instants."""
         nl, add, labels = self._b.nl, self._b.layout.add, {"labels": self._b.coordinates.leg_labels}
-        self.coast_legs = add(f"{self._named}coasting legs", count, nl, **labels)
-        self.coast_rates = add(f"{self._named}coasting leg rates", count, nl, **labels)
+        self.coast_legs = add(f"{self._prefix}coasting legs", count, nl, **labels)
+        self.coast_rates = add(f"{self._prefix}coasting leg rates", count, nl, **labels)
 
     @property
     def impulse(self) -> Affine:
@@ -444,7 +447,7 @@ class Collision(ContactParameters, Collocated):
         collision, force = [], []
         for i, s in enumerate(self.stages):
             state = self._slots(self.state, i, at_rest)
-            travel = self._slots(self.xt, i, zero, anew=True)
+            travel = self._slots(self.xt, i, zero, each_phase=True)
             impulse_slope, x1 = self._slots(self.p, i, zero)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
             force.append([*self._hand_slots(i), self.f[i], *state, *travel, x1, impulse_slope])
@@ -572,6 +575,10 @@ class Collision(ContactParameters, Collocated):
                 self._bound_rate(last, start + last * size, receding=False)
 
     def _add_dynamics(self, i: int, place: Place, first: dict[str, int]) -> None:
+        """Add the constraints of the robot at a stage, and those of the target.
+
+        first : index of the stage's first output of each block.
+        """
         b, c, joints = self._b, self._b.coordinates, self._b.robot.joint_names
         closure = [f"{leg.end} {d}" for leg in c.legs for d in DIRECTIONS]
         if "coasting" in first:
@@ -630,7 +637,7 @@ class Collision(ContactParameters, Collocated):
                 components=["target"],
                 outputs=first + part["invariant"],
                 lower=target.margin(k, self.stages[i].place if ends_by_guard or once else 0.0),
-                measure=percent("out of turn"),
+                measure=percent("too early"),
             )
 
     def _bound_rate(self, i: int, first: int, *, receding: bool) -> None:
@@ -645,7 +652,7 @@ class Collision(ContactParameters, Collocated):
             outputs=first + self._b.parts("force")["rate"],
             lower=-np.inf if receding else 0.0,
             upper=0.0 if receding else np.inf,
-            measure=Measure("m/s", 1.0, "the other way"),
+            measure=Measure("m/s", 1.0, "in the wrong direction"),
         )
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
@@ -669,7 +676,7 @@ class Collision(ContactParameters, Collocated):
         y, rate, _, one = self.state_after
         return self.link((y, rate, one))
 
-    # ------------------------------------------------------------------ numbers
+    # ------------------------------------------------------------------ initial guess and solution
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         """Write the initial guess to x (n,): all rates of the robot fall as a point mass's speed does.
 
@@ -691,7 +698,9 @@ class Collision(ContactParameters, Collocated):
         self.state.write(x, found.state)
         self.xt.write(x, found.travel[:, None] * per_time)
         self.f.write(x, np.where(self.forceless, 0.0, found.force)[:, None])
-        self.p.write(x, len(p.strikers) * found.impulse[:, None])
+        self.p.write(
+            x, len(p.strikers) * found.impulse[:, None]
+        )  # the point mass is in place of each striker
         for joined, each in ((self.joined, d[self.end]), (self.joined_x, self.xt.read(x)[self.end])):
             means = [(times[:k, None] / before[k] * each[:k]).sum(axis=0) for k in range(2, len(times))]
             joined.write(x, np.reshape(means, (joined.count, joined.size)))

@@ -106,9 +106,9 @@ def collision(
         feed-forward over torque limit (n,); d1; T1; d; T; u (ydot); u'; legs; f [N], one a striker; w (6 a
         sole);
         frozen: y, ydot and legs of the freeze; rates of the reference's legs at the beginning of the segment,
-        their accelerations; rates r of the legs, r'; lag of the legs behind the reference, lag'; time [s]
-        since the freeze; slope of the hand's speed; without bias, wrenches that carry the weight (nw,);
-        logarithms of the gain factors.
+        their accelerations at the freeze; rates r of the legs, r'; lag of the legs behind the reference,
+        lag'; time [s] since the beginning of the segment; slope of the hand's speed; without bias, wrenches
+        that carry the weight (nw,); logarithms of the gain factors.
     p = normal (3,); s (place in the phase); 1 after the first phase else 0; Kp, Kd, torque limits (n, each);
         weight [N]; lever [m]; with friction the parameters of `ContactFriction`.
     out = closure [m, rad]; base equations over weight and weight x lever; joint equations over torque limit;

@@ -293,7 +293,7 @@ def map_contact(new: Collision, old: Collision, into: Array, x: Array) -> None:
     start = {"u": old.contact.u0.read(x), "state": np.zeros((1, old.state.size))}
     start |= {name: np.zeros((1, 1)) for name in ("xt", "p")}
     for name, at_contact in start.items():
-        weights = _weights(new.stages, old.stages, anew=name == "xt")
+        weights = _weights(new.stages, old.stages, each_phase=name == "xt")
         values = np.vstack([getattr(old, name).read(x), at_contact])
         getattr(new, name).write(into, weights @ values)
     weights = _weights(new.stages, old.stages, known=False)[:, :-1]
@@ -320,12 +320,12 @@ def _weights(
     new: Sequence[CollocationPoint],
     old: Sequence[CollocationPoint],
     *,
-    anew: bool = False,
+    each_phase: bool = False,
     known: bool = True,
 ) -> Array:
     """Interpolation matrix (new, old + 1) from values at the old stages and at contact to the new stages.
 
-    anew : for quantities that begin each phase with the last value, that at contact.
+    each_phase : quantities begin each phase with their value at contact.
     known : there is a value at contact, else its weights are zero.
     """
     out = np.zeros((len(new), len(old) + 1))
@@ -336,7 +336,7 @@ def _weights(
         first = old[own[0]]
         at, places = list(own), [old[k].place for k in own]
         if known or first.previous >= 0:
-            begins = first.previous < 0 or (anew and first.new_phase)
+            begins = first.previous < 0 or (each_phase and first.new_phase)
             at.append(len(old) if begins else first.previous)
             places.append(0.0 if first.new_phase else old[first.previous].place)
         out[i, at] = lagrange(places, s.place)

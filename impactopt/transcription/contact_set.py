@@ -18,9 +18,9 @@ from impactopt.transcription.layout import Array, Index, Place, Turn, determined
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
 
-MAX_DRIFT = (
-    2e-3  # of the contact's time: deviation of a freeze from its place that is not worth another solve
-)
+# Deviation of a freeze from its place, as a fraction of the contact's time, that does not justify another
+# solve.
+MAX_DRIFT = 2e-3
 
 
 class ContactSet:
@@ -177,7 +177,7 @@ class ContactSet:
         feedforward = determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))
         return [*(each for part in parts for each in part.determined()), feedforward]
 
-    # ------------------------------------------------------------------ numbers
+    # ------------------------------------------------------------------ initial guess and solution
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         """Write the initial guess to x (n,), for coordinates and rates (ny,) and legs (nl,) at contact."""
         self.contact.u0.write(x, rates)

@@ -54,7 +54,7 @@ class InstantImpact:
 
     mass : of a target [kg] that moves on together with the hand. None: the problem's target, with the
         restitution of its collision model.
-    named : prefix of the variables' names.
+    prefix : of the variables' names.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class InstantImpact:
     w : impulsive sole wrenches [N s, N m s].
     """
 
-    def __init__(self, b: Builder, contact: Contact, *, mass: float | None = None, named: str = "") -> None:
+    def __init__(self, b: Builder, contact: Contact, *, mass: float | None = None, prefix: str = "") -> None:
         self._b, self.contact, self._without_rebound = b, contact, mass is not None
         c = b.coordinates
         self.target = b.problem.target
@@ -72,10 +72,10 @@ class InstantImpact:
         self.speed_before = float(self.target.speed_before())
 
         def add(name: str, size: int, **options: Any) -> Group:
-            return b.layout.add(named + name, 1, size, **options)
+            return b.layout.add(prefix + name, 1, size, **options)
 
         self.du = add("change of rate", b.ny, labels=c.labels)
-        self.impulse_group = add("impulse", 1, lower=1e-3, scale=10.0)
+        self.impulse_group = add("impulse", 1, lower=1e-3, scale=10.0)  # > 0, as the block divides by it
         scale = 0.05 * b.limits.wrench_scale
         self.w = add("impulsive sole wrench", b.nw, **{**b.limits.of_wrenches, "scale": scale})
 
@@ -107,7 +107,7 @@ class InstantImpact:
         b, (start, _) = self._b, at["impact"]
         part = b.parts("impact")
         base, joints = start + part["base"], start + part["joints"]
-        units = {"N": "N s", "N m": "N m s"}  # the block's scale is the weight over 0.1 s
+        units = {"N": "N s", "N m": "N m s"}  # the block's scale is 0.1 s times the weight
         unbalanced = [Measure(units[m.unit], 0.1 * m.factor, "off") for m in b.limits.unbalanced]
         of_limit = percent("off, of its limit for 0.1 s")
         b.equal("impulse balance", "impact", DIRECTIONS[: b.coordinates.base], base, unbalanced)
@@ -140,14 +140,16 @@ class InstantImpact:
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         """Write the initial guess to x (n,): the robot loses 30 % of its rates."""
         self.du.write(x, -0.3 * rates)
+        # what gives the target 0.5 m/s; 1 N s to a wall
         self.impulse_group.write(x, 0.5 * self.mass if np.isfinite(self.mass) else 1.0)
 
     def durations(self, x: Array) -> tuple[float, float]:
+        """Durations of compression and restitution [s]: none."""
         return 0.0, 0.0
 
     def decode(self, x: Array, outputs: dict[str, Array], approaches: Array) -> PlannedCollision:
-        b = self._b
         """Collision of a plan, from solver variables (n,): two instants without a force."""
+        b = self._b
         gained = float(self.impulse_group.read(x)[0, 0]) / self.mass  # [m/s]
         outcome = self.target.outcome([gained] * self.target.n_states)
         return PlannedCollision(
@@ -182,10 +184,10 @@ class FrozenCollision(Collision):
     leg_rates, lag : rates of the constrained legs' joints by the frozen Jacobians, and their angles behind
         the reference.
     speed, travel, joined_travel : of the hand along the normal; its integrals, as `d` and `joined`.
-    begins : speed of the hand at the beginning of each segment.
+    begin_speeds : speed of the hand at the beginning of each segment.
     frozen_at, frozen_legs : coordinates and legs of each freeze during the contact.
     carried : sole wrenches that carry the weight, in a model without bias.
-    bends : accelerations of the coasting reference's legs.
+    coast_accelerations : of the legs of the coasting reference.
     """
 
     def __init__(
@@ -203,7 +205,7 @@ class FrozenCollision(Collision):
         c, n, legs = b.coordinates, len(stages), {"labels": b.coordinates.leg_labels}
 
         def add(name: str, count: int, size: int, **options: Any) -> Group:
-            return b.layout.add(self._named + name, count, size, **options)
+            return b.layout.add(self._prefix + name, count, size, **options)
 
         hand, joined = {"labels": ["hand"]}, self.joined.count
         self.leg_rates = add("collision leg rates", n, b.nl, **legs)
@@ -211,7 +213,9 @@ class FrozenCollision(Collision):
         self.speed = add("hand speed", n, 1, **hand)
         self.travel = add("hand travel", n, 1, **hand)
         self.joined_travel = add("hand travel in compression", joined, 1, **hand)
-        self.begins = [add(f"hand speed, segment {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))]
+        self.begin_speeds = [
+            add(f"hand speed, segment {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))
+        ]
         self.frozen_at = [add(f"freeze {k}", 1, b.ny, labels=c.labels) for k in range(self.freezes)]
         self.frozen_legs = [add(f"legs of freeze {k}", 1, b.nl, **legs) for k in range(self.freezes)]
         count = int(not self.effects.bias and b.nw > 0)
@@ -220,7 +224,7 @@ class FrozenCollision(Collision):
         if self.effects.jdot and not self.freezes:
             inverse_mass = float(target_start(b.problem.target, self.target)[0])
             mass = 1 / inverse_mass if inverse_mass > 0 else np.inf
-            self._meeting = InstantImpact(b, contact, mass=mass, named=f"{self._named}meeting: ")
+            self._meeting = InstantImpact(b, contact, mass=mass, prefix=f"{self._prefix}meeting: ")
         self._segments = [self._segment(s) for s in stages]
         self._legs_at: list[Affine] = []
         self._frozen = [self._freeze(k) for k in range(max(self.freezes, 1))]
@@ -229,8 +233,8 @@ class FrozenCollision(Collision):
         """Add variables of the reference: first at the beginnings of segments, then at their freezes."""
         count, labels = max(2 * self.freezes, 1), self._b.coordinates.leg_labels
         super()._add_reference(count)
-        name = f"{self._named}coasting leg accelerations"
-        self.bends = self._b.layout.add(name, count, self._b.nl, labels=labels)
+        name = f"{self._prefix}coasting leg accelerations"
+        self.coast_accelerations = self._b.layout.add(name, count, self._b.nl, labels=labels)
 
     # ------------------------------------------------------------------ freezes
     def _segment(self, s: CollocationPoint) -> int:
@@ -306,7 +310,7 @@ class FrozenCollision(Collision):
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         b, state = self._b, self.contact.state
         out = super().instances()
-        moved = [self._travel_before(k) for k in range(len(self.begins))]
+        moved = [self._travel_before(k) for k in range(len(self.begin_speeds))]
         moved += [self._travel_to(k) for k in range(self.freezes)]
         out["moved"] = moved, [b.problem.normal] * len(moved)
         if self._meeting is not None:
@@ -320,7 +324,9 @@ class FrozenCollision(Collision):
         """Slots of the block ``collision``: steps 3b to 6b at stage i, with the freeze of step 1b."""
         b, s, k = self._b, self.stages[i], self._segments[i]
         y, u0, at = self.contact.state.y, self.contact.u0[0], self._frozen[k]
-        bends = self.bends[self.freezes + k] if self.effects.jdot else Affine.zeros(b.nl)
+        # In a segment the reference's rates go on from those at its beginning, with the acceleration at its
+        # freeze. Without dJ/dt v there is none.
+        acceleration = self.coast_accelerations[self.freezes + k] if self.effects.jdot else Affine.zeros(b.nl)
         since = self._time(s.phase, s.place) - self._time(*self._instants()[k])
         legs = [
             *self._slots(self.leg_rates, i, self.coast_rates[0]),
@@ -329,21 +335,21 @@ class FrozenCollision(Collision):
         carried = [] if self.effects.bias else [self.carried[0] if self.carried.count else Affine.zeros(b.nw)]
         motion = [*self._travel(i), *self._slots(self.u, i, u0), self.legs[i]]
         own = [y, u0, self._feedforward(), *motion, self.f[i], self.w[i]]
-        reference = [self.coast_rates[k], bends]
+        reference = [self.coast_rates[k], acceleration]
         rest = [*legs, since, self._hand_slope(i), *carried, self.contact.gains[0]]
         return [*own, at.y, at.u, at.legs, *reference, *rest]
 
     def _hand_slope(self, i: int) -> Affine:
         """Slope of the hand's speed along the normal at stage i.
 
-        At the beginning of each segment the speed is that of the robot, by `begins`.
+        At the beginning of each segment the speed is that of the robot, by `begin_speeds`.
         """
         s, k = self.stages[i], self._segments[i]
         first = s.previous < 0 or self._segments[s.previous] != k
         slope = self.speed[s.members[0]] * 0.0
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + self.speed[m] * w
-        return slope + (self.begins[k][0] if first else self.speed[s.previous]) * s.start
+        return slope + (self.begin_speeds[k][0] if first else self.speed[s.previous]) * s.start
 
     def _hand_slots(self, i: int) -> list[Affine]:
         """Slots of the block ``force``: the hand's motion by step 7b, not by forward kinematics."""
@@ -352,6 +358,7 @@ class FrozenCollision(Collision):
         return [before, self._before(s.phase)[0], self.travel[i], self.T[s.phase][0], self.speed[i]]
 
     def _reference(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
+        """Slots and parameters of the block ``coasting``, at `_instants` in place of the stages."""
         if not self._b.coordinates.legs:
             return {}
         start = [self.contact.state.y, self.contact.u0[0]]
@@ -363,7 +370,8 @@ class FrozenCollision(Collision):
         return {"coasting": (slots, [[place, float(phase > 0)] for phase, place in self._instants()])}
 
     def _reference_groups(self) -> tuple[Group, ...]:
-        return self.coast_legs, self.coast_rates, self.bends
+        """Variables of the reference's legs, in the order of the block ``coasting``."""
+        return self.coast_legs, self.coast_rates, self.coast_accelerations
 
     def _feedforward(self) -> Affine:
         if self.effects.feedforward:
@@ -391,11 +399,11 @@ class FrozenCollision(Collision):
         return (*super().states(), self.leg_rates, self.lag)
 
     def kept_groups(self) -> list[Group]:
-        met = (
-            [] if self._meeting is None else [self._meeting.du, self._meeting.w, self._meeting.impulse_group]
-        )
-        own = [*self._reference_groups(), self.joined_travel, self.carried]
-        return [*super().kept_groups(), *own, *self.begins, *self.frozen_at, *self.frozen_legs, *met]
+        out = [*super().kept_groups(), *self._reference_groups(), self.joined_travel, self.carried]
+        out += [*self.begin_speeds, *self.frozen_at, *self.frozen_legs]
+        if self._meeting is not None:
+            out += [self._meeting.du, self._meeting.w, self._meeting.impulse_group]
+        return out
 
     def determined(self) -> list[Determined]:
         out = [determined(Turn.LIFTED, group.index(0)) for group in self.frozen_legs if group.size]
@@ -424,10 +432,14 @@ class FrozenCollision(Collision):
         super().add_rows({name: found for name, found in at.items() if name != "coasting"})
 
     def _add_freezes(self, start: int, size: int) -> None:
+        """Equate the states of freezes, and the hand's speeds at the beginnings of segments, to the motion.
+
+        start : index of the block's first output.  size : outputs of an instance.
+        """
         b, part = self._b, self._b.parts("moved")
         # instances of the block ``moved``: beginnings of segments, then freezes
-        parts = [(group, k, "speed") for k, group in enumerate(self.begins)]
-        parts += [(group, len(self.begins) + k, "y") for k, group in enumerate(self.frozen_at)]
+        parts = [(group, k, "speed") for k, group in enumerate(self.begin_speeds)]
+        parts += [(group, len(self.begin_speeds) + k, "y") for k, group in enumerate(self.frozen_at)]
         for group, instance, name in parts:
             outputs = start + instance * size + part[name]
             measure = along(group.labels, "off") if name == "y" else Measure("m/s", 1.0, "off")
@@ -454,6 +466,7 @@ class FrozenCollision(Collision):
             )
 
     def _add_coasting(self, start: int, size: int) -> None:
+        """Add the constraints of the reference's legs.  start, size : as of `_add_freezes`."""
         b, part = self._b, self._b.parts("coasting")
         closure = [f"{leg.end} {d}" for leg in b.coordinates.legs for d in DIRECTIONS]
         for k in range(self.coast_legs.count):
@@ -486,16 +499,17 @@ class FrozenCollision(Collision):
             )
 
     def _add_dynamics(self, i: int, place: Place, first: dict[str, int]) -> None:
+        """Add the constraints of `Collision` at a stage, and those of the motion by frozen Jacobians."""
         super()._add_dynamics(i, place, first)
         b, part = self._b, self._b.parts("collision")
-        for labels, name in (
-            (self.lag.labels, "legs"),
-            (self.lag.labels, "lag"),
-            (self.travel.labels, "hand"),
+        for name, labels in (
+            ("legs", self.lag.labels),
+            ("lag", self.lag.labels),
+            ("hand", self.travel.labels),
         ):
             b.equal("collision kinematics", place, labels, first["collision"] + part[name], rates(labels))
 
-    # ------------------------------------------------------------------ numbers
+    # ------------------------------------------------------------------ initial guess and solution
     def guess_model(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         """Write the initial guess of variables that only this collision model has.
 

@@ -133,8 +133,8 @@ def collision(
         own = [ref_legs, ref_rates]
     else:
         of_freeze = ca.SX.sym("yf", ny), ca.SX.sym("uf", ny), ca.SX.sym("legsf", nl)
-        of_legs = [ca.SX.sym(s, nl) for s in ("began", "bends", "r", "r1", "lag", "lag1")]
-        ref_rates0, ref_accelerations, r, r1, lag, lag1 = of_legs
+        names = ("ref_rates0", "ref_accelerations", "r", "r1", "lag", "lag1")
+        ref_rates0, ref_accelerations, r, r1, lag, lag1 = of_legs = [ca.SX.sym(s, nl) for s in names]
         since, hand_slope = ca.SX.sym("since"), ca.SX.sym("h1")
         at, own = of_freeze, [*of_freeze, *of_legs, since, hand_slope]
         if not frozen.bias:
@@ -142,6 +142,7 @@ def collision(
             own.append(carried)
     v, a, stages = _motion(c, *at, ydd, jdot=frozen is None or frozen.jdot)
     q = c.configuration(at[0], at[2])
+    # equation (6): H a + bias + j' f - J_c' w = S' tau
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
     for k, name in enumerate(strikers):
         J = _striker_jacobian(c, name, q)
@@ -162,6 +163,7 @@ def collision(
     angle_error = c.configuration(y0 + coasts * u0 * t - y, lag)[c.base :]
     rate_error = c.configuration(u0 - u, rate_lag)[c.base :]
     stiffness, damping = with_gain_factors(kp, kd, logs, gain_groups)
+    # equation (10), over the torque limit
     servo = ff + (stiffness * angle_error + damping * rate_error) / limit
     out = {
         "closure": c.closure(y, legs),
@@ -177,6 +179,7 @@ def collision(
 
 
 def _strikers(striker: str, second: str) -> list[str]:
+    """Names of the one or two strikers; ``second`` is "" if there is one."""
     return [striker, second] if second else [striker]
 
 

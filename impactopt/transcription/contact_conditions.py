@@ -208,11 +208,11 @@ def _add_clearance(
     # the target's plane, which it reaches at contact with constant speed
     duration = float(np.mean(p.swing.duration))
     surface, speed = Affine.constant(float(p.normal @ point)), float(p.target.speed_before())
-    for i, s in enumerate(before):
-        plane = surface - swing.T[0] * (speed * (1 - s))
-        spot = first + i, swing.place_at(s), CLEARANCE_RATE * (1 - s) * duration
-        _add_plane_distance(b, "no touch before contact", number, spot, plane)
     distances = [CLEARANCE_RATE * (1 - s) * duration for s in before]
+    for i, (s, distance) in enumerate(zip(before, distances, strict=True)):
+        plane = surface - swing.T[0] * (speed * (1 - s))
+        spot = first + i, swing.place_at(s), distance
+        _add_plane_distance(b, "no touch before contact", number, spot, plane)
     b.follow(lambda b: _update_distances(b, number, start, distances))
     if travel is None:
         return

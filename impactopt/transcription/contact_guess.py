@@ -105,9 +105,8 @@ def coasted(
     Yields joint angles, and rates with accelerations; shape (nl,) each.
     """
     for time in elapsed:
-        with contextlib.suppress(
-            InputError
-        ):  # out of the legs' reach: the last angles, for the solver to fix
+        # out of the legs' reach: the last angles, for the solver to correct
+        with contextlib.suppress(InputError):
             legs = c.solve_legs(y + rates * time, legs)
         _, v, a = c.complete_motion(y + rates * time, rates, np.zeros(c.ny), legs)
         yield legs, (v[c.base + c.dependent], a[c.base + c.dependent])
@@ -121,9 +120,9 @@ def fastest_at_contact(problem: ImpactProblem) -> float:
     """
     c, limit = problem.coordinates, problem.term(VelocityLimit).most(problem.robot)
     y, legs = c.split(problem.contact_posture)
-    model, data, still = c.model, c.model.createData(), np.zeros(c.ny)
+    model, data, at_rest = c.model, c.model.createData(), np.zeros(c.ny)
     # rates of all joints (nv, ny), and the striker's speed (ny,), for rates ydot of 1
-    motions = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
+    motions = np.column_stack([c.complete_motion(y, e, at_rest, legs)[1] for e in np.eye(c.ny)])
     pin.computeJointJacobians(model, data, c.join(y, legs))
     frame = model.getFrameId(f"striker:{problem.striker}")
     jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)

@@ -37,15 +37,15 @@ class Chain:
     columns : index of each joint among base coordinates and joints (nv).
     ratios : factor on each joint's coordinate: -1 towards the root, else 1, times a follower's ratio to its
         leader.
-    turns : 1 for a revolute joint, 0 for a prismatic one.
-    places : n + 1 placements (pin.SE3) before, between and after the joints.
+    revolute : 1 for a revolute joint, 0 for a prismatic one.
+    placements : n + 1 placements (pin.SE3) before, between and after the joints.
     base : the position of the floating base comes before all joints.
     """
 
     columns: tuple[int, ...]
     ratios: tuple[float, ...]
-    turns: tuple[float, ...]
-    places: tuple[Any, ...]
+    revolute: tuple[float, ...]
+    placements: tuple[Any, ...]
     base: bool = False
 
     def parameters(self, before: Any = None) -> Array:
@@ -53,13 +53,13 @@ class Chain:
         if before is None:
             return self._parameters
         out = self._parameters.copy()
-        out[:12] = _placement(before * self.places[0])
+        out[:12] = _placement(before * self.placements[0])
         return out
 
     @cached_property
     def _parameters(self) -> Array:
         # cached, as thousands of constraints have the same
-        return np.concatenate([*map(_placement, self.places), self.turns])
+        return np.concatenate([*map(_placement, self.placements), self.revolute])
 
     def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Index, Index, Array]:
         """z of a constraint as sums of coordinates: indices in z, indices in (y, legs), factors, (k,) each.
@@ -102,35 +102,30 @@ def chain_between(model: Any, one: int, other: int) -> Chain:
         shared = 0
     # The chain goes up from the other body to the common ancestor, and down to the one. `place` collects the
     # fixed placements until the next joint.
-    place, columns, ratios, turns, places = pin.SE3.Identity(), [], [], [], []
-    base = False
+    place, placements, base = pin.SE3.Identity(), [], False
+    joints: list[tuple[int, float, float]] = []  # column, ratio, 1 if it is revolute
     for j in reversed([j for j in up_other if j > shared]):
         joint = axis_of(model, j)
         axis, revolute = _axis_to_z(joint)
-        places.append(place * axis)
-        columns.append(int(model.joints[j].idx_v))
-        ratios.append(-joint.ratio)
-        turns.append(revolute)
+        placements.append(place * axis)
+        joints.append((int(model.joints[j].idx_v), -joint.ratio, revolute))
         place = axis.inverse() * joint.placement.inverse()
     for j in [j for j in up_one if j > shared]:
         if model.joints[j].nv == 6:  # floating base: position, and yaw, pitch, roll in turn
             base, place = True, place * model.jointPlacements[j]
             for column, direction in ((5, [0, 0, 1]), (4, [0, 1, 0]), (3, [1, 0, 0])):
                 axis = _turned(np.array(direction, dtype=float))
-                places.append(place * axis)
-                columns.append(column)
-                ratios.append(1.0)
-                turns.append(1.0)
+                placements.append(place * axis)
+                joints.append((column, 1.0, 1.0))
                 place = axis.inverse()
             continue
         joint = axis_of(model, j)
         axis, revolute = _axis_to_z(joint)
-        places.append(place * joint.placement * axis)
-        columns.append(int(model.joints[j].idx_v))
-        ratios.append(joint.ratio)
-        turns.append(revolute)
+        placements.append(place * joint.placement * axis)
+        joints.append((int(model.joints[j].idx_v), joint.ratio, revolute))
         place = axis.inverse()
-    return Chain(tuple(columns), tuple(ratios), tuple(turns), (*places, place), base)
+    columns, ratios, revolutes = zip(*joints, strict=True) if joints else ((), (), ())
+    return Chain(columns, ratios, revolutes, (*placements, place), base)
 
 
 _chains: WeakKeyDictionary[Robot, dict[tuple[int, int], Chain]] = WeakKeyDictionary()
@@ -352,7 +347,7 @@ def move_bodies(
         if key.other < 0:
             body, normal = problem.bodies.world[-1 - key.other], problem.bodies.normal
             at = pin.SE3(body.rotation, body.place + direction.travel * normal * body.moves)
-            parameters[name][instance[name], :12] = _placement(at.inverse() * chain.places[0])
+            parameters[name][instance[name], :12] = _placement(at.inverse() * chain.placements[0])
         instance[name] += 1
     for name, block in of_name.items():
         block.take_parameters(parameters[name])

@@ -133,7 +133,7 @@ def test_only_the_joints_between_two_links_are_in_their_chain() -> None:
     columns |= {robot.model.joints[names[f"left hip {n}"]].idx_v for n in ("yaw", "roll", "pitch")}
     columns |= {robot.model.joints[names["left knee"]].idx_v}
     assert set(chain.columns) == columns and not chain.base
-    assert len(chain.places) == len(chain.columns) + 1
+    assert len(chain.placements) == len(chain.columns) + 1
     slots, coordinates, _ = chain.pattern(c)
     assert sorted(slots) == list(range(3, 3 + len(columns)))
     assert sum(k >= c.ny for k in coordinates) == 4, "the leg's are not free"

@@ -281,7 +281,7 @@ def add_clearance_constraints(
         before = None
         if body is not None:
             shift = direction.travel * bodies.normal * body.moves
-            before = pin.SE3(body.rotation, body.place + shift).inverse()
+            before = pin.SE3(body.rotation, body.place + shift).inverse()  # distances are in the body's frame
         n = shapes.index[key.joint, key.other, key.number]
         group = groups.setdefault(len(chain.columns), _Group())
         group.keys.append(key)
@@ -289,6 +289,7 @@ def add_clearance_constraints(
         group.ways.append(direction.way)
         group.patterns.append(pattern)
         group.spots.append(spot_of[key.place])
+        # capsules and spheres are their axes and centres, at a distance that is larger by their radius
         group.parameters.append(np.append(chain.parameters(before), direction.reach + shapes.radius[n]))
         term = (SelfCollision if key.other >= 0 else KeepOut).name
         # each pair of pieces of two bodies has a name of its own, by which multipliers are mapped

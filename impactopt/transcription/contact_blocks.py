@@ -257,13 +257,15 @@ def force(
         return sum((ca.vertcat(ca.SX(0, 1), *part) * within[k] for k, part in enumerate(parts) if part), 0.0)
 
     if target.guards:
+        # guards take the time by which a phase lasts longer than its least duration
         speed, derivative = of_phase([[v] for v, _ in modes]), of_phase([rates for _, rates in modes])
         event = of_phase(
             [[target.guard(state, total, T - shortest, k, parameters)] for k in range(len(target.guards))]
         )
         invariant = of_phase([target.invariant(state, total, k, parameters) for k in phases])
         reserve = ca.SX(of_phase([target.reserve(state, total, k, parameters) for k in phases]))
-    of_hands = []
+    of_hands = []  # residual of the law, rate, penetration and separation of each striker
+    # equation (17) with one branch of the law, and (14) to (16) as penetration and its rate
     for k, (position, velocity) in enumerate(hands):
         penetration, rate = position - surface, velocity - speed
         compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))

@@ -346,10 +346,11 @@ def _least_accelerations(
     c, limits = t.coordinates, t.builder.limits
     limit = np.concatenate([np.full(c.base, np.inf), limits.rate_limit[c.independent]])
     control = np.zeros((count, c.ny))
-    for k in range(c.ny):
+    for k in range(c.ny):  # coordinates do not depend on each other: one small least squares problem each
         slowest = np.inf  # largest rate of the slowest spline so far
         for factor in (1.0, 0.8, 0.6, 0.4, 0.2):  # of the given rates
             u0, u1 = (0.0 if u is None else factor * duration * float(u[k]) for u in (rates, end_rates))
+            # control points: the rate at an end is the difference of two, times a factor over the duration
             points = np.zeros(count)
             points[0] = start[k]
             points[1] = points[0] + u0 / factors[0]

@@ -266,30 +266,30 @@ def builders(
     first : with the first instant of contact.  second : another striker.
     gain_groups : joints that share a gain factor.  friction : striking points have friction.
     """
-    hit: dict[str, Callable[[], BlockExpression]] = {
+    lasting: dict[str, Callable[[], BlockExpression]] = {
         "collision": lambda: collision(c, striker, frozen, second, gain_groups, friction),
         "force": lambda: force(c, striker, law, target, frozen, second),
     }
     if c.legs:
-        hit["coasting"] = lambda: coasting(c, frozen)
+        lasting["coasting"] = lambda: coasting(c, frozen)
     if c.legs and frozen is not None and not frozen.bias:
-        hit["carried"] = lambda: carried(c)
+        lasting["carried"] = lambda: carried(c)
     if frozen is not None:
-        hit["moved"] = lambda: moved(c, striker)
+        lasting["moved"] = lambda: moved(c, striker)
     if frozen is not None and frozen.jdot and not freezes:
-        hit["impact"] = lambda: impact(c, striker)
+        lasting["impact"] = lambda: impact(c, striker)
     if target.guards:
-        hit["join"] = join
+        lasting["join"] = join
     if second:
-        hit["second_contact"] = lambda: contact(c, second)
-        hit["second_approach"] = lambda: approach(c, second)
+        lasting["second_contact"] = lambda: contact(c, second)
+        lasting["second_approach"] = lambda: approach(c, second)
     if first:
-        hit["first"] = lambda: first_instant(c, striker, law, friction)
+        lasting["first"] = lambda: first_instant(c, striker, law, friction)
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),
         "approach": lambda: approach(c, striker),
-        **({"impact": lambda: impact(c, striker)} if instant else hit),
+        **({"impact": lambda: impact(c, striker)} if instant else lasting),
         "link": link,
         **({"balance": lambda: balance(c, edges)} if c.legs else {}),
         **({"momentum": lambda: momentum(c)} if c.drifts else {}),

@@ -241,15 +241,16 @@ def _map_by_label(group: Group, known: Group, *vectors: tuple[Array, Array]) -> 
 
     Entries with a new label are lifted variables, which `_finished` computes.
     """
-    before = {label: j for j, label in enumerate(known.labels)}
-    there = [k for k, label in enumerate(group.labels) if label in before]
-    here = [before[group.labels[k]] for k in there]
+    places = {label: j for j, label in enumerate(known.labels)}
+    entries = [k for k, label in enumerate(group.labels) if label in places]
+    known_entries = [places[group.labels[k]] for k in entries]
     for k in range(min(group.count, known.count)):
         for new, old in vectors:
-            new[group.index(k)[there]] = old[known.index(k)[here]]
+            new[group.index(k)[entries]] = old[known.index(k)[known_entries]]
 
 
 def _model(t: ContactProgram) -> tuple[str, int]:
+    """Collision model and number of freezes."""
     return t.problem.collision, t.problem.freezes
 
 

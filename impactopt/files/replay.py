@@ -27,7 +27,7 @@ from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.controller import ControllerSettings, controller_of
 from impactopt.simulation.engines import check_steps
 from impactopt.solvers.program import SolverResult, Status, max_violation
-from impactopt.transcription.clearance import ApartRow, Held
+from impactopt.transcription.clearance import ClearanceKey, SeparatingDirection
 from impactopt.transcription.mesh import Elements, MoreNodes
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.transcription import Transcription
@@ -76,10 +76,10 @@ def program_of_record(record: Record, problem: ImpactProblem) -> Transcription |
     return t.with_apart(_apart(told["apart"])) if told["apart"] else t
 
 
-def _apart(told: list[dict[str, Any]]) -> dict[ApartRow, Held]:
+def _apart(told: list[dict[str, Any]]) -> dict[ClearanceKey, SeparatingDirection]:
     """Constraints between bodies."""
     return {
-        ApartRow(*(row[key] for key in ApartRow._fields)): Held(
+        ClearanceKey(*(row[key] for key in ClearanceKey._fields)): SeparatingDirection(
             tuple(row["way"]), row["reach"], row["travel"]
         )
         for row in told

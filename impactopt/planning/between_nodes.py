@@ -11,7 +11,7 @@ from impactopt.planning.budget import Budget, touching, with_effort_of
 from impactopt.planning.clearance_constraints import Margins, clearance_violations, solved_apart
 from impactopt.planning.contact_replay import AGREED, REFUTED
 from impactopt.planning.refinement import Additions, Guess, Outcome, program_for, refine, start_of
-from impactopt.transcription.contact_refinement import ASKED, all_halved, refined_elements
+from impactopt.transcription.contact_refinement import TOLERANCE_PCT, all_halved, refined_elements
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import Elements, contact_elements, nodes_to_add
 from impactopt.transcription.transcription import Transcription
@@ -89,7 +89,7 @@ class BetweenNodes:
         missed = error is not None and error.missed
         if violated is None and nodes == t.nodes and elements is None:
             replay = outcome.at.replay if self._refined < _MESH_ROUNDS else None
-            if replay is None or replay.off <= ASKED or replay.unforeseen:
+            if replay is None or replay.off <= TOLERANCE_PCT or replay.unforeseen:
                 return None
             missed, elements = missed or replay.off > REFUTED, all_halved(t.hit.elements)
             if elements is None:

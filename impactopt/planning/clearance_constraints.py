@@ -28,7 +28,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import SolverResult
 from impactopt.solvers.run import Path
-from impactopt.transcription.clearance import ApartRow, Held
+from impactopt.transcription.clearance import ClearanceKey, SeparatingDirection
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.layout import stack
 from impactopt.transcription.mesh import MoreNodes
@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-Rows = dict[ApartRow, Held]
+Rows = dict[ClearanceKey, SeparatingDirection]
 WITHIN, AFTER = 1, 2  # phases in and after contact
 # [m] nearer bodies get a constraint: when there are to be more of them, and what asks for more
 NEAR, ENTERS = 0.1, 0.03
@@ -180,7 +180,7 @@ class Watch:
         for k, n in zip(found.spot[new].tolist(), found.pair[new].tolist(), strict=True):
             (joint, other), number = self._shapes.pairs[n].tolist(), int(self._shapes.number[n])
             way, reach = self._ways[k, n].tolist(), float(self._margins.pieces[n])
-            out[ApartRow(self._names[k], joint, other, number)] = Held(
+            out[ClearanceKey(self._names[k], joint, other, number)] = SeparatingDirection(
                 tuple(way), reach, float(self._travel[k])
             )
         self._has[found.spot, found.pair] |= new
@@ -411,7 +411,7 @@ class _Asked:
             for row, held in own.items():
                 if gaps[row] < least + ROUND:
                     reach = max(held.reach, self.rows.get(row, held).reach, least + missing)
-                    self.rows[ApartRow(*row)] = held._replace(reach=reach)
+                    self.rows[ClearanceKey(*row)] = held._replace(reach=reach)
 
 
 class _Nodes:

@@ -19,7 +19,7 @@ from impactopt.planning.budget import VIOLATED, Budget, one_after_the_other, ran
 from impactopt.planning.contact_replay import ContactReplay, PlannedContact, checked, planned_contact
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, Violation, max_violation, worst_rows
-from impactopt.transcription.clearance import ApartRow, Held
+from impactopt.transcription.clearance import ClearanceKey, SeparatingDirection
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import ContactError, contact_error
 from impactopt.transcription.initial_guess import carried_over
@@ -286,7 +286,7 @@ def program_for(
     nodes: MoreNodes | None = None,
     elements: Elements | None = None,
     shares: Shares | None = None,
-    constraints: Mapping[ApartRow, Held] | None = None,
+    constraints: Mapping[ClearanceKey, SeparatingDirection] | None = None,
     report: Callable[[str], None] | None = None,
 ) -> Program:
     """A program with another problem, or on another mesh, or with other clearance constraints."""

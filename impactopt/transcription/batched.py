@@ -1,4 +1,4 @@
-"""Compiled functions called for many instances through buffers."""
+"""Compiled functions, evaluated for many instances in one call, and blocks of them with derivatives."""
 
 from __future__ import annotations
 
@@ -13,28 +13,36 @@ from numpy.typing import ArrayLike
 from impactopt.errors import InputError
 from impactopt.transcription.layout import Affine, Array, Index, stack
 
-# of functions that take one instance a call: those in lanes are done before a thread has started
+# For functions of one instance a call. Functions in SIMD lanes are done before a thread has started.
 THREADS = 2
-_LONGEST = 64  # calls at once
+MAX_MAPPED_CALLS = 64  # CasADi takes long to map a function to more calls
 
 
 class BatchedFunction:
-    """A CasADi function of ``count`` instances, called through its buffer: no copies, no Python lists.
+    """CasADi function (z, p[, multipliers]) evaluated for ``count`` instances, without copies.
 
-    The function takes as many instances a call as z has columns.
+    The function takes as many instances a call as z has columns, `columns`. Arguments and results are NumPy
+    arrays that CasADi's buffers point to.
+
+    parameters (count, n_p) : p of the instances.
+
+    Attributes
+    ----------
+    inputs : arguments, (calls * columns, size) each.
+    output (count, nnz) : nonzeros of the result of each instance.
     """
 
     def __init__(self, function: Any, count: int, parameters: Array) -> None:
         self._function = function
         self.columns = columns = function.size2_in(0)
         calls = -(-count // columns)
-        # instances beyond `count` fill the last call up: they are the last one, again
+        # instances beyond `count` fill the last call up; they repeat the last instance
         self.inputs = [np.zeros((calls * columns, function.size1_in(i))) for i in range(function.n_in())]
         self.count, self._shape = count, (calls * columns, function.nnz_out(0) // columns)
         self.take_parameters(parameters)
-        self._parts = []  # of all instances, with the buffer of each
-        for first, last in _parts(calls, calls if columns == 1 else _LONGEST):
-            buffer, run = _repeated(function, last - first).buffer()
+        self._parts = []  # slice of the instances, buffer, and function that runs it
+        for first, last in _parts(calls, calls if columns == 1 else MAX_MAPPED_CALLS):
+            buffer, run = _mapped(function, last - first).buffer()
             self._parts.append((slice(first * columns, last * columns), buffer, run))
         for part, buffer, _ in self._parts:
             for i, a in enumerate(self.inputs):
@@ -43,16 +51,16 @@ class BatchedFunction:
         self.write_to(np.zeros(self.size))
 
     def take_parameters(self, parameters: Array) -> None:
-        """Others (count, n_p) from now on."""
+        """Use these parameters (count, n_p) from now on."""
         self.inputs[1][...] = parameters[np.minimum(np.arange(len(self.inputs[1])), self.count - 1)]
 
     def copy(self) -> BatchedFunction:
-        """The same, with numbers of its own."""
+        """Copy with arrays of its own."""
         return BatchedFunction(self._function, self.count, self.inputs[1][: self.count])
 
     @property
     def size(self) -> int:
-        """Numbers that a call writes: those of the instances, and behind them what fills the last call up."""
+        """Length of the array that a call writes, with the instances that fill the last call up."""
         return self._shape[0] * self._shape[1]
 
     def write_to(self, numbers: Array) -> None:
@@ -63,10 +71,7 @@ class BatchedFunction:
             buffer.set_res(0, self._all[part].data)
 
     def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
-        """Rows are instances: z (count, n_z) -> (count, nnz of the output).
-
-        The result is overwritten by the next call.
-        """
+        """Result (count, nnz) for z (count, n_z), which the next call overwrites."""
         self.inputs[0][: self.count] = z
         self.inputs[0][self.count :] = z[-1:]
         if multipliers is not None:
@@ -77,13 +82,16 @@ class BatchedFunction:
 
     @property
     def pattern(self) -> tuple[Index, Index]:
-        """Rows and columns of an instance's nonzeros, in CasADi's (column-major) order."""
+        """Row and column indices of an instance's nonzeros, in CasADi's (column-major) order."""
         rows, columns = pattern(self._function.sparsity_out(0))
         return rows[: self.output.shape[1]], columns[: self.output.shape[1]]
 
 
 def _parts(calls: int, longest: int) -> Iterator[tuple[int, int]]:
-    """First and last of as few calls at once as there are powers of two, up to ``longest``."""
+    """Begin and end of batches of calls: all calls, or batches of ``longest`` and then of powers of two.
+
+    Few different sizes, because `_mapped` has to make a function for each.
+    """
     first = 0
     while first < calls:
         size = min(calls - first, longest)
@@ -93,14 +101,17 @@ def _parts(calls: int, longest: int) -> Iterator[tuple[int, int]]:
 
 
 @functools.lru_cache(maxsize=1024)
-def _repeated(function: Any, calls: int) -> Any:
-    """So many calls at once: for a hundred, CasADi takes longer to make this than to run it ten times."""
+def _mapped(function: Any, calls: int) -> Any:
+    """Function that makes this number of calls.
+
+    Cached: for a hundred calls CasADi takes longer to make it than to run it ten times.
+    """
     threads = ("thread", THREADS) if function.size2_in(0) == 1 else ()
     return function.map(calls, *threads) if calls > 1 else function
 
 
 def pattern(sparsity: Any) -> tuple[Index, Index]:
-    """Rows and columns of a CasADi sparsity's nonzeros, in its (column-major) order."""
+    """Row and column indices of a CasADi sparsity's nonzeros, in its (column-major) order."""
     start = np.array(sparsity.colind(), dtype=np.intp)
     columns = np.repeat(np.arange(sparsity.size2()), start[1:] - start[:-1])
     return np.array(sparsity.row(), dtype=np.intp), columns
@@ -108,7 +119,11 @@ def pattern(sparsity: Any) -> tuple[Index, Index]:
 
 @dataclass
 class Block:
-    """``count`` instances of a compiled function  out = f(z), its Jacobian and the Hessian of lambda.out."""
+    """``count`` instances of a compiled function out = f(z, p), its Jacobian, and the Hessian of lambda.out.
+
+    lift : z of all instances (count * n_in) as affine expressions in the program's variables.
+    jac_pattern, hess_pattern : row and column indices of an instance's nonzeros.
+    """
 
     name: str
     value: BatchedFunction
@@ -117,23 +132,23 @@ class Block:
     n_in: int
     n_out: int
     count: int
-    lift: Affine  # (count * n_in)
+    lift: Affine
     jac_pattern: tuple[Index, Index]
     hess_pattern: tuple[Index, Index]
 
     @property
     def parameters(self) -> Array:
-        """(count, n_p)"""
+        """Parameters (count, n_p)."""
         return self.value.inputs[1][: self.count]
 
     def take_parameters(self, parameters: Array) -> None:
-        """Others (count, n_p), or (n_p,) of all, from now on."""
+        """Use these parameters (count, n_p), or (n_p,) for all instances, from now on."""
         parameters = np.broadcast_to(parameters, self.parameters.shape)
         for function in (self.value, self.jacobian, self.hessian):
             function.take_parameters(parameters)
 
     def copy(self) -> Block:
-        """The same for another program: a program tells its functions where to write."""
+        """Copy for another program, as a program sets the arrays that its blocks write to."""
         parts = {name: getattr(self, name).copy() for name in ("value", "jacobian", "hessian")}
         return replace(self, **parts)
 
@@ -145,9 +160,12 @@ class Block:
         instances: Sequence[Sequence[Affine]],
         parameters: ArrayLike,
     ) -> Block:
-        """``functions``: of one instance, or `in_lanes`; ``instances``: of each, the slots that make up z.
+        """Block whose z is given as parts.
 
-        ``parameters``: (n_p,) for all or (count, n_p).
+        functions : compiled, of one instance or by `impactopt.transcription.simd.in_lanes`: ``name``,
+            ``name_jac`` and ``name_hess``.
+        instances : of each, the affine expressions ("slots") that make up its z, in order.
+        parameters : (n_p,) for all instances, or (count, n_p).
         """
         n_in = functions[name].size1_in(0)
         lifts = [stack(slots) for slots in instances]
@@ -160,12 +178,12 @@ class Block:
     def of_lift(
         cls, name: str, functions: dict[str, Any], lift: Affine, count: int, parameters: ArrayLike
     ) -> Block:
-        """Makes the block (:meth:`make`) with the z of all instances (count * n_in) as one expression."""
+        """Block, as of :meth:`make`, with z of all instances (count * n_in) as one expression."""
         f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
         n_in, n_out = f.size1_in(0), f.size1_out(0)
         p, n_p = np.asarray(parameters, dtype=float), f.size1_in(1)
         if p.ndim and p.shape[-1] != n_p:
-            raise InputError(f"block {name} takes {n_p} numbers, was given {p.shape[-1]}")
+            raise InputError(f"block {name} takes {n_p} parameters, was given {p.shape[-1]}")
         p = np.broadcast_to(p, (count, n_p))
         value, jacobian, hessian = (BatchedFunction(function, count, p) for function in (f, j, h))
         return cls(

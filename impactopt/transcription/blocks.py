@@ -1,8 +1,8 @@
-"""The nonlinear pieces of an impact motion's program as CasADi functions of (variables z, parameters p).
+"""Nonlinear functions of a motion's program as CasADi expressions of variables z and parameters p.
 
-Everything that is a number of the scene (normal, contact law, target, gains, limits) is a parameter, so one
-compiled library per robot, stance and striker serves every problem.  Times and rates: y' and y'' are
-derivatives in the phase's own s in [0, 1], so ydot = y'/T and yddot = y''/T^2.
+All parameters of the scene (normal, contact law, target, gains, limits) are in p, so one compiled library per
+robot, stance and striker serves every problem. y' and y'' are derivatives in the phase's own s in [0, 1]:
+ydot = y'/T and yddot = y''/T^2. Lists of z, p and out are in the order of the vectors' parts.
 """
 
 from __future__ import annotations
@@ -27,10 +27,9 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.transcription.contact_blocks import (
     SECOND,
-    Joints,
+    JointGroups,
     base_scale,
     carried,
-    chosen_gains,
     coasting,
     collision,
     first_instant,
@@ -39,6 +38,7 @@ from impactopt.transcription.contact_blocks import (
     join,
     leg_part,
     moved,
+    with_gain_factors,
 )
 from impactopt.transcription.mesh import Elements, contact_mesh
 
@@ -58,8 +58,9 @@ __all__ = [
 def sizes(
     c: StanceCoordinates, target: Target, block: str, *, frozen: bool = False, second: bool = False
 ) -> dict[str, int]:
-    """Lengths of the named slices of a block's output, in order; of models with frozen dynamics or not, with
-    a second striker or not.
+    """Lengths of the named slices of a block's output, in order.
+
+    frozen : of a model with frozen dynamics.  second : with a second striker.
     """
     n, base, soles = c.robot.n, c.base, len(c.legs)
     legs = {"legs": c.nl, "lag": c.nl, "hand": 1} if frozen else {}
@@ -97,12 +98,12 @@ def sizes(
 
 
 def node(c: StanceCoordinates) -> BlockExpression:
-    """A node of a swing or follow-through: closed legs, inverse dynamics under the soles' wrenches.
+    """Closure of the legs and inverse dynamics under the soles' wrenches, at a node of a motion.
 
-    z = y, y', y'' (ny each), legs (nl), sole wrenches (6 a sole, [N, N m], in the sole's frame), T [s];
-    p = torque limits (n), leg rate limits (nl), weight [N], lever [m], leg determinants in the start posture.
-    out = closure [m, rad], base rows of the equation of motion over weight and weight x lever, torque over
-        limit, leg rate over limit, leg determinants over those of the start posture.
+    z = y, y', y'' (ny, each); legs (nl,); sole wrenches (6 a sole, [N, N m], in the sole's frame); T [s].
+    p = torque limits (n,); leg rate limits (nl,); weight [N]; lever [m]; leg determinants at the start.
+    out = closure [m, rad]; base equations over weight and weight x lever; torque over limit; leg rates over
+        limits; leg determinants over those at the start.
     """
     ny, n = c.ny, c.robot.n
     y, y1, y2 = ca.SX.sym("y", ny), ca.SX.sym("y1", ny), ca.SX.sym("y2", ny)
@@ -126,11 +127,10 @@ def node(c: StanceCoordinates) -> BlockExpression:
 
 
 def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """The striking point when it meets the target.
+    """Striking point at contact.
 
-    z = y, y', T;  p = rotation rows (normal, two tangents: 9).
-
-    out = point [m] (world), velocity [m/s] along the normal and the two tangents.
+    z = y; y'; T.  p = normal and two tangents (9).
+    out = point [m] (world); velocity [m/s] along the normal and the two tangents.
     """
     y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
     axes = ca.SX.sym("axes", 9)
@@ -145,7 +145,7 @@ def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
 
 
 def approach(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """The striking point on its way.  z = y;  p = normal (3);  out = its coordinate along the normal [m]."""
+    """Position of the striking point along the normal [m].  z = y.  p = normal (3,)."""
     y, normal = ca.SX.sym("y", c.ny), ca.SX.sym("n", 3)
     zero = ca.SX.zeros(c.ny)
     q, v, _ = c.upper_motion(y, zero, zero)
@@ -154,10 +154,11 @@ def approach(c: StanceCoordinates, striker: str) -> BlockExpression:
 
 
 def link() -> BlockExpression:
-    """One coordinate's hand-over from swing to collision, and from the state after it to the follow-through.
+    """Continuity of one coordinate from the swing through the collision to the follow-through.
 
-    z = follow-through's first value and y', its T; swing's last value and y', its T; T1, T2; d after each
-        phase; u at contact and at the end.
+    z = y, y' and T at the beginning of the follow-through; y, y' and T at the end of the swing; T1; T2; mean
+        rates d1, d2 in these two phases; ydot at contact; ydot after it.
+    out = residuals of the rate at contact, and of position and rate after it.
     """
     names = ("yf", "yf1", "Tf", "y", "y1", "Ts", "T1", "T2", "d1", "d2", "u0", "u")
     yf, yf1, Tf, y, y1, Ts, T1, T2, d1, d2, u0, u = z = [ca.SX.sym(s) for s in names]
@@ -166,14 +167,16 @@ def link() -> BlockExpression:
 
 
 def pace() -> BlockExpression:
-    """One coordinate's rate.  z = y', T;  out = ydot."""
+    """Rate of one coordinate.  z = y'; T.  out = ydot."""
     y1, T = ca.SX.sym("y1"), ca.SX.sym("T")
     return make_block([y1, T], [], {"rate": y1 / T})
 
 
 def corner_heights(c: StanceCoordinates, frame: str, corners: int) -> BlockExpression:
-    """A sole that is not held.  z = y;  p = its corners in its frame [m] (2 each);  out = their heights
-    [m]; where its frame is on the ground (2) [m].
+    """Corners of a sole that is not fixed.
+
+    z = y.  p = its corners in its frame [m] (2 each).
+    out = their heights [m]; position of its frame, x and y [m].
     """
     y, zero, p = ca.SX.sym("y", c.ny), ca.SX.zeros(c.ny), ca.SX.sym("corners", 2 * corners)
     q, _, _ = c.upper_motion(y, zero, zero)
@@ -182,29 +185,31 @@ def corner_heights(c: StanceCoordinates, frame: str, corners: int) -> BlockExpre
     return make_block([y], [p], {"height": heights, "place": point[:2]})
 
 
-def spring(c: StanceCoordinates, chosen: Joints = ()) -> BlockExpression:
-    """Torques of springs and dampers at joints outside the constrained legs, less what they bear at rest.
+def spring(c: StanceCoordinates, gain_groups: JointGroups = ()) -> BlockExpression:
+    """Torques of springs and dampers at joints outside the constrained legs, minus those at rest.
 
-    z = y, y', T, logarithms of the factors on the gains of the joints of each of ``chosen``;  p = angles at
-        rest, stiffness and damping over torque limit (one a joint).
+    gain_groups : joints that share a factor on stiffness and damping.
+
+    z = y; y'; T; logarithms of the factors.  p = angles at rest; stiffness and damping over torque limit, one
+        a joint.
+    out = torques over limit.
     """
     m = c.ny - c.base
     y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
     rest, stiffness, damping = ca.SX.sym("rest", m), ca.SX.sym("k", m), ca.SX.sym("d", m)
-    logs, own = ca.SX.sym("logs", len(chosen)), {int(joint): k for k, joint in enumerate(c.independent)}
-    here = tuple(tuple(own[joint] for joint in joints if joint in own) for joints in chosen)
-    stiff, damped = chosen_gains(stiffness, damping, logs, here)
-    torque = -stiff * (y[c.base :] - rest) - damped * y1[c.base :] / T
+    logs, place = ca.SX.sym("logs", len(gain_groups)), {int(j): k for k, j in enumerate(c.independent)}
+    groups = tuple(tuple(place[j] for j in joints if j in place) for joints in gain_groups)
+    scaled_stiffness, scaled_damping = with_gain_factors(stiffness, damping, logs, groups)
+    torque = -scaled_stiffness * (y[c.base :] - rest) - scaled_damping * y1[c.base :] / T
     return make_block([y, y1, T, logs], [rest, stiffness, damping], {"torque": torque})
 
 
 def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
     """Balance after the impact: capture point, vertical speed and angular momentum.
 
-    The capture point [m], the vertical speed of the CoM [m/s], the angular momentum [N m s].
-    z = y, y', legs, T;  p = the support polygon's edges (inward normal, offset: 3 an edge).  out = distance
-    of the capture point c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012) from each edge, positive inside;
-    vertical speed; angular momentum.
+    z = y; y'; legs; T.  p = edges of the support polygon (inward normal and offset, 3 an edge).
+    out = distance of the capture point c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012) from each edge [m],
+        positive inside; vertical speed of the centre of mass [m/s]; angular momentum about it [N m s].
     """
     y, y1, legs, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("T")
     rb, u = c.rb, ca.SX.sym("u", c.ny)
@@ -222,10 +227,11 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
 
 
 def momentum(c: StanceCoordinates) -> BlockExpression:
-    """Momentum of a robot that nothing holds.
+    """Momentum of a robot that floats freely.
 
-    z = y, y', T;  p = weight [N], lever [m];  out = linear momentum and angular momentum about the centre of
-    mass, world axes, over weight and weight x lever [s].
+    z = y; y'; T.  p = weight [N]; lever [m].
+    out = linear momentum, and angular momentum about the centre of mass, world axes, over weight and weight x
+        lever [s].
     """
     y, y1, T, u = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T"), ca.SX.sym("u", c.ny)
     rb, none = c.rb, ca.SX(0, 1)
@@ -248,51 +254,53 @@ def builders(
     freezes: int = 0,
     first: bool = False,
     second: str = "",
-    chosen: Joints = (),
-    rubs: bool = False,
+    gain_groups: JointGroups = (),
+    friction: bool = False,
 ) -> dict[str, Callable[[], BlockExpression]]:
-    """Block's name -> a function that builds its expression; ``instant``: for an impact without duration;
-    ``frozen``: the terms of a model with frozen dynamics, and its freezes on the way; ``first``: whether the
-    first instant of contact is looked at; ``second``: another striker; ``chosen``: joints whose gains have a
-    factor each; ``rubs``: whether striking points have friction.
+    """Functions that build the expressions of the blocks, by name.
 
-    That is slow: it is only called when the compiled library is not in the cache.
+    They take seconds, and are called only if the compiled library is not in the cache.
+
+    edges : of the support polygon.  instant : for an impact without duration.
+    frozen, freezes : terms of a model with frozen dynamics, and its number of freezes during contact.
+    first : with the first instant of contact.  second : another striker.
+    gain_groups : joints that share a gain factor.  friction : striking points have friction.
     """
-    hit: dict[str, Callable[[], BlockExpression]] = {
-        "collision": lambda: collision(c, striker, frozen, second, chosen, rubs),
+    lasting: dict[str, Callable[[], BlockExpression]] = {
+        "collision": lambda: collision(c, striker, frozen, second, gain_groups, friction),
         "force": lambda: force(c, striker, law, target, frozen, second),
     }
     if c.legs:
-        hit["coasting"] = lambda: coasting(c, frozen)
+        lasting["coasting"] = lambda: coasting(c, frozen)
     if c.legs and frozen is not None and not frozen.bias:
-        hit["carried"] = lambda: carried(c)
+        lasting["carried"] = lambda: carried(c)
     if frozen is not None:
-        hit["moved"] = lambda: moved(c, striker)
+        lasting["moved"] = lambda: moved(c, striker)
     if frozen is not None and frozen.jdot and not freezes:
-        hit["impact"] = lambda: impact(c, striker)
+        lasting["impact"] = lambda: impact(c, striker)
     if target.guards:
-        hit["join"] = join
+        lasting["join"] = join
     if second:
-        hit["second_contact"] = lambda: contact(c, second)
-        hit["second_approach"] = lambda: approach(c, second)
+        lasting["second_contact"] = lambda: contact(c, second)
+        lasting["second_approach"] = lambda: approach(c, second)
     if first:
-        hit["first"] = lambda: first_instant(c, striker, law, rubs)
+        lasting["first"] = lambda: first_instant(c, striker, law, friction)
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),
         "approach": lambda: approach(c, striker),
-        **({"impact": lambda: impact(c, striker)} if instant else hit),
+        **({"impact": lambda: impact(c, striker)} if instant else lasting),
         "link": link,
         **({"balance": lambda: balance(c, edges)} if c.legs else {}),
         **({"momentum": lambda: momentum(c)} if c.drifts else {}),
-        **({"spring": lambda: spring(c, chosen)} if c.robot.sprung.any() else {}),
+        **({"spring": lambda: spring(c, gain_groups)} if c.robot.sprung.any() else {}),
     }
 
 
 def stance_blocks(
     problem: ImpactProblem,
 ) -> dict[str, tuple[StanceCoordinates, Callable[[], BlockExpression]]]:
-    """Blocks of a problem's stance phases: their coordinates, and what builds them."""
+    """Coordinates and build function of each block of a problem's stance phases, by name."""
     out: dict[str, tuple[StanceCoordinates, Callable[[], BlockExpression]]] = {}
     for k, c in enumerate(problem.stance_coordinates if problem.stances else ()):
         out["pace"] = problem.coordinates, pace
@@ -307,7 +315,10 @@ def stance_blocks(
 
 @dataclass(frozen=True)
 class ExtraBlock:
-    """``key``: what shapes the block beside robot, stance and striker; ``build`` makes its expression."""
+    """Block of a term or an objective.
+
+    key : all that shapes the expression beside robot, stance and striker.  build : makes the expression.
+    """
 
     key: tuple[Any, ...]
     build: Callable[[], BlockExpression]
@@ -316,7 +327,7 @@ class ExtraBlock:
 def own_blocks(
     problem: ImpactProblem, c: StanceCoordinates, edges: int = 0
 ) -> dict[str, Callable[[], BlockExpression]]:
-    """Name -> what builds it, of all that a problem's program has in any case; ``edges`` : of its polygon."""
+    """Functions that build the blocks which every program of this problem has (`builders`)."""
     return builders(
         c,
         problem.striker,
@@ -328,28 +339,29 @@ def own_blocks(
         freezes=problem.freezes,
         first=problem.first_instant,
         second="" if problem.second is None else problem.second.striker,
-        chosen=problem.gain_joints,
-        rubs=problem.friction is not None,
+        gain_groups=problem.gain_joints,
+        friction=problem.friction is not None,
     )
 
 
 def extra_blocks(
     problem: ImpactProblem, c: StanceCoordinates, elements: Elements = ()
 ) -> dict[str, ExtraBlock]:
-    """Block's name -> the block, of what the problem's objectives and terms ask for.
+    """Blocks of the problem's objectives and terms, by name.
 
-    elements : of the contact, if not those that the problem asks for.
+    elements : of the contact; (): the problem's.
 
     Raises
     ------
-    InputError : a name that is taken or none for a function, something else than a block.
+    InputError : a name that is taken, or is no function's name; something other than a block.
     """
     taken = {*own_blocks(problem, c)}
     out: dict[str, ExtraBlock] = {}
-    things: list[Term | Objective] = [*problem.objectives, *problem.active_terms]
-    for thing in sorted(things, key=lambda t: not type(t).__module__.startswith("impactopt.")):
-        where = f"{type(thing).__name__}.blocks"
-        for name, block in thing.blocks(problem, c).items():
+    sources: list[Term | Objective] = [*problem.objectives, *problem.active_terms]
+    # the package's first, so that a name that is taken is reported of the user's class
+    for source in sorted(sources, key=lambda s: not type(s).__module__.startswith("impactopt.")):
+        where = f"{type(source).__name__}.blocks"
+        for name, block in source.blocks(problem, c).items():
             if not isinstance(block, (BlockExpression, BlockRecipe)):
                 raise InputError(
                     f"{where}: {name!r} is {block!r}; give what impactopt.problem.block.make_block makes"
@@ -372,7 +384,7 @@ def _extra(block: BlockExpression | BlockRecipe, problem: ImpactProblem, element
 
 
 def key_of(block: BlockExpression) -> tuple[Any, ...]:
-    """Hash of a block's expression, which identifies it, as a user's own block has no name."""
+    """Hash of a block's expression: the cache key of a user's block, whose source is not hashed."""
     stages = [stage.symbols for stage in block.through], [stage.expression for stage in block.through]
     graph = ca.Function("block", [block.z, block.p, *stages[0]], [block.out, *stages[1]])
     return hashlib.sha256(graph.serialize().encode()).hexdigest(), block.lanes

@@ -1,4 +1,4 @@
-"""Builder that the parts of a program share: variables, blocks and constraints, and the common limits."""
+"""Nonlinear program (NLP) under construction: variables, blocks, constraints and limits, for all parts."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from impactopt.transcription.layout import Array, Group, Index, Layout, Limits, 
 
 
 class Builder:
-    """The program under construction: all that a part of it gets to see, beside what other parts hand it.
+    """Program under construction: a part of the program adds its variables, blocks and constraints here.
 
     Attributes
     ----------
-    problem, coordinates, robot, limits : what is asked for.
-    functions : the compiled blocks by name.
-    ny, nl, nw : number of coordinates, of legs' joints, of sole wrenches' components.
-    y0 (ny,), legs0 (nl,) : the stance's posture, which is the start's where no sole has stepped.
-    layout, rows, blocks : variables, constraints and functions so far.
-    lifted : variables of :meth:`lift`, with the numbers of the outputs that they equal.
-    followers : what :meth:`follow` was given.
+    problem, coordinates, robot, limits : of the program.
+    functions : compiled blocks by name.
+    ny, nl, nw : number of coordinates, of the constrained legs' joints, of sole wrenches' components.
+    y0 (ny,), legs0 (nl,) : posture of the stance; the start posture if no sole has stepped.
+    layout, rows, blocks : variables, constraints and blocks so far.
+    lifted : variables of :meth:`lift`, with the indices of the outputs that they equal.
+    followers : functions that :meth:`follow` has been given.
     """
 
     def __init__(
@@ -44,13 +44,16 @@ class Builder:
         self.followers: list[Callable[[Builder], None]] = []
 
     def copy(self) -> Builder:
-        """The same program so far, to which other blocks and constraints can be added; no variables."""
+        """Copy to which other blocks and constraints can be added, but no variables."""
         other = copy.copy(self)
         other.blocks, other.rows = [block.copy() for block in self.blocks], self.rows.copy()
         return other
 
     def standing(self, coordinates: StanceCoordinates, node: str) -> Builder:
-        """The same program, to which a phase on other soles can be added; ``node``: its block's name."""
+        """The same program, to add a phase on other soles.
+
+        coordinates : of that stance phase.  node : name of its block ``node``.
+        """
         other = copy.copy(self)
         other.coordinates, other.limits = coordinates, Limits(self.problem, coordinates)
         other.ny, other.nl, other.nw = coordinates.ny, coordinates.nl, 6 * len(coordinates.legs)
@@ -61,24 +64,26 @@ class Builder:
         return other
 
     def follow(self, take: Callable[[Builder], None]) -> None:
-        """Have numbers follow the problem: ``take`` writes them to the blocks, constraints or bounds of a
-        builder, this one or a copy, that has another problem.
+        """Register a function that updates parameters and bounds when the problem changes.
+
+        take : writes them to the blocks, constraints and variables of a builder, this one or a copy, from its
+            ``problem``.
         """
         self.followers.append(take)
 
     def duration(self, name: str, bounds: tuple[float, float], scale: float) -> Group:
-        """A variable: how long [s] something lasts."""
+        """Add a duration [s] as a variable."""
         return self.layout.add(name, 1, 1, lower=bounds[0], upper=bounds[1], scale=scale, labels=["T"])
 
     def block(self, name: str) -> Block:
-        """The first block of a name."""
+        """First block of this name."""
         return next(block for block in self.blocks if block.name == name)
 
     def add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
-        """Append a block; the index of its first output.
+        """Add a block; returns the index of its first output.
 
-        instances : of each, the slots that make up z, in its order.  parameters : p (n_p,) of all, or
-            (count, n_p).
+        instances : of each, the affine expressions ("slots") that make up z, in order.
+        parameters : p (n_p,) of all instances, or (count, n_p).
         """
         if name not in self.functions:
             raise InputError(
@@ -88,7 +93,7 @@ class Builder:
         return self.append(Block.make(name, self.functions, instances, parameters))
 
     def append(self, block: Block) -> int:
-        """Append a block that is made; the index of its first output."""
+        """Add a block that is made already; returns the index of its first output."""
         at = sum(b.count * b.n_out for b in self.blocks)
         self.blocks.append(block)
         return at
@@ -106,10 +111,9 @@ class Builder:
         lower: ArrayLike = -np.inf,
         upper: ArrayLike = np.inf,
     ) -> Group:
-        """One vector of variables that equals outputs of blocks, so that constraints and objective can take
-        it.
+        """Add variables that equal outputs of blocks, for use in several constraints or the objective.
 
-        term, place, measure : of the constraints that say so; the term is the variables' name if not given.
+        term, place, measure : of the constraints that equate them; the default term is ``name``.
         scale, lower, upper : of the variables.
         """
         size = len(outputs)
@@ -136,7 +140,7 @@ class Builder:
         outputs: Any,
         measure: Measure | Sequence[Measure] | None = None,
     ) -> None:
-        """Rows: outputs of blocks are zero."""
+        """Constrain outputs of blocks to zero."""
         self.rows.add(
             term=term,
             place=place,
@@ -148,7 +152,7 @@ class Builder:
         )
 
     def parts(self, block: str) -> dict[str, Any]:
-        """Indices of the named slices of a block's output."""
+        """Indices of the named slices of a block's output, within an instance."""
         frozen = self.problem.frozen is not None
         second = self.problem.second is not None
         size = symbolic.sizes(self.coordinates, self.problem.target, block, frozen=frozen, second=second)

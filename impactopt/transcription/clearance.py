@@ -1,7 +1,8 @@
-"""Clearance constraints between bodies: one for a pair of convex pieces at a place, their smooth distance.
+"""Clearance constraints between bodies: the smooth distance of a pair of convex pieces at a node.
 
-The distance is `impactopt.bodies.separation`'s; here is what it is a function of. Between two links that is a
-chain of turns about z axes with fixed placements between, which are its parameters.
+`impactopt.bodies.separation` has the distance as a function of the joints between the two bodies: a kinematic
+chain of rotations about z axes, or translations along them. The fixed placements between the joints are
+parameters. This module finds the chains, and adds blocks and constraints to a program.
 """
 
 from __future__ import annotations
@@ -31,43 +32,45 @@ TOO_NEAR = millimetres("too near")
 
 @dataclass(frozen=True)
 class Chain:
-    """Kinematic chain between the frames of two bodies, joint by joint.
+    """Kinematic chain of n joints from the frame of one body to that of another.
 
-    columns (n,) : the joints' places among base coordinates and joints (nv), with their ``ratios``:
-    -1 on the way to the root, else 1, times a follower's to its leader.
-    turns (n,) : 1 for a joint that turns, 0 for one that slides.  places : n + 1 placements between them
-    (pin.SE3).
-    base : whether the base's position comes before all that.
+    columns : index of each joint among base coordinates and joints (nv).
+    ratios : factor on each joint's coordinate: -1 towards the root, else 1, times a follower's ratio to its
+        leader.
+    revolute : 1 for a revolute joint, 0 for a prismatic one.
+    placements : n + 1 placements (pin.SE3) before, between and after the joints.
+    base : the position of the floating base comes before all joints.
     """
 
     columns: tuple[int, ...]
     ratios: tuple[float, ...]
-    turns: tuple[float, ...]
-    places: tuple[Any, ...]
+    revolute: tuple[float, ...]
+    placements: tuple[Any, ...]
     base: bool = False
 
-    def numbers(self, before: Any = None) -> Array:
-        """The chain's part of a constraint's parameters; ``before``: a placement in front (pin.SE3)."""
+    def parameters(self, before: Any = None) -> Array:
+        """Parameters of the chain in a constraint.  before : a placement (pin.SE3) in front of the chain."""
         if before is None:
-            return self._numbers
-        out = self._numbers.copy()
-        out[:12] = _placement(before * self.places[0])
+            return self._parameters
+        out = self._parameters.copy()
+        out[:12] = _placement(before * self.placements[0])
         return out
 
     @cached_property
-    def _numbers(self) -> Array:
-        """Thousands of constraints have the same."""
-        return np.concatenate([*map(_placement, self.places), self.turns])
+    def _parameters(self) -> Array:
+        # cached, as thousands of constraints have the same
+        return np.concatenate([*map(_placement, self.placements), self.revolute])
 
     def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Index, Index, Array]:
-        """z of a constraint's function, sums of coordinates: slots, coordinates (y, then legs) and factors,
-        (k,) each.
+        """z of a constraint as sums of coordinates: indices in z, indices in (y, legs), factors, (k,) each.
 
-        rotation : axes, as columns, of the box that the chain ends at.
+        z = position of the base (3) in the axes of the other body; coordinates of the joints (n,).
+
+        rotation : axes, as columns, of the world's body that the chain ends at.
         """
-        where = _places(c)
+        index = _coordinate_indices(c)
         slots = [3 + k for k in range(len(self.columns))]
-        coordinates, factors = [where[k] for k in self.columns], list(self.ratios)
+        coordinates, factors = [index[k] for k in self.columns], list(self.ratios)
         if self.base and rotation is not None:
             for i in range(3):
                 slots += [i] * 3
@@ -77,12 +80,12 @@ class Chain:
 
 
 def _placement(m: Any) -> Array:
-    """Rotation by rows, and translation [m] (12)."""
+    """Rotation matrix, row by row, and translation [m]: (12,)."""
     return np.concatenate([np.asarray(m.rotation).ravel(), m.translation])
 
 
-def _places(c: StanceCoordinates) -> list[int]:
-    """Index of each base coordinate and joint (nv) in y followed by legs."""
+def _coordinate_indices(c: StanceCoordinates) -> list[int]:
+    """Index of each base coordinate and joint (nv) in (y, legs)."""
     out = [*range(c.base)] + [0] * c.robot.n
     for k, j in enumerate(c.independent):
         out[c.base + int(j)] = c.base + k
@@ -92,47 +95,44 @@ def _places(c: StanceCoordinates) -> list[int]:
 
 
 def chain_between(model: Any, one: int, other: int) -> Chain:
-    """Chain between the frames of joints ``one`` and ``other``; 0: the world."""
+    """Chain from the frame of joint ``other`` to that of ``one``; 0: the world."""
     up_one, up_other = list(model.supports[one]), list(model.supports[other])
-    shared = max(j for j in up_one if j in up_other)
+    shared = max(j for j in up_one if j in up_other)  # lowest common ancestor
     if other == 0:
         shared = 0
-    place, columns, ratios, turns, places = pin.SE3.Identity(), [], [], [], []
-    base = False
+    # The chain goes up from the other body to the common ancestor, and down to the one. `place` collects the
+    # fixed placements until the next joint.
+    place, placements, base = pin.SE3.Identity(), [], False
+    joints: list[tuple[int, float, float]] = []  # column, ratio, 1 if it is revolute
     for j in reversed([j for j in up_other if j > shared]):
         joint = axis_of(model, j)
         axis, revolute = _axis_to_z(joint)
-        places.append(place * axis)
-        columns.append(int(model.joints[j].idx_v))
-        ratios.append(-joint.ratio)
-        turns.append(revolute)
+        placements.append(place * axis)
+        joints.append((int(model.joints[j].idx_v), -joint.ratio, revolute))
         place = axis.inverse() * joint.placement.inverse()
     for j in [j for j in up_one if j > shared]:
-        if model.joints[j].nv == 6:  # position, and angles about z, y and x in turn
+        if model.joints[j].nv == 6:  # floating base: position, and yaw, pitch, roll in turn
             base, place = True, place * model.jointPlacements[j]
             for column, direction in ((5, [0, 0, 1]), (4, [0, 1, 0]), (3, [1, 0, 0])):
                 axis = _turned(np.array(direction, dtype=float))
-                places.append(place * axis)
-                columns.append(column)
-                ratios.append(1.0)
-                turns.append(1.0)
+                placements.append(place * axis)
+                joints.append((column, 1.0, 1.0))
                 place = axis.inverse()
             continue
         joint = axis_of(model, j)
         axis, revolute = _axis_to_z(joint)
-        places.append(place * joint.placement * axis)
-        columns.append(int(model.joints[j].idx_v))
-        ratios.append(joint.ratio)
-        turns.append(revolute)
+        placements.append(place * joint.placement * axis)
+        joints.append((int(model.joints[j].idx_v), joint.ratio, revolute))
         place = axis.inverse()
-    return Chain(tuple(columns), tuple(ratios), tuple(turns), (*places, place), base)
+    columns, ratios, revolutes = zip(*joints, strict=True) if joints else ((), (), ())
+    return Chain(columns, ratios, revolutes, (*placements, place), base)
 
 
 _chains: WeakKeyDictionary[Robot, dict[tuple[int, int], Chain]] = WeakKeyDictionary()
 
 
 def _chain(robot: Robot, one: int, other: int) -> Chain:
-    """`chain_between`, found once for a robot: hundreds of pairs have one, in every program anew."""
+    """`chain_between`, cached for each robot: hundreds of pairs in every program have the same."""
     known = _chains.setdefault(robot, {})
     if (one, other) not in known:
         known[one, other] = chain_between(robot.model, one, other)
@@ -140,13 +140,13 @@ def _chain(robot: Robot, one: int, other: int) -> Chain:
 
 
 def _axis_to_z(joint: Axis) -> tuple[Any, float]:
-    """Placement whose z axis is the joint's, and whether it turns."""
+    """Placement whose z axis is the joint's axis; 1 for a revolute joint, else 0."""
     revolute = bool(np.any(joint.subspace[3:]))
     return _turned(joint.subspace[3:] if revolute else joint.subspace[:3]), float(revolute)
 
 
 def _turned(direction: Array) -> Any:
-    """A placement at the origin whose z axis has this direction."""
+    """Placement at the origin whose z axis has this direction."""
     up = np.array([0.0, 0.0, 1.0])
     if np.abs(direction + up).max() < 1e-8:
         return pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
@@ -157,16 +157,19 @@ def _turned(direction: Array) -> Any:
 
 
 class SeparationPart:
-    """Values (``what`` = 0), gradients (1) or Hessians (2) of a block, as `BatchedFunction`."""
+    """Values, gradients or Hessians of a block of separations, with the interface of `BatchedFunction`.
 
-    def __init__(self, of: Separations, what: int, width: int) -> None:
-        self._of, self._what, self._width = of, what, width
+    order : of the derivative: 0, 1 or 2.  width : numbers of an instance.
+    """
+
+    def __init__(self, of: Separations, order: int, width: int) -> None:
+        self._of, self._order, self._width = of, order, width
         self.inputs = [np.zeros(0), of.numbers]
         self.write_to(np.zeros(self.size))
 
     @property
     def size(self) -> int:
-        """Numbers that a call writes."""
+        """Length of the array that a call writes."""
         return self._of.count * self._width
 
     def write_to(self, numbers: Array) -> None:
@@ -174,25 +177,25 @@ class SeparationPart:
         self.output = numbers.reshape(self._of.count, self._width)
 
     def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
-        """Rows are instances: z (count, n_z) -> (count, numbers of each), overwritten by the next call."""
-        self._of.write(self._what, z, self.output, multipliers)
+        """Result (count, width) for z (count, n_z), which the next call overwrites."""
+        self._of.write(self._order, z, self.output, multipliers)
         return self.output
 
 
 @dataclass
 class SeparationBlock(Block):
-    """Distances of pairs of pieces, with derivatives by `Separations`."""
+    """Block of distances of pairs of convex pieces, with derivatives by `Separations`."""
 
     of: Separations
 
     @classmethod
     def of_separations(cls, name: str, of: Separations, lift: Affine) -> SeparationBlock:
-        """Block of separations with the z of all instances as one expression."""
+        """Block of separations with z of all instances as one expression."""
         size = of.joints + 3
         everything = np.arange(size)
-        columns, rows = np.triu_indices(size)  # of a lower triangle, column by column
+        columns, rows = np.triu_indices(size)  # lower triangle, column by column
         parts: list[Any] = [
-            SeparationPart(of, what, width) for what, width in enumerate((1, size, len(rows)))
+            SeparationPart(of, order, width) for order, width in enumerate((1, size, len(rows)))
         ]
         return cls(
             name=name,
@@ -220,11 +223,13 @@ class SeparationBlock(Block):
 # ---- constraints
 
 
-class ApartRow(NamedTuple):
-    """Key of a clearance constraint: node and pair of convex pieces.
+class ClearanceKey(NamedTuple):
+    """Key of a clearance constraint: a node and a pair of convex pieces.
 
-    place : of the program.  joint : of the link.  other : joint of the other link; or -1 - the index of a
-    body of the world.  number : of the two pieces among those of these two bodies.
+    place : name of the node.
+    joint : of the link.
+    other : joint of the other link, or -1 - index of a body of the world.
+    number : index of the pair of pieces among those of the two bodies.
     """
 
     place: str
@@ -233,11 +238,13 @@ class ApartRow(NamedTuple):
     number: int = 0
 
 
-class Held(NamedTuple):
-    """Separating direction and distance of a clearance constraint.
+class SeparatingDirection(NamedTuple):
+    """Direction and least distance of a clearance constraint.
 
-    way (3) : direction from the other to the one in the other's frame, near which they are apart.
-    reach [m] : how far.  travel [m] : of the target, if the other moves with it.
+    way (3) : unit vector from the other body to the link, in the other's frame. The maximization of the
+        separation starts there.
+    reach : least distance [m].
+    travel : of the target [m], if the other body moves with it.
     """
 
     way: tuple[float, ...]
@@ -245,46 +252,50 @@ class Held(NamedTuple):
     travel: float = 0.0
 
 
-def add_apart_rows(
-    b: Builder, spots: Sequence[tuple[Place, list[Affine]]], rows: Mapping[ApartRow, Held]
-) -> list[ApartRow]:
-    """Blocks and constraints for these, and their names in the order of the program's constraints.
+def add_clearance_constraints(
+    b: Builder,
+    spots: Sequence[tuple[Place, list[Affine]]],
+    constraints: Mapping[ClearanceKey, SeparatingDirection],
+) -> list[ClearanceKey]:
+    """Add blocks and constraints; returns the keys in the order of the program's constraints.
 
-    spots : places of a program, with coordinates and legs.
+    spots : nodes of the program, with coordinates and legs.
     """
-    if not rows:
+    if not constraints:
         return []
     bodies, shapes = b.problem.bodies, b.problem.bodies.shapes
     spot_of = {place.name: k for k, (place, _) in enumerate(spots)}
     width = b.ny + b.nl
     everywhere = stack([part for _, slots in spots for part in slots])
     coordinates, constants = everywhere.matrix(b.layout.n), everywhere.const
-    known: dict[tuple[int, int], _Known] = {}
-    groups: dict[int, _Group] = {}
-    for row, held in rows.items():
-        body = bodies.world[-1 - row.other] if row.other < 0 else None
-        pair = row.joint, row.other
+    known: dict[tuple[int, int], _BodyPair] = {}
+    groups: dict[int, _Group] = {}  # by number of joints: a block has one
+    for key, direction in constraints.items():
+        body = bodies.world[-1 - key.other] if key.other < 0 else None
+        pair = key.joint, key.other
         if pair not in known:
-            chain = _chain(b.robot, row.joint, max(row.other, 0))
+            chain = _chain(b.robot, key.joint, max(key.other, 0))
             pattern = chain.pattern(b.coordinates, None if body is None else body.rotation)
-            known[pair] = _Known(chain, pattern, " and ".join(bodies.names(pair)))
+            known[pair] = _BodyPair(chain, pattern, " and ".join(bodies.names(pair)))
         chain, pattern, name = known[pair]
         before = None
         if body is not None:
-            shift = held.travel * bodies.normal * body.moves
-            before = pin.SE3(body.rotation, body.place + shift).inverse()
-        n = shapes.index[row.joint, row.other, row.number]
+            shift = direction.travel * bodies.normal * body.moves
+            before = pin.SE3(body.rotation, body.place + shift).inverse()  # distances are in the body's frame
+        n = shapes.index[key.joint, key.other, key.number]
         group = groups.setdefault(len(chain.columns), _Group())
-        group.names.append(row)
+        group.keys.append(key)
         group.pairs.append(n)
-        group.ways.append(held.way)
+        group.ways.append(direction.way)
         group.patterns.append(pattern)
-        group.spots.append(spot_of[row.place])
-        group.numbers.append(np.append(chain.numbers(before), held.reach + shapes.radius[n]))
-        term = (SelfCollision if row.other >= 0 else KeepOut).name
-        # pieces of the same two bodies have names of their own, as multipliers go by them
-        piece = f"{name} {row.number + 1}" if row.number else name
-        group.origins.append(Row(term, spots[spot_of[row.place]][0], piece, TOO_NEAR, whole=name))
+        group.spots.append(spot_of[key.place])
+        # capsules and spheres are their axes and centres, at a distance that is larger by their radius
+        group.parameters.append(np.append(chain.parameters(before), direction.reach + shapes.radius[n]))
+        term = (SelfCollision if key.other >= 0 else KeepOut).name
+        # each pair of pieces of two bodies has a name of its own, by which multipliers are mapped
+        piece = f"{name} {key.number + 1}" if key.number else name
+        group.origins.append(Row(term, spots[spot_of[key.place]][0], piece, TOO_NEAR, whole=name))
+    # z is a selection of the coordinates at all nodes, which are affine in the variables
     for length, group in groups.items():
         size, count = length + 3, len(group.pairs)
         counts = [len(slots) for slots, _, _ in group.patterns]
@@ -293,16 +304,24 @@ def add_apart_rows(
         at = np.repeat(group.spots, counts) * width + columns
         chosen = sp.csr_array((factors, (instance * size + slots, at)), shape=(count * size, len(constants)))
         of = Separations(
-            shapes, length, np.array(group.pairs), np.array(group.numbers), np.array(group.ways, dtype=float)
+            shapes,
+            length,
+            np.array(group.pairs),
+            np.array(group.parameters),
+            np.array(group.ways, dtype=float),
         )
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
         first = b.append(SeparationBlock.of_separations(f"apart{length}", of, lift))
         b.rows.add_each(group.origins, outputs=first + np.arange(count), lower=0.0)
-    return [name for group in groups.values() for name in group.names]
+    return [key for group in groups.values() for key in group.keys]
 
 
 def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_array:
-    """A matrix (n, n) with room, as zeros, for what the coordinates and legs of any place couple."""
+    """Matrix (n, n) with explicit zeros wherever clearance constraints may couple variables.
+
+    They couple the variables of the coordinates and legs at each node of ``spots``. So the structure of the
+    Hessian does not depend on which constraints there are.
+    """
     own = sp.coo_array(matrix)
     rows, columns, values = [own.coords[0]], [own.coords[1]], [own.data]
     for _, slots in spots:
@@ -314,25 +333,28 @@ def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_
     return sp.csc_array(sp.coo_array((np.concatenate(values), at), shape=matrix.shape))
 
 
-def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[ApartRow, Held]) -> None:
-    """Blocks of these constraints with the world's bodies where this problem has them; none is turned."""
+def move_bodies(
+    problem: ImpactProblem,
+    blocks: Sequence[Block],
+    constraints: Mapping[ClearanceKey, SeparatingDirection],
+) -> None:
+    """Update the blocks of these constraints to a problem that has moved, but not rotated, bodies."""
     of_name = {block.name: block for block in blocks}
-    numbers = {name: block.parameters.copy() for name, block in of_name.items()}
-    seen = dict.fromkeys(of_name, 0)
-    for row, held in rows.items():
-        chain = _chain(problem.robot, row.joint, max(row.other, 0))
+    parameters = {name: block.parameters.copy() for name, block in of_name.items()}
+    instance = dict.fromkeys(of_name, 0)
+    for key, direction in constraints.items():
+        chain = _chain(problem.robot, key.joint, max(key.other, 0))
         name = f"apart{len(chain.columns)}"
-        if row.other < 0:
-            placed = chain.places[0]
-            body, normal = problem.bodies.world[-1 - row.other], problem.bodies.normal
-            at = pin.SE3(body.rotation, body.place + held.travel * normal * body.moves)
-            numbers[name][seen[name], :12] = _placement(at.inverse() * placed)
-        seen[name] += 1
+        if key.other < 0:
+            body, normal = problem.bodies.world[-1 - key.other], problem.bodies.normal
+            at = pin.SE3(body.rotation, body.place + direction.travel * normal * body.moves)
+            parameters[name][instance[name], :12] = _placement(at.inverse() * chain.placements[0])
+        instance[name] += 1
     for name, block in of_name.items():
-        block.take_parameters(numbers[name])
+        block.take_parameters(parameters[name])
 
 
-class _Known(NamedTuple):
+class _BodyPair(NamedTuple):
     """Data that all constraints of a pair of bodies share."""
 
     chain: Chain
@@ -342,14 +364,15 @@ class _Known(NamedTuple):
 
 @dataclass(frozen=True)
 class _Group:
-    """Constraints whose chains have as many joints, with how z comes from the coordinates at each one's
-    spot.
+    """Constraints whose chains have the same number of joints, with lists of one entry a constraint.
+
+    pairs : index in `Shapes`.  patterns : `Chain.pattern`.  spots : index of the node.
     """
 
-    names: list[ApartRow] = field(default_factory=list)
+    keys: list[ClearanceKey] = field(default_factory=list)
     pairs: list[int] = field(default_factory=list)
     ways: list[tuple[float, ...]] = field(default_factory=list)
     origins: list[Row] = field(default_factory=list)
     patterns: list[tuple[Index, Index, Array]] = field(default_factory=list)
     spots: list[int] = field(default_factory=list)
-    numbers: list[Array] = field(default_factory=list)
+    parameters: list[Array] = field(default_factory=list)

@@ -1,8 +1,8 @@
 """Collocated contact phases: Radau IIA collocation of the whole equation of motion, and the impact's onset.
 
-Compression and restitution, each of which is smooth, or the phases of a target with events. One contact for
-the expected target, one for each scenario. They share the state at contact, the
-feed-forward and the servo; durations, motion, force and wrenches are each one's own.
+The phases are compression and restitution, each of which is smooth, or those of a target with events. There
+is one collision with the expected target, and one for each scenario. They share the state at contact, the
+feed-forward and the servo. Each has its own durations, motion, force and wrenches.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, FORCE_SCALE, typical_state
-from impactopt.transcription.contact_guess import blow, coasted, effective_mass
+from impactopt.transcription.contact_guess import coasted, effective_mass, guessed_contact
 from impactopt.transcription.contact_state import (
     Contact,
     ContactEnd,
-    ContactNumbers,
+    ContactParameters,
     DrivePoint,
+    joint_motion_slots,
     pulls_apart,
-    still,
     switches,
 )
 from impactopt.transcription.layout import (
@@ -52,13 +52,17 @@ from impactopt.transcription.mesh import CollocationPoint
 from impactopt.transcription.motion_phase import add_cone_rows
 from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
 
-TYPICAL = 100.0  # [rad/s^2]
+ACCELERATION_SCALE = 100.0  # [rad/s^2] of the jump
 
 
 class FirstInstant:
-    """Variables and constraints of it.
+    """Variables and constraints of the first instant of contact, at which accelerations jump.
 
-    law : numbers of the contact law.  suffix : of the names of its place and variables.
+    A damped contact law has a force as soon as bodies touch. Terms about gears and motors need the
+    accelerations there; collocation points begin later.
+
+    law : parameters of the contact law, by name.
+    suffix : appended to the names of the place and of the variables.
     """
 
     def __init__(self, b: Builder, contact: Contact, law: dict[str, float], suffix: str) -> None:
@@ -68,7 +72,7 @@ class FirstInstant:
         def add(name: str, size: int, **options: Any) -> Group:
             return b.layout.add(name + suffix, 1, size, **options)
 
-        self.change = add("jump of acceleration", b.ny, scale=TYPICAL, labels=b.coordinates.labels)
+        self.change = add("jump of acceleration", b.ny, scale=ACCELERATION_SCALE, labels=b.coordinates.labels)
         of_wrenches = {name: b.limits.of_wrenches[name] for name in ("scale", "labels")}
         self.w = add("jump of sole wrench", b.nw, **of_wrenches)
         self.f = add("first force", 1, scale=FORCE_SCALE)
@@ -79,87 +83,107 @@ class FirstInstant:
         slots = [state.y, state.legs, self.contact.u0[0], self.change[0], self.w[0], self.f[0]]
         law, robot = np.array([*self.law.values()]), b.robot
         before = np.array([float(b.problem.target.speed_before())])
-        numbers = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
-        return slots, np.concatenate([*numbers, friction_numbers(b.problem)])
+        parameters = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
+        return slots, np.concatenate([*parameters, friction_parameters(b.problem)])
 
     def add_rows(self, at: int) -> None:
-        """``at``: number of the first output of its instance."""
+        """Add the constraints.  at : index of the first output of this instance of the block ``first``."""
         b, part = self._b, self._b.parts("first")
-        term, share = "jump of acceleration", percent("of the joint's limit off")
+        term, of_limit = "jump of acceleration", percent("of the joint's limit off")
         b.equal(term, self.place, DIRECTIONS[: b.coordinates.base], at + part["base"], b.limits.unbalanced)
-        b.equal(term, self.place, b.robot.joint_names, at + part["joints"], share)
+        b.equal(term, self.place, b.robot.joint_names, at + part["joints"], of_limit)
         b.equal("contact law", self.place, ["force"], at + part["law"], Measure("N", FORCE_SCALE, "off"))
         self._rotors = at + part["rotors"]
 
     @property
     def rotors(self) -> Index:
-        """Numbers of the outputs that are the rotors' part of the gears' load, once constraints are there."""
+        """Indices of the outputs (n,) that are the rotors' part of the gears' load.
+
+        They are known after :meth:`add_rows`.
+        """
         return np.asarray(self._rotors)
 
     def determined(self) -> list[Determined]:
-        """All of it, as of one element."""
+        """All variables: their constraints determine them together, as those of a collocation element."""
         groups = (self.change, self.w, self.f)
         return [determined(Turn.ELEMENT, np.concatenate([g.index(0) for g in groups]))]
 
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """Write what it is for coordinates and rates (ny,) and legs (nl,) at contact."""
+        """Write the initial guess for coordinates and rates (ny,) and legs (nl,) at contact to x (n,)."""
         b, law = self._b, type(self._b.problem.law)(**self.law)
-        force, change, w, _ = jump(b.problem, b.coordinates, law, y, rates, legs)
+        force, change, w, _ = jump_at_contact(b.problem, b.coordinates, law, y, rates, legs)
         self.f.write(x, force)
         self.change.write(x, change)
         self.w.write(x, w)
 
 
-def friction_numbers(problem: ImpactProblem) -> Array:
-    """Parameters of the striking points' friction (2,); (0,) where there is none."""
+def friction_parameters(problem: ImpactProblem) -> Array:
+    """Parameters of the striking points' friction (2,); (0,) without friction."""
     return np.array(() if problem.friction is None else problem.friction.parameters, dtype=float)
 
 
-def jump(
+def jump_at_contact(
     problem: ImpactProblem, c: StanceCoordinates, law: ContactLaw, y: Array, rates: Array, legs: Array
 ) -> tuple[float, Array, Array, Array]:
-    """First force [N] of all strikers; by how much it changes yddot (ny,) and the sole wrenches (6 a sole);
-    and the joints' accelerations (n,) then, of a robot that has coasted until then.
+    """First contact force and the changes that it causes, of a robot that coasts until contact.
+
+    Returns
+    -------
+    Sum of the strikers' forces [N]; changes of yddot (ny,) and of the sole wrenches (6 a sole);
+    accelerations (n,) of the joints just after contact.
     """
     model = problem.robot.model
     q, v, a = c.complete_motion(y, rates, np.zeros(c.ny), legs)
     data: Any = model.createData()
-    inertia = mass_matrix(model, data, q)
-    soles = c.sole_jacobians(q)[0] if c.legs else np.zeros((0, model.nv))
-    hands = [model.getFrameId(problem.robot.striker(name).model_frame) for name in problem.strikers]
+    H = mass_matrix(model, data, q)
+    J_c = c.sole_jacobians(q)[0] if c.legs else np.zeros((0, model.nv))
+    frames = [model.getFrameId(problem.robot.striker(name).model_frame) for name in problem.strikers]
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)
     axes = pin.LOCAL_WORLD_ALIGNED
-    found = [np.reshape(pin.getFrameJacobian(model, data, hand, axes), (6, model.nv))[:3] for hand in hands]
-    rows = np.array([problem.normal @ jacobian for jacobian in found])
-    pushes = rows
+    jacobians = [np.reshape(pin.getFrameJacobian(model, data, k, axes), (6, model.nv))[:3] for k in frames]
+    normals = np.array([problem.normal @ jacobian for jacobian in jacobians])  # (strikers, nv)
+    pushes = normals  # generalized force of a unit normal force, with its friction
     if problem.friction is not None:
-        pushes = np.array([problem.friction.way(problem.normal, each @ v) @ each for each in found])
-    rates = rows @ v - float(problem.target.speed_before())
-    forces = np.array([float(law.branch(0.0, float(rate), True)) for rate in rates])
-    both = np.linalg.solve(inertia, np.column_stack([soles.T, -forces @ pushes]))
-    spread, free = both[:, :-1], both[:, -1]
-    w: Array = np.zeros(0)
-    if len(soles):
-        w = np.asarray(np.linalg.lstsq(soles @ spread, -soles @ free, rcond=None)[0])
-    change = free + spread @ w
-    base = change[: c.base].copy()
+        pushes = np.array([problem.friction.way(problem.normal, J @ v) @ J for J in jacobians])
+    approach = normals @ v - float(problem.target.speed_before())
+    forces = np.array([float(law.branch(0.0, float(rate), True)) for rate in approach])
+    # H da = J_c' dw - j' f, with J_c da = 0: dw by least squares, as a straight knee makes J_c H^-1 J_c'
+    # singular
+    solved = np.linalg.solve(H, np.column_stack([J_c.T, -forces @ pushes]))
+    of_wrenches, of_forces = solved[:, :-1], solved[:, -1]
+    dw: Array = np.zeros(0)
+    if len(J_c):
+        dw = np.asarray(np.linalg.lstsq(J_c @ of_wrenches, -J_c @ of_forces, rcond=None)[0])
+    da = of_forces + of_wrenches @ dw
+    base = da[: c.base].copy()
     if c.base:  # from the base's own frame to rates of its coordinates
         base[:3] = pin.rpy.rpyToMatrix(y[3:6]) @ base[:3]
         base[3:] = np.linalg.solve(pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL), base[3:])
-    independent = np.concatenate([base, change[c.base :][c.independent]])
-    return float(forces.sum()), independent, w, np.asarray((a + change)[c.base :])
+    independent = np.concatenate([base, da[c.base :][c.independent]])
+    return float(forces.sum()), independent, dw, np.asarray((a + da)[c.base :])
 
 
 class Collocated:
-    """Its stages, and variables that all contacts have: who completes it makes them.
+    """Collocation of a collision's motion; `Collision` adds the variables.
+
+    Time in a phase of duration T is s T, with s in [0, 1]. The integral of a rate u over the phase so far is
+    T d, with d = integral of u ds. The contact begins at y0, so the position in a phase is
+    y = y0 + T1 d1 + T d, where T1 is the time of all phases before and d1 the mean rate in that time.
 
     Attributes
     ----------
-    stages : collocation points of the phases.  end : the last one of each phase.  T : durations [s] of them.
-    u, d : rates and travel of the robot.  xt : travel of the target.  joined, joined_x : those of the first
-        two phases as one, of the first three, and so on to all but the last.  suffix : of places' names.
-    legs : at the stages.  contact : what it starts from.  torques : over limit at the stages, as variables.
+    stages : collocation points of all phases.
+    end : index of the last stage of each phase.
+    T : durations of the phases [s].
+    u, d : rates ydot of the robot, and their integrals.
+    xt : integral of the target's speed, as d is of u.
+    joined, joined_x : d1 of the first two phases, of the first three, and so on to all but the last; of the
+        robot and of the target.
+    suffix : appended to the names of places.
+    legs, w : joint angles of the constrained legs and sole wrenches, at the stages.
+    contact : state at contact, from which the collision begins.
+    torques : torques over limit at the stages, as variables if a term is about drives; else empty.
     """
 
     _b: Builder
@@ -178,45 +202,59 @@ class Collocated:
     torques: list[Affine]
 
     def _before(self, phase: int) -> tuple[Affine, Affine, Affine]:
-        """Time [s], travel and the target's travel in the phases before one, both divided by that time."""
+        """T1 [s], d1 of the robot and d1 of the target."""
         time = Affine.zeros(1)
         for T in self.T[:phase]:
             time = time + T[0]
-        return time, self._so_far(self.d, self.joined, phase), self._so_far(self.xt, self.joined_x, phase)
+        return (
+            time,
+            self._mean_before(self.d, self.joined, phase),
+            self._mean_before(self.xt, self.joined_x, phase),
+        )
 
-    def _so_far(self, integral: Group, joined: Group, phase: int) -> Affine:
-        """Integral over the phases before one, divided by their time."""
+    def _mean_before(self, integral: Group, joined: Group, phase: int) -> Affine:
+        """Mean rate in the phases before one; zero before the first."""
         if phase == 0:
             return Affine.zeros(integral.size)
         return integral[self.end[0]] if phase == 1 else joined[phase - 2]
 
     def _time(self, phase: int, place: float) -> Affine:
-        """[s] since contact."""
+        """Time [s] since contact."""
         return self._before(phase)[0] + self.T[phase][0] * place
 
     def _integrals(self) -> list[tuple[Group, Group]]:
-        """Integrals over the phase so far, each with its group of the first phases as one."""
+        """Integrals over the phase so far, each with its mean rates over several phases (`joined`)."""
         return [(self.d, self.joined), (self.xt, self.joined_x)]
 
     def _join(self) -> list[list[Affine]]:
-        """Slots of the block ``join``: integrals in the first phases as one, phase by phase."""
+        """Slots of the block ``join``, which determines `joined` phase by phase, component by component."""
         out = []
         for phase in range(1, len(self.end) - 1):
             times = self._before(phase)[0], self.T[phase][0]
             for integral, joined in self._integrals():
-                parts = self._so_far(integral, joined, phase), integral[self.end[phase]], joined[phase - 1]
+                parts = (
+                    self._mean_before(integral, joined, phase),
+                    integral[self.end[phase]],
+                    joined[phase - 1],
+                )
                 out += [[*times, *(part[k : k + 1] for part in parts)] for k in range(integral.size)]
         return out
 
-    def _slots(self, group: Group, i: int, start: Affine, *, anew: bool = False) -> tuple[Affine, Affine]:
-        """Value and d/ds of a collocated group at stage i; ``start``: at contact; ``anew``: of each phase."""
+    def _slots(
+        self, group: Group, i: int, start: Affine, *, each_phase: bool = False
+    ) -> tuple[Affine, Affine]:
+        """Value and slope d/ds of a collocated group at stage i.
+
+        start : value at contact.  each_phase : the group has this value at the beginning of each phase.
+        """
         s = self.stages[i]
+        # Slope of the polynomial through the element's beginning and its stages, by the inverse of Radau's A
+        # (Hairer and Wanner II, table IV.5.6): `weights` of the stages' values, weight `start` of the
+        # beginning's.
         slope = Affine.zeros(group.size)
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + group[m] * w
-        # the slope of the polynomial through the element's begin and its stages, by Radau's A^-1: the values
-        # at the stages with `weights`, that at the begin with `start`
-        begins = s.previous < 0 or (anew and s.new_phase)
+        begins = s.previous < 0 or (each_phase and s.new_phase)
         before = start if begins else group[s.previous]
         return group[i], slope + before * s.start
 
@@ -226,13 +264,13 @@ class Collocated:
         return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
 
     def _travel(self, i: int) -> list[Affine]:
-        """Slots of y = y0 + T1 d1 + T d at a stage."""
+        """Slots d1, T1, d, T of y = y0 + T1 d1 + T d at a stage."""
         s = self.stages[i]
         T1, d1, _ = self._before(s.phase)
         return [d1, T1, self.d[i], self.T[s.phase][0]]
 
-    def _torque_rows(self, place: Place, outputs: Index, most: float) -> None:
-        """Servo torques over limit (n) at a stage are bounded; as variables, if a term is about drives."""
+    def _bound_torques(self, place: Place, outputs: Index, most: float) -> None:
+        """Bound servo torques over limit (n) at a stage; add them as variables if a term is about drives."""
         b, term = self._b, f"{self._b.limits.torque.name} in collision"
         common: dict[str, Any] = {"term": term, "place": place, "lower": -most, "upper": most}
         common["measure"] = percent("over its limit", of=most)
@@ -243,7 +281,7 @@ class Collocated:
             b.rows.add(components=b.robot.joint_names, outputs=outputs, **common)
 
     def drives(self) -> list[DrivePoint]:
-        """Drives at each stage; known once constraints are added, if a term is about drives."""
+        """Torques and joint motions at each stage, if a term is about drives; after `Collision.add_rows`."""
         pairs = zip(self.stages, self.torques, strict=True)
         return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
 
@@ -252,24 +290,24 @@ class Collocated:
         return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
 
     def _motion(self, i: int) -> list[Affine]:
-        """Slots of a `impactopt.problem.block.joint_motion` at a stage."""
+        """Slots of `impactopt.problem.block.joint_motion` at a stage."""
         rates = self._slots(self.u, i, self.contact.u0[0])
         return [self.contact.state.y, *self._travel(i), *rates, Affine.constant(1.0), self.legs[i]]
 
     def contact_end(self) -> ContactEnd:
         state, u0, last = self.contact.state, self.contact.u0[0], self.end[-1]
-        before = still(state.y, u0, u0 * 0.0, Affine.constant(1.0), state.legs)
+        before = joint_motion_slots(state.y, u0, u0 * 0.0, Affine.constant(1.0), state.legs)
         place = Place.plain(f"after contact{self.suffix}")
         return ContactEnd(place, before, self._motion(last), self.u[last] - u0)
 
     def _joints(self, x: Array, law: ContactLaw) -> dict[str, Array]:
-        """Velocity and acceleration of the joints (m + 1, n), the first at once after contact, for solver
-        variables (n,).
+        """Joint velocities and accelerations (1 + stages, n), the first just after contact, for solver
+        variables.
         """
         b, c, state = self._b, self._b.coordinates, self.contact.state
         y, rates, legs = (e.evaluate(x) for e in (state.y, self.contact.u0[0], state.legs))
         velocity = [c.complete_motion(y, rates, 0 * rates, legs)[1][c.base :]]
-        acceleration = [jump(b.problem, c, law, y, rates, legs)[3]]
+        acceleration = [jump_at_contact(b.problem, c, law, y, rates, legs)[3]]
         for i in range(len(self.stages)):
             y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
             _, v, a = c.complete_motion(y0 + T1 * d1 + T * d, u, slope / T, legs_there)
@@ -277,8 +315,8 @@ class Collocated:
             acceleration.append(a[c.base :])
         return {"velocity": np.array(velocity), "acceleration": np.array(acceleration)}
 
-    def _integral_rows(self, i: int, place: Place, integrals: Group, rate: Group) -> None:
-        """A group of integrals over the phase so far, of a group of rates."""
+    def _add_integral(self, i: int, place: Place, integrals: Group, rate: Group) -> None:
+        """Add the constraints of integrals over the phase so far: Radau quadrature of the rates' values."""
         s, labels = self.stages[i], integrals.labels
         integral = integrals[i]
         for m, w in zip(s.members, s.quadrature, strict=True):
@@ -296,15 +334,27 @@ class Collocated:
         )
 
 
-class Collision(ContactNumbers, Collocated):
-    """Variables and constraints of the contact with one target.
+class Collision(ContactParameters, Collocated):
+    """Variables and constraints of the collision with one target.
 
-    contact : what all start from.  stages : collocation points of its phases.
-    number : of the program's collisions; 0 that with the expected target.
-    mass : of the robot at its striker [kg].  forceless : mask of the stages at which its force is zero.
-    guarded : whether its force may not pull within a phase, whatever the law.
-    scenario : None: the expected target.  after : what the variables of the position after contact have
-    (labels, bounds); None: there are none, a follow-through starts there.
+    contact : state at contact, which all collisions of a program share.
+    stages : collocation points of the contact phases.
+    number : index of this collision in the program; 0: that with the expected target.
+    mass : effective mass of the robot at its striker [kg].
+    guarded : forbid a force that pulls within a phase, whatever the law.
+    scenario : of the target; None: the expected one.
+    after : labels and bounds of the variables of the position after contact. None: there are no such
+        variables, as a follow-through starts there.
+
+    Attributes
+    ----------
+    forceless (stages,) : mask of the stages at which the contact force is zero.
+    holds : the force may pull while a nail is driven.
+    coast_legs, coast_rates : joint angles and rates of the legs of the coasting reference.
+    f : contact forces [N], one a striker.
+    state : of the target.
+    p : impulse to the target since contact [N s].
+    after : position y after contact.
     """
 
     def __init__(
@@ -321,59 +371,64 @@ class Collision(ContactNumbers, Collocated):
     ) -> None:
         self._b, self.contact, self.stages = b, contact, stages
         self.number, self.scenario, self.torques = number, scenario, []
-        self._each = ["", "second "][: len(b.problem.strikers)]  # of the strikers, before names of outputs
+        self._prefixes = ["", "second "][: len(b.problem.strikers)]  # of the block's outputs, by striker
         p, c, limits = b.problem, b.coordinates, b.limits
         self.phases = p.contact_phases
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in range(len(self.phases))]
-        # where bodies are apart, and where they part, there is no force
         self.forceless = np.array([self.phases[s.phase].apart for s in stages])
         self.forceless[[i for i, f in zip(self.end, self.phases, strict=True) if f.end == SEPARATION]] = True
-        self._named = named = f"{scenario.name}: " if scenario is not None else ""
+        self._prefix = prefix = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
         self.mass = mass
-        self.renew()
+        self.update_parameters()
         self.torque_fraction = scenario.torque if scenario else limits.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else limits.cone.collision_margin
         n, self._switches = len(stages), switches(p.law)
 
         def add(name: str, size: int, **options: Any) -> Group:
-            return b.layout.add(named + name, n, size, **options)
+            """Add variables at every stage."""
+            return b.layout.add(prefix + name, n, size, **options)
 
         longest = p.contact_duration[1]
         self.T = [
-            b.duration(f"{named}{phase.name} duration", (least, longest), 0.01)
+            b.duration(f"{prefix}{phase.name} duration", (least, longest), 0.01)
             for phase, least in zip(self.phases, self.shortest, strict=True)
         ]
         self._add_reference(n)
         self.u = add("collision rate", b.ny, labels=c.labels)
         self.d = add("collision travel", b.ny, labels=c.labels)
         self.legs = add("collision legs", b.nl, **limits.of_legs)
-        # where law or target might make it pull, it has to be kept from that
-        none = self.forceless[:, None]
-        least = 0.0 if p.target.guards or pulls_apart(p.law) or guarded else np.where(none, 0.0, -np.inf)
-        # what is driven and rattles is held on to meanwhile, and the check of plans says what that leaves
-        # out; of no use where forces are wanted
+        # In contact chatter a driven nail jumps ahead of the hammer. A plan has no events for that: the force
+        # may pull meanwhile, and the check of the plan in full dynamics reports the difference. An objective
+        # on the peak force would exploit such a force.
         self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
-        if self.holds:
-            driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
-            least = np.where(driven, -np.inf, 0.0)[:, None]
-        most = np.where(none, 0.0, np.inf)
+        least, most = self._least_force(guarded), np.where(self.forceless, 0.0, np.inf)[:, None]
         self.f = add("contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
         self.xt = add("target travel", 1, labels=["target"])
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
         joined = len(self.phases) - 2
-        self.joined = b.layout.add(f"{named}travel in compression", joined, b.ny, labels=c.labels)
-        self.joined_x = b.layout.add(f"{named}target travel in compression", joined, 1)
-        wanted = int(after is not None)
-        self.after = b.layout.add(f"{named}position after contact", wanted, b.ny, **(after or {}))
+        self.joined = b.layout.add(f"{prefix}travel in compression", joined, b.ny, labels=c.labels)
+        self.joined_x = b.layout.add(f"{prefix}target travel in compression", joined, 1)
+        count = int(after is not None)
+        self.after = b.layout.add(f"{prefix}position after contact", count, b.ny, **(after or {}))
+
+    def _least_force(self, guarded: bool) -> Any:
+        """Lower bound of the forces at the stages [N]: zero where law or target might make bodies pull."""
+        p = self._b.problem
+        if self.holds:
+            driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
+            return np.where(driven, -np.inf, 0.0)[:, None]
+        if p.target.guards or pulls_apart(p.law) or guarded:
+            return 0.0
+        return np.where(self.forceless, 0.0, -np.inf)[:, None]
 
     def _add_reference(self, count: int) -> None:
-        """Variables of the legs of the reference: angles and rates, at so many instants."""
+        """Add variables of the coasting reference: angles and rates of its legs, at ``count`` instants."""
         nl, add, labels = self._b.nl, self._b.layout.add, {"labels": self._b.coordinates.leg_labels}
-        self.coast_legs = add(f"{self._named}coasting legs", count, nl, **labels)
-        self.coast_rates = add(f"{self._named}coasting leg rates", count, nl, **labels)
+        self.coast_legs = add(f"{self._prefix}coasting legs", count, nl, **labels)
+        self.coast_rates = add(f"{self._prefix}coasting leg rates", count, nl, **labels)
 
     @property
     def impulse(self) -> Affine:
@@ -388,20 +443,21 @@ class Collision(ContactNumbers, Collocated):
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of each block's instances, one a stage."""
         b, p = self._b, self._b.problem
-        none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
+        zero, at_rest = Affine.zeros(1), Affine.zeros(p.target.n_states)
         collision, force = [], []
         for i, s in enumerate(self.stages):
-            state = self._slots(self.state, i, still)
-            travelled = self._slots(self.xt, i, none, anew=True)
-            given, x1 = self._slots(self.p, i, none)[1], self._before(s.phase)[2]
+            state = self._slots(self.state, i, at_rest)
+            travel = self._slots(self.xt, i, zero, each_phase=True)
+            impulse_slope, x1 = self._slots(self.p, i, zero)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
-            force.append([*self._of_hand(i), self.f[i], *state, *travelled, x1, given])
-        of_all = [*self._gains(), b.robot.torque_limit, b.limits.units, friction_numbers(p)]
-        gains = np.concatenate(of_all)
-        collision_p = [np.concatenate([p.normal, [s.place, s.phase > 0], gains]) for s in self.stages]
+            force.append([*self._hand_slots(i), self.f[i], *state, *travel, x1, impulse_slope])
+        common = np.concatenate(
+            [*self._gains(), b.robot.torque_limit, b.limits.units, friction_parameters(p)]
+        )
+        collision_p = [np.concatenate([p.normal, [s.place, s.phase > 0], common]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
             "collision": (collision, collision_p),
-            "force": (force, self.force_numbers()),
+            "force": (force, self.force_parameters()),
             **self._reference(),
         }
         if self.joined.count:
@@ -412,44 +468,44 @@ class Collision(ContactNumbers, Collocated):
     def _dynamics(self, i: int) -> list[Affine]:
         """Slots of the block ``collision``."""
         y, u0, ff = self.contact.state.y, self.contact.u0[0], self._feedforward()
-        coast = [self.coast_legs[i], self.coast_rates[i]]
-        hit = [self.legs[i], self.f[i], self.w[i]]
-        return [y, u0, *coast, ff, *self._travel(i), *self._slots(self.u, i, u0), *hit, self.contact.gains[0]]
+        reference = [self.coast_legs[i], self.coast_rates[i]]
+        motion = [*self._travel(i), *self._slots(self.u, i, u0), self.legs[i]]
+        return [y, u0, *reference, ff, *motion, self.f[i], self.w[i], self.contact.gains[0]]
 
-    def _of_hand(self, i: int) -> list[Affine]:
-        """The slots of the block ``force`` that say where the hand is, and how fast."""
+    def _hand_slots(self, i: int) -> list[Affine]:
+        """Slots of the block ``force`` that determine the hand's position and speed."""
         return [self.contact.state.y, *self._travel(i), self.u[i]]
 
     def _feedforward(self) -> Affine:
-        """Torques over limit (n)."""
+        """Feed-forward torques over limit (n)."""
         return self.contact.feedforward[0]
 
     def integrated(self) -> list[tuple[Group, Group]]:
-        """Integrals over the phase so far, and what they are of."""
+        """Integrals over the phase so far, each with the rates that are integrated."""
         return [(self.d, self.u)]
 
     def states(self) -> tuple[Group, ...]:
-        """Variables with a slope, and a value at contact, beside the rates of `integrated`."""
+        """Collocated variables whose value at contact is known, beside those of `integrated`."""
         return self.state, self.xt, self.p
 
-    def held_over(self) -> list[Group]:
-        """Variables that finer elements do not change."""
+    def kept_groups(self) -> list[Group]:
+        """Variables that are not at stages: a mesh of finer elements keeps their values."""
         return [*self.T, self.joined, self.joined_x, self.after]
 
-    def _at_stage(self) -> tuple[Group, ...]:
-        """Legs at each collocation point, in the order of their constraints."""
+    def _leg_groups(self) -> tuple[Group, ...]:
+        """Variables of the legs at each stage, in the order of their constraints."""
         return self.coast_legs, self.coast_rates, self.legs
 
-    def loose(self) -> list[Group]:
-        """Variables with a value at each collocation point, and no known value at contact."""
+    def groups_without_start(self) -> list[Group]:
+        """Variables at each stage that have no known value at contact."""
         return [self.coast_legs, self.coast_rates, self.legs, self.f, self.w]
 
     def _gains(self) -> tuple[Array, Array]:
-        """Kp and Kd."""
+        """Servo gains Kp and Kd (n,)."""
         return self._b.robot.kp, self._b.robot.kd
 
     def _reference(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
-        """Slots and parameters of the block ``coasting``."""
+        """Slots and parameters of the block ``coasting``; none without constrained legs."""
         if not self._b.coordinates.legs:
             return {}
         start = [self.contact.state.y, self.contact.u0[0]]
@@ -459,24 +515,21 @@ class Collision(ContactNumbers, Collocated):
         ]
         return {"coasting": (slots, [[s.place, float(s.phase > 0)] for s in self.stages])}
 
-    def _restitution(self, i: int) -> bool:
-        return self.stages[i].phase == len(self.end) - 1
-
     def determined(self) -> list[Determined]:
-        """Variables that each stage's constraints determine, leg by leg, and those of each element.
+        """Variables in the order in which the constraints determine them.
 
-        An element's travel comes first, by linear constraints; last, if there are three phases or more, the
-        integrals of the first ones as one.
+        The legs at each stage, leg by leg; then element by element, first its integrals, by linear
+        constraints, and then its other variables as one system. `joined` is last.
         """
         out: list[Determined] = []
         for i in range(len(self.stages)):
-            legs = [leg for g in self._at_stage() for leg in by_leg(g.index(i))]
+            legs = [leg for g in self._leg_groups() for leg in by_leg(g.index(i))]
             out += [determined(Turn.STAGE_LEGS, leg, k) for k, leg in enumerate(legs)]
         integrals, states = zip(*self.integrated(), strict=True)
         groups = (*states, self.w, self.f, *self.states())
         step = 0
         for members in sorted({s.members for s in self.stages}):
-            # where there is none, the force is given
+            # a force that is zero by its bounds is not determined
             part = [g.index(i) for i in members for g in groups if g is not self.f or not self.forceless[i]]
             out += [determined(Turn.ELEMENT, one.index(i), step) for i in members for one in integrals]
             out.append(determined(Turn.ELEMENT, np.concatenate(part), step + 1))
@@ -491,16 +544,19 @@ class Collision(ContactNumbers, Collocated):
 
     # ------------------------------------------------------------------ constraints
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
-        """``at``: of each block, the index of the first output of this collision and the outputs a stage."""
+        """Add the constraints of all stages and of the ends of phases.
+
+        at : by block, the index of this collision's first output, and the number of outputs a stage.
+        """
         for i, s in enumerate(self.stages):
             place = self._place(s)
             for integral, rate in self.integrated():
-                self._integral_rows(i, place, integral, rate)
+                self._add_integral(i, place, integral, rate)
             first = {name: start + i * size for name, (start, size) in at.items()}
-            self._dynamics_rows(i, place, first)
+            self._add_dynamics(i, place, first)
         (start, size), order = at["force"], percent("off")
         part, where = self._b.parts("force"), self.suffix.lstrip(", ")
-        if self.joined.count:  # first, as they determine variables of their own
+        if self.joined.count:  # before the ends of phases, as these constraints determine `joined`
             names = [label for one, _ in self._integrals() for label in one.labels] * self.joined.count
             outputs = at["join"][0] + np.arange(len(names))
             self._b.equal("travel in compression", where, names, outputs, along(names, "off"))
@@ -510,14 +566,19 @@ class Collision(ContactNumbers, Collocated):
             TOUCH: ("penetration", "penetration", Measure("mm", 1e3 * DEPTH_SCALE, "left")),
         }
         for last, phase in zip(self.end, self.phases, strict=True):
+            # any other end is an event of the target, which has one, whatever the number of strikers
             component, name, measure = ends.get(phase.end, ("target", "event", order))
-            for one in self._each if phase.end in ends else self._each[:1]:
-                outputs = start + last * size + part[one + name]
-                self._b.equal(phase.end, where, [one + component], outputs, measure)
-            if phase.end == TOUCH:  # they approach then
-                self._rate_row(last, start + last * size, back=False)
+            for prefix in self._prefixes if phase.end in ends else self._prefixes[:1]:
+                outputs = start + last * size + part[prefix + name]
+                self._b.equal(phase.end, where, [prefix + component], outputs, measure)
+            if phase.end == TOUCH:
+                self._bound_rate(last, start + last * size, receding=False)
 
-    def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
+    def _add_dynamics(self, i: int, place: Place, first: dict[str, int]) -> None:
+        """Add the constraints of the robot at a stage, and those of the target.
+
+        first : index of the stage's first output of each block.
+        """
         b, c, joints = self._b, self._b.coordinates, self._b.robot.joint_names
         closure = [f"{leg.end} {d}" for leg in c.legs for d in DIRECTIONS]
         if "coasting" in first:
@@ -530,28 +591,33 @@ class Collision(ContactNumbers, Collocated):
         base, joint = first["collision"] + part["base"], first["collision"] + part["joints"]
         b.equal("collision dynamics", place, DIRECTIONS[: c.base], base, b.limits.unbalanced)
         b.equal("collision dynamics", place, joints, joint, percent("of the joint's limit off"))
-        self._torque_rows(place, first["collision"] + part["torque"], self.torque_fraction)
+        self._bound_torques(place, first["collision"] + part["torque"], self.torque_fraction)
         if self.cone_margin is not None:
             minimum = b.limits.cone.minimum_force if self.scenario is None else 0.0
             add_cone_rows(b, self.w[i], place, self.cone_margin, minimum)
-        self._target_rows(i, place, first["force"])
+        self._add_target(i, place, first["force"])
 
-    def _target_rows(self, i: int, place: Place, first: int) -> None:
+    def _add_target(self, i: int, place: Place, first: int) -> None:
+        """Add contact law, target dynamics and the conditions of the phase at a stage.
+
+        first : index of the stage's first output of the block ``force``.
+        """
         b, target, phase = self._b, self._b.problem.target, self.phases[self.stages[i].phase]
         part, fast = b.parts("force"), Measure("m/s", 1.0, "off")
-        if not self.forceless[i]:  # there the force is zero by its bounds
+        if not self.forceless[i]:  # else the force is zero by its bounds
             force = Measure("N", FORCE_SCALE, "off")
-            for one in self._each:
-                b.equal("contact law", place, [f"{one}force"], first + part[f"{one}law"], force)
+            for prefix in self._prefixes:
+                b.equal("contact law", place, [f"{prefix}force"], first + part[f"{prefix}law"], force)
         states = [f"state {k}" for k in range(target.n_states)]
         of_size = percent("of its size off")
         b.equal("target's motion", place, states, first + part["target"], of_size)
         b.equal("target's motion", place, ["travel"], first + part["travel"], fast)
         b.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
-        k, still = phase.mode, [0.0] * target.n_states
-        ends, once = phase.end in target.guards, self._b.problem.planned_touches == 1
-        if i in self.end and (ends or once):
-            if ends and target.reserve(still, 0.0, k):
+        k, at_rest = phase.mode, [0.0] * target.n_states  # a state, to ask which expressions the target has
+        ends_by_guard, once = phase.end in target.guards, self._b.problem.planned_touches == 1
+        if i in self.end and (ends_by_guard or once):
+            # The constraint that ends the phase stands for rate and invariant there.
+            if ends_by_guard and target.reserve(at_rest, 0.0, k):
                 b.rows.add(
                     term=phase.end,
                     place=place,
@@ -562,70 +628,82 @@ class Collision(ContactNumbers, Collocated):
                 )
             return
         if self._switches and target.guards:
-            self._rate_row(i, first, back=self._restitution(i))
-        if target.invariant(still, 0.0, k):
+            # The phase's branch of the law is right while bodies approach, or, in the last phase, recede.
+            self._bound_rate(i, first, receding=self.stages[i].phase == len(self.end) - 1)
+        if target.invariant(at_rest, 0.0, k):
             b.rows.add(
                 term=target.guards[min(k, len(target.guards) - 1)],
                 place=place,
                 components=["target"],
                 outputs=first + part["invariant"],
-                lower=target.margin(k, self.stages[i].place if ends or once else 0.0),
-                measure=percent("out of turn"),
+                lower=target.margin(k, self.stages[i].place if ends_by_guard or once else 0.0),
+                measure=percent("too early"),
             )
 
-    def _rate_row(self, i: int, first: int, *, back: bool) -> None:
-        """Striker and target approach at a stage, or go ``back``; first : its first output of ``force``."""
+    def _bound_rate(self, i: int, first: int, *, receding: bool) -> None:
+        """Constrain striker and target to approach each other at a stage, or to recede.
+
+        first : index of the stage's first output of the block ``force``.
+        """
         self._b.rows.add(
             term="approach speed",
             place=self._place(self.stages[i]),
             components=["striker and target"],
             outputs=first + self._b.parts("force")["rate"],
-            lower=-np.inf if back else 0.0,
-            upper=0.0 if back else np.inf,
-            measure=Measure("m/s", 1.0, "the other way"),
+            lower=-np.inf if receding else 0.0,
+            upper=0.0 if receding else np.inf,
+            measure=Measure("m/s", 1.0, "in the wrong direction"),
         )
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
-        """Slots of the block ``link``: this state after contact to a ``start`` (y, d y/ds, duration [s])."""
+        """Slots of the block ``link``, from the state after contact to the start of the next phase.
+
+        start : y, y' and duration [s] of that phase.
+        """
         last = len(self.end) - 1
-        time, travel, _ = self._before(last)
-        moved = travel, self.d[self.end[last]]
-        return self.contact.link(start, (time, self.T[last][0]), moved, self.u[self.end[last]])
+        T1, d1, _ = self._before(last)
+        end = self.end[last]
+        return self.contact.link(start, (T1, self.T[last][0]), (d1, self.d[end]), self.u[end])
 
     @property
     def state_after(self) -> list[Affine]:
-        """Coordinates, rates, legs and T (1 s) after contact, if its position is a variable."""
+        """y, ydot, legs and T (1 s) after contact, if the position after contact is a variable."""
         end = self.end[-1]
         return [self.after[0], self.u[end], self.legs[end], Affine.constant(1.0)]
 
     def link_after(self) -> list[list[Affine]]:
-        """Slots of the block ``link`` that make its position what the contact leaves behind."""
+        """Slots of the block ``link`` that determine the position after contact."""
         y, rate, _, one = self.state_after
         return self.link((y, rate, one))
 
-    # ------------------------------------------------------------------ numbers
+    # ------------------------------------------------------------------ initial guess and solution
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """The robot loses rates all alike, as a point mass in its place does."""
+        """Write the initial guess to x (n,): all rates of the robot fall as a point mass's speed does.
+
+        y, rates (ny,), legs (nl,) : at contact.
+        """
         c, p, layout = self._b.coordinates, self._b.problem, self._b.layout
         place = np.array([s.place for s in self.stages])
         phase = np.array([s.phase for s in self.stages])
         mass, speed = effective_mass(c, p.strikers, p.normal, y, legs, rates)
-        found = blow(*self.alone(), mass, speed, phase, place, p.planned_touches)
+        found = guessed_contact(*self.per_striker(), mass, speed, phase, place, p.planned_touches)
         times = np.clip(found.durations, *np.transpose([layout.bounds(group) for group in self.T]))
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)
         before = np.concatenate([[0.0], np.cumsum(times)])
-        per_time = (1 / found.durations[phase])[:, None]
+        per_time = (1 / found.durations[phase])[:, None]  # d and xt are integrals over s
         d = found.moved[:, None] * per_time * rates
         self.u.write(x, found.speed[:, None] * rates)
         self.d.write(x, d)
         self.state.write(x, found.state)
         self.xt.write(x, found.travel[:, None] * per_time)
         self.f.write(x, np.where(self.forceless, 0.0, found.force)[:, None])
-        self.p.write(x, len(p.strikers) * found.impulse[:, None])
+        self.p.write(
+            x, len(p.strikers) * found.impulse[:, None]
+        )  # the point mass is in place of each striker
         for joined, each in ((self.joined, d[self.end]), (self.joined_x, self.xt.read(x)[self.end])):
-            ways = [(times[:k, None] / before[k] * each[:k]).sum(axis=0) for k in range(2, len(times))]
-            joined.write(x, np.reshape(ways, (joined.count, joined.size)))
+            means = [(times[:k, None] / before[k] * each[:k]).sum(axis=0) for k in range(2, len(times))]
+            joined.write(x, np.reshape(means, (joined.count, joined.size)))
         self.after.write(x, y + float(found.moved[self.end].sum()) * rates)
         self.guess_model(x, y, rates, legs)
         if c.legs:
@@ -633,30 +711,33 @@ class Collision(ContactNumbers, Collocated):
             self.w.write(x, self.contact.state.w.evaluate(x))
 
     def guess_model(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """Initial guess of a collision model's own variables: here the legs of the reference."""
+        """Write the initial guess of variables that only this collision model has: the reference's legs."""
         if not legs.size:
             return
         elapsed = np.ravel([self._time(s.phase, s.place).evaluate(x) for s in self.stages])
-        for k, (there, motion) in enumerate(coasted(self._b.coordinates, elapsed, y, rates, legs)):
-            x[self.coast_legs.index(k)], x[self.coast_rates.index(k)] = there, motion[0]
+        for k, (angles, motion) in enumerate(coasted(self._b.coordinates, elapsed, y, rates, legs)):
+            x[self.coast_legs.index(k)], x[self.coast_rates.index(k)] = angles, motion[0]
 
     def durations(self, x: Array) -> tuple[float, float]:
-        """Compression and restitution [s]."""
+        """Durations of compression, with all phases before the last, and of restitution [s]."""
         *before, last = (float(g.read(x)[0, 0]) for g in self.T)
         return sum(before), last
 
     def decode(self, x: Array, outputs: dict[str, Array], approaches: Array) -> PlannedCollision:
-        """The collision that solver variables (n,) stand for; ``outputs`` are the blocks'."""
+        """Collision of a plan, from solver variables (n,).
+
+        outputs : of the blocks, by name.  approaches (strikers,) : speeds along the normal at contact [m/s].
+        """
         b, target = self._b, self._b.problem.target
         durations = [float(g.read(x)[0, 0]) for g in self.T]
         time = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in self.stages]
         before = float(target.speed_before(self.target))
         first = [float(b.problem.law.branch(0.0, float(v) - before, True, self.law)) for v in approaches]
         forces, wrench = np.vstack([first, self.f.read(x)]), self.w.read(x)
-        start = self.number * len(self.stages)  # of its instances in the blocks
-        of_stages = slice(start, start + len(self.stages))
-        torque = outputs["collision"][of_stages, b.parts("collision")["torque"]]
-        speed = outputs["force"][of_stages, b.parts("force")["speed"][0]]
+        start = self.number * len(self.stages)  # the blocks' instances are collision by collision
+        own = slice(start, start + len(self.stages))
+        torque = outputs["collision"][own, b.parts("collision")["torque"]]
+        speed = outputs["force"][own, b.parts("force")["speed"][0]]
         return PlannedCollision(
             time=np.array([0.0, *time]),
             force=forces.sum(axis=1),

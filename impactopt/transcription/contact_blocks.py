@@ -1,7 +1,10 @@
-"""The nonlinear pieces of a contact as CasADi functions of (variables z, parameters p): see `blocks`.
+"""Nonlinear functions of a contact as CasADi expressions of variables z and parameters p: see `blocks`.
 
-One set of functions serves all models of the collision: what is frozen is a point of the contact of its own,
-given to the same rigid-body functions. Numbers of steps and equations are the paper's.
+All collision models share them: a frozen model evaluates the rigid-body functions at a state of its own, the
+freeze. Numbers of steps and equations are the paper's.
+
+The position in a phase is y = y0 + T1 d1 + T d: y0 at contact, T1 the time of all phases before, d1 the mean
+rate in it, T the duration of the phase, d the integral of the rate u = ydot over s. A prime is d/ds.
 """
 
 from __future__ import annotations
@@ -24,10 +27,9 @@ __all__ = [
     "FORCE_SCALE",
     "RESTITUTING",
     "SECOND",
-    "Joints",
+    "JointGroups",
     "base_scale",
     "carried",
-    "chosen_gains",
     "coasting",
     "collision",
     "first_instant",
@@ -38,13 +40,14 @@ __all__ = [
     "moved",
     "two_mass_restitution",
     "typical_state",
+    "with_gain_factors",
 ]
 
-FORCE_SCALE = 100.0  # [N] contact forces in the program's constraints
-DEPTH_SCALE = 0.01  # [m] penetration in the program's constraints
+FORCE_SCALE = 100.0  # [N] of contact forces, and of their constraints
+DEPTH_SCALE = 0.01  # [m] of the constraints of penetration
 SECOND = ("second law", "second rate", "second penetration", "second separation")  # outputs of `force`
-RESTITUTING = 6  # which parameter of `force` says so
-Joints = tuple[tuple[int, ...], ...]  # of each factor, their places among the gains
+RESTITUTING = 6  # index of the parameter of `force` that is 1 in restitution, else 0
+JointGroups = tuple[tuple[int, ...], ...]  # joints (indices of the gains) that share one gain factor each
 
 
 def base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
@@ -53,17 +56,17 @@ def base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
 
 
 def leg_part(c: StanceCoordinates, v: Any) -> Any:
-    """Entries of the constrained legs' joints (nl), out of (nv)."""
+    """Entries of the constrained legs' joints (nl,) of a vector (nv,)."""
     return ca.vertcat(*[v[c.base + int(j)] for j in c.dependent])
 
 
 def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpression:
-    """The legs of the reference that coasts through the collision: soles in place and at rest, as residuals.
+    """Legs of the reference that coasts through the collision: residuals of soles in place and at rest.
 
-    z = y0, u0 (ydot) at contact, T1, T, legs, leg rates [rad/s], of a freeze their accelerations [rad/s^2];
-    p = s (place in the phase), 1 in restitution else 0.
-    out = pose error of the fixed soles [m, rad], twist of the fixed soles [m/s, rad/s]; of a freeze, what
-        rates and accelerations are off by.
+    z = y0; u0 (ydot at contact); T1; T; legs; leg rates [rad/s]; frozen: leg accelerations [rad/s^2].
+    p = s (place in the phase); 1 after the first phase else 0.
+    out = pose error of the fixed soles [m, rad]; their twist [m/s, rad/s]. Frozen: in place of the twist,
+        residuals of rates and accelerations.
     """
     y0, u0 = ca.SX.sym("y0", c.ny), ca.SX.sym("u0", c.ny)
     legs, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("rates", c.nl)
@@ -73,10 +76,10 @@ def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpres
     if frozen is None:
         out = {"closure": c.closure(y, legs), "twist": c.sole_twists(y, legs, u0, rates)}
         return make_block(z, [s, after], out, lanes=4)
-    bends = ca.SX.sym("bends", c.nl)
+    accelerations = ca.SX.sym("accelerations", c.nl)
     v, a = (leg_part(c, x) for x in c.motion(y, legs, u0, ca.SX.zeros(c.ny)))
-    out = {"closure": c.closure(y, legs), "rate": rates - v, "acceleration": bends - a}
-    return make_block([*z, bends], [s, after], out, lanes=2)
+    out = {"closure": c.closure(y, legs), "rate": rates - v, "acceleration": accelerations - a}
+    return make_block([*z, accelerations], [s, after], out, lanes=2)
 
 
 def collision(
@@ -84,28 +87,32 @@ def collision(
     striker: str,
     frozen: Effects | None = None,
     second: str = "",
-    chosen: Joints = (),
-    rubs: bool = False,
+    gain_groups: JointGroups = (),
+    friction: bool = False,
 ) -> BlockExpression:
     """Equation of motion (6) at one collocation point of the collision.
 
-    H, J and bias are those at the point, anew at each (steps 1a to 4a of the paper); or those that a freeze
-    has stored (1b), with its terms. Then accelerations are linear in torques and forces (3b to 5b), and so
-    are those of legs and striker in the frozen Jacobians (6b).
+    H, J and bias are those at the point (steps 1a to 4a of the paper). In a frozen model they are those of a
+    freeze (1b), so accelerations are linear in torques and forces (3b to 5b), and so are those of legs and
+    striker by the frozen Jacobians (6b).
     The servo (equation 10; 12 as constraints) follows a reference that coasts at its velocity at contact:
     tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
 
-    z = y0, u0 (ydot) at contact; feed-forward over torque limit (n); d1, T1, d, T: y = y0 + T1 d1 + T d;
-        u = ydot; u' (in the phase's s); legs; f [N], with a second striker two; w (6 a sole).
-      not frozen: legs and leg rates of the coasting reference.
-      frozen: y, ydot and legs of the freeze; rates of the reference's legs when its segment began, their
-        acceleration, time [s] since; rates of the legs and their lag behind the reference, each with its
-        slope; slope of the hand's speed; wrenches that carry the weight, where the model has no bias (nw).
-      last: logarithms of the factors on the gains of ``chosen`` joints.
-    p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight
-        [N], lever [m]; if the striking point ``rubs`` the parameters of `ContactFriction`.
-    out = closure [m, rad], base rows, joint rows over torque limit, servo torque over limit; frozen: what the
-        slopes of the legs' rates, of their lag and of the hand's speed are off by.
+    frozen : terms of the frozen model; None: full dynamics.  second : another striker.
+    gain_groups : joints whose gains have a factor each.  friction : the striking point has friction.
+
+    z = y0; u0 (ydot at contact);
+        not frozen: legs and leg rates of the coasting reference;
+        feed-forward over torque limit (n,); d1; T1; d; T; u (ydot); u'; legs; f [N], one a striker; w (6 a
+        sole);
+        frozen: y, ydot and legs of the freeze; rates of the reference's legs at the beginning of the segment,
+        their accelerations at the freeze; rates r of the legs, r'; lag of the legs behind the reference,
+        lag'; time [s] since the beginning of the segment; slope of the hand's speed; without bias, wrenches
+        that carry the weight (nw,); logarithms of the gain factors.
+    p = normal (3,); s (place in the phase); 1 after the first phase else 0; Kp, Kd, torque limits (n, each);
+        weight [N]; lever [m]; with friction the parameters of `ContactFriction`.
+    out = closure [m, rad]; base equations over weight and weight x lever; joint equations over torque limit;
+        servo torque over limit; frozen: residuals of r', of lag' and of the slope of the hand's speed.
     """
     ny, n, nl, nw = c.ny, c.robot.n, c.nl, 6 * len(c.legs)
     y0, u0, d1, d, u, u1 = (ca.SX.sym(s, ny) for s in ("y0", "u0", "d1", "d", "u", "u1"))
@@ -114,45 +121,50 @@ def collision(
     T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f", len(strikers))
     normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
     kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
-    weight, lever, logs = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("logs", len(chosen))
-    rub = ca.SX.sym("rub", 2 * rubs)
-    t = after * T1 + T * s
+    weight, lever, logs = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("logs", len(gain_groups))
+    of_friction = ca.SX.sym("friction", 2 * friction)
+    t = after * T1 + T * s  # since contact
     y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
     through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
+    # at: state at which the rigid-body functions are evaluated
     at, carried, slopes = (y, u, legs), ca.SX.zeros(nw), {}
     if frozen is None:
-        lag, slower = (ca.SX.sym(s, nl) for s in ("ref_legs", "ref_rates"))
-        more = [lag, slower]
+        ref_legs, ref_rates = (ca.SX.sym(s, nl) for s in ("ref_legs", "ref_rates"))
+        own = [ref_legs, ref_rates]
     else:
         of_freeze = ca.SX.sym("yf", ny), ca.SX.sym("uf", ny), ca.SX.sym("legsf", nl)
-        of_legs = [ca.SX.sym(s, nl) for s in ("began", "bends", "r", "r1", "lag", "lag1")]
-        began, bends, r, r1, lag, lag1 = of_legs
-        since, faster = ca.SX.sym("since"), ca.SX.sym("h1")
-        at, more = of_freeze, [*of_freeze, *of_legs, since, faster]
+        names = ("ref_rates0", "ref_accelerations", "r", "r1", "lag", "lag1")
+        ref_rates0, ref_accelerations, r, r1, lag, lag1 = of_legs = [ca.SX.sym(s, nl) for s in names]
+        since, hand_slope = ca.SX.sym("since"), ca.SX.sym("h1")
+        at, own = of_freeze, [*of_freeze, *of_legs, since, hand_slope]
         if not frozen.bias:
             carried = ca.SX.sym("carried", nw)
-            more.append(carried)
+            own.append(carried)
     v, a, stages = _motion(c, *at, ydd, jdot=frozen is None or frozen.jdot)
     q = c.configuration(at[0], at[2])
+    # equation (6): H a + bias + j' f - J_c' w = S' tau
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
     for k, name in enumerate(strikers):
-        row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{name}")[:3, :])])(q)
-        way = pushed_way(normal, ca.mtimes(row, v), *ca.vertsplit(rub)) if rubs else normal
-        tau += ca.mtimes(row.T, way) * f[k]
+        J = _striker_jacobian(c, name, q)
+        way = pushed_way(normal, ca.mtimes(J, v), *ca.vertsplit(of_friction)) if friction else normal
+        tau += ca.mtimes(J.T, way) * f[k]
     tau -= c.sole_wrench_map(at[0], at[2], w - carried)
-    # position and rate of the reference relative to the robot, by joint (the base's part is not the servo's)
+    # Reference minus robot: angles and rates of the constrained legs' joints, ...
     if frozen is None:
-        lag, slower = lag - legs, slower - leg_part(c, v)
+        lag, rate_lag = ref_legs - legs, ref_rates - leg_part(c, v)
     else:
-        slower = began + bends * since - r
-        tip = striker_kinematics(c, striker)(q, v if frozen.jdot else 0 * v, a)[2]
-        slopes = {"legs": r1 - T * leg_part(c, a), "lag": lag1 - T * slower}
-        slopes["hand"] = faster - T * ca.dot(normal, tip)
-    driven = np.ones(ny)
-    driven[c.base :] -= c.robot.sprung[c.independent]  # a spring's rest does not move
-    ahead = c.configuration(y0 + driven * u0 * t - y, lag)[c.base :]
-    stiff, damped = chosen_gains(kp, kd, logs, chosen)
-    servo = ff + (stiff * ahead + damped * c.configuration(u0 - u, slower)[c.base :]) / limit
+        rate_lag = ref_rates0 + ref_accelerations * since - r
+        hand_acceleration = striker_kinematics(c, striker)(q, v if frozen.jdot else 0 * v, a)[2]
+        slopes = {"legs": r1 - T * leg_part(c, a), "lag": lag1 - T * rate_lag}
+        slopes["hand"] = hand_slope - T * ca.dot(normal, hand_acceleration)
+    # ... and of all others. The reference of a sprung joint is its angle at rest, which does not coast.
+    coasts = np.ones(ny)
+    coasts[c.base :] -= c.robot.sprung[c.independent]
+    angle_error = c.configuration(y0 + coasts * u0 * t - y, lag)[c.base :]
+    rate_error = c.configuration(u0 - u, rate_lag)[c.base :]
+    stiffness, damping = with_gain_factors(kp, kd, logs, gain_groups)
+    # equation (10), over the torque limit
+    servo = ff + (stiffness * angle_error + damping * rate_error) / limit
     out = {
         "closure": c.closure(y, legs),
         "base": tau[: c.base, :] / base_scale(c, weight, lever),
@@ -160,25 +172,31 @@ def collision(
         "torque": servo,
         **slopes,
     }
-    z = [y0, u0, *more[: 2 * (frozen is None)], ff, d1, T1, d, T, u, u1, legs, f, w]
-    z += [*(more if frozen is not None else []), logs]
-    p = [normal, s, after, kp, kd, limit, weight, lever, rub]
+    z = [y0, u0, *(own if frozen is None else []), ff, d1, T1, d, T, u, u1, legs, f, w]
+    z += [*(own if frozen is not None else []), logs]
+    p = [normal, s, after, kp, kd, limit, weight, lever, of_friction]
     return make_block(z, p, out, through, lanes=4, stages=stages)
 
 
 def _strikers(striker: str, second: str) -> list[str]:
+    """Names of the one or two strikers; ``second`` is "" if there is one."""
     return [striker, second] if second else [striker]
+
+
+def _striker_jacobian(c: StanceCoordinates, striker: str, q: Any) -> Any:
+    """Jacobian (3, nv) of the striking point's velocity, world axes."""
+    return ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{striker}")[:3, :])])(q)
 
 
 def _motion(
     c: StanceCoordinates, y: Any, u: Any, legs: Any, ydd: Any, *, jdot: bool = True
 ) -> tuple[Any, Any, list[Stage]]:
-    """v and a (nv) on fixed soles, and their stages; without dJ/dt v, a as if nothing moved."""
+    """v and a (nv,) on fixed soles, and their stages.  jdot : a has the term dJ/dt v."""
     return motion_in_stages(c, y, legs, u, ydd) if jdot else (*(c.velocity(y, legs, x) for x in (u, ydd)), [])
 
 
 def _inverse_dynamics(c: StanceCoordinates, q: Any, v: Any, a: Any, *, bias: bool = True) -> Any:
-    """H a (nv), and Coriolis, centrifugal and gravity forces."""
+    """H a (nv,), with bias plus Coriolis, centrifugal and gravity forces."""
     rb = c.rb
     if not bias:
         return _inertia(c)(q, a)
@@ -195,16 +213,16 @@ def force(
 ) -> BlockExpression:
     """Contact law and target at one collocation point (equations 14 to 17, integrated).
 
-    z = y0; d1, T1, d, T, u as in :func:`collision`, or where its dynamics are frozen in place of y0, d1, d
-        and u those of the hand along the normal (no y0; 7b); f [N], with a second striker two, whose sum the
-        target feels; the target's state and its slope (in s);
-        travel x of its surface, x' and x1 as d, u and d1; slope p' of the impulse.
-    p = point (3), normal (3), 1 in restitution else 0, the law's parameters, the target's; of a target with
-        events before them, of each phase, 1 in it else 0, and how long [s] it has to last; the second point.
-    out = (f - law) / 100 N, state' - T d(state)/dt over its typical size, x' - speed [m/s], p' - T f [N s],
-        approach speed [m/s], penetration / 1 cm, what is zero at separation / 100 N, speed of the target's
-        surface [m/s], what is zero when its phase ends, what is not below zero while it lasts, and when it
-        ends; of a second striker: law, approach speed, penetration and what is zero at separation.
+    z = y0; d1; T1; d; T; u. Frozen: no y0, and d1, d, u of the hand along the normal (step 7b);
+        f [N], one a striker: the target feels their sum; the target's state, state';
+        x, x', x1 of the target's surface, as d, d', d1 of the robot; slope p' of the impulse.
+    p = point (3,); normal (3,); 1 in restitution else 0; of a target with events, for each phase 1 in it else
+        0, and its least duration [s]; parameters of the law; of the target; the second striker's point.
+    out = law: (f - law) / 100 N; target: state' - T d(state)/dt over its typical size; travel: x' - speed
+        [m/s]; impulse: p' - T f [N s]; rate of the penetration [m/s]; penetration / 1 cm; separation: zero
+        where contact ends, over 100 N; speed of the target's surface [m/s];
+        event, invariant, reserve: `Target.guard`, `Target.invariant` and `Target.reserve` of the phase;
+        of a second striker its law, rate, penetration and separation.
     """
     ny, n = c.ny if frozen is None else 1, target.n_states
     y0, d1, d, u = (ca.SX.sym(s, ny) for s in ("y0", "d1", "d", "u"))
@@ -219,47 +237,50 @@ def force(
     within, shortest = ca.SX.sym("within", len(phases)), ca.SX.sym("shortest", min(len(phases), 1))
     of_law = ca.SX.sym("law", len(law.parameters))
     of_target = ca.SX.sym("target", len(target.parameters))
-    y, gone = ca.SX.sym("y", ny), ca.SX.sym("gone")
+    y, surface = ca.SX.sym("y", ny), ca.SX.sym("surface")
     if frozen is None:
         q, vel, _ = c.upper_motion(y, u, ca.SX.zeros(ny))
-        hands = []
+        hands = []  # position and speed along the normal
         for name, at in zip(strikers, (point, other), strict=False):
             place, twist, _ = striker_kinematics(c, name)(q, vel, ca.SX.zeros(c.rb.nv))
             hands.append((ca.dot(normal, place - at), ca.dot(normal, twist)))
     else:
         hands = [(y, u)]
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
-    numbers = {name: of_target[i] for i, name in enumerate(target.parameters)}
-    pieces = [target.smooth(state, total, k, numbers) for k in phases or (0,)]
-    speed, moves = ca.SX(pieces[0][0]), ca.vertcat(ca.SX(0, 1), *pieces[0][1])
+    parameters = {name: of_target[i] for i, name in enumerate(target.parameters)}
+    modes = [target.smooth(state, total, k, parameters) for k in phases or (0,)]
+    speed, derivative = ca.SX(modes[0][0]), ca.vertcat(ca.SX(0, 1), *modes[0][1])
     event = invariant = reserve = ca.SX(0, 1)
 
     def of_phase(parts: list[list[Any]]) -> Any:
+        """The part of the phase that the point is in: all are evaluated, as `within` is a parameter."""
         return sum((ca.vertcat(ca.SX(0, 1), *part) * within[k] for k, part in enumerate(parts) if part), 0.0)
 
     if target.guards:
-        speed, moves = of_phase([[v] for v, _ in pieces]), of_phase([rates for _, rates in pieces])
+        # guards take the time by which a phase lasts longer than its least duration
+        speed, derivative = of_phase([[v] for v, _ in modes]), of_phase([rates for _, rates in modes])
         event = of_phase(
-            [[target.guard(state, total, T - shortest, k, numbers)] for k in range(len(target.guards))]
+            [[target.guard(state, total, T - shortest, k, parameters)] for k in range(len(target.guards))]
         )
-        invariant = of_phase([target.invariant(state, total, k, numbers) for k in phases])
-        reserve = ca.SX(of_phase([target.reserve(state, total, k, numbers) for k in phases]))
-    of_hands = []
-    for k, (way, approach) in enumerate(hands):
-        penetration, rate = way - gone, approach - speed
+        invariant = of_phase([target.invariant(state, total, k, parameters) for k in phases])
+        reserve = ca.SX(of_phase([target.reserve(state, total, k, parameters) for k in phases]))
+    of_hands = []  # residual of the law, rate, penetration and separation of each striker
+    # equation (17) with one branch of the law, and (14) to (16) as penetration and its rate
+    for k, (position, velocity) in enumerate(hands):
+        penetration, rate = position - surface, velocity - speed
         compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
-        off = (f[k] - ((1 - restituting) * compress + restituting * restitute)) / FORCE_SCALE
-        ends = ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE
-        of_hands.append((off, rate, penetration / DEPTH_SCALE, ends))
-    off, rate, deep, ends = of_hands[0]
+        residual = (f[k] - ((1 - restituting) * compress + restituting * restitute)) / FORCE_SCALE
+        separation = ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE
+        of_hands.append((residual, rate, penetration / DEPTH_SCALE, separation))
+    residual, rate, depth, separation = of_hands[0]
     out = {
-        "law": off,
-        "target": (slope - T * moves) / np.array(typical_state(target)),
+        "law": residual,
+        "target": (slope - T * derivative) / np.array(typical_state(target)),
         "travel": rate_x - speed,
         "impulse": rate_p - T * total,
         "rate": rate,
-        "penetration": deep,
-        "separation": ends,
+        "penetration": depth,
+        "separation": separation,
         "speed": speed,
         "event": event,
         "invariant": invariant,
@@ -268,15 +289,16 @@ def force(
     }
     z = [*([y0] if frozen is None else []), d1, T1, d, T, u, f, state, slope, x, rate_x, x1, rate_p]
     start = y0 if frozen is None else 0.0
-    through = [(y, start + T1 * d1 + T * d), (gone, T1 * x1 + T * x)]
+    through = [(y, start + T1 * d1 + T * d), (surface, T1 * x1 + T * x)]
     p = [point, normal, restituting, within, shortest, of_law, of_target, other]
     return make_block(z, p, out, through, lanes=4)
 
 
 def moved(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """Position of the robot in contact, for a new freeze there, and its hand's speed along the normal.
+    """Position of the robot during contact, for a freeze there, and its hand's speed along the normal.
 
-    z = y0, d1, T1, d, T, u as in :func:`collision`;  p = normal (3).  out = y; speed along the normal [m/s].
+    z = y0; d1; T1; d; T; u.  p = normal (3,).
+    out = y; speed along the normal [m/s].
     """
     y0, d1, d, u, y = (ca.SX.sym(s, c.ny) for s in ("y0", "d1", "d", "u", "y"))
     T1, T, normal = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("n", 3)
@@ -287,72 +309,79 @@ def moved(c: StanceCoordinates, striker: str) -> BlockExpression:
 
 
 def carried(c: StanceCoordinates) -> BlockExpression:
-    """Base load of the soles beside the forces of a model without bias: weight, Coriolis and centrifugal
-    forces.
+    """Base equations of the sole wrenches that carry the weight and the Coriolis and centrifugal forces.
 
-    z = y, legs, u at contact; wrenches (6 a sole);  p = weight [N], lever [m].  out = base rows.
+    A model without bias has the other forces only.
+
+    z = y, legs, u (ydot) at contact; wrenches (6 a sole).  p = weight [N]; lever [m].
+    out = base equations over weight and weight x lever.
     """
     y, u, legs = ca.SX.sym("y", c.ny), ca.SX.sym("u", c.ny), ca.SX.sym("legs", c.nl)
     w, weight, lever = ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("weight"), ca.SX.sym("lever")
     v = c.velocity(y, legs, u)
-    force = _inverse_dynamics(c, c.configuration(y, legs), v, ca.SX.zeros(c.rb.nv)) - c.sole_wrench_map(
-        y, legs, w
-    )
+    force = _inverse_dynamics(c, c.configuration(y, legs), v, ca.SX.zeros(c.rb.nv))
+    force -= c.sole_wrench_map(y, legs, w)
     out = {"base": force[: c.base, :] / base_scale(c, weight, lever)}
     return make_block([y, legs, u, w], [weight, lever], out, lanes=1)
 
 
 def typical_state(target: Target) -> tuple[float, ...]:
-    """Sizes of the numbers of a target's state."""
+    """Typical sizes of the components of a target's state."""
     return target.typical or (1.0,) * target.n_states
 
 
 def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """An impact in no time: impulse balance of the robot on its soles, and the law of the impulse.
+    """Impact without duration: impulse balance of the robot on its soles, and the law of the impulse.
 
-    z = y; legs; u0 (ydot) at contact; its change; impulsive sole wrenches [N s, N m s]; impulse I [N s].
-    p = normal (3); 1 for a given restitution, 0 for that of the contact law; that restitution; stiffness
-        [N/m], damping [N s/m] of the law; 1/mass of the target [1/kg], its speed before [m/s]; torque limits
-        (n); weight [N]; lever [m].
-    out = base rows, joint rows (over torque limit), separation against approach [m/s].
+    z = y; legs; u0 (ydot) before; its change du; impulsive sole wrenches [N s, N m s]; impulse I [N s].
+    p = normal (3,); 1 for a given restitution, 0 for that of the contact law; the given restitution;
+        stiffness [N/m] and damping [N s/m] of the law; 1/mass of the target [1/kg]; its speed before [m/s];
+        torque limits (n,); weight [N]; lever [m].
+    out = base equations over 0.1 s of weight and weight x lever; joint equations over 0.1 s of the torque
+        limit; residual of the speed of separation [m/s].
     """
     ny, n = c.ny, c.robot.n
     y, u0, du = (ca.SX.sym(s, ny) for s in ("y", "u0", "du"))
-    legs, w, blow = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("I")
+    legs, w, impulse = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("I")
     normal, rigid, given = ca.SX.sym("n", 3), ca.SX.sym("rigid"), ca.SX.sym("e")
     stiffness, damping, inverse_mass = ca.SX.sym("k"), ca.SX.sym("d"), ca.SX.sym("im")
     before = ca.SX.sym("before")
     limit, weight, lever = ca.SX.sym("limit", n), ca.SX.sym("weight"), ca.SX.sym("lever")
-    q, push = _pushed(c, striker, y, legs, normal)
+    q = c.configuration(y, legs)
+    j = ca.mtimes(_striker_jacobian(c, striker, q).T, normal)  # (nv, 1)
     change = c.velocity(y, legs, du)
-    balance = _inertia(c)(q, change) + push * blow - c.sole_wrench_map(y, legs, w)
-    lost = -ca.dot(
-        push, change
-    )  # speed that the impulse takes from the hand; I over it is the effective mass
-    approach = ca.dot(push, c.velocity(y, legs, u0)) - before
+    # H N du = -j' I + J_c' w, joints without torque
+    balance = _inertia(c)(q, change) + j * impulse - c.sole_wrench_map(y, legs, w)
+    lost = -ca.dot(j, change)  # speed of the hand that the impulse takes: I / m_a
+    approach = ca.dot(j, c.velocity(y, legs, u0)) - before
     # zeta = d / (2 sqrt(k mu)), with 1/mu = 1/m_a + 1/m_t
-    stiff = damping / 2 * ca.sqrt((lost / blow + inverse_mass) / stiffness)
-    e = rigid * given + (1 - rigid) * two_mass_restitution(stiff)
+    damping_ratio = damping / 2 * ca.sqrt((lost / impulse + inverse_mass) / stiffness)
+    e = rigid * given + (1 - rigid) * two_mass_restitution(damping_ratio)
     out = {
-        # 0.1 s of the limits' forces: impulses of order one
+        # over what the limits' forces give in 0.1 s, so that impulses are of order one
         "base": balance[: c.base, :] / (0.1 * base_scale(c, weight, lever)),
         "joints": balance[c.base :] / (0.1 * limit),
-        # the target gains I / m_t, the hand loses I / m_a: what approached with v_c parts with e v_c
-        "blow": blow * inverse_mass + lost - (1 + e) * approach,
+        # The target gains I / m_t and the hand loses I / m_a: from approach at v_c to separation at e v_c.
+        "blow": impulse * inverse_mass + lost - (1 + e) * approach,
     }
     p = [normal, rigid, given, stiffness, damping, inverse_mass, before, limit, weight, lever]
-    return make_block([y, legs, u0, du, w, blow], p, out, lanes=2)
+    return make_block([y, legs, u0, du, w, impulse], p, out, lanes=2)
 
 
-def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw, rubs: bool = False) -> BlockExpression:
-    """The first instant of contact, at which a damped contact has a force already: accelerations jump.
+def first_instant(
+    c: StanceCoordinates, striker: str, law: ContactLaw, friction: bool = False
+) -> BlockExpression:
+    """First instant of contact: a damped contact has a force at once, so accelerations jump.
 
-    What changes is linear in the force: H da = J_c' dw - j' f, the frozen part of equation (6).
-    z = y, legs, u0 (ydot) at contact; change of ydd; of the sole wrenches (6 a sole); f [N].
-    p = normal (3), the law's parameters, the target's speed before [m/s], armature (n), torque limits (n),
-        weight [N], lever [m]; if the striking point ``rubs`` the parameters of `ContactFriction`.
-    out = base rows, joint rows over torque limit, (f - law) / 100 N, torque that the rotors take off the
-        gears, over limit: -armature x acceleration.
+    The jump is linear in the force: H da = J_c' dw - j' f, the frozen part of equation (6).
+
+    friction : the striking point has friction.
+
+    z = y, legs, u0 (ydot) at contact; change of yddot; of the sole wrenches (6 a sole); f [N].
+    p = normal (3,); parameters of the law; the target's speed before [m/s]; armature (n,); torque limits
+        (n,); weight [N]; lever [m]; with friction the parameters of `ContactFriction`.
+    out = base equations over weight and weight x lever; joint equations over torque limit; (f - law) / 100 N;
+        -armature x acceleration over torque limit: the torque that rotors take from the gears' load.
     """
     ny, n = c.ny, c.robot.n
     y, u0, change = (ca.SX.sym(s, ny) for s in ("y", "u0", "change"))
@@ -360,45 +389,41 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw, rubs: boo
     normal, of_law = ca.SX.sym("n", 3), ca.SX.sym("law", len(law.parameters))
     armature, limit = ca.SX.sym("armature", n), ca.SX.sym("limit", n)
     weight, lever, before = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("before")
-    q, push = _pushed(c, striker, y, legs, normal)
-    jump = c.velocity(y, legs, change)
+    q = c.configuration(y, legs)
+    J = _striker_jacobian(c, striker, q)
+    da = c.velocity(y, legs, change)
     v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
-    rub, way = ca.SX.sym("rub", 2 * rubs), push
-    if rubs:
+    j = push = ca.mtimes(J.T, normal)  # (nv, 1)
+    of_friction = ca.SX.sym("friction", 2 * friction)
+    if friction:
         speed = striker_kinematics(c, striker)(q, v, 0 * v)[1]
-        way = _pushed(c, striker, y, legs, pushed_way(normal, speed, *ca.vertsplit(rub)))[1]
-    balance = _inertia(c)(q, jump) + way * f - c.sole_wrench_map(y, legs, w)
+        push = ca.mtimes(J.T, pushed_way(normal, speed, *ca.vertsplit(of_friction)))
+    balance = _inertia(c)(q, da) + push * f - c.sole_wrench_map(y, legs, w)
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     out = {
         "base": balance[: c.base, :] / base_scale(c, weight, lever),
         "joints": balance[c.base :] / limit,
-        "law": (f - law.branch(0.0, ca.dot(push, v) - before, True, named)) / FORCE_SCALE,
-        "rotors": -armature * (a + jump)[c.base :] / limit,
+        "law": (f - law.branch(0.0, ca.dot(j, v) - before, True, named)) / FORCE_SCALE,
+        "rotors": -armature * (a + da)[c.base :] / limit,
     }
-    z, p = [y, legs, u0, change, w, f], [normal, of_law, before, armature, limit, weight, lever, rub]
-    return make_block(z, p, out, lanes=2)
+    p = [normal, of_law, before, armature, limit, weight, lever, of_friction]
+    return make_block([y, legs, u0, change, w, f], p, out, lanes=2)
 
 
 def _inertia(c: StanceCoordinates) -> Any:
-    """H a (nv) as a function of q and a."""
+    """Function (q, a) -> H a (nv,)."""
     rb = c.rb
     return ca.Function("inertia", [rb.q, rb.a], [rb.rnea(None, rb.a, gravity=False)])
 
 
-def _pushed(c: StanceCoordinates, striker: str, y: Any, legs: Any, normal: Any) -> tuple[Any, Any]:
-    """q, and the row (nv, 1) of the striking point's speed along the normal in the velocities."""
-    q = c.configuration(y, legs)
-    row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{striker}")[:3, :])])(q)
-    return q, ca.mtimes(row.T, normal)
-
-
 def two_mass_restitution(ratio: Any) -> Any:
-    """Speed of separation over that of approach of two masses with a spring, and a damper in compression.
+    """Coefficient of restitution of two masses with a spring between them, and a damper in compression.
 
-    ratio: the damping over the critical one, of the reduced mass: zeta = d / (2 sqrt(k mu)).
+    ratio : damping over critical damping, zeta = d / (2 sqrt(k mu)), of the reduced mass mu.
+
     e = exp(-zeta arccos(zeta) / sqrt(1 - zeta^2)), continued through zeta = 1 by its series.
     """
-    # Near zeta = 1 both forms are 0/0; the series is right to 3e-10 there. All branches are evaluated, so
+    # Near zeta = 1 both forms are 0/0, and the series is accurate to 3e-10. All branches are evaluated, so
     # each gets an argument at which it is finite.
     below, above = ca.fmin(ratio, 0.99), ca.fmax(ratio, 1.01)
     x = 1 - ratio
@@ -412,19 +437,22 @@ def two_mass_restitution(ratio: Any) -> Any:
 
 
 def join() -> BlockExpression:
-    """One coordinate's way through two phases as that through one.
+    """Mean rate d of one coordinate over two phases: out = T1 d1 + T2 d2 - (T1 + T2) d.
 
-    z = T1, T2, d1, d2, d;  out = T1 d1 + T2 d2 - (T1 + T2) d.
+    z = T1, T2 (durations [s]); d1, d2 (mean rates in them); d.
     """
     T1, T2, d1, d2, d = z = [ca.SX.sym(s) for s in ("T1", "T2", "d1", "d2", "d")]
     return make_block(list(z), [], {"travel": T1 * d1 + T2 * d2 - (T1 + T2) * d})
 
 
-def chosen_gains(stiffness: Any, damping: Any, logs: Any, chosen: Joints) -> tuple[Any, Any]:
-    """Stiffness times the factors of ``chosen``, whose logarithms are ``logs``; damping times their roots."""
+def with_gain_factors(stiffness: Any, damping: Any, logs: Any, groups: JointGroups) -> tuple[Any, Any]:
+    """Servo stiffness times the factor of each joint group, and damping times its root.
+
+    logs (groups,) : logarithms of the factors.
+    """
     stiffness, damping = ca.SX(stiffness), ca.SX(damping)
-    for k, joints in enumerate(chosen):
+    for k, joints in enumerate(groups):
         for joint in joints:
             stiffness[joint] *= ca.exp(logs[k])
-            damping[joint] *= ca.exp(logs[k] / 2)  # the damping ratio stays
+            damping[joint] *= ca.exp(logs[k] / 2)  # keeps the damping ratio
     return stiffness, damping

@@ -1,6 +1,6 @@
-"""Initial guess of a contact: a point mass in place of the robot meets the target.
+"""Initial guess of a contact phase: the collision of a point mass, in place of the robot, with the target.
 
-The law and the target are the true ones, switches and all, integrated by SciPy.
+Contact law and target are those of the problem, with their switches and events. SciPy integrates them.
 """
 
 from __future__ import annotations
@@ -28,27 +28,35 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import VelocityLimit
 from impactopt.transcription.layout import Array
 
-LONGEST = 0.2  # [s] a contact that has not ended by then is cut off
-AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as long
-# the blow is made harder until a board breaks, or a nail moves; and softer, where contact is so stiff that
-# a harder one has hammer and nail part before the nail stands
-FASTER, TRIES = 1.3, 12
-FINER = 6  # times as many speeds are tried where the blow has several touches: few have as many as are asked
-CLOSING = 0.5  # [m/s] at which what moves away is met, at least
-FASTEST = 10.0  # [m/s] beyond a start's speed none is looked for
-SLOW = 0.1  # [m/s] that a striker has at least, either way
-DECADES = range(1, 5)  # of stiffness that are tried where bodies part too early
-# a push: durations [s] of compression and restitution, the mass's speed [m/s] at the end, what is left of the
-# robot's; and the shortest blow [s] that it stands for
-PUSH, PUSHED, LEFT, SOFT = np.array([0.015, 0.02]), 0.8, 0.6, 0.02
+MAX_CONTACT_TIME = 0.2  # [s] the integration of a contact ends here
+# [s] first phase of a nail that moves at first touch: no phase may be empty
+MIN_PRESS_TIME = 1e-6
+# A search multiplies the approach speed by powers of this factor, so many times up and as many down. Boards
+# and nails may need a faster mass; stiff contacts a slower one, as mass and nail part before the nail stops.
+SPEED_FACTOR, SPEED_STEPS = 1.3, 12
+# Steps in place of one where the contact has several touches: few speeds have the number of touches wanted.
+STEPS_FOR_TOUCHES = 6
+MIN_APPROACH_SPEED = 0.5  # [m/s] relative to a target that moves away
+MAX_SPEED_INCREASE = 10.0  # [m/s] over the given speed, in the search for a target's speed after contact
+MIN_STRIKER_SPEED = 0.1  # [m/s] a striker that is slower, in either direction, counts as this fast
+STIFFNESS_DECADES = range(1, 5)  # powers of 10, up and down, of stiffnesses tried where bodies part too early
+# Substitute for a long contact with a free mass: durations [s] of compression and restitution, speed that the
+# mass gains [m/s], fraction of its speed that the robot keeps.
+PUSH_DURATIONS, PUSH_SPEED, PUSH_SPEED_KEPT = np.array([0.015, 0.02]), 0.8, 0.6
+MAX_IMPACT_TIME = 0.02  # [s] longer contacts with a free mass are replaced by the push
 
 
 @dataclass(frozen=True)
-class Blow:
-    """A contact at k collocation points. ``durations`` [s] of its phases; the others at the points:
+class GuessedContact:
+    """A point mass's contact with the target, at k collocation points.
 
-    speed (k,) of the point mass over that at contact, moved (k,) [s]: its integral in the phase so far;
-    force (k,) [N]; impulse (k,) [N s]; state (k, n), travel (k,) [m] of the target in the phase.
+    durations : of the contact phases [s].
+    speed (k,) : of the mass, over its speed at contact.
+    moved (k,) : integral of ``speed`` since the beginning of the phase [s].
+    force (k,) : on the target [N].
+    impulse (k,) : to the target since contact [N s].
+    state (k, n_states) : of the target.
+    travel (k,) : of the target's surface since the beginning of the phase [m].
     """
 
     durations: Array
@@ -63,22 +71,23 @@ class Blow:
 def effective_mass(
     c: StanceCoordinates, strikers: Sequence[str], normal: Array, y: Array, legs: Array, rates: Array
 ) -> tuple[float, float]:
-    """Mass [kg] of a robot on fixed soles at its striker, along the normal, and the striker's speed [m/s].
+    """Effective mass [kg] of a robot on fixed soles at its striker, and the striker's speed [m/s], along the
+    normal.
 
-    Of several strikers: of each, with the others as fast; and their mean speed. One that goes back is met by
-    what comes; one that hardly moves counts as slow.
+    With two strikers: the mean of the masses at each one, as both change speed alike, and the mean speed.
     """
     q, v = c.join(y, legs), c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
     bodies = [Held.at(c.model, q, c.frames, c.robot.striker(name).model_frame) for name in strikers]
-    rows, held = np.array([normal @ body.hand for body in bodies]), bodies[0].held
-    speed, m = float((rows @ v).mean()), len(held)
-    both = np.vstack([held, rows])
-    inner = both @ np.linalg.solve(bodies[0].inertia, both.T)
-    # j P j' with the P of docs/notation.md: the inverse mass of the strikers on fixed soles, whose Delassus
-    # matrix is singular at a straight knee: least squares
-    yields = inner[m:, m:] - inner[m:, :m] @ np.linalg.lstsq(inner[:m, :m], inner[:m, m:], rcond=1e-12)[0]
-    mass = float(np.linalg.solve(yields, np.ones(len(rows))).mean())
-    return mass, speed if abs(speed) > SLOW else SLOW
+    J_hand, J_c = np.array([normal @ body.hand for body in bodies]), bodies[0].held
+    speed, m = float((J_hand @ v).mean()), len(J_c)
+    both = np.vstack([J_c, J_hand])
+    delassus = both @ np.linalg.solve(bodies[0].inertia, both.T)
+    # J_hand P J_hand' (strikers, strikers), with P = H^-1 - H^-1 J_c' (J_c H^-1 J_c')^-1 J_c H^-1 as in
+    # docs/notation.md. Least squares, because J_c H^-1 J_c' is singular at a straight knee.
+    soles, coupling = delassus[:m, :m], delassus[:m, m:]
+    inverse_mass = delassus[m:, m:] - delassus[m:, :m] @ np.linalg.lstsq(soles, coupling, rcond=1e-12)[0]
+    mass = float(np.linalg.solve(inverse_mass, np.ones(len(J_hand))).mean())
+    return mass, speed if abs(speed) > MIN_STRIKER_SPEED else MIN_STRIKER_SPEED
 
 
 def mass_at_contact(problem: ImpactProblem) -> float:
@@ -91,40 +100,48 @@ def mass_at_contact(problem: ImpactProblem) -> float:
 def coasted(
     c: StanceCoordinates, elapsed: Array, y: Array, rates: Array, legs: Array
 ) -> Iterator[tuple[Array, tuple[Array, Array]]]:
-    """Legs of a robot that coasts, at times [s] since y: angles, and rates and accelerations; (nl,) each."""
-    for at in elapsed:
-        with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
-            legs = c.solve_legs(y + rates * at, legs)
-        _, v, a = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)
+    """Legs of a robot that coasts at constant rates ydot, at ``elapsed`` times [s] since y.
+
+    Yields joint angles, and rates with accelerations; shape (nl,) each.
+    """
+    for time in elapsed:
+        # out of the legs' reach: the last angles, for the solver to correct
+        with contextlib.suppress(InputError):
+            legs = c.solve_legs(y + rates * time, legs)
+        _, v, a = c.complete_motion(y + rates * time, rates, np.zeros(c.ny), legs)
         yield legs, (v[c.base + c.dependent], a[c.base + c.dependent])
 
 
 def fastest_at_contact(problem: ImpactProblem) -> float:
-    """Greatest speed [m/s] of the striker along the normal that the joints' limits allow, where inverse
-    kinematics reaches the target.
+    """Largest speed [m/s] of the striker along the normal within the joints' velocity limits.
+
+    The posture is the one with which inverse kinematics reaches the target. A linear program; inf if it is
+    unbounded.
     """
     c, limit = problem.coordinates, problem.term(VelocityLimit).most(problem.robot)
     y, legs = c.split(problem.contact_posture)
-    model, data, still = c.model, c.model.createData(), np.zeros(c.ny)
+    model, data, at_rest = c.model, c.model.createData(), np.zeros(c.ny)
     # rates of all joints (nv, ny), and the striker's speed (ny,), for rates ydot of 1
-    motions = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
+    motions = np.column_stack([c.complete_motion(y, e, at_rest, legs)[1] for e in np.eye(c.ny)])
     pin.computeJointJacobians(model, data, c.join(y, legs))
     frame = model.getFrameId(f"striker:{problem.striker}")
     jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
     jacobian = np.reshape(jacobian, (6, model.nv))[:3]  # pin drops an axis where nv is 1
-    row, joints = problem.normal @ jacobian @ motions, motions[c.base :]
+    speed, joints = problem.normal @ jacobian @ motions, motions[c.base :]
     bounds = np.concatenate([limit, limit])
-    found = linprog(-row, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))
+    found = linprog(-speed, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))
     return float(-found.fun) if found.status == 0 else np.inf
 
 
 @dataclass(frozen=True)
 class Parting:
-    """Point masses that part before the last of a target's events, ``event``: when [s].
+    """A point mass and a target that separate before the last of the target's events; None: not known.
 
-    touches : how often they have to meet for it, at a speed that they may have.
-    needed : speed [m/s] at which they do not; stiffness: the nearest, by factors of 10, with which they do
-        not at the speed that they have. None where none is known.
+    event : name of that event.
+    time : of the separation [s].
+    touches : number of touches that bring the event about, at a speed the robot can have.
+    needed : speed at which one touch does [m/s].
+    stiffness : of the contact with which one touch does at the robot's speed, the nearest by factors of 10.
     """
 
     event: str
@@ -135,69 +152,78 @@ class Parting:
 
 
 def touches_needed(law: ContactLaw, target: Target, mass: float, fastest: float) -> int | None:
-    """Touches in which a point mass [kg] brings about all events of a target, at a speed up to the fastest;
-    None where as many as a plan may have do not.
+    """Least number of touches in which a point mass [kg] brings about all events of a target.
+
+    fastest : largest speed of the mass [m/s].
+
+    None if no number of touches that a plan may have does.
     """
-    speeds = (fastest * FASTER ** (1 - k) for k in range(2 * TRIES))
-    if any(_phases(_histories(law, target, mass, v), target) is not None for v in speeds):
+    speeds = (fastest * SPEED_FACTOR ** (1 - k) for k in range(2 * SPEED_STEPS))
+    if any(_phases(_integrated(law, target, mass, v), target) is not None for v in speeds):
         return 1
     if not target.met_again:
         return None
     least: int | None = None
-    for k in range(2 * TRIES * FINER):
-        found = _histories(law, target, mass, fastest * FASTER ** (1 - k / FINER), least or MOST_TOUCHES)
+    for k in range(2 * SPEED_STEPS * STEPS_FOR_TOUCHES):
+        speed = fastest * SPEED_FACTOR ** (1 - k / STEPS_FOR_TOUCHES)
+        found = _integrated(law, target, mass, speed, least or MOST_TOUCHES)
         if _phases(found, target) is not None:
             least = min(found.touches, least or MOST_TOUCHES)
-        if least in (1, 2) or _first_event(found, target) is None:  # slower, there is none either
+        if least in (1, 2) or _first_event(found, target) is None:  # nor is there one at lower speeds
             break
     return least
 
 
 def can_meet(law: ContactLaw, target: Target, mass: float, fastest: float, touches: int) -> bool:
-    """True if a point mass [kg] brings about all events of a target in so many touches, at some speed up to
-    the fastest.
+    """True if a point mass [kg] brings about all events of a target in this number of touches.
+
+    fastest : largest speed of the mass [m/s].
     """
-    for k in range(2 * TRIES * FINER):
-        found = _histories(law, target, mass, fastest * FASTER ** (-k / FINER), touches)
+    for k in range(2 * SPEED_STEPS * STEPS_FOR_TOUCHES):
+        speed = fastest * SPEED_FACTOR ** (-k / STEPS_FOR_TOUCHES)
+        found = _integrated(law, target, mass, speed, touches)
         if found.touches == touches and _phases(found, target) is not None:
             return True
-        if _first_event(found, target) is None:  # slower, there is none either
+        if _first_event(found, target) is None:  # nor is there one at lower speeds
             return False
     return False
 
 
 def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
-    """Detects that a point mass [kg] and a target part before the phases' events, at all speeds up to the
-    fastest.
+    """Detects that a point mass [kg] and a target separate before the events of the contact phases.
 
-    None: at one of them, they do not.
+    fastest : largest speed of the mass [m/s].
+
+    None if there is a speed at which one touch has all events, or nothing is known.
     """
 
-    def whole(law: ContactLaw, speed: float) -> bool:
-        return _phases(_histories(law, target, mass, speed), target) is not None
+    def complete(law: ContactLaw, speed: float) -> bool:
+        return _phases(_integrated(law, target, mass, speed), target) is not None
 
     if not np.isfinite(fastest):
         return None
     touches = touches_needed(law, target, mass, fastest)
     if touches == 1:
         return None
-    time = _histories(law, target, mass, fastest).time
-    if time[-1] >= LONGEST:
+    time = _integrated(law, target, mass, fastest).time
+    if time[-1] >= MAX_CONTACT_TIME:
         return None
-    faster = (fastest * FASTER**k for k in range(2, 2 * TRIES))
-    numbers = law.parameters
-    factors = [10.0**n for k in DECADES for n in (-k, k)] if "stiffness" in numbers else []
-    other = (numbers["stiffness"] * factor for factor in factors)
+    faster = (fastest * SPEED_FACTOR**k for k in range(2, 2 * SPEED_STEPS))
+    parameters = law.parameters
+    factors = [10.0**n for k in STIFFNESS_DECADES for n in (-k, k)] if "stiffness" in parameters else []
+    others = (parameters["stiffness"] * factor for factor in factors)
     return Parting(
         event=target.guards[-1],
         time=float(time[-1]),
         touches=touches,
-        needed=next((v for v in faster if whole(law, v)), None),
-        stiffness=next((k for k in other if whole(type(law)(**{**numbers, "stiffness": k}), fastest)), None),
+        needed=next((v for v in faster if complete(law, v)), None),
+        stiffness=next(
+            (k for k in others if complete(type(law)(**{**parameters, "stiffness": k}), fastest)), None
+        ),
     )
 
 
-def blow(
+def guessed_contact(
     law: ContactLaw,
     target: Target,
     mass: float,
@@ -205,80 +231,79 @@ def blow(
     phase: NDArray[np.intp],
     place: Array,
     touches: int,
-) -> Blow:
-    """A point mass [kg] that meets the target at a speed [m/s], at points ``place`` in [0, 1] of phases.
+) -> GuessedContact:
+    """Contact of a point mass [kg] with the target, sampled at collocation points.
 
-    A target with events is met as fast, or as slowly, as it takes for all of them to happen in so many
-    touches, and one that moves away no slower than it goes.
+    speed : of the mass at contact [m/s]. It is changed as little as a target with events needs for all of
+        them to happen in ``touches`` touches, and raised where the target moves away faster.
+    phase (k,), place (k,) : of each collocation point, its contact phase and place in it, in [0, 1].
     """
-    speed = max(speed, float(target.speed_before()) + CLOSING)
-    finer = 1 if touches == 1 else FINER
-    for k in range(2 * TRIES * finer if target.guards else 1):
-        # nearest speeds first, slower and faster in turn
-        at = speed * FASTER ** ((k + 1) // 2 / finer * (1 if k % 2 else -1))
-        found = _histories(law, target, mass, at, touches)
+    speed = max(speed, float(target.speed_before()) + MIN_APPROACH_SPEED)
+    finer = 1 if touches == 1 else STEPS_FOR_TOUCHES
+    for k in range(2 * SPEED_STEPS * finer if target.guards else 1):
+        # nearest speeds first, faster and slower in turn
+        at = speed * SPEED_FACTOR ** ((k + 1) // 2 / finer * (1 if k % 2 else -1))
+        found = _integrated(law, target, mass, at, touches)
         ends = _phases(found, target) if found.touches == touches else None
         if ends is not None:
             break
-    time, rows, _ = found
-    if ends is None:  # somewhere, where the solver has to fix it
+    time, values, _ = found
+    if ends is None:  # no speed has the events: arbitrary phases, for the solver to correct
         ends = np.array([0.0, 0.4, 0.5, 1.0] if target.guards else [0.0, 0.5, 1.0])
         ends = time[-1] * (ends if touches == 1 else np.linspace(0.0, 1.0, 2 * touches + 1))
     times = ends[phase] + place * np.diff(ends)[phase]
 
-    def sample(values: Array) -> Array:
-        return np.stack([np.interp(times, time, row) for row in values], axis=1)
+    def in_phase(quantity: Array) -> Array:
+        return np.interp(times, time, quantity) - np.interp(ends[phase], time, quantity)
 
-    def since(values: Array) -> Array:
-        return np.interp(times, time, values) - np.interp(ends[phase], time, values)
-
-    x, v, travel, force = rows[0], rows[1], rows[2], rows[-1]
-    state = sample(rows[3:-1]) if target.n_states else np.zeros((len(times), 0))
-    comes = float(target.speed_before()) < 0  # through the hand, if it were pushed
-    if isinstance(target, FreeMass) and ends[-1] > SOFT and not comes:
-        return push(target, phase, place)
-    return Blow(
+    x, v, travel, force = values[0], values[1], values[2], values[-1]
+    states = [np.interp(times, time, state) for state in values[3:-1]]
+    # A mass that comes towards the robot cannot be pushed: its travel would begin inside the hand.
+    comes = float(target.speed_before()) < 0
+    if isinstance(target, FreeMass) and ends[-1] > MAX_IMPACT_TIME and not comes:
+        return _push(target, phase, place)
+    return GuessedContact(
         durations=np.diff(ends),
         speed=np.interp(times, time, v) / v[0],
-        moved=since(x) / v[0],
+        moved=in_phase(x) / v[0],
         force=np.interp(times, time, force),
         impulse=mass * (v[0] - np.interp(times, time, v)),
-        state=state,
-        travel=since(travel),
+        state=np.reshape(states, (target.n_states, len(times))).T,
+        travel=in_phase(travel),
     )
 
 
 def speed_that_leaves(
     law: ContactLaw, target: Target, mass: float, speed: float, least: float, most: float
 ) -> float:
-    """The speed [m/s] nearest to a given one with which a point mass [kg] leaves the target no slower than
-    ``least``, and no faster than ``most`` [m/s].
+    """Approach speed [m/s] of a point mass [kg], nearest to the given one, after which the target's speed is
+    between ``least`` and ``most`` [m/s].
     """
 
-    def left(speed: float) -> float:
-        rows = _histories(law, target, mass, speed).rows
-        return float(target.velocity(rows[3:-1, -1], target.parameters))
+    def target_speed(speed: float) -> float:
+        values = _integrated(law, target, mass, speed).values
+        return float(target.velocity(values[3:-1, -1], target.parameters))
 
-    after = left(speed)
+    after = target_speed(speed)
     wanted = min(max(after, least), most)
     low = high = speed
     if after > most:
-        low = float(target.speed_before()) + CLOSING
+        low = float(target.speed_before()) + MIN_APPROACH_SPEED
     else:
-        high = speed + FASTEST
-    if not left(low) <= wanted <= left(high):
+        high = speed + MAX_SPEED_INCREASE
+    if not target_speed(low) <= wanted <= target_speed(high):
         return speed
-    return float(brentq(lambda v: left(v) - wanted, low, high, xtol=1e-2)) if low < high else speed
+    return float(brentq(lambda v: target_speed(v) - wanted, low, high, xtol=1e-2)) if low < high else speed
 
 
 def natural_durations(law: ContactLaw, target: Target, mass: float, touches: int) -> Array:
-    """Duration [s] of each phase of a point mass [kg] that hits at 1 m/s.
+    """Duration [s] of each contact phase of a point mass [kg] that hits at 1 m/s.
 
-    It is known from the last programs, which mostly are of the same blow.
+    Cached, as successive programs mostly have the same law, target and mass.
     """
     try:
         return _natural_durations(law, target, mass, touches)
-    except TypeError:  # a law or a target of one's own that has no hash
+    except TypeError:  # a user's law or target without a hash
         return _natural_durations.__wrapped__(law, target, mass, touches)
 
 
@@ -286,107 +311,110 @@ def natural_durations(law: ContactLaw, target: Target, mass: float, touches: int
 def _natural_durations(law: ContactLaw, target: Target, mass: float, touches: int) -> Array:
     phases = len(contact_phases(target, touches))
     at = np.arange(phases, dtype=np.intp)
-    return blow(law, target, mass, 1.0, at, np.ones(phases), touches).durations
+    return guessed_contact(law, target, mass, 1.0, at, np.ones(phases), touches).durations
 
 
-def push(target: FreeMass, phase: NDArray[np.intp], place: Array) -> Blow:
-    """A uniform force on a free mass.
+def _push(target: FreeMass, phase: NDArray[np.intp], place: Array) -> GuessedContact:
+    """Uniform force on a free mass, in place of a contact that is soft.
 
-    Where a contact with one is soft, plans with much else to meet converge more surely from here than from
-    its true blow.
+    Plans with many other constraints converge more reliably from here than from the soft contact.
     """
-    total = float(PUSH.sum())
-    before = np.array([0.0, PUSH[0]])[phase]
-    elapsed = before + place * PUSH[phase]
+    total = float(PUSH_DURATIONS.sum())
+    before = np.array([0.0, PUSH_DURATIONS[0]])[phase]
+    elapsed = before + place * PUSH_DURATIONS[phase]
     fraction = elapsed / total
-    ramp = (before / total + fraction) / 2 * place * PUSH[phase]  # the fraction's integral in the phase
-    force = np.full(len(phase), target.mass * PUSHED / total)
-    return Blow(
-        durations=PUSH,
-        speed=1 - (1 - LEFT) * fraction,
-        moved=place * PUSH[phase] - (1 - LEFT) * ramp,
+    ramp = (before / total + fraction) / 2 * place * PUSH_DURATIONS[phase]  # integral of the fraction
+    force = np.full(len(phase), target.mass * PUSH_SPEED / total)
+    return GuessedContact(
+        durations=PUSH_DURATIONS,
+        speed=1 - (1 - PUSH_SPEED_KEPT) * fraction,
+        moved=place * PUSH_DURATIONS[phase] - (1 - PUSH_SPEED_KEPT) * ramp,
         force=force,
         impulse=force * elapsed,
-        state=PUSHED * fraction[:, None],
-        travel=PUSHED * ramp + target.initial_velocity * place * PUSH[phase],
+        state=PUSH_SPEED * fraction[:, None],
+        travel=PUSH_SPEED * ramp + target.initial_velocity * place * PUSH_DURATIONS[phase],
     )
 
 
 class _History(NamedTuple):
-    """Instants (k,) [s], and rows of the mass's position and speed, the target's travel and state, force.
+    """Integrated contact of a point mass.
 
-    met : instants [s] at which they part and meet again, in turn, before they part for the last time.
+    time (k,) : [s].
+    values (4 + n_states, k) : position [m] and speed [m/s] of the mass, travel [m] and state of the target,
+        contact force [N].
+    switched : instants [s] of separation and of the next touch, in turn, before the last separation.
     """
 
     time: Array
-    rows: Array
-    met: list[float]
+    values: Array
+    switched: list[float]
 
     @property
     def touches(self) -> int:
-        return len(self.met) // 2 + 1
+        return len(self.switched) // 2 + 1
 
 
-def _histories(law: ContactLaw, target: Target, mass: float, speed: float, touches: int = 1) -> _History:
-    """The blow of a point mass that meets a target until its first event has happened, so many times at
-    most.
+def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touches: int = 1) -> _History:
+    """Contact of a point mass [kg] with a target, up to the separation after the target's first event, or
+    after this number of touches.
     """
 
     of_law, of_target = law.parameters, target.parameters
 
-    def moves(y: Array) -> float:
+    # y = position and speed of the mass, travel and state of the target
+    def surface_speed(y: Array) -> float:
         return float(target.velocity(y[3:], of_target))
 
     def force(y: Array) -> float:
-        return float(law.force(float(y[0] - y[2]), float(y[1] - moves(y)), of_law))
+        return float(law.force(float(y[0] - y[2]), float(y[1] - surface_speed(y)), of_law))
 
-    def flow(_: float, y: Array) -> list[float]:
+    def derivative(_: float, y: Array) -> list[float]:
         f = force(y)
-        return [y[1], -f / mass, moves(y), *map(float, target.derivative(y[3:], f, of_target))]
+        return [y[1], -f / mass, surface_speed(y), *map(float, target.derivative(y[3:], f, of_target))]
 
-    def apart(_: float, y: Array) -> float:
-        rate = float(y[1] - moves(y))
+    def separation(_: float, y: Array) -> float:
+        rate = float(y[1] - surface_speed(y))
         return 1.0 if rate > 0 else float(law.separation(float(y[0] - y[2]), rate, of_law))
 
-    def meet(_: float, y: Array) -> float:
+    def touch(_: float, y: Array) -> float:
         return float(y[0] - y[2])
 
-    apart.terminal, apart.direction = True, -1.0  # type: ignore[attr-defined]
-    meet.terminal, meet.direction = True, 1.0  # type: ignore[attr-defined]
+    separation.terminal, separation.direction = True, -1.0  # type: ignore[attr-defined]
+    touch.terminal, touch.direction = True, 1.0  # type: ignore[attr-defined]
     start = np.array([0.0, speed, 0.0, *np.zeros(target.n_states)])
-    # explicit: what switches, as a nail does, makes stiff solvers stall
-    options = {"method": "RK23", "rtol": 1e-4, "atol": 1e-8, "max_step": LONGEST / 400}
-    times, columns, met = list[Array](), list[Array](), list[float]()
-    for k in range(2 * touches - 1):
-        span = (met[-1] if met else 0.0, LONGEST)
-        found = solve_ivp(flow, span, start, events=meet if k % 2 else apart, **options)
+    # An explicit method, because the switches of a nail make implicit ones stall.
+    options = {"method": "RK23", "rtol": 1e-4, "atol": 1e-8, "max_step": MAX_CONTACT_TIME / 400}
+    times, values, switched = list[Array](), list[Array](), list[float]()
+    for k in range(2 * touches - 1):  # touches (even k) and gaps between them (odd k)
+        span = (switched[-1] if switched else 0.0, MAX_CONTACT_TIME)
+        found = solve_ivp(derivative, span, start, events=touch if k % 2 else separation, **options)
         times.append(found.t)
-        columns.append(found.y)
-        if found.status != 1:
+        values.append(found.y)
+        if found.status != 1:  # no event until the end of the time
             break
         start = found.y[:, -1]
         if k % 2 == 0 and (k == 2 * touches - 2 or target.guard(start[3:], 0.0, found.t[-1], 0) >= 0):
             break
-        met.append(float(found.t[-1]))
-    y = np.hstack(columns)
-    return _History(np.concatenate(times), np.vstack([y, [force(each) for each in y.T]]), met)
+        switched.append(float(found.t[-1]))
+    y = np.hstack(values)
+    return _History(np.concatenate(times), np.vstack([y, [force(each) for each in y.T]]), switched)
 
 
 def _phases(found: _History, target: Target) -> Array | None:
-    """Start and ends of the phases [s]; None if the target's events have not happened in their order."""
-    time, rows, met = found
-    if met:
+    """Start and ends (phases + 1,) of the contact phases [s]; None if events are out of order."""
+    time, values, switched = found
+    if switched:  # several touches, and the event in the last of them
         first = _first_event(found, target)
-        if len(met) % 2 or first is None or not met[-1] < time[first] < time[-1]:
+        if len(switched) % 2 or first is None or not switched[-1] < time[first] < time[-1]:
             return None
-        return np.array([0.0, *met, time[first], time[-1]])
-    deepest = int(np.argmax(rows[0] - rows[2]))
-    ends = [0.0, time[deepest], time[-1]]
-    if isinstance(target, Nail):
-        moves = np.flatnonzero(rows[3] > 0)
+        return np.array([0.0, *switched, time[first], time[-1]])
+    deepest = int(np.argmax(values[0] - values[2]))
+    ends = [0.0, time[deepest], time[-1]]  # compression and restitution
+    if isinstance(target, Nail):  # pressed, driven, released
+        moves = np.flatnonzero(values[3] > 0)
         if not moves.size:
             return None
-        ends = [0.0, max(time[moves[0] - 1], AT_ONCE), time[moves[-1]], time[-1]]
+        ends = [0.0, max(time[moves[0] - 1], MIN_PRESS_TIME), time[moves[-1]], time[-1]]
     elif target.guards:
         first = _first_event(found, target)
         if first is None or first >= deepest:
@@ -396,9 +424,7 @@ def _phases(found: _History, target: Target) -> Array | None:
 
 
 def _first_event(found: _History, target: Target) -> int | None:
-    """Index of the instant at which a target's first event has happened; None: it does not happen."""
-    time, rows, _ = found
-    return next(
-        (k for k in range(len(time)) if float(target.guard(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0),
-        None,
-    )
+    """Index of the first instant after a target's first event; None if it does not happen."""
+    time, values, _ = found
+    guards = (float(target.guard(values[3:-1, k], values[-1, k], time[k], 0)) for k in range(len(time)))
+    return next((k for k, guard in enumerate(guards) if guard >= 0), None)

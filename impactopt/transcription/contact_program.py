@@ -17,11 +17,17 @@ from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.clearance import ApartRow, Held, add_apart_rows, coupled, move_apart
+from impactopt.transcription.clearance import (
+    ClearanceKey,
+    SeparatingDirection,
+    add_clearance_constraints,
+    coupled,
+    move_bodies,
+)
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE
-from impactopt.transcription.contact_set import Hit
-from impactopt.transcription.contact_state import ContactEnd, DrivePoint, still
+from impactopt.transcription.contact_set import ContactSet
+from impactopt.transcription.contact_state import ContactEnd, DrivePoint, joint_motion_slots
 from impactopt.transcription.frozen_collision import InstantImpact
 from impactopt.transcription.layout import (
     Affine,
@@ -44,8 +50,12 @@ Program = TypeVar("Program", bound="ContactProgram")
 
 
 class BodyState(NamedTuple):
-    """Configuration of the robot at a node: phase (0 before contact, 2 after it, 3 after a missed one), the
-    node's name, time [s] since the start, and configuration (nq,).
+    """Configuration of the robot at a node.
+
+    phase : 0 before contact, 2 after it, 3 after a missed one.
+    name : of the node.
+    time : since the start [s].
+    q : configuration (nq,).
     """
 
     phase: int
@@ -55,24 +65,28 @@ class BodyState(NamedTuple):
 
 
 class ContactProgram(ABC):
-    """A builder, a hit, and what whoever completes it adds: its parts, and the clearance constraints.
+    """Nonlinear program (NLP) with a contact; subclasses add the motion's other parts.
+
+    A subclass builds its parts and calls :meth:`_finish`. Terms and objectives use the methods up to
+    :meth:`squares`.
 
     Attributes
     ----------
-    builder : with which all parts are built.  hit : the contact with all targets.
+    builder : variables, blocks and constraints of all parts.
+    hit : collisions with all targets.
     problem, coordinates, robot, functions, y0, legs0 : the builder's.
-    angular_momentum : after contact, a group of three, if an objective asks for it.
-    objectives : the problem's that it knows, with their quantities.
-    apart_rows : clearance constraints, in the order of their rows, which are the last.
+    angular_momentum : after contact, a group of three variables, if it is in the objective.
+    objectives : of the problem, as far as this program has them, with their quantities.
+    apart_rows : clearance constraints, in the program's order; they are its last constraints.
     """
 
-    def __init__(self, builder: Builder, hit: Hit) -> None:
+    def __init__(self, builder: Builder, hit: ContactSet) -> None:
         self.builder, self.hit = builder, hit
         self.problem, self.coordinates, self.robot = builder.problem, builder.coordinates, builder.robot
         self.functions, self.y0, self.legs0 = builder.functions, builder.y0, builder.legs0
         self.angular_momentum: Group | None = None
         self.objectives: list[tuple[Objective, Quantity]] = []
-        self.apart_rows: Mapping[ApartRow, Held] = {}
+        self.apart_rows: Mapping[ClearanceKey, SeparatingDirection] = {}
 
     # ------------------------------------------------------------------ for terms and objectives
     @property
@@ -134,91 +148,88 @@ class ContactProgram(ABC):
 
     @property
     def feedforward(self) -> Group:
-        """Torques over limit (n) at contact, held from there on."""
+        """Feed-forward torques over limit (n,), constant during contact."""
         return self.hit.contact.feedforward
 
     @property
     def u0(self) -> Group:
-        """The rate ydot (ny) at contact."""
+        """Rate ydot (ny,) at contact."""
         return self.hit.contact.u0
 
     def drive_points(self) -> list[DrivePoint]:
-        """Torques and motions of the joints, as variables: at the nodes, and at collocation points of all
-        contacts.
-        """
+        """Torques and motions of the joints at the nodes and at the collocation points of all collisions."""
         return self._points
 
     @cached_property
     def _points(self) -> list[DrivePoint]:
         nodes = [
-            DrivePoint(place, torque, still(y, y1, y2, T, legs))
+            DrivePoint(place, torque, joint_motion_slots(y, y1, y2, T, legs))
             for place, torque, (y, y1, y2, legs, _, T) in self._nodes()
         ]
         return [*nodes, *self.hit.drives()]
 
     def wrenches(self) -> list[tuple[Place, Affine]]:
-        """Wrenches on soles and supporting hands (6 each), at the nodes and at collocation points of all
-        contacts that last.
+        """Wrenches on soles and supporting hands (6 each), at the nodes and at the collocation points of all
+        collisions.
         """
         nodes = [(place, slots[4]) for place, slots in self._node_slots()]
-        lasting = [c for c in self.hit.collisions if isinstance(c, Collision)]
-        return [*nodes, *(found for collision in lasting for found in collision.wrenches())]
+        return [*nodes, *(found for collision in self.hit.lasting for found in collision.wrenches())]
 
     def first_instants(self) -> list[tuple[Place, Index]]:
-        """First instants of damped contacts, of a program with a term that looks at them.
+        """First instants of damped contacts, if a term needs them.
 
-        Place, and numbers of the outputs (n) that are -armature x acceleration over the torque limit. The
-        torque is that of `feedforward`.
+        Place, and indices of the outputs (n,) that are -armature x acceleration over the torque limit. The
+        torque there is `feedforward`.
         """
         return self.hit.first_instants()
 
     def contact_ends(self) -> list[ContactEnd]:
-        """States at the beginning and the end of all contacts."""
+        """Joint motions before and after each collision."""
         return self.hit.contact_ends()
 
     def deepest_penetration(self) -> Affine:
-        """[m], of a contact that lasts: at the end of compression, as a variable."""
+        """Penetration [m] at the end of the expected target's compression, as a variable."""
         return self.lift("deepest penetration", self.hit.deepest)[0] * DEPTH_SCALE
 
     def target_energy(self) -> Affine:
-        """[J] in the target at separation, as a variable."""
+        """Energy [J] of the target at separation, as a variable."""
 
-        def numbers(problem: ImpactProblem) -> Array:
+        def parameters(problem: ImpactProblem) -> Array:
             return np.array(list(problem.target.parameters.values()))
 
-        at = self.add_block("energy", [[self.expected.target_state]], numbers(self.problem))
-        self.builder.follow(lambda b: b.block("energy").take_parameters(numbers(b.problem)))
+        at = self.add_block("energy", [[self.expected.target_state]], parameters(self.problem))
+        self.builder.follow(lambda b: b.block("energy").take_parameters(parameters(b.problem)))
         return self.lift("target energy", np.array([at]))[0]
 
     def peak_force(self) -> Affine:
-        """The largest contact force [N], of one that lasts, as a variable."""
-        hit: Any = self.expected
-        forces = hit.f
+        """Largest contact force [N] of the expected collision, as a variable."""
+        assert isinstance(self.expected, Collision)
+        forces = self.expected.f
         at = self.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
         return self.lift("peak force", np.array([at]))[0] * PEAK_SCALE
 
     def squares(self, group: Group) -> Quantity:
-        """The sum of the squares of a group's variables, in physical units."""
+        """Sum of the squares of a group's variables, in physical units."""
         return Quantity(Affine.zeros(1), group)
 
     # ------------------------------------------------------------------ the program
     def _finish(self, terms: tuple[Term, ...], objectives: tuple[Objective, ...]) -> None:
-        """Rows that these terms bring, those of springs and hinges, and the objective."""
+        """Add the constraints of springs, hinges and terms, and assemble the objective."""
         add_springs(self.builder, self._spring_points(), self.hit.contact.gains[0])
         if self.builder.robot.hinges.any():
             add_hinges(self.builder, [(place, torque) for place, torque, _ in self._nodes()])
         for term in terms:
-            if type(term).add_rows is not Term.add_rows:  # those of others are there
+            if type(term).add_rows is not Term.add_rows:  # the parts have those of the other terms
                 term.add_rows(self)
         self.objectives = quantities(self, objectives)
-        self._worth = assemble(self.layout, self.objectives, self._prices())
-        self._bare = self.builder
+        self._objective = assemble(self.layout, self.objectives, self._prices())
+        self._without_clearance = self.builder
 
     @cached_property
     def program(self) -> StructuredProgram:
-        """All of it, for a solver."""
-        objective, quadratic, linear = self._worth
-        if self.apart_rows:  # all that such constraints may couple: solvers' structures serve any of them
+        """The program for a solver."""
+        objective, quadratic, linear = self._objective
+        if self.apart_rows:  # one structure for all sets of clearance constraints, which solvers can reuse
             quadratic = coupled(quadratic, self.body_spots())
         return StructuredProgram(
             self.layout,
@@ -232,59 +243,61 @@ class ContactProgram(ABC):
             ),
         )
 
-    def with_apart(self: Program, rows: Mapping[ApartRow, Held]) -> Program:
-        """The same program with just these clearance constraints."""
+    def with_apart(self: Program, constraints: Mapping[ClearanceKey, SeparatingDirection]) -> Program:
+        """The same program with exactly these clearance constraints."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
-        other.builder = self._bare.copy()
-        order = add_apart_rows(other.builder, self.body_spots(), rows)
-        other.apart_rows = {name: rows[name] for name in order}
+        other.builder = self._without_clearance.copy()
+        order = add_clearance_constraints(other.builder, self.body_spots(), constraints)
+        other.apart_rows = {key: constraints[key] for key in order}
         return other
 
     def body_spots(self) -> list[tuple[Place, list[Affine]]]:
-        """Places with coordinates and legs, where bodies are kept apart and tendons in their ranges."""
+        """Nodes with coordinates and legs, at which clearance and tendons' ranges are constrained."""
         return [*self.swing_spots(), *self.follow_spots()]
 
     def move_to(self, problem: ImpactProblem, *, anew: bool = True) -> None:
-        """Take the numbers of a problem with another point, law or target, and leave the rest as it is built.
+        """Update the program to a problem with another point, law or target.
 
-        anew : the least durations of a contact's phases too, which else are kept where numbers are alike.
+        anew : update the least durations of contact phases, too (`ContactParameters.update_parameters`).
 
-        What follows the problem then is what parts have told `Builder.follow`; whether that is all,
-        `StructuredProgram.same_numbers` finds.
+        All functions registered by `Builder.follow` are called. `StructuredProgram.same_numbers` tells
+        whether that has updated everything that depends on the problem.
         """
         self.problem = problem
-        builders = [self._bare] if self._bare is self.builder else [self._bare, self.builder]
+        builders = [self._without_clearance]
+        if self.builder is not self._without_clearance:
+            builders.append(self.builder)
         for b in builders:
             b.problem = problem
-        self.hit.renew(anew=anew)
+        self.hit.update_parameters(anew=anew)
         for b in builders:
-            for take in b.followers:
-                take(b)
-        own = len(self._bare.blocks)
-        move_apart(problem, self.blocks[own:], self.apart_rows)
+            for update in b.followers:
+                update(b)
+        own = len(self._without_clearance.blocks)
+        move_bodies(problem, self.blocks[own:], self.apart_rows)
         self.program.take_numbers(self.layout, self.blocks, self.rows)
 
     def with_lifted(self, x: Array) -> Array:
-        """The variables (n,) with lifted ones made equal to what they stand for."""
+        """Variables (n,) with lifted ones set to the outputs of blocks that they equal; 0 for NaN and inf."""
         x = x.copy()
-        for group, outputs in self.builder.lifted:  # in order: one may be a function of one before
+        for group, outputs in self.builder.lifted:  # in order, as one may be a function of earlier ones
             found = self.program.all_outputs(x)[outputs]
             group.write(x, np.where(np.isfinite(found), found, 0.0))
         return x
 
-    # ------------------------------------------------------------------ what completes it
+    # ------------------------------------------------------------------ for subclasses
     @abstractmethod
     def _determined(self) -> list[Determined]:
-        """Variables that linear or block constraints determine, of all parts."""
+        """Variables of all parts that linear or block constraints determine."""
 
     @abstractmethod
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
-        """Places of nodes, torques over limit there, and slots of the block ``node``."""
+        """Place, torques over limit, and slots of the block ``node``, at each node."""
 
     @abstractmethod
     def _node_slots(self) -> list[tuple[Place, list[Affine]]]:
-        """The same without torques, which not every program has as variables."""
+        """Place and slots of the block ``node`` at each node; torques are no variables in some programs."""
 
     def _spring_points(self) -> list[SpringPoint]:
         """Points where springs of joints obey their law."""
@@ -296,15 +309,15 @@ class ContactProgram(ABC):
 
     @abstractmethod
     def swing_spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
-        """Places of the swing's nodes with coordinates and legs, from a fraction of it on to the contact."""
+        """Swing's nodes with coordinates and legs, from a fraction of the swing on to the contact."""
 
     @abstractmethod
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
-        """Places after contact with coordinates and legs."""
+        """Nodes after contact with coordinates and legs."""
 
     @abstractmethod
     def body_states(self, x: Array) -> list[BodyState]:
-        """Configurations at all places of `body_spots`, for solver variables (n,)."""
+        """Configurations at the nodes of `body_spots`, for solver variables (n,)."""
 
     @abstractmethod
     def travel(self, x: Array, time: Array) -> Array:
@@ -312,11 +325,11 @@ class ContactProgram(ABC):
 
     @abstractmethod
     def decode(self, x: Array) -> Any:
-        """The plan or the strike that solver variables (n,) stand for."""
+        """Plan or strike, from solver variables (n,)."""
 
     # ------------------------------------------------------------------ solution
     def posture(self, x: Array, slots: list[Affine]) -> Array:
-        """Configuration (nq,) of coordinates and legs."""
+        """Configuration (nq,) of coordinates and legs, for solver variables (n,)."""
         y, legs = slots
         return self.coordinates.join(y.evaluate(x), legs.evaluate(x))
 

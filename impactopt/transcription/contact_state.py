@@ -1,6 +1,7 @@
-"""State at contact that all collisions of a program start from, and parameters of contact law and target.
+"""State at contact, which all collisions of a program share, and parameters of contact law and target.
 
-Also the points at which a program knows the state of joints and drives: nodes, contact and its ends.
+Also the points at which a program has the states of joints and drives: nodes, collocation points, and the
+ends of a contact.
 """
 
 from __future__ import annotations
@@ -18,20 +19,27 @@ from impactopt.transcription.contact_guess import natural_durations
 from impactopt.transcription.layout import Affine, Array, Group, Place
 from impactopt.transcription.mesh import CollocationPoint
 
-# of the shortest compression that each of the two may last which an event makes of it, and the first of them
-# where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
-SHARE, AT_ONCE = 0.1, 0.05
-SEVERAL = 0.01  # the same of each phase where striker and target part and meet again
-# of a phase without a shortest time: share of the natural one, [s] at most, and share of the longest time
-OF_NATURAL, LEAST, HALF = 0.15, 2e-3, 0.5
-ALIKE = 3.0  # factor between numbers that are
+# Least durations of contact phases, as fractions of that of compression or restitution (`contact_duration`).
+# Phases into which events split compression may last the first fraction. A first phase whose event may come
+# at first touch may last the second: short, as nothing moves in it, but not zero, as its constraints are
+# divided by its duration.
+EVENT_PHASE_FRACTION, IMMEDIATE_PHASE_FRACTION = 0.1, 0.05
+TOUCH_PHASE_FRACTION = 0.01  # of each phase where striker and target separate and meet again
+# Where no least duration is given, it is the least of a fraction of a point mass's restitution, a time [s],
+# and a fraction of the longest duration.
+NATURAL_FRACTION, MOST_LEAST_DURATION, LONGEST_FRACTION = 0.15, 2e-3, 0.5
+SIMILAR_FACTOR = 3.0  # parameters within this factor share least durations
 
 
-class ContactNumbers:
-    """Part of a `impactopt.transcription.collision.Collision`, which has its attributes too.
+class ContactParameters:
+    """Parameters of one collision's contact law and target, and the least durations of its phases.
 
-    law, target : numbers by name.  shortest : least durations [s] of the phases.
-    mass : of the robot at its striker [kg].  natural : how long the last phase [s] is of a point mass's blow.
+    Base of `impactopt.transcription.collision.Collision`, which has more attributes.
+
+    law, target : parameters by name.
+    shortest : least durations of the phases [s].
+    mass : effective mass of the robot at its striker [kg].
+    natural : duration of the last phase of a point mass's contact [s].
     """
 
     _b: Builder
@@ -42,72 +50,75 @@ class ContactNumbers:
     mass: float
     law: dict[str, float]
     target: dict[str, float]
-    _known: Array
+    _parameters: Array  # for which `natural` and `shortest` were found
 
-    def renew(self, mass: float | None = None, *, anew: bool = True) -> None:
-        """Take the numbers of the builder's problem.
+    def update_parameters(self, mass: float | None = None, *, anew: bool = True) -> None:
+        """Take the parameters of the builder's problem.
 
-        mass : of the robot at its striker [kg], if it is another.  anew : the least durations too; else those
-        are kept where numbers are alike, as they are far below what a blow takes.
+        mass : effective mass of the robot at its striker [kg]; None: as before.
+        anew : compute the least durations, too. Otherwise they are kept if the parameters are similar, as
+            they are far below the duration of an impact.
         """
         p = self._b.problem
         self.mass = self.mass if mass is None else mass
         self.law, self.target = p.law.parameters, p.target.parameters
         if self.scenario is not None:
             self.law, self.target = self.scenario.numbers(p.law, p.target)
-        numbers = np.array([*self.law.values(), *self.target.values(), self.mass])
-        if not anew and alike(numbers, self._known):
+        parameters = np.array([*self.law.values(), *self.target.values(), self.mass])
+        if not anew and similar(parameters, self._parameters):
             return
-        self._known = numbers
-        # how long the last phase [s] is of a point mass's blow: the unit of what is too short
-        self.natural = float(natural_durations(*self.alone(), self.mass, p.planned_touches)[-1])
+        self._parameters = parameters
+        self.natural = float(natural_durations(*self.per_striker(), self.mass, p.planned_touches)[-1])
         self.shortest = shortest_phases(p, self.natural)
 
-    def alone(self) -> tuple[Any, Any]:
-        """Law and target as one of all strikers has them, which has its share of a mass."""
-        p, numbers = self._b.problem, dict(self.target)
-        numbers |= {"mass": numbers["mass"] / len(p.strikers)} if "mass" in numbers else {}
-        return type(p.law)(**self.law), type(p.target)(**numbers)
+    def per_striker(self) -> tuple[Any, Any]:
+        """Law and target that one striker meets: two strikers share the target's mass."""
+        p, parameters = self._b.problem, dict(self.target)
+        if "mass" in parameters:
+            parameters["mass"] /= len(p.strikers)
+        return type(p.law)(**self.law), type(p.target)(**parameters)
 
-    def follow(self) -> None:
-        """Bounds of durations follow the problem."""
+    def update_bounds(self) -> None:
+        """Set the bounds of the phases' durations to those of the builder's problem."""
         longest = self._b.problem.contact_duration[1]
         for T, least in zip(self.T, self.shortest, strict=True):
             self._b.layout.bound(T, least, longest)
 
-    def force_numbers(self) -> list[list[float]]:
-        """Parameters of the block ``force``, of each stage."""
+    def force_parameters(self) -> list[list[float]]:
+        """Parameters of the block ``force`` at each stage."""
         p = self._b.problem
         modes = np.eye(len(p.target.phases))[[phase.mode for phase in p.contact_phases]]
         phases = np.column_stack([modes, self.shortest])
         within = phases if p.target.guards else phases[:, :0]
-        numbers = [*self.law.values(), *self.target.values()]
-        numbers += [] if p.second is None else [*p.second.point]
+        common = [*self.law.values(), *self.target.values()]
+        common += [] if p.second is None else [*p.second.point]
         return [
-            [*p.point, *p.normal, float(s.phase == len(self.end) - 1), *within[s.phase], *numbers]
+            [*p.point, *p.normal, float(s.phase == len(self.end) - 1), *within[s.phase], *common]
             for s in self.stages
         ]
 
 
 def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
-    """Least duration [s] of each contact phase; ``natural``: that of a point mass's last phase."""
-    target, (shortest, longest) = problem.target, problem.contact_duration
-    if not shortest:  # no bound: far below what a blow takes, as constraints are over these times
-        shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
-    shares = [SHARE if target.guards else 1.0] * (len(problem.contact_phases) - 1) + [1.0]
-    if problem.planned_touches > 1:
-        shares = [SEVERAL] * len(shares)
-    if target.at_once:
-        shares[0] = AT_ONCE
-    return [share * shortest for share in shares]
+    """Least duration of each contact phase [s].
 
-
-def alike(numbers: Array, others: Array) -> bool:
-    """True if problems with these parameters (k,) can share least durations, as their blows take about as
-    long.
+    natural : duration of the last phase of a point mass's contact [s].
     """
-    sizes = np.sort(np.abs([numbers, others]), axis=0)
-    return bool(np.all(sizes[1] <= ALIKE * sizes[0]))
+    target, (shortest, longest) = problem.target, problem.contact_duration
+    if not shortest:  # none is given: far below the duration of an impact, as constraints are divided by it
+        shortest = min(NATURAL_FRACTION * natural, MOST_LEAST_DURATION, LONGEST_FRACTION * longest)
+    before = EVENT_PHASE_FRACTION if target.guards else 1.0
+    fractions = [before] * (len(problem.contact_phases) - 1) + [1.0]
+    if problem.planned_touches > 1:
+        fractions = [TOUCH_PHASE_FRACTION] * len(fractions)
+    if target.at_once:
+        fractions[0] = IMMEDIATE_PHASE_FRACTION
+    return [fraction * shortest for fraction in fractions]
+
+
+def similar(parameters: Array, others: Array) -> bool:
+    """True if contacts with these parameters (k,) last about as long, and can share least durations."""
+    sizes = np.sort(np.abs([parameters, others]), axis=0)
+    return bool(np.all(sizes[1] <= SIMILAR_FACTOR * sizes[0]))
 
 
 def switches(law: ContactLaw) -> bool:
@@ -118,7 +129,7 @@ def switches(law: ContactLaw) -> bool:
 
 def pulls_apart(law: ContactLaw) -> bool:
     """True if the law would pull at bodies that separate fast."""
-    # hardly any penetration [m], and separation at 10 m/s: a damper without a spring behind it would pull
+    # penetration of 1e-6 m and separation at 10 m/s: the spring's force is negligible, a damper pulls
     return float(law.branch(1e-6, -10.0, False)) < 0
 
 
@@ -126,10 +137,11 @@ GAINS = "logarithms of factors on gains"
 
 
 class ContactState(NamedTuple):
-    """The state at contact, as a swing or a posture hands it over.
+    """State at contact, at the end of a swing or in a strike's posture.
 
-    y, y1, y2 : coordinates, y' and y''.  T : the duration [s] of the phase that they are of: ydot = y'/T.
-    legs, w : legs and sole wrenches.
+    y, y1, y2 : coordinates, y' and y'', all (ny,).
+    T : duration [s] of the phase whose derivatives y1 and y2 are: ydot = y'/T.
+    legs, w : joint angles of the constrained legs (nl,), and sole wrenches (6 a sole).
     """
 
     y: Affine
@@ -141,8 +153,11 @@ class ContactState(NamedTuple):
 
 
 class Coasting(NamedTuple):
-    """Reference during contact: the feed-forward torques over limit (n), the rate (ny) ydot, and the
-    logarithms of the factors on the servo's gains, one for each of the problem's `gains`.
+    """Reference of the servo during contact, which coasts from the state at contact.
+
+    feedforward : torques over limit (n,).
+    u0 : rate ydot (ny,).
+    gains : logarithms of the factors on the servo's gains, one for each of the problem's `gains`.
     """
 
     feedforward: Group
@@ -151,7 +166,7 @@ class Coasting(NamedTuple):
 
 
 def add_coasting(b: Builder, rates: dict[str, Any] | None = None) -> Coasting:
-    """Its variables.  rates : bounds of the rates at contact."""
+    """Add the variables of the reference.  rates : bounds of the rate at contact."""
     limit, names = b.limits.torque.fraction, b.robot.joint_names
     return Coasting(
         b.layout.add("feed-forward at contact", 1, b.robot.n, lower=-limit, upper=limit, labels=names),
@@ -170,7 +185,7 @@ def _add_gains(b: Builder) -> Group:
 
 
 class Contact(NamedTuple):
-    """State at contact and what coasts from there."""
+    """State at contact and the reference that coasts from there (`Coasting`)."""
 
     state: ContactState
     feedforward: Group
@@ -184,10 +199,11 @@ class Contact(NamedTuple):
         travel: tuple[Affine, Affine],
         rate: Affine,
     ) -> list[list[Affine]]:
-        """Slots of the block ``link``, coordinate by coordinate: from the state at contact to a later start.
+        """Slots of the block ``link``, coordinate by coordinate, from contact to the start of a later phase.
 
-        start : y and d y/ds of what starts, and its duration [s].  times [s], travel : of two phases between,
-        whose ways are time x travel.  rate : ydot after them.
+        start : y, y' and duration [s] of the later phase.
+        times, travel : durations [s] of the two phases between, and mean rates (ny,) in them.
+        rate : ydot (ny,) after them.
         """
         y, y1, *_ = self.state
         out = []
@@ -200,9 +216,10 @@ class Contact(NamedTuple):
 
 
 class DrivePoint(NamedTuple):
-    """State of the drives at a node.
+    """State of the drives at a node or collocation point.
 
-    torque (n,) : of the servos, over limit.  slots : z of `impactopt.problem.block.joint_motion`.
+    torque : of the servos, over limit (n,).
+    slots : z of `impactopt.problem.block.joint_motion`.
     """
 
     place: Place
@@ -211,9 +228,10 @@ class DrivePoint(NamedTuple):
 
 
 class ContactEnd(NamedTuple):
-    """A contact's two ends.
+    """Joint motions just before and just after a contact.
 
-    before, after : z of `impactopt.problem.block.joint_motion`.  change (ny,) : of ydot.
+    before, after : z of `impactopt.problem.block.joint_motion`.
+    change : of ydot (ny,).
     """
 
     place: Place
@@ -222,7 +240,7 @@ class ContactEnd(NamedTuple):
     change: Affine
 
 
-def still(y: Affine, rate: Affine, slope: Affine, T: Affine, legs: Affine) -> list[Affine]:
-    """Slots of a motion at y, with ydot = rate/T and yddot = slope/T^2."""
-    none = Affine.zeros(y.size)
-    return [y, none, Affine.zeros(1), none, T, rate, slope, T, legs]
+def joint_motion_slots(y: Affine, rate: Affine, slope: Affine, T: Affine, legs: Affine) -> list[Affine]:
+    """z of `impactopt.problem.block.joint_motion` at y, with ydot = rate/T and yddot = slope/T^2."""
+    zero = Affine.zeros(y.size)
+    return [y, zero, Affine.zeros(1), zero, T, rate, slope, T, legs]

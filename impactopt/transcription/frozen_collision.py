@@ -1,19 +1,20 @@
-"""Contact with one target by a model with frozen dynamics: the SDC inside a program, or one impulse balance.
+"""Collision with one target by a model with frozen dynamics (SDC), or by one impulse balance.
 
-H, J and the bias are those of one freeze, or of several on the way, and are constant between them (paper,
-steps 1b to 8b; `collision.frozen` has them in numbers, `collision.model` the freezes on the way). What is
-frozen is a point of the contact: coordinates, rates and legs, at which the blocks of a collision evaluate the
-rigid-body functions. Beside the robot's coordinates, the legs' rates and the hand's speed are integrated of
-their own, as frozen Jacobians move them: servo, penetration and force are of these.
+`FrozenCollision` has H, J and the bias of one freeze, or of several during the contact, constant between
+them: steps 1b to 8b of the paper. `collision.frozen` and `collision.model` do the same outside a program.
+A freeze is a state of the contact: coordinates, rates and legs, at which the blocks of a collision evaluate
+the rigid-body functions. Beside the robot's coordinates, the legs' rates and the hand's speed are integrated,
+as the frozen Jacobians move them. Servo, penetration and contact force depend on these.
 
-With one freeze it is at the state at contact, and the velocities that the bias and dJ/dt v depend on are
-those with which hand and target have met (`v_meet`), by the constraints of an impact in which they stay
-together. With N there is one in the middle of each of N segments of the contact's time. Phases share that
-time as in the program's ``shares``; scenarios have the expected target's segments.
+A single freeze is at the state at contact. The bias and dJ/dt v depend on the velocity there; they are
+evaluated at the velocity with which hand and target have met (`v_meet` in `collision.frozen`), which the
+constraints of an impact without rebound determine. Of N freezes, one is in the middle of each of N segments
+of the contact's time. The phases' fractions of that time are the program's ``shares``; scenarios have the
+segments of the expected target.
 
-H (u+ - u-) = -J^T n I + J_c^T w, joints without torque: the generalized impulse balance. The impulse I comes
-from Newton's restitution ("rigid"), or from the two-mass collision of the virtual mass with the contact law
-("virtual-mass"; paper, sec. 2 and fig. 1), in closed form for the spring-damper.
+`InstantImpact` is the generalized impulse balance H (u+ - u-) = -J^T n I + J_c^T w, joints without torque.
+The impulse I comes from Newton's restitution ("rigid"), or from the two-mass collision of the effective mass
+with the contact law ("virtual-mass"; paper, sec. 2 and fig. 1), in closed form for the spring-damper.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import coasted, effective_mass
-from impactopt.transcription.contact_state import Contact, ContactEnd, still
+from impactopt.transcription.contact_state import Contact, ContactEnd, joint_motion_slots
 from impactopt.transcription.layout import (
     DIRECTIONS,
     Affine,
@@ -49,100 +50,112 @@ from impactopt.transcription.plan import PlannedCollision
 
 
 class InstantImpact:
-    """Variables and constraints of an impact in no time; no constraint of torque or wrench while it lasts.
+    """Variables and constraints of an impact without duration; torques and wrenches are not bounded in it.
 
-    mass : of a target that hand and robot have met, when they move on together; None: the problem's, which
-    parts as its model of the collision says.  named : begin of the variables' names.
+    mass : of a target [kg] that moves on together with the hand. None: the problem's target, with the
+        restitution of its collision model.
+    prefix : of the variables' names.
+
+    Attributes
+    ----------
+    du : change of the rate ydot.
+    impulse : to the target [N s].
+    w : impulsive sole wrenches [N s, N m s].
     """
 
-    def __init__(self, b: Builder, contact: Contact, *, mass: float | None = None, named: str = "") -> None:
-        self._b, self.contact, self._meets = b, contact, mass is not None
+    def __init__(self, b: Builder, contact: Contact, *, mass: float | None = None, prefix: str = "") -> None:
+        self._b, self.contact, self._without_rebound = b, contact, mass is not None
         c = b.coordinates
         self.target = b.problem.target
-        # a wall takes any impulse without moving
+        # a target without a mass is a wall
         self.mass = self.target.parameters.get("mass", np.inf) if mass is None else mass
-        self.before = float(self.target.speed_before())
+        self.speed_before = float(self.target.speed_before())
 
         def add(name: str, size: int, **options: Any) -> Group:
-            return b.layout.add(named + name, 1, size, **options)
+            return b.layout.add(prefix + name, 1, size, **options)
 
         self.du = add("change of rate", b.ny, labels=c.labels)
-        self.blow = add("impulse", 1, lower=1e-3, scale=10.0)
+        self.impulse_group = add("impulse", 1, lower=1e-3, scale=10.0)  # > 0, as the block divides by it
         scale = 0.05 * b.limits.wrench_scale
         self.w = add("impulsive sole wrench", b.nw, **{**b.limits.of_wrenches, "scale": scale})
 
     @property
     def impulse(self) -> Affine:
         """Impulse to the target [N s]."""
-        return self.blow[0]
+        return self.impulse_group[0]
 
     @property
     def target_state(self) -> Affine:
         """State of the target after the impact."""
-        return self.blow[0] * (1 / self.mass)
+        return self.impulse_group[0] * (1 / self.mass)
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of the block ``impact``."""
         b, p, state = self._b, self._b.problem, self.contact.state
-        slots = [state.y, state.legs, self.contact.u0[0], self.du[0], self.w[0], self.blow[0]]
-        rigid = float(self._meets or p.collision == "rigid")
+        slots = [state.y, state.legs, self.contact.u0[0], self.du[0], self.w[0], self.impulse_group[0]]
+        rigid = float(self._without_rebound or p.collision == "rigid")
         law = [p.law.parameters.get(name, 1.0) for name in ("stiffness", "damping")]
-        numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass, self.before]
-        return {"impact": ([slots], [np.concatenate([numbers, b.robot.torque_limit, b.limits.units])])}
+        parameters = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass, self.speed_before]
+        return {"impact": ([slots], [np.concatenate([parameters, b.robot.torque_limit, b.limits.units])])}
 
     def determined(self) -> list[Determined]:
-        """All of it, as of one element."""
-        return [determined(Turn.ELEMENT, np.concatenate([g.index(0) for g in (self.du, self.w, self.blow)]))]
+        """All variables: their constraints determine them together, as those of a collocation element."""
+        groups = (self.du, self.w, self.impulse_group)
+        return [determined(Turn.ELEMENT, np.concatenate([g.index(0) for g in groups]))]
 
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
         b, (start, _) = self._b, at["impact"]
         part = b.parts("impact")
         base, joints = start + part["base"], start + part["joints"]
-        units = {"N": "N s", "N m": "N m s"}  # constraints are over a tenth of a second of the weight
+        units = {"N": "N s", "N m": "N m s"}  # the block's scale is 0.1 s times the weight
         unbalanced = [Measure(units[m.unit], 0.1 * m.factor, "off") for m in b.limits.unbalanced]
-        share = percent("off, of its limit for 0.1 s")
+        of_limit = percent("off, of its limit for 0.1 s")
         b.equal("impulse balance", "impact", DIRECTIONS[: b.coordinates.base], base, unbalanced)
-        b.equal("impulse balance", "impact", b.robot.joint_names, joints, share)
+        b.equal("impulse balance", "impact", b.robot.joint_names, joints, of_limit)
         off = Measure("m/s", 1.0, "off")
         b.equal("law of the impact", "impact", ["impulse"], start + part["blow"], off)
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
-        """Linking constraints (:meth:`impactopt.transcription.collision.Collision.link`); no time passes."""
-        none, still = Affine.zeros(1), Affine.zeros(self._b.ny)
-        return self.contact.link(start, (none, none), (still, still), self._rate)
+        """Slots of the block ``link``, as of `impactopt.transcription.collision.Collision.link`."""
+        zero, no_travel = Affine.zeros(1), Affine.zeros(self._b.ny)
+        return self.contact.link(start, (zero, zero), (no_travel, no_travel), self._rate_after)
 
     @property
     def state_after(self) -> list[Affine]:
-        """State after contact (:meth:`impactopt.transcription.collision.Collision.state_after`)."""
+        """y, ydot, legs and T (1 s) after contact."""
         state = self.contact.state
-        return [state.y, self._rate, state.legs, Affine.constant(1.0)]
+        return [state.y, self._rate_after, state.legs, Affine.constant(1.0)]
 
     def contact_end(self) -> ContactEnd:
-        state, none, one = self.contact.state, Affine.zeros(self._b.ny), Affine.constant(1.0)
-        before = still(state.y, self.contact.u0[0], none, one, state.legs)
-        after = still(state.y, self._rate, none, one, state.legs)
+        state, zero, one = self.contact.state, Affine.zeros(self._b.ny), Affine.constant(1.0)
+        before = joint_motion_slots(state.y, self.contact.u0[0], zero, one, state.legs)
+        after = joint_motion_slots(state.y, self._rate_after, zero, one, state.legs)
         return ContactEnd(Place.plain("after contact"), before, after, self.du[0])
 
     @property
-    def _rate(self) -> Affine:
-        """ydot after it."""
+    def _rate_after(self) -> Affine:
+        """ydot (ny,) after the impact."""
         return self.contact.u0[0] + self.du[0]
 
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        """Write the initial guess to x (n,): the robot loses 30 % of its rates."""
         self.du.write(x, -0.3 * rates)
-        self.blow.write(x, 0.5 * self.mass if np.isfinite(self.mass) else 1.0)
+        # what gives the target 0.5 m/s; 1 N s to a wall
+        self.impulse_group.write(x, 0.5 * self.mass if np.isfinite(self.mass) else 1.0)
 
     def durations(self, x: Array) -> tuple[float, float]:
+        """Durations of compression and restitution [s]: none."""
         return 0.0, 0.0
 
     def decode(self, x: Array, outputs: dict[str, Array], approaches: Array) -> PlannedCollision:
+        """Collision of a plan, from solver variables (n,): two instants without a force."""
         b = self._b
-        gained = float(self.blow.read(x)[0, 0]) / self.mass
+        gained = float(self.impulse_group.read(x)[0, 0]) / self.mass  # [m/s]
         outcome = self.target.outcome([gained] * self.target.n_states)
         return PlannedCollision(
             time=np.zeros(2),
             force=np.zeros(2),
-            target_speed=self.before + np.array([0.0, gained]),
+            target_speed=self.speed_before + np.array([0.0, gained]),
             outcome=outcome,
             torque=np.repeat(self.contact.feedforward.read(x), 2, axis=0) * b.robot.torque_limit,
             sole_wrench=np.zeros((0, b.nw)),
@@ -152,7 +165,7 @@ class InstantImpact:
 
 @dataclass(frozen=True)
 class _Freeze:
-    """Point at which the dynamics is frozen: phase, place in it; coordinates, rates, legs."""
+    """State at which the dynamics are frozen: phase and place in it; coordinates, rates and legs there."""
 
     phase: int
     place: float
@@ -162,8 +175,19 @@ class _Freeze:
 
 
 class FrozenCollision(Collision):
-    """Variables and constraints of the contact with one target. shares : of the hit; the rest as of
-    `Collision`.
+    """Variables and constraints of the collision with one target, with frozen dynamics.
+
+    shares : fractions of the contact's time that the phases last. The other arguments are `Collision`'s.
+
+    Attributes
+    ----------
+    leg_rates, lag : rates of the constrained legs' joints by the frozen Jacobians, and their angles behind
+        the reference.
+    speed, travel, joined_travel : of the hand along the normal; its integrals, as `d` and `joined`.
+    begin_speeds : speed of the hand at the beginning of each segment.
+    frozen_at, frozen_legs : coordinates and legs of each freeze during the contact.
+    carried : sole wrenches that carry the weight, in a model without bias.
+    coast_accelerations : of the legs of the coasting reference.
     """
 
     def __init__(
@@ -181,7 +205,7 @@ class FrozenCollision(Collision):
         c, n, legs = b.coordinates, len(stages), {"labels": b.coordinates.leg_labels}
 
         def add(name: str, count: int, size: int, **options: Any) -> Group:
-            return b.layout.add(self._named + name, count, size, **options)
+            return b.layout.add(self._prefix + name, count, size, **options)
 
         hand, joined = {"labels": ["hand"]}, self.joined.count
         self.leg_rates = add("collision leg rates", n, b.nl, **legs)
@@ -189,45 +213,49 @@ class FrozenCollision(Collision):
         self.speed = add("hand speed", n, 1, **hand)
         self.travel = add("hand travel", n, 1, **hand)
         self.joined_travel = add("hand travel in compression", joined, 1, **hand)
-        self.begins = [add(f"hand speed, segment {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))]
+        self.begin_speeds = [
+            add(f"hand speed, segment {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))
+        ]
         self.frozen_at = [add(f"freeze {k}", 1, b.ny, labels=c.labels) for k in range(self.freezes)]
         self.frozen_legs = [add(f"legs of freeze {k}", 1, b.nl, **legs) for k in range(self.freezes)]
-        carried = int(not self.effects.bias and b.nw > 0)
-        self.carried = add("sole wrench that carries", carried, b.nw, **b.limits.of_wrenches)
+        count = int(not self.effects.bias and b.nw > 0)
+        self.carried = add("sole wrench that carries", count, b.nw, **b.limits.of_wrenches)
         self._meeting: InstantImpact | None = None
         if self.effects.jdot and not self.freezes:
-            gives_way = float(target_start(b.problem.target, self.target)[0])
-            mass = 1 / gives_way if gives_way > 0 else np.inf
-            self._meeting = InstantImpact(b, contact, mass=mass, named=f"{self._named}meeting: ")
+            inverse_mass = float(target_start(b.problem.target, self.target)[0])
+            mass = 1 / inverse_mass if inverse_mass > 0 else np.inf
+            self._meeting = InstantImpact(b, contact, mass=mass, prefix=f"{self._prefix}meeting: ")
         self._segments = [self._segment(s) for s in stages]
         self._legs_at: list[Affine] = []
         self._frozen = [self._freeze(k) for k in range(max(self.freezes, 1))]
 
     def _add_reference(self, count: int) -> None:
-        """Adds reference variables at the beginnings of segments, then at later freezes."""
+        """Add variables of the reference: first at the beginnings of segments, then at their freezes."""
         count, labels = max(2 * self.freezes, 1), self._b.coordinates.leg_labels
         super()._add_reference(count)
-        name = f"{self._named}coasting leg accelerations"
-        self.bends = self._b.layout.add(name, count, self._b.nl, labels=labels)
+        name = f"{self._prefix}coasting leg accelerations"
+        self.coast_accelerations = self._b.layout.add(name, count, self._b.nl, labels=labels)
 
-    # ------------------------------------------------------------------ where it is frozen
+    # ------------------------------------------------------------------ freezes
     def _segment(self, s: CollocationPoint) -> int:
+        """Index of the segment that a stage's element belongs to."""
         if not self.freezes:
             return 0
         begin, end = self._ends(s)
         return segment_of(s.phase, begin, end, self.shares, self.freezes)
 
     def _ends(self, s: CollocationPoint) -> tuple[float, float]:
-        """Places of begin and end of a stage's element, in the phase."""
+        """Places in the phase where a stage's element begins and ends."""
         return 0.0 if s.new_phase else self.stages[s.previous].place, self.stages[s.members[-1]].place
 
     def _freeze(self, k: int) -> _Freeze:
+        """State of freeze k; appends the legs that the contact has there to ``_legs_at``."""
         state, u0 = self.contact.state, self.contact.u0[0]
         if not self.freezes:
-            # v_meet of docs/notation.md: hand and target move at one speed, after the impulse that this takes
-            met = u0 if self._meeting is None else u0 + self._meeting.du[0]
-            return _Freeze(0, 0.0, state.y, met, state.legs)
-        # in the middle of its segment: the midpoint rule, whose error falls with 1 / freezes^2
+            # v_meet of `collision.frozen`: the velocity at which hand and target have one speed
+            v_meet = u0 if self._meeting is None else u0 + self._meeting.du[0]
+            return _Freeze(0, 0.0, state.y, v_meet, state.legs)
+        # In the middle of its segment: the midpoint rule, whose error falls with 1 / freezes^2.
         phase, place = place_of((k + 0.5) / self.freezes, self.shares)
         s = self._element_at(phase, place)
         at = [self._ends(s)[0], *(self.stages[m].place for m in s.members)]
@@ -243,25 +271,26 @@ class FrozenCollision(Collision):
         return _Freeze(phase, place, self.frozen_at[k][0], value(self.u, u0), self.frozen_legs[k][0])
 
     def _element_at(self, phase: int, place: float) -> CollocationPoint:
-        """A stage of the element that a place in a phase is in."""
+        """First stage of the element that contains a place in a phase."""
         return next(
             s for s in self.stages if s.phase == phase and place <= self.stages[s.members[-1]].place + 1e-9
         )
 
     def _instants(self) -> list[tuple[int, float]]:
-        """Phases and places at which the reference is known: where segments begin, and at freezes."""
+        """Phase and place of each instant of the reference's variables: beginnings of segments, freezes."""
         firsts = [self.stages[self._segments.index(k)].previous for k in range(len(self._frozen))]
         begins = [(0, 0.0) if i < 0 else (self.stages[i].phase, self.stages[i].place) for i in firsts]
         return [*begins, *((at.phase, at.place) for at in self._frozen[: self.freezes])]
 
     def _travel_to(self, k: int) -> list[Affine]:
-        """Slots of the block ``moved``: to the freeze in the middle of a segment."""
+        """Slots of the block ``moved`` at the freeze in the middle of segment k."""
         at = self._frozen[k]
         s = self._element_at(at.phase, at.place)
         T1, d1, _ = self._before(at.phase)
         d = Affine.zeros(self._b.ny) if s.new_phase else self.d[s.previous]
         places, begin = [self.stages[m].place for m in s.members], self._ends(s)[0]
-        # the polynomial through the element's rates is integrated exactly by as many of its values
+        # Integral of the polynomial through the element's rates, from its beginning to the freeze: Gauss's
+        # quadrature with one point a stage is exact.
         x, w = np.polynomial.legendre.leggauss(len(places))
         inner = [lagrange(places, begin + (at.place - begin) * (z + 1) / 2) for z in x]
         for m, weight in zip(s.members, (at.place - begin) / 2 * (w @ np.array(inner)), strict=True):
@@ -269,19 +298,19 @@ class FrozenCollision(Collision):
         return [self.contact.state.y, d1, T1, d, self.T[at.phase][0], at.u]
 
     def _travel_before(self, k: int) -> list[Affine]:
-        """Slots of the block ``moved``: to the beginning of a segment."""
+        """Slots of the block ``moved`` at the beginning of segment k."""
         i = self._segments.index(k)
         y, s = self.contact.state.y, self.stages[i]
         if s.previous < 0:
-            none, still = Affine.zeros(1), Affine.zeros(self._b.ny)
-            return [y, still, none, still, none, self.contact.u0[0]]
+            zero, no_travel = Affine.zeros(1), Affine.zeros(self._b.ny)
+            return [y, no_travel, zero, no_travel, zero, self.contact.u0[0]]
         return [y, *self._travel(s.previous), self.u[s.previous]]
 
     # ------------------------------------------------------------------ blocks
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         b, state = self._b, self.contact.state
         out = super().instances()
-        moved = [self._travel_before(k) for k in range(len(self.begins))]
+        moved = [self._travel_before(k) for k in range(len(self.begin_speeds))]
         moved += [self._travel_to(k) for k in range(self.freezes)]
         out["moved"] = moved, [b.problem.normal] * len(moved)
         if self._meeting is not None:
@@ -292,51 +321,57 @@ class FrozenCollision(Collision):
         return out
 
     def _dynamics(self, i: int) -> list[Affine]:
-        """Slots of the block ``collision``: steps 3b to 6b at one instant, with what step 1b has stored."""
+        """Slots of the block ``collision``: steps 3b to 6b at stage i, with the freeze of step 1b."""
         b, s, k = self._b, self.stages[i], self._segments[i]
         y, u0, at = self.contact.state.y, self.contact.u0[0], self._frozen[k]
-        hit = [self.legs[i], self.f[i], self.w[i]]
-        bends = self.bends[self.freezes + k] if self.effects.jdot else Affine.zeros(b.nl)
+        # In a segment the reference's rates go on from those at its beginning, with the acceleration at its
+        # freeze. Without dJ/dt v there is none.
+        acceleration = self.coast_accelerations[self.freezes + k] if self.effects.jdot else Affine.zeros(b.nl)
         since = self._time(s.phase, s.place) - self._time(*self._instants()[k])
         legs = [
             *self._slots(self.leg_rates, i, self.coast_rates[0]),
             *self._slots(self.lag, i, Affine.zeros(b.nl)),
         ]
         carried = [] if self.effects.bias else [self.carried[0] if self.carried.count else Affine.zeros(b.nw)]
-        own = [y, u0, self._feedforward(), *self._travel(i), *self._slots(self.u, i, u0), *hit]
-        reference = [self.coast_rates[k], bends]
-        more = [*reference, *legs, since, self._hand_slope(i), *carried, self.contact.gains[0]]
-        return [*own, at.y, at.u, at.legs, *more]
+        motion = [*self._travel(i), *self._slots(self.u, i, u0), self.legs[i]]
+        own = [y, u0, self._feedforward(), *motion, self.f[i], self.w[i]]
+        reference = [self.coast_rates[k], acceleration]
+        rest = [*legs, since, self._hand_slope(i), *carried, self.contact.gains[0]]
+        return [*own, at.y, at.u, at.legs, *reference, *rest]
 
     def _hand_slope(self, i: int) -> Affine:
-        """Slope of the hand's speed along the normal, which starts each segment at the robot's speed."""
+        """Slope of the hand's speed along the normal at stage i.
+
+        At the beginning of each segment the speed is that of the robot, by `begin_speeds`.
+        """
         s, k = self.stages[i], self._segments[i]
         first = s.previous < 0 or self._segments[s.previous] != k
         slope = self.speed[s.members[0]] * 0.0
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + self.speed[m] * w
-        return slope + (self.begins[k][0] if first else self.speed[s.previous]) * s.start
+        return slope + (self.begin_speeds[k][0] if first else self.speed[s.previous]) * s.start
 
-    def _of_hand(self, i: int) -> list[Affine]:
-        """Step 7b: of the accelerations of the contact point, and not of the robot's geometry."""
+    def _hand_slots(self, i: int) -> list[Affine]:
+        """Slots of the block ``force``: the hand's motion by step 7b, not by forward kinematics."""
         s = self.stages[i]
-        before = self._so_far(self.travel, self.joined_travel, s.phase)
+        before = self._mean_before(self.travel, self.joined_travel, s.phase)
         return [before, self._before(s.phase)[0], self.travel[i], self.T[s.phase][0], self.speed[i]]
 
     def _reference(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
+        """Slots and parameters of the block ``coasting``, at `_instants` in place of the stages."""
         if not self._b.coordinates.legs:
             return {}
         start = [self.contact.state.y, self.contact.u0[0]]
-        own = zip(
-            self._instants(),
-            *(map(group.__getitem__, range(group.count)) for group in self._of_reference()),
-            strict=True,
-        )
-        slots = [[*start, self._before(phase)[0], self.T[phase][0], *legs] for (phase, _), *legs in own]
+        groups = self._reference_groups()
+        slots = [
+            [*start, self._before(phase)[0], self.T[phase][0], *(group[k] for group in groups)]
+            for k, (phase, _) in enumerate(self._instants())
+        ]
         return {"coasting": (slots, [[place, float(phase > 0)] for phase, place in self._instants()])}
 
-    def _of_reference(self) -> tuple[Group, ...]:
-        return self.coast_legs, self.coast_rates, self.bends
+    def _reference_groups(self) -> tuple[Group, ...]:
+        """Variables of the reference's legs, in the order of the block ``coasting``."""
+        return self.coast_legs, self.coast_rates, self.coast_accelerations
 
     def _feedforward(self) -> Affine:
         if self.effects.feedforward:
@@ -354,25 +389,27 @@ class FrozenCollision(Collision):
     def _integrals(self) -> list[tuple[Group, Group]]:
         return [*super()._integrals(), (self.travel, self.joined_travel)]
 
-    def _at_stage(self) -> tuple[Group, ...]:
+    def _leg_groups(self) -> tuple[Group, ...]:
         return (self.legs,)
 
-    def loose(self) -> list[Group]:
+    def groups_without_start(self) -> list[Group]:
         return [self.legs, self.f, self.w, self.leg_rates, self.lag, self.speed]
 
     def states(self) -> tuple[Group, ...]:
         return (*super().states(), self.leg_rates, self.lag)
 
-    def held_over(self) -> list[Group]:
-        met = [] if self._meeting is None else [self._meeting.du, self._meeting.w, self._meeting.blow]
-        own = [*self._of_reference(), self.joined_travel, self.carried]
-        return [*super().held_over(), *own, *self.begins, *self.frozen_at, *self.frozen_legs, *met]
+    def kept_groups(self) -> list[Group]:
+        out = [*super().kept_groups(), *self._reference_groups(), self.joined_travel, self.carried]
+        out += [*self.begin_speeds, *self.frozen_at, *self.frozen_legs]
+        if self._meeting is not None:
+            out += [self._meeting.du, self._meeting.w, self._meeting.impulse_group]
+        return out
 
     def determined(self) -> list[Determined]:
         out = [determined(Turn.LIFTED, group.index(0)) for group in self.frozen_legs if group.size]
         out += super().determined()
         for k in range(self.coast_legs.count):
-            legs = [leg for g in self._of_reference() for leg in by_leg(g.index(k))]
+            legs = [leg for g in self._reference_groups() for leg in by_leg(g.index(k))]
             out += [determined(Turn.STAGE_LEGS, leg, j) for j, leg in enumerate(legs)]
         if self.carried.count:
             out.append(determined(Turn.ELEMENT, self.carried.index(0)))
@@ -380,23 +417,30 @@ class FrozenCollision(Collision):
 
     # ------------------------------------------------------------------ constraints
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
-        """Adds constraints; those of the freezes come first, as they determine variables that all others
-        have.
+        """Add the constraints, as of `Collision`.
+
+        Those of the freezes are first, as they determine variables in which all others are written.
         """
         if self._meeting is not None:
             self._meeting.add_rows(at)
-        self._moved_rows(*at["moved"])
+        self._add_freezes(*at["moved"])
         if "coasting" in at:
-            self._reference_rows(*at["coasting"])
+            self._add_coasting(*at["coasting"])
         if "carried" in at:
-            self._carried_rows(at["carried"][0])
+            self._add_carried(at["carried"][0])
+        # of the full model, each stage has an instance of ``coasting``; here only the instants above
         super().add_rows({name: found for name, found in at.items() if name != "coasting"})
 
-    def _moved_rows(self, start: int, size: int) -> None:
+    def _add_freezes(self, start: int, size: int) -> None:
+        """Equate the states of freezes, and the hand's speeds at the beginnings of segments, to the motion.
+
+        start : index of the block's first output.  size : outputs of an instance.
+        """
         b, part = self._b, self._b.parts("moved")
-        places = [(group, k, "speed") for k, group in enumerate(self.begins)]
-        places += [(group, len(self.begins) + k, "y") for k, group in enumerate(self.frozen_at)]
-        for group, instance, name in places:
+        # instances of the block ``moved``: beginnings of segments, then freezes
+        parts = [(group, k, "speed") for k, group in enumerate(self.begin_speeds)]
+        parts += [(group, len(self.begin_speeds) + k, "y") for k, group in enumerate(self.frozen_at)]
+        for group, instance, name in parts:
             outputs = start + instance * size + part[name]
             measure = along(group.labels, "off") if name == "y" else Measure("m/s", 1.0, "off")
             b.rows.add(
@@ -421,7 +465,8 @@ class FrozenCollision(Collision):
                 measure=along(group.labels, "off"),
             )
 
-    def _reference_rows(self, start: int, size: int) -> None:
+    def _add_coasting(self, start: int, size: int) -> None:
+        """Add the constraints of the reference's legs.  start, size : as of `_add_freezes`."""
         b, part = self._b, self._b.parts("coasting")
         closure = [f"{leg.end} {d}" for leg in b.coordinates.legs for d in DIRECTIONS]
         for k in range(self.coast_legs.count):
@@ -432,8 +477,12 @@ class FrozenCollision(Collision):
             b.equal(term, place, labels, outputs + part["rate"], rates(labels))
             b.equal(term, place, labels, outputs + part["acceleration"], Measure("rad/s^2", 1.0, "off"))
 
-    def _carried_rows(self, start: int) -> None:
-        """They are what the soles bear at contact, and as much more each as makes them carry all."""
+    def _add_carried(self, start: int) -> None:
+        """Add the constraints of `carried`.
+
+        They are the wrenches at contact, plus one wrench that is the same on each sole. Together they carry
+        the weight and the Coriolis and centrifugal forces.
+        """
         b, term, place = self._b, "weight that soles carry", f"contact{self.suffix}"
         outputs = start + b.parts("carried")["base"]
         b.equal(term, place, DIRECTIONS[: b.coordinates.base], outputs, b.limits.unbalanced)
@@ -449,38 +498,42 @@ class FrozenCollision(Collision):
                 measure=b.limits.unbalanced[:6],
             )
 
-    def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
-        super()._dynamics_rows(i, place, first)
+    def _add_dynamics(self, i: int, place: Place, first: dict[str, int]) -> None:
+        """Add the constraints of `Collision` at a stage, and those of the motion by frozen Jacobians."""
+        super()._add_dynamics(i, place, first)
         b, part = self._b, self._b.parts("collision")
-        for labels, name in (
-            (self.lag.labels, "legs"),
-            (self.lag.labels, "lag"),
-            (self.travel.labels, "hand"),
+        for name, labels in (
+            ("legs", self.lag.labels),
+            ("lag", self.lag.labels),
+            ("hand", self.travel.labels),
         ):
             b.equal("collision kinematics", place, labels, first["collision"] + part[name], rates(labels))
 
-    # ------------------------------------------------------------------ numbers
+    # ------------------------------------------------------------------ initial guess and solution
     def guess_model(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """The hand is slowed down as the coordinates are, all alike: as the fastest of them."""
+        """Write the initial guess of variables that only this collision model has.
+
+        The hand's speed is in a constant ratio to the fastest rate, as all rates fall alike.
+        """
         k = int(np.argmax(np.abs(rates)))
         if rates[k] != 0:
-            speed = self._speed(y, rates, legs) / rates[k]
-            for mine, its in ((self.speed, self.u), (self.travel, self.d), (self.joined_travel, self.joined)):
-                mine.write(x, its.read(x)[:, k : k + 1] * speed)
+            p, c = self._b.problem, self._b.coordinates
+            ratio = effective_mass(c, p.strikers, p.normal, y, legs, rates)[1] / rates[k]
+            for hand, coordinates in (
+                (self.speed, self.u),
+                (self.travel, self.d),
+                (self.joined_travel, self.joined),
+            ):
+                hand.write(x, coordinates.read(x)[:, k : k + 1] * ratio)
         if self._meeting is not None:
             self._meeting.guess(x, y, rates, legs)
         if not legs.size:
             return
         self.carried.write(x, self.contact.state.w.evaluate(x))
         time = np.ravel([self._time(*at).evaluate(x) for at in self._instants()])
-        for k, (there, motion) in enumerate(coasted(self._b.coordinates, time, y, rates, legs)):
-            for group, value in zip(self._of_reference(), (there, *motion), strict=True):
+        for k, (angles, motion) in enumerate(coasted(self._b.coordinates, time, y, rates, legs)):
+            for group, value in zip(self._reference_groups(), (angles, *motion), strict=True):
                 x[group.index(k)] = value
         self.leg_rates.write(x, self.coast_rates.read(x)[:1])
         for group in self.frozen_legs:
             group.write(x, legs)
-
-    def _speed(self, y: Array, rates: Array, legs: Array) -> float:
-        """Speed of the hand along the normal [m/s]."""
-        p = self._b.problem
-        return effective_mass(self._b.coordinates, p.strikers, p.normal, y, legs, rates)[1]

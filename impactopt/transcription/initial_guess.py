@@ -1,4 +1,4 @@
-"""Initial guesses: a reach to the target by inverse kinematics, or a strike's state at contact; and back."""
+"""Initial guesses of programs: by inverse kinematics, from a strike, or mapped from another solution."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves
 from impactopt.transcription.contact_program import ContactProgram
-from impactopt.transcription.contact_refinement import carry_contact, same_places
+from impactopt.transcription.contact_refinement import map_contact, same_places
 from impactopt.transcription.layout import Array, Group, Row
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase
@@ -28,9 +28,9 @@ from impactopt.transcription.plan import drifting_reference
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 
-# ends of names of variables that models of the collision have each for itself
-OF_MODEL = ("coasting legs", "coasting leg rates")
-_SLOW = 2.0  # [s] of a swing: a guess that is slower has the robot nearly still at contact
+# ends of names of variables whose meaning depends on the collision model: they are guessed anew for another
+MODEL_VARIABLES = ("coasting legs", "coasting leg rates")
+MAX_DURATION = 2.0  # [s] of a phase: in a slower swing the robot hardly moves at contact
 
 
 def strike_rates(
@@ -42,9 +42,9 @@ def strike_rates(
     *,
     base: float = 0.3,
 ) -> Array:
-    """Least rates ydot (ny,) that give the striking points ``velocity`` (3,) [m/s].
+    """Least rates ydot (ny,) that give all striking points ``velocity`` (3,) [m/s].
 
-    ``base`` : ease of the base's rates.
+    base : scale of the base's rates against the joints'; 0: the base does not move.
     """
     model, data = c.model, c.model.createData()
     frames = [model.getFrameId(f"striker:{name}") for name in strikers]
@@ -55,26 +55,27 @@ def strike_rates(
 
     h = 1e-6
     jac = np.stack([(point(y + h * e) - point(y - h * e)) / (2 * h) for e in np.eye(c.ny)], axis=1)
-    # least |rates / weight|, by the substitution rates = weight r
+    # least |rates / weight|, by the substitution rates = weight * r
     weight = np.ones(c.ny)
     weight[: c.base] = base
     return np.asarray(weight * np.linalg.lstsq(jac * weight, np.tile(velocity, len(frames)), rcond=None)[0])
 
 
 @dataclass(frozen=True)
-class Contact:
-    """A state at contact: coordinates y and rates (ny,), legs (nl,)."""
+class ContactGuess:
+    """State at contact: coordinates y and rates ydot (ny,), legs (nl,)."""
 
     y: Array
     rates: Array
     legs: Array
 
 
-def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Contact:
-    """The target reached by inverse kinematics, and met at ``speed`` [m/s] where joints are that fast; where
-    the target's speed after the blow is bounded, at the nearest that a point mass may have.
+def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> ContactGuess:
+    """State at contact by inverse kinematics.
 
-    ``noise`` [rad] perturbs the posture, for several starts.
+    speed : of the striking points [m/s]; less if joints are not that fast. If the target's speed after the
+        impact is bounded, the nearest speed with which a point mass meets the bounds.
+    noise, seed : standard deviation [rad] and seed of a perturbation of the joints, for several guesses.
     """
     p, c = t.problem, t.coordinates
     rng = np.random.default_rng(seed)
@@ -86,23 +87,23 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     if bounds is not None:
         mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]
         speed = speed_that_leaves(p.law, p.target, mass, speed, bounds.least, bounds.most)
-    ease = {"base": 0.0} if c.drifts else {}  # its momentum says how it moves
-    rates = strike_rates(c, p.strikers, y, legs, speed * p.normal, **ease)
-    return Contact(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
+    options = {"base": 0.0} if c.drifts else {}  # momentum determines the rates of a floating base
+    rates = strike_rates(c, p.strikers, y, legs, speed * p.normal, **options)
+    return ContactGuess(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
 
 
 def _within(rates: Array, limit: Array) -> float:
-    """The factor, 1 at most, that brings rates inside their limits."""
+    """Factor, at most 1, that brings rates inside their limits."""
     return min(1.0, float((limit / np.maximum(np.abs(rates), 1e-9)).min()))
 
 
 def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Array:
-    """Solver variables (n,) of a plain reach; speed, noise, seed: as of :func:`reached`."""
+    """Initial guess (n,) of a motion: quintic splines to the state of :func:`reached`, and back."""
     hit = reached(t, speed=speed, noise=noise, seed=seed)
     zero, (swing_T, follow_T) = np.zeros(len(t.y0)), _durations(t)
     start, end = _ends(t.problem, t.coordinates, t.problem.blow)
     swing = quintic(start, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
-    # half of the rates is left after contact, as where two like masses meet
+    # half of the rates is left after contact, as after an inelastic impact of two equal masses
     back = quintic(hit.y, 0.5 * hit.rates, end, zero, follow_T, t.follow.breaks)
     curve = CubicSpline.fit(swing, t.swing.breaks, zero, hit.rates, swing_T)
     after = CubicSpline.fit(back, t.follow.breaks, 0.5 * hit.rates, zero, follow_T)
@@ -116,20 +117,20 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     return _finished(t, x)
 
 
-def _drifting(problem: ImpactProblem, curve: CubicSpline, since: Contact | None = None) -> CubicSpline:
-    """The spline with its joints' motion, and the base where that takes it if nothing holds it.
+def _drifting(problem: ImpactProblem, curve: CubicSpline, since: ContactGuess | None = None) -> CubicSpline:
+    """Spline with the joints' motion of another one, and the base's motion that conserves momentum.
 
-    since : the state in which it begins; None: that of the spline.
+    since : state in which it begins; None: that of the spline.
     """
     breaks, c = curve.breaks, problem.coordinates
     fine = with_middles(with_middles(breaks))
     time = fine * curve.duration
 
     def sample(at: Array) -> tuple[Array, ...]:
-        rows = curve.sample(at)
+        values = curve.sample(at)
         if since is not None and not at[0]:
-            rows[0][0, :6], rows[1][0, :6] = since.y[:6], since.rates[:6]
-        return rows
+            values[0][0, :6], values[1][0, :6] = since.y[:6], since.rates[:6]
+        return values
 
     found = drifting_reference(problem, sample, time, backward=False)
     y = np.array([c.split(q)[0] for q in found.q])
@@ -138,10 +139,10 @@ def _drifting(problem: ImpactProblem, curve: CubicSpline, since: Contact | None 
 
 
 def strike_iterate(t: StrikeTranscription, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Array:
-    """Solver variables (n,) of a strike, as of :func:`first_iterate`."""
+    """Initial guess (n,) of a strike, from the state at contact of :func:`reached`."""
     hit = reached(t, speed=speed, noise=noise, seed=seed)
     x = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
-    with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
+    with contextlib.suppress(InputError):  # out of the legs' reach, for the solver to correct
         hit = replace(hit, legs=t.coordinates.solve_legs(hit.y, hit.legs))
     t.y.write(x, hit.y)
     t.legs.write(x, hit.legs)
@@ -152,7 +153,7 @@ def strike_iterate(t: StrikeTranscription, *, speed: float = 1.0, noise: float =
 
 
 def _draw_gains(t: ContactProgram, x: Array, noise: float, seed: int) -> None:
-    """Gains that are chosen begin as they are given, and in noisy starts anywhere between their bounds."""
+    """Draw gain factors between their bounds, if there is noise; without, they are 1."""
     gains = t.hit.contact.gains
     if noise and gains.size:
         k = gains.index(0)
@@ -160,9 +161,9 @@ def _draw_gains(t: ContactProgram, x: Array, noise: float, seed: int) -> None:
 
 
 def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array) -> Array:
-    """Solver variables (n,) of a motion from those of a strike: to its state at contact, and back.
+    """Initial guess (n,) of a motion from solver variables x of a strike: to its state at contact, and back.
 
-    Where the swing there would break limits of rates it goes as fast as they allow.
+    A coordinate whose swing would exceed its rate limit gets a lower rate at contact.
     """
     y, u = strike.y.read(x)[0], strike.u0.read(x)[0]
     after, rates = (e.evaluate(x) for e in strike.expected.state_after[:2])
@@ -174,140 +175,148 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
         _least_accelerations(t, t.follow.breaks, follow_T, after, end, rates=rates),
     )
     for name, group in strike.layout.groups.items():
-        mine = t.layout.groups.get(name)
-        if mine is not None and mine.count == group.count:
-            mine.write(out, group.read(x))
+        own = t.layout.groups.get(name)
+        if own is not None and own.count == group.count:
+            own.write(out, group.read(x))
     return _finished(t, out)
 
 
 def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
-    """Variables, multipliers of constraints and of bounds of a program with more nodes than an old one, or
-    elements, or of another model of the collision that lasts, or with a first instant of contact.
+    """Solution of an old program, mapped to one that differs: warm start of the solver.
 
-    What is at nodes is between those of the old nodes, and the contact is that of its polynomials;
-    multipliers are those of the same constraints and variables.
+    The new program may have more nodes or collocation elements, another collision model with duration, or
+    first instants of contact. Variables at nodes are interpolated, and those of the contact sampled from its
+    polynomials. Multipliers are those of the same constraints and variables, else zero.
+
+    x, y, z : solver variables (n,), multipliers of constraints (m,) and of bounds (n,) of the old program.
+
+    Returns the same three of the new program.
     """
     stages = same_places(t.hit.stages, old.hit.stages)
-    places = {}
+    nodes = {}  # old and new nodes, by the first word of the variables' names
     if isinstance(t, Transcription) and isinstance(old, Transcription):
-        places = {"swing": (old.swing_nodes, t.swing_nodes)}
-        places |= dict.fromkeys(("follow", "abort"), (old.follow_nodes, t.follow_nodes))
-        for mine, its in zip((t.before, *t.after), (old.before, *old.after), strict=True):
-            places |= {one.kind: (its.stands[k].nodes, one.nodes) for k, one in mine.stands.items()}
+        nodes = {"swing": (old.swing_nodes, t.swing_nodes)}
+        nodes |= dict.fromkeys(("follow", "abort"), (old.follow_nodes, t.follow_nodes))
+        for course, old_course in zip((t.before, *t.after), (old.before, *old.after), strict=True):
+            nodes |= {
+                phase.kind: (old_course.stands[k].nodes, phase.nodes) for k, phase in course.stands.items()
+            }
     new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
     for name, group in t.layout.groups.items():
         known = old.layout.groups.get(name)
         if known is None or not group.size:
             continue
-        if known.labels != group.labels:  # of one vector with a part for each node, which its label names
-            _carry_by_label(group, known, (new, x), (bounds, z))
+        if known.labels != group.labels:  # one vector with an entry for each node, which its label names
+            _map_by_label(group, known, (new, x), (bounds, z))
             continue
-        pairs = [(k, k) for k in range(group.count)]
-        if name.endswith(OF_MODEL) and _model(t) != _model(old):
+        pairs = [(k, k) for k in range(group.count)]  # vectors, new and old, whose multipliers are the same
+        if name.endswith(MODEL_VARIABLES) and _model(t) != _model(old):
             continue
-        if name.split()[0] in places and known.count != group.count:
-            before, now = places[name.split()[0]]
+        if name.split()[0] in nodes and known.count != group.count:
+            before, now = nodes[name.split()[0]]
             pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]
             group.write(new, np.column_stack([np.interp(now, before, column) for column in known.read(x).T]))
         elif known.count == len(old.hit.stages) and known.count != group.count:
-            pairs = stages
+            pairs = stages  # `map_contact` writes the variables, below
         else:
             group.write(new, known.read(x))
         for i, k in pairs:
             bounds[group.index(i)] = z[known.index(k)]
-    for mine, its in zip(t.hit.collisions, old.hit.collisions, strict=True):
-        if not isinstance(mine, Collision) or not isinstance(its, Collision):
+    state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
+    for collision, old_collision in zip(t.hit.collisions, old.hit.collisions, strict=True):
+        if not isinstance(collision, Collision) or not isinstance(old_collision, Collision):
             continue
         if _model(t) != _model(old):
-            state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
-            mine.guess_model(new, *state)
+            collision.guess_model(new, *state)
         elif t.hit.elements != old.hit.elements:
-            carry_contact(mine, its, new, x)
+            map_contact(collision, old_collision, new, x)
     if len(t.hit.first) != len(old.hit.first):
-        state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
         for first in t.hit.first:
             first.guess(new, *state)
-    return _finished(t, new), _of_same_rows(t.program.origins, old.program.origins, y), bounds
+    return _finished(t, new), _mapped_multipliers(t.program.origins, old.program.origins, y), bounds
 
 
-def _carry_by_label(group: Group, known: Group, *vectors: tuple[Array, Array]) -> None:
-    """Copy what has the same label; ``vectors``: new and old ones. What is new is lifted, so it is found
-    afterwards.
+def _map_by_label(group: Group, known: Group, *vectors: tuple[Array, Array]) -> None:
+    """Copy the entries with the same label.  vectors : pairs of a new and an old vector (n,).
+
+    Entries with a new label are lifted variables, which `_finished` computes.
     """
-    before = {label: j for j, label in enumerate(known.labels)}
-    there = [k for k, label in enumerate(group.labels) if label in before]
-    here = [before[group.labels[k]] for k in there]
+    places = {label: j for j, label in enumerate(known.labels)}
+    entries = [k for k, label in enumerate(group.labels) if label in places]
+    known_entries = [places[group.labels[k]] for k in entries]
     for k in range(min(group.count, known.count)):
         for new, old in vectors:
-            new[group.index(k)[there]] = old[known.index(k)[here]]
+            new[group.index(k)[entries]] = old[known.index(k)[known_entries]]
 
 
 def _model(t: ContactProgram) -> tuple[str, int]:
+    """Collision model and number of freezes."""
     return t.problem.collision, t.problem.freezes
 
 
-def _of_same_rows(rows: Sequence[Row], known: Sequence[Row], numbers: Array) -> Array:
-    """The numbers of known constraints for these: those of the same name, as often as there are any; else 0.
-
-    Most constraints in front are the very same: programs differ by what comes after them.
-    """
-    differ = (k for k, (one, other) in enumerate(zip(rows, known, strict=False)) if one is not other)
-    same = next(differ, min(len(rows), len(known)))
-    of_names = dict(zip(_keys(known[same:]), numbers[same:].tolist(), strict=True))
-    return np.concatenate([numbers[:same], [of_names.get(key, 0.0) for key in _keys(rows[same:])]])
+def _mapped_multipliers(constraints: Sequence[Row], known: Sequence[Row], multipliers: Array) -> Array:
+    """Multipliers of constraints by name, from those of known constraints; 0 for names that are new."""
+    # most programs share their first constraints, and differ in those that come after them
+    differ = (k for k, (one, other) in enumerate(zip(constraints, known, strict=False)) if one is not other)
+    same = next(differ, min(len(constraints), len(known)))
+    of_names = dict(zip(_keys(known[same:]), multipliers[same:].tolist(), strict=True))
+    return np.concatenate([multipliers[:same], [of_names.get(k, 0.0) for k in _keys(constraints[same:])]])
 
 
-def _keys(rows: Sequence[Row]) -> Iterator[tuple[tuple[str, str, str], int]]:
-    """Name of each constraint, and the number of earlier ones of that name."""
+def _keys(constraints: Sequence[Row]) -> Iterator[tuple[tuple[str, str, str], int]]:
+    """Name of each constraint, and the number of earlier ones with that name."""
     seen: dict[tuple[str, str, str], int] = {}
-    for row in rows:
-        name = row.term, row.place.name, row.component
+    for constraint in constraints:
+        name = constraint.term, constraint.place.name, constraint.component
         before = seen.get(name, 0)
         seen[name] = before + 1
         yield name, before
 
 
 def _finished(t: ContactProgram, x: Array) -> Array:
+    """Variables x with lifted ones computed, inside their bounds."""
     return np.clip(t.with_lifted(x), t.layout.lower, t.layout.upper)
 
 
 def _durations(t: Transcription) -> tuple[float, float]:
-    """Durations of swing and follow-through [s]: the middle of their ranges, where that is not slow."""
+    """Durations of swing and follow-through [s]: the middle of their ranges, or `MAX_DURATION`."""
     swing, follow = (
-        max(phase.duration[0], min(float(np.mean(phase.duration)), _SLOW))
+        max(phase.duration[0], min(float(np.mean(phase.duration)), MAX_DURATION))
         for phase in (t.problem.swing, t.problem.follow)
     )
     return swing, follow
 
 
 def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
-    """A swing and a follow-through, with legs and sole wrenches as at rest."""
+    """Variables of a motion (n,) with these splines as swing and follow-through, and stance phases between
+    their postures; legs and sole wrenches as at rest.
+    """
     x = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
     for phase, spline in ((t.swing, curve), *((follow, back) for follow in t.follows)):
         _write(t.builder, x, phase, spline)
     for course in (t.before, *t.after):
         for k, phase in course.stands.items():
             b, T = course.builders[k], float(np.mean(phase.phase.duration))
-            (start, end), still = _ends(t.problem, b.coordinates, k), np.zeros(b.ny)
-            way = quintic(start, still, end, still, T, phase.breaks)
-            _write(b, x, phase, CubicSpline.fit(way, phase.breaks, still, still, T))
+            (start, end), at_rest = _ends(t.problem, b.coordinates, k), np.zeros(b.ny)
+            values = quintic(start, at_rest, end, at_rest, T, phase.breaks)
+            _write(b, x, phase, CubicSpline.fit(values, phase.breaks, at_rest, at_rest, T))
     if t.abort is not None and t.coordinates.legs:
         t.abort.coast_w.write(x, t.swing.w.read(x)[-1:])
     return x
 
 
 def _ends(problem: ImpactProblem, c: StanceCoordinates, k: int) -> list[Array]:
-    """Coordinates (ny,) at the ends of stance phase k."""
+    """Coordinates (ny,) at the beginning and the end of stance phase k."""
     return [c.split(problem.change_posture(j))[0] for j in (k - 1, k)]
 
 
 def _write(b: Builder, x: Array, phase: MotionPhase, spline: CubicSpline) -> None:
-    """A phase's spline, with legs and sole wrenches as at rest."""
+    """Write a phase's spline to x (n,), with legs and sole wrenches as at rest."""
     c, limits, legs = b.coordinates, b.limits, b.legs0
     phase.guess(x, spline)
     all_legs, all_w = [], []
     for y in spline.sample(phase.nodes * spline.duration)[0]:
-        with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to fix it
+        with contextlib.suppress(InputError):  # out of the legs' reach, for the solver to correct
             legs = c.solve_legs(y, legs)
         all_legs.append(np.clip(legs, limits.legs_lower, limits.legs_upper))
         all_w.append(static_wrenches(c, y, legs))
@@ -326,41 +335,41 @@ def _least_accelerations(
     rates: Array | None = None,
     end_rates: Array | None = None,
 ) -> CubicSpline:
-    """The spline of least accelerations inside the limits of positions, to ``end`` without acceleration.
+    """Spline of least squared accelerations inside position limits, from ``start`` to ``end`` (ny,).
 
-    It starts and ends at rest, or with these rates. A coordinate that would break its limit of rates starts
-    and ends slower.
+    rates, end_rates : ydot at start and end; None: at rest. There is no acceleration at the end, nor at a
+        start at rest. A coordinate that would exceed its rate limit starts and ends with lower rates.
     """
     factors, count = rate_weights(breaks), len(breaks) + 2
     nodes = with_middles(breaks)
-    # weighted by the root of a node's part of the time, so that squares sum up to the integral
+    # weighted by the root of the time around a node, so that the sum of squares is an integral
     accelerations = basis(breaks, nodes)[2] * np.sqrt(np.gradient(nodes))[:, None]
     c, limits = t.coordinates, t.builder.limits
     limit = np.concatenate([np.full(c.base, np.inf), limits.rate_limit[c.independent]])
     control = np.zeros((count, c.ny))
-    for k in range(c.ny):
-        fastest = np.inf
-        for slower in (1.0, 0.8, 0.6, 0.4, 0.2):
-            way = slower * duration
-            u0, u1 = (0.0 if u is None else way * float(u[k]) for u in (rates, end_rates))
+    for k in range(c.ny):  # coordinates do not depend on each other: one small least squares problem each
+        slowest = np.inf  # largest rate of the slowest spline so far
+        for factor in (1.0, 0.8, 0.6, 0.4, 0.2):  # of the given rates
+            u0, u1 = (0.0 if u is None else factor * duration * float(u[k]) for u in (rates, end_rates))
+            # control points: the rate at an end is the difference of two, times a factor over the duration
             points = np.zeros(count)
             points[0] = start[k]
             points[1] = points[0] + u0 / factors[0]
-            held = [0, 1, count - 3, count - 2, count - 1]
+            fixed = [0, 1, count - 3, count - 2, count - 1]
             if rates is None:  # at rest without acceleration
                 points[2] = points[1]
-                held.append(2)
+                fixed.append(2)
             points[-1] = end[k]
-            # three points with the end's rate between them: no acceleration there
+            # the last three points have the end's rate between them: no acceleration there
             points[-2] = points[-1] - u1 / factors[-1]
             points[-3] = points[-2] - u1 / factors[-2]
-            free = np.setdiff1d(np.arange(count), held)
+            free = np.setdiff1d(np.arange(count), fixed)
             bounds = limits.y_lower[k] - 1e-9, limits.y_upper[k] + 1e-9
             found = lsq_linear(accelerations[:, free], -accelerations @ points, bounds)
             points[free] = found.x
-            fast = float(np.abs(factors * np.diff(points)).max()) / duration
-            if fast < fastest:
-                fastest, control[:, k] = fast, points
-            if fast <= limit[k]:
+            largest = float(np.abs(factors * np.diff(points)).max()) / duration
+            if largest < slowest:
+                slowest, control[:, k] = largest, points
+            if largest <= limit[k]:
                 break
     return CubicSpline(control=control, breaks=breaks, duration=duration)

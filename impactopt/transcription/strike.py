@@ -16,9 +16,9 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.contact_conditions import add_balance, add_touch_rows
+from impactopt.transcription.contact_conditions import add_balance, add_conditions
 from impactopt.transcription.contact_program import BodyState, ContactProgram
-from impactopt.transcription.contact_set import Hit
+from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
 from impactopt.transcription.layout import Affine, Array, Measure, Place, along, by_leg
 from impactopt.transcription.mesh import Elements, Shares
@@ -31,7 +31,7 @@ class StrikeTranscription(ContactProgram):
     """The program of one problem's strike, with the groups that its solution is read from.
 
     Terms and objectives are the problem's, but for those that only a whole motion has.
-    elements, shares : of the contact, as of `Hit`.
+    elements, shares : of the contact, as of `ContactSet`.
     """
 
     def __init__(
@@ -52,12 +52,12 @@ class StrikeTranscription(ContactProgram):
         coasting = add_coasting(b, {"lower": -fastest, "upper": fastest})
         still, one = Affine.zeros(b.ny), Affine.constant(1.0)
         state = ContactState(self.y[0], coasting.u0[0], still, one, self.legs[0], self.w[0])
-        super().__init__(b, Hit(b, Contact(state, *coasting), elements, shares, after=True))
+        super().__init__(b, ContactSet(b, Contact(state, *coasting), elements, shares, after=True))
         node = [state.y, state.y1, state.y2, state.legs, state.w, state.T]
         (torque,) = add_nodes(b, [node], ["contact"])
         self._node = node
         self.hit.add_feedforward_rows(torque)
-        add_touch_rows(b, state)
+        add_conditions(b, state)
         self.hit.add_rows()
         self._add_after(fastest)
         if c.legs:

@@ -26,9 +26,9 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import SeparationBlock
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import typical_state
-from impactopt.transcription.contact_conditions import add_balance, add_clearance, add_touch_rows
+from impactopt.transcription.contact_conditions import add_balance, add_clearance, add_conditions
 from impactopt.transcription.contact_program import BodyState, ContactProgram
-from impactopt.transcription.contact_set import Hit
+from impactopt.transcription.contact_set import ContactSet
 from impactopt.transcription.contact_state import Contact, add_coasting
 from impactopt.transcription.layout import (
     Affine,
@@ -125,7 +125,7 @@ class Transcription(ContactProgram):
     """The program of one problem, with the parts that its solution is read from.
 
     nodes : beside the ends and middles of the splines' intervals.
-    elements, shares : of the contact, as of `Hit`.
+    elements, shares : of the contact, as of `ContactSet`.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class Transcription(ContactProgram):
         self.before = Course(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
         self.swing = cast(Swing, self.before.phases[problem.blow])
         contact = Contact(self.swing.end, *add_coasting(b))
-        super().__init__(b, Hit(b, contact, elements, shares, after=False))
+        super().__init__(b, ContactSet(b, contact, elements, shares, after=False))
         self.after = [Course(b, after, lambda _, ends: FollowThrough(b, nodes.follow, ends=ends), nodes)]
         self.follow = cast(FollowThrough, self.after[0].phases[problem.blow])
         self.abort: AbortMotion | None = None
@@ -167,7 +167,7 @@ class Transcription(ContactProgram):
         self.follows = [self.follow] if self.abort is None else [self.follow, self.abort]
         self.torques: list[Affine] = []
         self._add_motions()
-        add_touch_rows(b, contact.state)
+        add_conditions(b, contact.state)
         add_clearance(b, self.swing, self.follow, self.hit.expected.target_state)
         self.hit.add_rows()
         self._add_links()

@@ -69,7 +69,7 @@ def slow_parting() -> Iterator[None]:
     here about one of them.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contact_conditions, "PARTING", contact_conditions.HASTE)
+        patch.setattr(contact_conditions, "SOFT_GRIP_RATE", contact_conditions.CLEARANCE_RATE)
         yield
 
 

@@ -41,7 +41,7 @@ from impactopt.solvers.elimination.condense import Condenser, find_eliminations
 from impactopt.solvers.elimination.kernels import Kernels
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Determined, Status, check_program
-from impactopt.transcription.contact_conditions import CLEARANCE, HASTE
+from impactopt.transcription.contact_conditions import CLEARANCE, CLEARANCE_RATE
 from impactopt.transcription.contact_guess import speed_that_leaves
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import contact_mesh
@@ -202,7 +202,7 @@ def test_what_stays_is_not_touched_again(target: Target) -> None:
     plan = transcription.decode(result.x)
     after = np.linspace(0.0, plan.follow.duration, 50)
     x = plan.follow.sample(after)[0][:, 0]
-    assert (x[1:] <= x[0] - np.minimum(CLEARANCE, HASTE * after[1:]) + 1e-3).all()
+    assert (x[1:] <= x[0] - np.minimum(CLEARANCE, CLEARANCE_RATE * after[1:]) + 1e-3).all()
 
 
 def test_a_board_breaks_where_its_spring_has_the_breaking_force() -> None:
@@ -440,7 +440,7 @@ def test_the_striker_gives_way_to_a_target_that_comes_on_after_contact() -> None
     after = np.linspace(0.0, plan.follow.duration, 50)
     x = plan.follow.sample(after)[0][:, 0]
     surface = x[0] + plan.collision.outcome["speed_m_s"] * after
-    assert (x[1:] <= (surface - np.minimum(CLEARANCE, HASTE * after))[1:] + 1e-3).all()
+    assert (x[1:] <= (surface - np.minimum(CLEARANCE, CLEARANCE_RATE * after))[1:] + 1e-3).all()
 
 
 def test_lifted_variables_are_found_beside_rows_on_demand() -> None:

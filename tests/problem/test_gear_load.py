@@ -20,7 +20,7 @@ from impactopt.robots.loads import motor_power, motor_use
 from impactopt.simulation import simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.transcription.collision import jump
+from impactopt.transcription.collision import jump_at_contact
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
 from impactopt.transcription.plan import motion_loads
 from impactopt.transcription.transcription import Transcription
@@ -109,7 +109,7 @@ def test_on_two_soles_the_first_instant_is_what_the_numbers_say(biped_transcript
     equal = [i for i in rows if origins[i].term in ("jump of acceleration", "contact law")]
     assert len(equal) == t.coordinates.rb.nv + 1
     assert np.abs(g[equal]).max() < 1e-8
-    force, _, wrench, a = jump(t.problem, t.coordinates, t.problem.law, y, rates, legs)
+    force, _, wrench, a = jump_at_contact(t.problem, t.coordinates, t.problem.law, y, rates, legs)
     assert force > 10.0 and np.abs(wrench).max() > 1.0
     load = [i for i in rows if origins[i].term == "gear load"]
     torque = t.feedforward.read(x)[0]

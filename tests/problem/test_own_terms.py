@@ -295,7 +295,7 @@ def test_mistakes_in_rows_are_told_where_they_are_made(arm_transcription: Transc
     for attribute, value, words in (
         ("rows", [("ab", np.zeros(1, dtype=int))], "ceiling: outputs are 1, components 2"),
         ("rows", [("a", 0), ("b", 0)], "in two constraints, ceiling, a and ceiling, b: "),
-        ("numbers", 2, "block ceiling takes 0 numbers, was given 2"),
+        ("numbers", 2, "block ceiling takes 0 parameters, was given 2"),
         ("block", "cieling", r"no block 'cieling' \(did you mean 'ceiling'\?\): return it from `blocks`"),
     ):
         setattr(Wrong, attribute, value)

@@ -302,7 +302,7 @@ def test_the_hand_keeps_clear_of_the_target_until_just_before_contact(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     near, x = hovering(arm_transcription, gap=0.022)
-    wanted = {float(s): min(nlp.CLEARANCE, nlp.HASTE * (1 - s) * LEISURE) for s in near.swing_nodes}
+    wanted = {float(s): min(nlp.CLEARANCE, nlp.CLEARANCE_RATE * (1 - s) * LEISURE) for s in near.swing_nodes}
     assert max(wanted.values()) == nlp.CLEARANCE
     assert all(gap >= wanted[s] - 1e-5 for s, gap in swing_gaps(near, x).items())
     monkeypatch.setattr(nlp, "CLEARANCE", 0.0)

@@ -83,7 +83,7 @@ def transcribed(problem: ImpactProblem) -> Transcription:
         )
     for instant in (False, True):
         given = c, problem.striker, problem.law, problem.target, edges
-        found |= builders(*given, instant=instant, first=True, rubs=problem.friction is not None)
+        found |= builders(*given, instant=instant, first=True, friction=problem.friction is not None)
     found |= {name: build for name, (_, build) in stance_blocks(problem).items()}
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))
 

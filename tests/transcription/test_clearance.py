@@ -36,7 +36,7 @@ from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
-from impactopt.transcription.clearance import ApartRow, Chain, chain_between
+from impactopt.transcription.clearance import Chain, ClearanceKey, chain_between
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -121,7 +121,7 @@ def test_a_chain_takes_a_point_to_where_pinocchio_does(name: str) -> None:
             else:
                 z, before, frame = posed.z(chain, body.rotation), body.inverse(), body
             there = frame.actInv(posed.data.oMi[one].act(centre))
-            np.testing.assert_allclose(taken(chain, z, chain.numbers(before), centre), there, atol=1e-9)
+            np.testing.assert_allclose(taken(chain, z, chain.parameters(before), centre), there, atol=1e-9)
 
 
 def test_only_the_joints_between_two_links_are_in_their_chain() -> None:
@@ -133,7 +133,7 @@ def test_only_the_joints_between_two_links_are_in_their_chain() -> None:
     columns |= {robot.model.joints[names[f"left hip {n}"]].idx_v for n in ("yaw", "roll", "pitch")}
     columns |= {robot.model.joints[names["left knee"]].idx_v}
     assert set(chain.columns) == columns and not chain.base
-    assert len(chain.places) == len(chain.columns) + 1
+    assert len(chain.placements) == len(chain.columns) + 1
     slots, coordinates, _ = chain.pattern(c)
     assert sorted(slots) == list(range(3, 3 + len(columns)))
     assert sum(k >= c.ny for k in coordinates) == 4, "the leg's are not free"
@@ -197,7 +197,7 @@ def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any,
     assert len(t.apart_rows) == t.program.m - len(without(t).program.origins)
 
 
-def pieces(bodies: Any, row: ApartRow) -> tuple[Any, Any]:
+def pieces(bodies: Any, row: ClearanceKey) -> tuple[Any, Any]:
     """As coal has them."""
     if row.other < 0:
         return bodies.links.of_joint[row.joint][row.number].shape, bodies.world[-1 - row.other].shape

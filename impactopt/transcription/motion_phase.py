@@ -467,7 +467,7 @@ class FollowThrough(MotionPhase):
         return y, y1, self.T[0]
 
     def determined(self) -> list[Determined]:
-        """Variables as of `MotionPhase`, and the first two control points: position and rate after contact."""
+        """Variables as of `MotionPhase`, and two control points: position and rate after contact."""
         first = np.concatenate([self.c.index(0), self.c.index(1)])
         return [*super().determined(), determined(Turn.AFTER, first)]
 

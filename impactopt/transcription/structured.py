@@ -129,8 +129,8 @@ class Runs:
         cls, source: Index, destination: Index, length: Index, factor: Array, shape: tuple[int, int]
     ) -> Runs:
         """Makes runs from index arrays of any integer type."""
-        source, destination, length = (a.astype(np.int32) for a in (source, destination, length))
-        return cls(source, destination, length, factor, shape)
+        runs = source.astype(np.int32), destination.astype(np.int32), length.astype(np.int32)
+        return cls(*runs, factor, shape)
 
     def add_to(self, out: Array, entries: Array) -> None:
         """Add the scattered entries to ``out``."""

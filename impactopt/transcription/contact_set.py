@@ -19,7 +19,7 @@ from impactopt.transcription.layout import Array, Index, Place, Turn, determined
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
 
-DRIFT = 2e-3  # of the contact's time: how far a freeze may be from where it is asked for
+DRIFT = 2e-3  # of the contact's time: tolerance of the instants at which the model is frozen
 
 
 class Contacts:
@@ -27,10 +27,9 @@ class Contacts:
 
     Attributes
     ----------
-    contact : what all collisions start from.
-    expected, scenarios : the collisions; who completes this makes them. All of them, the expected one first,
-        are `collisions`.
-    elements, stages, shares, guarded, first : of a collocated contact, see `Hit`; others have none.
+    contact : state at contact, from which all collisions start.
+    expected, scenarios : the collisions, made by the subclass; `collisions` are all of them.
+    elements, stages, shares, guarded, first : of a collocated contact, as of `Hit`; empty of others.
     """
 
     expected: Any
@@ -59,7 +58,7 @@ class Contacts:
         return mass_at_contact(self._b.problem)
 
     def add_feedforward_rows(self, torque: Index) -> None:
-        """The feed-forward is the torque at the node at contact, whose outputs are given."""
+        """Constrains the feed-forward to the torque at contact.  torque (n,) : numbers of block outputs."""
         self._b.rows.add(
             term="feed-forward that makes the robot coast",
             place="contact",
@@ -72,16 +71,16 @@ class Contacts:
         )
 
     def determined(self) -> list[Determined]:
-        """The feed-forward."""
+        """Variables that can be eliminated: the feed-forward."""
         return [determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
 
     def drives(self) -> list[DrivePoint]:
-        """Drives in contact, as far as they are known; none for an impact without duration."""
+        """Torques and joint motions at collocation points; none of an impact without duration."""
         return []
 
     def first_instants(self) -> list[tuple[Place, Index]]:
-        """Instants at which accelerations jump, with the indices of the outputs that rotors subtract from
-        gear loads.
+        """First instants of contact, at which accelerations jump: place, and numbers (n,) of the outputs that
+        are the rotors' part of gear loads.
         """
         return []
 
@@ -90,17 +89,17 @@ class Contacts:
         return [collision.contact_end() for collision in self.collisions]
 
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """Write what a contact starts from with these coordinates and rates (ny,) and legs (nl,)."""
+        """Write the contact's initial guess to x (n,), from coordinates y, rates (ny,) and legs (nl,)."""
         self.contact.u0.write(x, rates)
 
     def drifted(self, x: Array) -> Shares | None:
-        """The phases' shares of the contact's time in solver variables (n,), where freezes on the way went by
-        others; None where they did not.
+        """The phases' shares of the contact's time at solver variables x (n,), if the model was frozen by
+        others and these differ by more than `DRIFT`; else None.
         """
         return None
 
     def impulse(self, x: Array) -> float:
-        """Impulse to the expected target [N s], for solver variables (n,)."""
+        """Impulse to the expected target [N s], at solver variables x (n,)."""
         return float(self.expected.impulse.evaluate(x)[0])
 
 
@@ -111,19 +110,19 @@ def approaches(outputs: dict[str, Array]) -> Array:
 
 
 class Hit(Contacts):
-    """Takes what all collisions start from; hands them back.
+    """Contacts by collocation, or by an impulse if the collision has no duration.
 
-    elements : lengths of each phase's; none: those that the problem asks for.
-    shares : of the contact's time that each phase lasts, by which freezes on the way come when they do; none:
-        those of a point mass.
-    after : whether the position after the expected target is among the variables.
+    elements : lengths of each phase's elements; empty: the problem's.
+    shares : fraction of the contact's time that each phase lasts, which fixes the instants at which the model
+        is frozen; empty: those of a point mass.
+    after : True if the position after the expected collision is a variable.
 
     Attributes
     ----------
-    elements, stages : of every collision's phases, and their collocation points.
-    shares : of the phases, where something is frozen on the way.
-    guarded : the elements are given, and finer, because a plan was wrong on others: it may have pulled within
-        a phase.
+    elements, stages : of the phases of every collision, and their collocation points.
+    shares : as above; empty if nothing is frozen during contact.
+    guarded : True if elements were given: an earlier plan was inaccurate on the problem's. As its force may
+        have pulled within a phase, collisions then have constraints against that.
     """
 
     def __init__(
@@ -158,11 +157,11 @@ class Hit(Contacts):
 
     # ------------------------------------------------------------------ constraints
     def add_rows(self) -> None:
-        """One block for all collisions, each with its constraints."""
+        """Adds the blocks, each with the instances of all collisions, and the collisions' constraints."""
         b = self._b
         slots: dict[str, list[Any]] = {}
         parameters: dict[str, list[Any]] = {}
-        first: list[dict[str, int]] = []
+        first: list[dict[str, int]] = []  # of each collision: number of its first instance in each block
         for collision in self.collisions:
             found = collision.instances()
             first.append({name: len(slots.get(name, ())) for name in found})
@@ -204,9 +203,9 @@ class Hit(Contacts):
         b.block("first").take_parameters(np.array([first.instance()[1] for first in self.first]))
 
     def output(self, collision: int, stage: int, part: str) -> Index:
-        """Numbers of outputs of the block ``force``, whose ``part`` they are: at a stage of a collision.
+        """Numbers of the outputs that are a ``part`` of the block ``force``, at a stage of a collision.
 
-        Once constraints are there, and of collisions that last.
+        Needs :meth:`add_rows` first, and a collision with a duration.
         """
         size = self._b.block("force").n_out
         at = self._at["force"] + (collision * len(self.stages) + stage) * size
@@ -225,7 +224,7 @@ class Hit(Contacts):
         return self.output(0, self.expected.end[-2], "penetration")
 
     def determined(self) -> list[Determined]:
-        """Determined variables of all collisions, and of the feed-forward."""
+        """Variables that can be eliminated: those of all collisions, and the feed-forward."""
         parts = [*self.collisions, *self.first]
         return [*(each for part in parts for each in part.determined()), *super().determined()]
 
@@ -245,7 +244,7 @@ class Hit(Contacts):
         return tuple(float(share) for share in found)
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
-        """Contact data of plans and strikes, for solver variables (n,) and the blocks' outputs."""
+        """Contact data of plans and strikes, from solver variables x (n,) and the blocks' outputs."""
         approach = approaches(outputs)
         compression, restitution = self.expected.durations(x)
         scenarios = [

@@ -36,8 +36,8 @@ GEAR = 0.03  # of a gear's limit; also between collocation points
 class MoreNodes(NamedTuple):
     """Nodes in addition to the ends and middles of splines' intervals, as fractions of a phase.
 
-    swing, follow : of the swing, and of all motions to rest.  stands : of each stance phase; empty of the one
-    with the impact.
+    swing, follow : of the swing, and of all motions to rest.
+    stands : of each stance phase; empty of the one with the impact.
     """
 
     swing: tuple[float, ...] = ()

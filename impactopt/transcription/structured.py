@@ -115,7 +115,7 @@ Int32 = npt.NDArray[np.int32]
 class Runs:
     """Scatter-add in k runs: for i < length,  out[destination + i] += factor * entries[source + i].
 
-    source, destination, length, factor (k,).  shape : sizes of ``out`` and of ``entries``.
+    source, destination, length, factor : (k,) of each run.  shape : sizes of ``out`` and of ``entries``.
     """
 
     source: Int32

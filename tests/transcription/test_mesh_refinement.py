@@ -92,8 +92,8 @@ def test_torques_between_nodes_by_inverse_dynamics(arm_plan: Planned, fraction: 
         ratio = np.array([np.abs(tau / limit).max() for _, tau in forces(plan, curve, at)])
         expected.append(middles_of(nodes, at[ratio > 1.2 * fraction]))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(between, "_SHARE", 0.0)
-        patch.setattr(between, "_TORQUE", 0.2 * fraction)
+        patch.setattr(between, "_MARGIN_LOSS", 0.0)
+        patch.setattr(between, "_TORQUE_LOSS", 0.2 * fraction)
         assert nodes_to_add(plan, NO_MORE) == MoreNodes(*expected)
     assert bool(expected[0]) == (fraction < 1.0)
     assert nodes_to_add(plan, NO_MORE) == NO_MORE  # half of the room up to all that there is
@@ -307,8 +307,8 @@ def test_more_nodes_go_together_with_everything_on_two_legs(biped_transcription:
 def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A problem whose torques are a little over their limit between the nodes, where nothing is given up."""
     monkeypatch.setattr(reconstruction, "block_functions", lambda *_: arm_transcription.functions)
-    monkeypatch.setattr(between, "_SHARE", 0.0)
-    monkeypatch.setattr(between, "_TORQUE", 1e-6)
+    monkeypatch.setattr(between, "_MARGIN_LOSS", 0.0)
+    monkeypatch.setattr(between, "_TORQUE_LOSS", 1e-6)
     return dataclasses.replace(
         arm_transcription.problem,
         swing=Phase(duration=0.4, intervals=6),

@@ -57,7 +57,7 @@ class Contacts:
         """Effective mass [kg] of the robot at its striker, where inverse kinematics reaches the target."""
         return mass_at_contact(self._b.problem)
 
-    def add_feedforward_rows(self, torque: Index) -> None:
+    def add_feedforward(self, torque: Index) -> None:
         """Constrains the feed-forward to the torque at contact.  torque (n,) : numbers of block outputs."""
         self._b.rows.add(
             term="feed-forward that makes the robot coast",

@@ -85,7 +85,7 @@ def add_nodes(
             lower=b.limits.extension.minimum,
             measure=percent("too near to straight", of=b.limits.extension.minimum),
         )
-        add_cone_rows(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force, fading)
+        add_cone(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force, fading)
         torques.append(at + part["torque"])
     return torques
 
@@ -96,7 +96,7 @@ def node_numbers(b: Builder) -> Array:
     return np.concatenate([limits, rates, b.limits.units, b.coordinates.start_determinants])
 
 
-def add_cone_rows(
+def add_cone(
     b: Builder,
     wrench: Affine,
     place: Place | str,
@@ -310,7 +310,7 @@ class MotionPhase:
         return [each for parts in found for each in at_node(parts)]
 
     # ------------------------------------------------------------------ constraints
-    def add_rate_rows(self, b: Builder) -> None:
+    def add_rate_limits(self, b: Builder) -> None:
         """Bounds the velocity spline's control points, and so the velocity everywhere between them.
 
         Multiplied by T, |c'_j| / T <= limit is linear in the variables.
@@ -354,7 +354,7 @@ class MotionPhase:
                     measure=fast,
                 )
 
-    def add_momentum_rows(self, b: Builder) -> None:
+    def add_momentum_conservation(self, b: Builder) -> None:
         """Constrains the momentum of a free-floating robot: h(s) = h(0) + s T m g.
 
         It is collocated in the middles of the spline's intervals and at its end: as many points as the base

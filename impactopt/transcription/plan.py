@@ -89,9 +89,9 @@ def complete_reference(
     state = np.hstack([y, yd, ydd, wrench])
     changes = np.append(True, (state[1:] != state[:-1]).any(axis=1))[:n]
     distinct = np.flatnonzero(changes)
-    for k, (configuration, _) in zip(distinct.tolist(), c.closing.follow(y[distinct], legs), strict=True):
+    for k, (configuration, _) in zip(distinct.tolist(), c.leg_closure.follow(y[distinct], legs), strict=True):
         q[k] = configuration
-        v[k], a[k], jac = c.closing.rates(configuration, y[k], yd[k], ydd[k])
+        v[k], a[k], jac = c.leg_closure.rates(configuration, y[k], yd[k], ydd[k])
         tau = robot.inverse_dynamics(data, q[k], v[k], a[k])
         if c.legs:
             # minimize |C dw|^2 subject to B' dw = unbalanced, where B are the columns of the contact Jacobian
@@ -681,7 +681,7 @@ class Plan:
         coordinates : by default those of the stance phase with the impact.
         """
         c = coordinates or self.coordinates
-        return np.array([q for q, _ in c.closing.follow(y, c.start_legs)]).reshape(len(y), c.model.nq)
+        return np.array([q for q, _ in c.leg_closure.follow(y, c.start_legs)]).reshape(len(y), c.model.nq)
 
     def margins(
         self,

@@ -171,7 +171,7 @@ class PhaseSequence:
                     upper=limit,
                     measure=percent("over its limit", of=limit),
                 )
-            phase.add_rate_rows(b)
+            phase.add_rate_limits(b)
 
     def add_changes(self) -> None:
         """Adds constraints where soles lift off or touch down, and while they are in the air."""
@@ -307,9 +307,7 @@ class PhaseSequence:
         out = []
         for k, phase in self.stands.items():
             nodes, wrench = phase.nodes, phase.wrenches(x)
-            if nodes[
-                0
-            ]:  # a phase from rest has no node at its start: the first node's wrench holds there too
+            if nodes[0]:  # a phase from rest has no node at its start: the first wrench holds there too
                 nodes, wrench = np.append(0.0, nodes), np.vstack([wrench[:1], wrench])
             out.append(PlannedStand(number=k, spline=phase.spline(x), nodes=nodes, wrench=wrench))
         return tuple(out)

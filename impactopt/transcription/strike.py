@@ -57,7 +57,7 @@ class StrikeTranscription(ContactProgram):
         node = [state.y, state.y1, state.y2, state.legs, state.w, state.T]
         (torque,) = add_nodes(b, [node], ["contact"])
         self._node = node
-        self.hit.add_feedforward_rows(torque)
+        self.hit.add_feedforward(torque)
         add_touch_rows(b, state)
         self.hit.add_rows()
         self._add_after(fastest)

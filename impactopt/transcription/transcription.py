@@ -178,8 +178,8 @@ class Transcription(ContactProgram):
         self.hit.add_rows()
         self._add_links()
         if coordinates.drifts:  # after the links, whose constraints determine the start of the follow-through
-            self.swing.add_momentum_rows(b)
-            self.follow.add_momentum_rows(b)
+            self.swing.add_momentum_conservation(b)
+            self.follow.add_momentum_conservation(b)
         if coordinates.legs:
             y, y1, T = self.follow.start
             separation = [y, y1, self.follow.legs[0], T]
@@ -241,7 +241,7 @@ class Transcription(ContactProgram):
             fading=self.before.fading(self.problem.blow),
         )
         self._slots = instances, places
-        self._add_torque_rows(places, outputs)
+        self._add_torque_limits(places, outputs)
         joints = np.arange(self.coordinates.base, b.ny)
         b.rows.add(
             term=limits.position.name,
@@ -252,9 +252,9 @@ class Transcription(ContactProgram):
             upper=limits.y_upper[joints],
             measure=degrees("outside"),
         )
-        self.swing.add_rate_rows(b)
+        self.swing.add_rate_limits(b)
         for follow in self.follows:
-            follow.add_rate_rows(b)
+            follow.add_rate_limits(b)
         for sequence in (self.before, *self.after):
             sequence.add_stands()
             sequence.add_changes()
@@ -267,7 +267,7 @@ class Transcription(ContactProgram):
             return True
         return any(o.needs_torques for o in p.objectives)
 
-    def _add_torque_rows(self, places: list[Place], outputs: list[Index]) -> None:
+    def _add_torque_limits(self, places: list[Place], outputs: list[Index]) -> None:
         """Adds torque limits.  outputs : for each node, numbers (n,) of its torques among block outputs."""
         b, torque_limit = self.builder, self.builder.limits.torque
         limit, names = torque_limit.fraction, self.robot.joint_names
@@ -298,7 +298,7 @@ class Transcription(ContactProgram):
                     upper=limit,
                     measure=strong,
                 )
-        self.hit.add_feedforward_rows(outputs[contact])
+        self.hit.add_feedforward(outputs[contact])
 
     def _add_links(self) -> None:
         """Adds constraints that link motions after contact to the end of the contact, or of coasting.

@@ -32,7 +32,7 @@ def moving(request: pytest.FixtureRequest) -> Motion:
 
 def test_they_are_those_of_one_instant_after_the_other(moving: Motion) -> None:
     c, y, legs = moving
-    found, before = np.array([leg for _, leg in c.closing.follow(y, legs)]), legs
+    found, before = np.array([leg for _, leg in c.leg_closure.follow(y, legs)]), legs
     for k, row in enumerate(y):
         before = c.solve_legs(row, before)
         np.testing.assert_allclose(found[k], before, atol=1e-11)
@@ -43,12 +43,12 @@ def test_a_base_out_of_reach_is_told(moving: Motion) -> None:
     y = y.copy()
     y[-1, 2] += 1.0
     with pytest.raises(InputError, match="out of the legs' reach"):
-        np.array(list(c.closing.follow(y, legs)))
+        np.array(list(c.leg_closure.follow(y, legs)))
 
 
 def test_an_arm_has_none() -> None:
     robot = arm()
     posture = robot.posture(next(iter(robot.postures)))
     c = StanceCoordinates(robot, (), posture)
-    found = [leg for _, leg in c.closing.follow(np.zeros((3, c.ny)), np.zeros(0))]
+    found = [leg for _, leg in c.leg_closure.follow(np.zeros((3, c.ny)), np.zeros(0))]
     assert np.array(found).shape == (3, 0)

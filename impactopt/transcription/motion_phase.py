@@ -323,35 +323,29 @@ class MotionPhase:
         names = c.labels[c.base :]
         factors = rate_weights(self.breaks)
         shortest, longest = b.layout.bounds(self.T)
-        fixed = shortest == longest
         for j in js:
             step = (self.control(j + 1) - self.control(j))[joints] * (factors[j] / limit)
             # for messages: the Greville abscissa, the mean of the knots, where this control point weighs most
             s = float(knots(self.breaks)[j + 2 : j + 4].mean())
             name = f"{self.name}, control point {j}"
             place = Place(name, f"{self.name} at about {{s}}", self.T[0] * s)
-            fast = Measure("%", 100.0, "over its limit", self.T[0])
-            if fixed:  # T is a number: one two-sided constraint instead of two
-                bound = float(longest)
+            if shortest == longest:  # T is a number: one two-sided constraint instead of two
+                constraints = [(name, step, -longest, longest)]
+            else:
+                time = stack([self.T[0]] * len(joints))
+                constraints = [
+                    (f"{name}, forward", step - time, -np.inf, 0.0),
+                    (f"{name}, backward", -step - time, -np.inf, 0.0),
+                ]
+            for own_name, affine, lower, upper in constraints:
                 b.rows.add(
                     term=velocity.name,
-                    place=place,
+                    place=replace(place, name=own_name),
                     components=names,
-                    affine=step,
-                    lower=-bound,
-                    upper=bound,
-                    measure=fast,
-                )
-                continue
-            time = stack([self.T[0]] * len(joints))
-            for sign, direction in ((1.0, "forward"), (-1.0, "backward")):
-                b.rows.add(
-                    term=velocity.name,
-                    place=replace(place, name=f"{name}, {direction}"),
-                    components=names,
-                    affine=step * sign - time,
-                    upper=0,
-                    measure=fast,
+                    affine=affine,
+                    lower=lower,
+                    upper=upper,
+                    measure=Measure("%", 100.0, "over its limit", self.T[0]),
                 )
 
     def add_momentum_conservation(self, b: Builder) -> None:

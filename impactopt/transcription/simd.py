@@ -30,14 +30,7 @@ import numpy.typing as npt
 from impactopt.codegen.compiler import NativeCode, SharedCode, address, find_compiler, native_library
 from impactopt.problem.block import LANES
 
-__all__ = [
-    "LESS_PRODUCT",
-    "PRODUCT_LESS",
-    "SUM_OF_PRODUCT",
-    "InstructionTable",
-    "in_lanes",
-    "instruction_table",
-]
+__all__ = ["InstructionTable", "in_lanes", "instruction_table"]
 
 WINDOW = 20_000  # operations by which one may be done earlier than in CasADi's order
 # Kinds of operations in addition to CasADi's; the numbers are also those of arrange.c.
@@ -278,7 +271,8 @@ def in_lanes(functions: Sequence[ca.Function], lanes: int = LANES) -> list[Nativ
 def _loops(lanes: int, place: str) -> SharedCode:
     """C code of the loops over operations of each kind, which all functions share."""
     each = [f"IN_EACH_LANE(op_{kind}, {formula})" for kind, formula in _IN_EACH_LANE.items()]
-    loops = _LOOPS % "\n      ".join(map(_run, _OPERANDS))
+    runs = (f"RUN({kind}, {operands}, {_formula(kind)})" for kind, operands in _OPERANDS.items())
+    loops = _LOOPS % "\n      ".join(runs)
     code = "\n".join([_VECTORS % (lanes, place), _HEAD, *each, loops])
     return SharedCode(name="lanes", code=code, level=_LEVEL)
 
@@ -308,11 +302,6 @@ def _body(function: ca.Function, table: InstructionTable, number: int) -> list[s
         at += function.nnz_out(i)
     start = f"(const place *)program_{number}"
     return [*before, f"run_in_lanes({start}, {start} + {table.words.size}, v);", *after]
-
-
-def _run(kind: int) -> str:
-    """C loop over a run of operations of one kind."""
-    return f"RUN({kind}, {_OPERANDS[kind]}, {_formula(kind)})"
 
 
 def _number(value: float) -> str:

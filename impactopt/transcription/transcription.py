@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from itertools import groupby
 from typing import Any, cast
 
@@ -80,7 +81,6 @@ def block_functions(
     target = problem.target
     frozen = () if problem.frozen is None else (problem.frozen,)
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
-    groups: list[FunctionGroup] = []
     springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
     rubs = () if problem.friction is None else ("rubs",)
@@ -92,24 +92,26 @@ def block_functions(
         name: ExtraBlock(keys.get(name, ()), build)
         for name, build in own_blocks(problem, coordinates, edges).items()
     }
-    for name, block in {**found, **extra_blocks(problem, coordinates, elements)}.items():
-
-        def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
-            b = block.build()
-            return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
-
-        groups.append(
-            FunctionGroup(name=f"{robot.name}-{name}", recipe=(name, *recipe, *block.key), build=functions)
+    found |= extra_blocks(problem, coordinates, elements)
+    blocks = [(name, (*recipe, *block.key), block.build) for name, block in found.items()]
+    soles = [(sole.frame, len(sole.polygon)) for sole in problem.soles]
+    blocks += [
+        (name, (*_coordinates_recipe(c), *soles), build)
+        for name, (c, build) in stance_blocks(problem).items()
+    ]
+    groups = [
+        FunctionGroup(
+            name=f"{robot.name}-{name}", recipe=(name, *key), build=partial(_functions, name, build)
         )
-    for name, (c, build) in stance_blocks(problem).items():
-
-        def of_stance(name: str = name, build: Callable[[], BlockExpression] = build) -> list[Any]:
-            b = build()
-            return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
-
-        key = name, *_coordinates_recipe(c), *((sole.frame, len(sole.polygon)) for sole in problem.soles)
-        groups.append(FunctionGroup(name=f"{robot.name}-{name}", recipe=key, build=of_stance))
+        for name, key, build in blocks
+    ]
     return cached_groups(groups, report=report)
+
+
+def _functions(name: str, build: Callable[[], BlockExpression]) -> list[Any]:
+    """Value, Jacobian and Hessian of a block, for several instances at once."""
+    b = build()
+    return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
 
 
 def _coordinates_recipe(c: StanceCoordinates) -> tuple[Any, ...]:

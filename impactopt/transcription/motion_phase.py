@@ -189,16 +189,22 @@ class MotionPhase:
         b: Builder,
         names: tuple[str, str],
         phase: Phase,
-        mesh: tuple[Array, Array, tuple[float, ...]],
+        more: tuple[float, ...],
         begins: str | Affine,
         ends: str | Affine,
+        *,
+        fine_end: bool,
     ) -> None:
-        """names : `kind` and `name`.  mesh : `breaks`, `nodes`, `more`.
+        """names : `kind` and `name`.  fine_end : the shortest interval is the last one, not the first.
 
         begins : `REST`, `FREE`, or coordinates (ny) of its first point.  ends : likewise, or `COASTING`.
         """
         self.kind, self.name = names
-        self.phase, (self.breaks, self.nodes, self.more) = phase, mesh
+        self.phase, self.more = phase, more
+        self.breaks = graded_breaks(phase.intervals, phase.grading, fine_end=fine_end)
+        regular = with_middles(self.breaks)
+        # a start at rest has no node: the posture there is given
+        self.nodes = np.union1d(regular[1:] if begins == REST else regular, more)
         self._begins, self._ends = begins, ends
         self._at: dict[float, tuple[Affine, Affine, Affine]] = {}
         self.unloaded: dict[int, Index] = {}
@@ -420,12 +426,7 @@ class Swing(MotionPhase):
     """
 
     def __init__(self, b: Builder, more: tuple[float, ...] = (), begins: str | Affine = REST) -> None:
-        phase = b.problem.swing
-        breaks = graded_breaks(phase.intervals, phase.grading, fine_end=True)
-        nodes = with_middles(breaks)
-        nodes = nodes[1:] if begins == REST else nodes  # the start posture is given, not constrained
-        mesh = breaks, np.union1d(nodes, more), more
-        super().__init__(b, ("swing", "swing"), phase, mesh, begins, COASTING)
+        super().__init__(b, ("swing", "swing"), b.problem.swing, more, begins, COASTING, fine_end=True)
 
     @property
     def end(self) -> ContactState:
@@ -449,10 +450,7 @@ class FollowThrough(MotionPhase):
         name: str = "follow-through",
         ends: str | Affine = REST,
     ) -> None:
-        phase = b.problem.follow
-        breaks = graded_breaks(phase.intervals, phase.grading, fine_end=False)
-        mesh = breaks, np.union1d(with_middles(breaks), more), more
-        super().__init__(b, (kind, name), phase, mesh, FREE, ends)
+        super().__init__(b, (kind, name), b.problem.follow, more, FREE, ends, fine_end=False)
 
     @property
     def start(self) -> tuple[Affine, Affine, Affine]:

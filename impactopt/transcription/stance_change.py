@@ -4,7 +4,7 @@ Each phase is a spline in the coordinates of its own stance, so its soles stay i
 two neighbouring phases the *lighter* one stands on fewer soles and has more coordinates. Its spline begins,
 or ends, at the *heavier* one's posture. Further constraints at the change:
 
-* Rates are continuous. Those of the heavier phase are its coordinates' and its closed legs' rates.
+* Rates are continuous: the heavier phase's rates of coordinates and leg joints equal the lighter one's.
 * Torques are continuous, and the sole that changes carries no load. So accelerations are continuous too: the
   sole leaves the ground, and meets it, at rest and without acceleration.
 """
@@ -17,7 +17,6 @@ from itertools import pairwise
 import numpy as np
 
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.splines import graded_breaks
 from impactopt.robots.loads import fading
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import (
@@ -31,7 +30,7 @@ from impactopt.transcription.layout import (
     select,
     stack,
 )
-from impactopt.transcription.mesh import MoreNodes, with_middles
+from impactopt.transcription.mesh import MoreNodes
 from impactopt.transcription.motion_phase import FREE, REST, MotionPhase, add_nodes, node_numbers
 from impactopt.transcription.plan import PlannedStand
 
@@ -59,18 +58,15 @@ class Stand(MotionPhase):
         p = b.problem
         stance = p.stances[number]
         assert stance.phase is not None
-        breaks = graded_breaks(stance.phase.intervals, stance.phase.grading, fine_end=number < p.blow)
-        nodes = with_middles(breaks)
-        mesh = breaks, np.union1d(nodes[1:] if begins == REST else nodes, more), more
         soles = " and ".join(stance.soles)
         names = (f"stance{number}", f"on {soles}, phase {number + 1}")
         if missed:
             names = (f"{names[0]}-abort", f"{names[1]}, if nothing is hit")
-        super().__init__(b, names, stance.phase, mesh, begins, ends)
+        super().__init__(b, names, stance.phase, more, begins, ends, fine_end=number < p.blow)
 
 
 def posture_in(c: StanceCoordinates, other: StanceCoordinates, y: Affine, legs: Affine) -> list[Affine]:
-    """Coordinates and legs, in stance c, of the posture that has these in the ``other`` stance."""
+    """Coordinates and legs, in stance c, of the posture of ``y`` and ``legs`` in the ``other`` stance."""
     # for base and joints, in the robot's order: their positions in `whole`
     position = np.zeros(c.base + c.robot.n, dtype=np.intp)
     position[: c.base] = np.arange(c.base)

@@ -1,14 +1,13 @@
-"""Contacts with all targets of a problem, the expected one and those of scenarios."""
+"""Set of collisions of a problem: with the expected target, and with those of scenarios."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
-from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision, FirstInstant
@@ -22,41 +21,78 @@ from impactopt.transcription.plan import PlannedScenario
 DRIFT = 2e-3  # of the contact's time: tolerance of the instants at which the model is frozen
 
 
-class Contacts:
-    """The collision with the expected target, and one for each scenario that hits one.
+def approaches(outputs: dict[str, Array]) -> Array:
+    """Speeds (strikers,) [m/s] along the normal at contact, from the blocks' outputs."""
+    names = ("contact", "second_contact")
+    return np.array([float(outputs[name][0, 3]) for name in names if name in outputs])
+
+
+class ContactSet:
+    """Collisions of an NLP: with the expected target, and with that of each scenario that has one.
+
+    They are collocated, or impulses if the collision has no duration.
+
+    elements : lengths of each phase's elements; empty: the problem's.
+    shares : fraction of the contact's time that each phase lasts, which fixes the instants at which the model
+        is frozen; empty: those of a point mass.
+    after : True if the position after the expected collision is a variable.
 
     Attributes
     ----------
     contact : state at contact, from which all collisions start.
-    expected, scenarios : the collisions, made by the subclass; `collisions` are all of them.
-    elements, stages, shares, guarded, first : of a collocated contact, as of `Hit`; empty of others.
+    expected, scenarios : the collisions.
+    elements, stages : of the phases of every collision, and their collocation points.
+    shares : as above; empty if nothing is frozen during contact.
+    guarded : True if elements were given: an earlier plan was inaccurate on the problem's. As its force may
+        have pulled within a phase, collisions then have constraints against that.
+    first : first instants of the collisions, if a term needs them.
     """
 
-    expected: Any
-    scenarios: Sequence[Any]
-    elements: Elements = ()
-    stages: Sequence[Any] = ()
-    first: Sequence[Any] = ()
-    shares: Shares = ()
-    guarded = False
-
-    def __init__(self, b: Builder, contact: Contact) -> None:
-        self._b, self.contact = b, contact
+    def __init__(
+        self, b: Builder, contact: Contact, elements: Elements = (), shares: Shares = (), *, after: bool
+    ) -> None:
+        self._b, self.contact, p = b, contact, b.problem
+        self.guarded = bool(elements)
+        self.shares = shares or (guessed_shares(p) if p.freezes else ())
+        self.elements = elements or contact_elements(p, self.shares)
+        self.stages = contact_mesh(p, self.elements)
+        self.scenarios: list[Collision] = []
+        self.expected: Collision | InstantImpact
+        if p.lasts:
+            common: dict[str, Any] = {"mass": self.mass, "guarded": self.guarded}
+            labels = {"labels": b.coordinates.labels}
+            kind: Callable[..., Collision] = Collision
+            if p.frozen is not None:
+                kind = partial(FrozenCollision, shares=self.shares)
+            with_target = [scenario for scenario in p.scenarios if not scenario.missing]
+            self.scenarios = [
+                kind(b, contact, self.stages, number=k, scenario=s, after=labels, **common)
+                for k, s in enumerate(with_target, start=1)
+            ]
+            own = b.limits.of_y if after else None
+            self.expected = kind(b, contact, self.stages, number=0, after=own, **common)
+        else:
+            self.expected = InstantImpact(b, contact)
+        self.first: list[FirstInstant] = []
+        if p.first_instant:
+            self.first = [FirstInstant(b, contact, c.law, c.suffix) for c in self.lasting]
 
     @property
     def collisions(self) -> list[Any]:
+        """All collisions, the expected one first."""
         return [self.expected, *self.scenarios]
 
     @property
-    def hit(self) -> list[Scenario]:
-        """Scenarios with a target."""
-        return [s for s in self._b.problem.scenarios if not s.missing]
+    def lasting(self) -> list[Collision]:
+        """Collisions with a duration."""
+        return [c for c in self.collisions if isinstance(c, Collision)]
 
     @cached_property
     def mass(self) -> float:
         """Effective mass [kg] of the robot at its striker, where inverse kinematics reaches the target."""
         return mass_at_contact(self._b.problem)
 
+    # ------------------------------------------------------------------ constraints
     def add_feedforward(self, torque: Index) -> None:
         """Constrains the feed-forward to the torque at contact.  torque (n,) : numbers of block outputs."""
         self._b.rows.add(
@@ -70,92 +106,6 @@ class Contacts:
             measure=percent("of the joint's limit off"),
         )
 
-    def determined(self) -> list[Determined]:
-        """Variables that can be eliminated: the feed-forward."""
-        return [determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
-
-    def drives(self) -> list[DrivePoint]:
-        """Torques and joint motions at collocation points; none of an impact without duration."""
-        return []
-
-    def first_instants(self) -> list[tuple[Place, Index]]:
-        """First instants of contact, at which accelerations jump: place, and numbers (n,) of the outputs that
-        are the rotors' part of gear loads.
-        """
-        return []
-
-    def contact_ends(self) -> list[ContactEnd]:
-        """States at the beginning and the end of all contacts."""
-        return [collision.contact_end() for collision in self.collisions]
-
-    def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """Write the contact's initial guess to x (n,), from coordinates y, rates (ny,) and legs (nl,)."""
-        self.contact.u0.write(x, rates)
-
-    def drifted(self, x: Array) -> Shares | None:
-        """The phases' shares of the contact's time at solver variables x (n,), if the model was frozen by
-        others and these differ by more than `DRIFT`; else None.
-        """
-        return None
-
-    def impulse(self, x: Array) -> float:
-        """Impulse to the expected target [N s], at solver variables x (n,)."""
-        return float(self.expected.impulse.evaluate(x)[0])
-
-
-def approaches(outputs: dict[str, Array]) -> Array:
-    """Speeds (strikers,) [m/s] along the normal at contact, from the blocks' outputs."""
-    names = ("contact", "second_contact")
-    return np.array([float(outputs[name][0, 3]) for name in names if name in outputs])
-
-
-class Hit(Contacts):
-    """Contacts by collocation, or by an impulse if the collision has no duration.
-
-    elements : lengths of each phase's elements; empty: the problem's.
-    shares : fraction of the contact's time that each phase lasts, which fixes the instants at which the model
-        is frozen; empty: those of a point mass.
-    after : True if the position after the expected collision is a variable.
-
-    Attributes
-    ----------
-    elements, stages : of the phases of every collision, and their collocation points.
-    shares : as above; empty if nothing is frozen during contact.
-    guarded : True if elements were given: an earlier plan was inaccurate on the problem's. As its force may
-        have pulled within a phase, collisions then have constraints against that.
-    """
-
-    def __init__(
-        self, b: Builder, contact: Contact, elements: Elements = (), shares: Shares = (), *, after: bool
-    ) -> None:
-        super().__init__(b, contact)
-        p = b.problem
-        self.guarded = bool(elements)
-        self.shares = shares or (guessed_shares(p) if p.freezes else ())
-        self.elements = elements or contact_elements(p, self.shares)
-        self.stages = contact_mesh(p, self.elements)
-        self.scenarios: list[Collision] = []
-        self.expected: Collision | InstantImpact
-        if p.lasts:
-            common: dict[str, Any] = {"mass": self.mass, "guarded": self.guarded}
-            labels = {"labels": b.coordinates.labels}
-            kind: Callable[..., Collision] = Collision
-            if p.frozen is not None:
-                kind = partial(FrozenCollision, shares=self.shares)
-            self.scenarios = [
-                kind(b, contact, self.stages, number=k, scenario=s, after=labels, **common)
-                for k, s in enumerate(self.hit, start=1)
-            ]
-            own = b.limits.of_y if after else None
-            self.expected = kind(b, contact, self.stages, number=0, after=own, **common)
-        else:
-            self.expected = InstantImpact(b, contact)
-        self.first: list[FirstInstant] = []
-        if p.first_instant:
-            lasting = [c for c in self.collisions if isinstance(c, Collision)]
-            self.first = [FirstInstant(b, contact, c.law, c.suffix) for c in lasting]
-
-    # ------------------------------------------------------------------ constraints
     def add_rows(self) -> None:
         """Adds the blocks, each with the instances of all collisions, and the collisions' constraints."""
         b = self._b
@@ -187,10 +137,9 @@ class Hit(Contacts):
     def renew(self, *, anew: bool) -> None:
         """Renews all collisions (:meth:`impactopt.transcription.collision.Collision.renew`)."""
         self.__dict__.pop("mass", None)
-        lasting = [c for c in self.collisions if isinstance(c, Collision)]
-        for collision in lasting:
+        for collision in self.lasting:
             collision.renew(self.mass, anew=anew)
-        for first, collision in zip(self.first, lasting, strict=False):
+        for first, collision in zip(self.first, self.lasting, strict=False):
             first.law = collision.law
 
     def _follow_force(self, b: Builder) -> None:
@@ -212,9 +161,17 @@ class Hit(Contacts):
         return np.asarray(at + self._b.parts("force")[part])
 
     def drives(self) -> list[DrivePoint]:
-        return [point for c in self.collisions if isinstance(c, Collision) for point in c.drives()]
+        """Torques and joint motions at collocation points; none of an impact without duration."""
+        return [point for collision in self.lasting for point in collision.drives()]
+
+    def contact_ends(self) -> list[ContactEnd]:
+        """States at the beginning and the end of all contacts."""
+        return [collision.contact_end() for collision in self.collisions]
 
     def first_instants(self) -> list[tuple[Place, Index]]:
+        """First instants of contact, at which accelerations jump: place, and numbers (n,) of the outputs that
+        are the rotors' part of gear loads.
+        """
         return [(first.place, first.rotors) for first in self.first]
 
     @property
@@ -225,16 +182,20 @@ class Hit(Contacts):
 
     def determined(self) -> list[Determined]:
         """Variables that can be eliminated: those of all collisions, and the feed-forward."""
-        parts = [*self.collisions, *self.first]
-        return [*(each for part in parts for each in part.determined()), *super().determined()]
+        found = [each for part in (*self.collisions, *self.first) for each in part.determined()]
+        return [*found, determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
 
-    # ------------------------------------------------------------------ numbers
+    # ------------------------------------------------------------------ solution
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        super().guess(x, y, rates, legs)
+        """Write the contact's initial guess to x (n,), from coordinates y, rates (ny,) and legs (nl,)."""
+        self.contact.u0.write(x, rates)
         for part in (*self.collisions, *self.first):
             part.guess(x, y, rates, legs)
 
     def drifted(self, x: Array) -> Shares | None:
+        """The phases' shares of the contact's time at solver variables x (n,), if the model was frozen by
+        others and these differ by more than `DRIFT`; else None.
+        """
         if not self.shares or not isinstance(self.expected, Collision):
             return None
         times = np.concatenate([T.read(x)[0] for T in self.expected.T])
@@ -242,6 +203,10 @@ class Hit(Contacts):
         if np.abs(found - self.shares).max() <= DRIFT:
             return None
         return tuple(float(share) for share in found)
+
+    def impulse(self, x: Array) -> float:
+        """Impulse to the expected target [N s], at solver variables x (n,)."""
+        return float(self.expected.impulse.evaluate(x)[0])
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
         """Contact data of plans and strikes, from solver variables x (n,) and the blocks' outputs."""

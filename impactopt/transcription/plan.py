@@ -500,7 +500,7 @@ class Plan:
         problem, pieces = self.problem, self.pieces(missed=missed)
         t0, t1, rest = self.contact_start, self.segment(2, missed=missed)[1], self.end(missed=missed)
         q = problem.start_posture
-        parts: list[tuple[Any, ...]] = []
+        parts: list[tuple[Any, ...]] = []  # of each piece: phase, times, and the fields of Completed
         stance = np.zeros(0, dtype=np.intp)
         for piece in pieces[: len(self.before) + 1] if known is None else ():
             times = sampled(piece.start, piece.start + piece.spline.duration, step)
@@ -694,7 +694,7 @@ class Plan:
         An impact without duration has neither, so ``collision`` is left out.
 
         collision : the planned one at more instants than the program has, such as `ContactError.finer`.
-        reference : a coarser one than `reference`; then ``missed`` is left out.
+        reference : a coarser one, used in place of the plan's; then ``missed`` is left out.
         """
         ref = self.reference if reference is None else reference
         limit = self.problem.robot.torque_limit
@@ -747,6 +747,8 @@ class Plan:
         ref = self.reference
         hit = self.collision if collision is None else collision
         of_hit = self._wrench_of_all(p.blow, hit.sole_wrench) if p.stances else hit.sole_wrench
+        # of each phase: wrenches (k, 6 a sole), and indices of stance phases (k,), or (0,) if there is one
+        # stance
         parts = {
             "swing": (ref.sole_wrench[ref.phase == 0], ref.stance[ref.phase[: len(ref.stance)] == 0]),
             "collision": (of_hit, np.full(len(of_hit), p.blow)),

@@ -135,20 +135,22 @@ class ContactSet:
                 each.add_rows(at + k * b.blocks[-1].n_out)
 
     def renew(self, *, anew: bool) -> None:
-        """Renews all collisions (:meth:`impactopt.transcription.collision.Collision.renew`)."""
-        self.__dict__.pop("mass", None)
+        """Updates the parameters of all collisions to the builder's problem, as of `Collision.renew`."""
+        self.__dict__.pop("mass", None)  # is computed again
         for collision in self.lasting:
             collision.renew(self.mass, anew=anew)
         for first, collision in zip(self.first, self.lasting, strict=False):
             first.law = collision.law
 
     def _follow_force(self, b: Builder) -> None:
+        """Writes parameters of the block ``force``, and bounds of durations, for the builder's problem."""
         numbers = [numbers for c in self.collisions for numbers in c.force_numbers()]
         b.block("force").take_parameters(np.array(numbers))
         for collision in self.collisions:
             collision.follow()
 
     def _follow_first(self, b: Builder) -> None:
+        """Writes the parameters of the block ``first`` for the builder's problem."""
         b.block("first").take_parameters(np.array([first.instance()[1] for first in self.first]))
 
     def output(self, collision: int, stage: int, part: str) -> Index:

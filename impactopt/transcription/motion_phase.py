@@ -388,9 +388,9 @@ class MotionPhase:
     def guess(self, x: Array, curve: CubicSpline) -> None:
         """Write a spline and its duration into solver variables x (n,)."""
         points = curve.control[self.lead : self.lead + self.c.count].copy()
-        if self._ends == REST:
+        if self._ends == REST:  # the last variable stands for the last three control points: take the end
             points[-1] = curve.control[-1]
-        if self.drift is not None and self.bend is not None:
+        if self.drift is not None and self.bend is not None:  # it does not for the base, which drifts
             points[-1, :6] = curve.control[self.lead + self.c.count - 1, :6]
             self.drift.write(x, curve.control[list(self._drifting), :6])
             second = curve.sample(self.nodes * curve.duration)[2] * curve.duration**2

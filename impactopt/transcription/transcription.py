@@ -403,7 +403,8 @@ class Transcription(ContactProgram):
     def _stand_states(
         self, x: Array, sequence: PhaseSequence, pieces: list[Piece], phase: int
     ) -> list[BodyState]:
-        found = iter(sequence.spots())
+        """States of the phases without the impact."""
+        found = iter(sequence.spots())  # of all these phases; each takes as many as it has nodes
         of_number = {piece.number: piece for piece in pieces}
         return [
             BodyState(

@@ -71,8 +71,7 @@ class Limb(NamedTuple):
 
 
 class LegClosure:
-    """Inverse kinematics of a stance's legs, and their velocities and accelerations from the soles'
-    constraint.
+    """Inverse kinematics of a stance's legs, and their rates and accelerations from the soles' constraint.
 
     It holds all that is common to the thousands of postures of references and clearance checks.
     """
@@ -249,8 +248,9 @@ def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:
 
 
 def solve_in_order(a: Any, b: Any, order: tuple[Index, Index]) -> tuple[Any, Any]:
-    """x (n, k) of  a x = b  (SX), a (n, n), by Gaussian elimination in a fixed order, and the product of the
-    pivots, which is the determinant up to its sign. Structural zeros are skipped.
+    """Solution x (n, k) of  a x = b  (SX) by Gaussian elimination in a fixed order, and the pivots' product.
+
+    a (n, n), b (n, k). The product is the determinant up to its sign. Structural zeros are skipped.
     """
     rows, cols = order
     n, k_rhs = a.shape[0], b.shape[1]
@@ -432,8 +432,10 @@ class StanceCoordinates:
         return self.embed(y[: self.base], y[self.base :], legs)
 
     def sole_terms(self, k: int, y: Any, legs: Any, v: Any, a: Any) -> Any:
-        """Sole k in the base's own frame, SX: rotation, position, Jacobian of the dependent joints, twist,
-        acceleration, and Jacobian of the joints before these.
+        """Kinematics of sole k in the base's own frame, SX.
+
+        Rotation, position, Jacobian of the dependent joints, twist, acceleration, and Jacobian of the joints
+        before these.
         """
         q = self.embed(ca.SX.zeros(self.base), y[self.base :], legs)
         rotation, point, jac, twist, acc = self._sole[k](q, v, a)
@@ -600,8 +602,9 @@ class StanceCoordinates:
 
 
 def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
-    """CasADi function (q, v, a) -> point [m], velocity [m/s], acceleration [m/s^2] of the striking point,
-    along the world's axes.
+    """CasADi function (q, v, a) -> position, velocity, acceleration of the striking point.
+
+    (3,) each, along the world's axes [m], [m/s], [m/s^2].
     """
     rb, frame = c.rb, f"striker:{striker}"
     _, point = rb.frame(frame)

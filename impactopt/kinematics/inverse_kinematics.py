@@ -24,8 +24,10 @@ UNBOUNDED = 50.0  # [rad, m] stands for an infinite bound
 
 
 class Reach(NamedTuple):
-    """Result of `reach`: the posture q (nq,); ``off``, the largest error of striking point and soles [m,
-    rad]; ``outside``, the distance [m] of the centre of mass from the support polygon, negative inside.
+    """Result of `reach`.
+
+    q (nq,) : the posture.  off : largest error of striking point and soles [m, rad].
+    outside : distance of the centre of mass from the support polygon, negative inside [m].
     """
 
     q: Array

@@ -1,5 +1,4 @@
-"""Striking point of a constrained robot: position, effective mass, mobility, coasting torque; wrenches at
-rest.
+"""Striking point of a constrained robot: position, effective mass, mobility; torques and wrenches at rest.
 
 Numeric, for one configuration, by Pinocchio and least squares. `impactopt.collision.effective_mass` and
 `impactopt.collide.contact_states` have compiled graphs for many configurations and for gradients; tests

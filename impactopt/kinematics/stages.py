@@ -72,8 +72,7 @@ def _in_stages(
 def _of_legs(
     c: StanceCoordinates, name: str, motion: Any, y: Any, legs: Any, term: int
 ) -> tuple[tuple[Any, Any], list[Stage]]:
-    """v and a with symbols for the legs' rates or accelerations, and the stage that defines these: soles at
-    rest.
+    """v and a with symbols for the legs' rates or accelerations, and the stage that defines these.
 
     motion : function that gives v and a from legs' rates or accelerations (nl,).
     term : index in `StanceCoordinates.sole_terms` of the quantity that has to be zero: twist or acceleration.

@@ -48,8 +48,9 @@ class Stance(ABC):
 
     @property
     def compliance(self) -> NDArray[np.float64]:
-        """Compliance (6,) of each fixed frame, LOCAL_WORLD_ALIGNED: acceleration over force [1/kg],
-        [1/(kg m2)].
+        """Compliance (6,) of each fixed frame in world axes, acceleration over force.
+
+        [1/kg] in translation, [1/(kg m2)] in rotation.
         """
         return np.zeros(6)
 

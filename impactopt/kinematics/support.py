@@ -59,8 +59,7 @@ def _clip(corners: Array, inside: Array) -> Array:
 
 
 def contact_wrench_cone(polygon: ArrayLike, friction: float, *, margin: float = 0.0) -> Array:
-    """Facets F (k, 6) of the cone:  F @ (f, m) >= 0  exactly for wrenches [N, N m] that the sole can
-    transmit.
+    """Facets F (k, 6) of the contact wrench cone:  F @ (f, m) >= 0  if and only if the sole can transmit (f, m).
 
     polygon (c, 2) : corners in the sole's frame, counter-clockwise [m].
     friction : coefficient mu of the pyramid |f_x|, |f_y| <= mu f_z along the sole's axes.

@@ -171,8 +171,9 @@ class ContactSet:
         return [collision.contact_end() for collision in self.collisions]
 
     def first_instants(self) -> list[tuple[Place, Index]]:
-        """First instants of contact, at which accelerations jump: place, and numbers (n,) of the outputs that
-        are the rotors' part of gear loads.
+        """First instants of contact, at which accelerations jump.
+
+        Place, and numbers (n,) of the outputs that are the rotors' part of gear loads.
         """
         return [(first.place, first.rotors) for first in self.first]
 
@@ -195,8 +196,10 @@ class ContactSet:
             part.guess(x, y, rates, legs)
 
     def drifted(self, x: Array) -> Shares | None:
-        """The phases' shares of the contact's time at solver variables x (n,), if the model was frozen by
-        others and these differ by more than `DRIFT`; else None.
+        """Shares of the contact's time at solver variables x (n,), if the model should be frozen by these.
+
+        None if nothing is frozen during contact, or they differ by `DRIFT` at most from those that it was
+        frozen by.
         """
         if not self.shares or not isinstance(self.expected, Collision):
             return None

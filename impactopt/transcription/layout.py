@@ -1,5 +1,4 @@
-"""Layout of an NLP: groups of variables, affine expressions in them, constraints, limits, order of
-elimination.
+"""Layout of an NLP: variables, affine expressions, constraints, limits, order of elimination.
 
 **Units.** The solver sees scaled variables. Expressions of a :class:`Group` carry its scale, so that
 everything built from them is in physical units.

@@ -77,9 +77,7 @@ def first_touch(plan: Plan) -> dict[str, float | None]:
 
 
 def ground_force_share(problem: ImpactProblem, normal: Array) -> list[float] | None:
-    """Smallest and largest normal force of the ground over the weight, of forces (k,) [N]; None without
-    soles.
-    """
+    """Smallest and largest of normal forces (k,) [N], over the weight; None without soles."""
     if not problem.soles or not len(normal):
         return None
     weight = weight_of(problem.robot)

@@ -243,8 +243,10 @@ class PlannedStand:
 
 
 class Piece(NamedTuple):
-    """Spline of a plan: phase (0 before, 2 after contact), index of its stance phase, start [s], nodes (k,)
-    as fractions of it, and sole wrenches (k, 6 a sole) at them.
+    """Spline of a plan, with sole wrenches.
+
+    phase : 0 before, 2 after contact.  number : index of the stance phase.  start : [s] since the motion's.
+    nodes (k,) : fractions of the spline.  wrench (k, 6 a sole) : at the nodes.
     """
 
     phase: int
@@ -644,8 +646,9 @@ class Plan:
         return before + within + last * np.maximum(since - hit.time[-1], 0.0)
 
     def stances(self) -> list[dict[str, Any]]:
-        """Stance phases of the problem, if it has any: standing soles, begin and end [s], and displacements
-        [m] of those that have stepped, from their places at the start.
+        """Stance phases as in ``summary.json``; none if the problem has one stance.
+
+        Standing soles, begin and end [s], and displacements [m] of soles from their places at the start.
         """
         out = []
         displacements = places_of_soles(self.problem.stances, [sole.name for sole in self.problem.soles])
@@ -688,10 +691,10 @@ class Plan:
         collision: PlannedCollision | None = None,
         reference: Trajectory | None = None,
     ) -> dict[str, dict[str, float]]:
-        """Planned ZMP margin [m] and torque demand over limit, by phase: ``swing``, ``collision``,
-        ``follow``, and ``missed`` (from the planned contact on, if nothing is hit).
+        """Planned ZMP margin [m] and torque demand over limit, by phase.
 
-        An impact without duration has neither, so ``collision`` is left out.
+        Phases are ``swing``, ``collision`` (not of an impact without duration), ``follow``, and ``missed``:
+        from the planned contact on, if nothing is hit.
 
         collision : the planned one at more instants than the program has, such as `ContactError.finer`.
         reference : a coarser one, used in place of the plan's; then ``missed`` is left out.
@@ -858,8 +861,9 @@ class PlannedStrike:
     scenarios: tuple[PlannedScenario, ...] = ()
 
     def margins(self) -> dict[str, Any]:
-        """Torque demand over limit and ZMP margin [m], at contact and in the collision; margin [m] of the
-        capture point after contact. An impact without duration has no torque and no ZMP.
+        """Torque demand over limit and ZMP margin [m] at contact and in the collision; capture margin [m].
+
+        The capture point is that after contact. An impact without duration has no torque and no ZMP.
         """
         limit, hit = self.problem.robot.torque_limit, self.collision
         lasts = len(hit.ground) > 0 or not self.problem.robot.floating

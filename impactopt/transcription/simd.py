@@ -58,8 +58,7 @@ class InstructionTable:
 
 
 def instruction_table(function: ca.Function, known: Mapping[int, int]) -> InstructionTable | None:
-    """Instruction table of an SX function; None if it has other than the known operations, or without a
-    compiler.
+    """Instruction table of an SX function; None if it has an unknown operation, or without a compiler.
 
     known : number of operands by the kind of operation.
     """

@@ -72,9 +72,7 @@ SIMPSON = (1 / 6, 4 / 6, 1 / 6)
 
 
 class SpringPoint(NamedTuple):
-    """Torques over limit (n,), coordinates y and y' (ny,), and duration T [s] at a node, or means of these
-    over an interval.
-    """
+    """Torques over limit (n,), y and y' (ny,), and duration T [s]: at a node, or means over an interval."""
 
     place: Place
     torque: Affine
@@ -107,8 +105,9 @@ def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) ->
 
 
 def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
-    """Points of spring constraints of a motion to rest: the ends of the spline's intervals. With means the
-    motion would oscillate.
+    """Points of spring constraints of a motion to rest: the ends of the spline's intervals.
+
+    With means over intervals the motion would oscillate.
     """
     return [
         SpringPoint(motion.place_at(s), torque, *motion.at(s)[:2], motion.T[0])

@@ -101,8 +101,7 @@ class StrikeTranscription(ContactProgram):
         )
 
     def _prices(self) -> Prices:
-        """Prices of sole wrenches, and of the least accelerations that lead from rest to the state at
-        contact.
+        """Prices of sole wrenches, and of the least accelerations from rest to the state at contact.
 
         A coordinate that moves by d from rest to the rate u in time T has at least
         integral a^2 dt = 12 d^2/T^3 - 12 d u/T^2 + 4 u^2/T, which a cubic attains.

@@ -59,7 +59,7 @@ def _clip(corners: Array, inside: Array) -> Array:
 
 
 def contact_wrench_cone(polygon: ArrayLike, friction: float, *, margin: float = 0.0) -> Array:
-    """Facets F (k, 6) of the contact wrench cone:  F @ (f, m) >= 0  if and only if the sole can transmit (f, m).
+    """Facets F (k, 6) of the contact wrench cone:  F @ (f, m) >= 0  for what the sole can transmit only.
 
     polygon (c, 2) : corners in the sole's frame, counter-clockwise [m].
     friction : coefficient mu of the pyramid |f_x|, |f_y| <= mu f_z along the sole's axes.

@@ -49,7 +49,7 @@ from impactopt.transcription.layout import (
     rates,
 )
 from impactopt.transcription.mesh import CollocationPoint
-from impactopt.transcription.motion_phase import add_cone
+from impactopt.transcription.motion_phase import add_cone_rows
 from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
 
 TYPICAL = 100.0  # [rad/s^2]
@@ -533,7 +533,7 @@ class Collision(ContactNumbers, Collocated):
         self._torque_rows(place, first["collision"] + part["torque"], self.torque_fraction)
         if self.cone_margin is not None:
             minimum = b.limits.cone.minimum_force if self.scenario is None else 0.0
-            add_cone(b, self.w[i], place, self.cone_margin, minimum)
+            add_cone_rows(b, self.w[i], place, self.cone_margin, minimum)
         self._target_rows(i, place, first["force"])
 
     def _target_rows(self, i: int, place: Place, first: int) -> None:

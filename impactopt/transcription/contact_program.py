@@ -20,7 +20,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import ApartRow, Held, add_apart_rows, coupled, move_apart
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE
-from impactopt.transcription.contact_set import ContactSet
+from impactopt.transcription.contact_set import Hit
 from impactopt.transcription.contact_state import ContactEnd, DrivePoint, still
 from impactopt.transcription.frozen_collision import InstantImpact
 from impactopt.transcription.layout import (
@@ -66,7 +66,7 @@ class ContactProgram(ABC):
     apart_rows : clearance constraints, in the order of their rows, which are the last.
     """
 
-    def __init__(self, builder: Builder, hit: ContactSet) -> None:
+    def __init__(self, builder: Builder, hit: Hit) -> None:
         self.builder, self.hit = builder, hit
         self.problem, self.coordinates, self.robot = builder.problem, builder.coordinates, builder.robot
         self.functions, self.y0, self.legs0 = builder.functions, builder.y0, builder.legs0

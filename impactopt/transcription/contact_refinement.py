@@ -20,7 +20,7 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
 from impactopt.transcription.contact_program import ContactProgram
-from impactopt.transcription.contact_set import ContactSet, approaches
+from impactopt.transcription.contact_set import Hit, approaches
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting, switches
 from impactopt.transcription.layout import Affine, Array, Index
 from impactopt.transcription.mesh import GEAR, CollocationPoint, Elements, halved, lagrange
@@ -128,9 +128,7 @@ class _Again:
         self._of, b = t.hit, Builder(t.problem, t.coordinates, t.functions)
         given = ContactState(*(Affine.constant(e.evaluate(x)) for e in t.hit.contact.state))
         self._builder = b
-        self.hit = ContactSet(
-            b, Contact(given, *add_coasting(b)), halved(t.hit.elements), t.hit.shares, after=False
-        )
+        self.hit = Hit(b, Contact(given, *add_coasting(b)), halved(t.hit.elements), t.hit.shares, after=False)
         self.hit.add_rows()
         # a plan has no law where contact ends, as force is zero there; here it is what it comes to
         last = len(self.hit.stages) - 1

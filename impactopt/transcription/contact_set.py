@@ -1,13 +1,14 @@
-"""Set of collisions of a problem: with the expected target, and with those of scenarios."""
+"""Contacts with all targets of a problem, the expected one and those of scenarios."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
+from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision, FirstInstant
@@ -18,7 +19,89 @@ from impactopt.transcription.layout import Array, Index, Place, Turn, determined
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
 
-DRIFT = 2e-3  # of the contact's time: tolerance of the instants at which the model is frozen
+DRIFT = 2e-3  # of the contact's time: how far a freeze may be from where it is asked for
+
+
+class Contacts:
+    """The collision with the expected target, and one for each scenario that hits one.
+
+    Attributes
+    ----------
+    contact : what all collisions start from.
+    expected, scenarios : the collisions; who completes this makes them. All of them, the expected one first,
+        are `collisions`.
+    elements, stages, shares, guarded, first : of a collocated contact, see `Hit`; others have none.
+    """
+
+    expected: Any
+    scenarios: Sequence[Any]
+    elements: Elements = ()
+    stages: Sequence[Any] = ()
+    first: Sequence[Any] = ()
+    shares: Shares = ()
+    guarded = False
+
+    def __init__(self, b: Builder, contact: Contact) -> None:
+        self._b, self.contact = b, contact
+
+    @property
+    def collisions(self) -> list[Any]:
+        return [self.expected, *self.scenarios]
+
+    @property
+    def hit(self) -> list[Scenario]:
+        """Scenarios with a target."""
+        return [s for s in self._b.problem.scenarios if not s.missing]
+
+    @cached_property
+    def mass(self) -> float:
+        """Effective mass [kg] of the robot at its striker, where inverse kinematics reaches the target."""
+        return mass_at_contact(self._b.problem)
+
+    def add_feedforward_rows(self, torque: Index) -> None:
+        """The feed-forward is the torque at the node at contact, whose outputs are given."""
+        self._b.rows.add(
+            term="feed-forward that makes the robot coast",
+            place="contact",
+            components=self._b.robot.joint_names,
+            outputs=torque,
+            affine=-self.contact.feedforward[0],
+            lower=0,
+            upper=0,
+            measure=percent("of the joint's limit off"),
+        )
+
+    def determined(self) -> list[Determined]:
+        """The feed-forward."""
+        return [determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
+
+    def drives(self) -> list[DrivePoint]:
+        """Drives in contact, as far as they are known; none for an impact without duration."""
+        return []
+
+    def first_instants(self) -> list[tuple[Place, Index]]:
+        """Instants at which accelerations jump, with the indices of the outputs that rotors subtract from
+        gear loads.
+        """
+        return []
+
+    def contact_ends(self) -> list[ContactEnd]:
+        """States at the beginning and the end of all contacts."""
+        return [collision.contact_end() for collision in self.collisions]
+
+    def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        """Write what a contact starts from with these coordinates and rates (ny,) and legs (nl,)."""
+        self.contact.u0.write(x, rates)
+
+    def drifted(self, x: Array) -> Shares | None:
+        """The phases' shares of the contact's time in solver variables (n,), where freezes on the way went by
+        others; None where they did not.
+        """
+        return None
+
+    def impulse(self, x: Array) -> float:
+        """Impulse to the expected target [N s], for solver variables (n,)."""
+        return float(self.expected.impulse.evaluate(x)[0])
 
 
 def approaches(outputs: dict[str, Array]) -> Array:
@@ -27,31 +110,27 @@ def approaches(outputs: dict[str, Array]) -> Array:
     return np.array([float(outputs[name][0, 3]) for name in names if name in outputs])
 
 
-class ContactSet:
-    """Collisions of an NLP: with the expected target, and with that of each scenario that has one.
+class Hit(Contacts):
+    """Takes what all collisions start from; hands them back.
 
-    They are collocated, or impulses if the collision has no duration.
-
-    elements : lengths of each phase's elements; empty: the problem's.
-    shares : fraction of the contact's time that each phase lasts, which fixes the instants at which the model
-        is frozen; empty: those of a point mass.
-    after : True if the position after the expected collision is a variable.
+    elements : lengths of each phase's; none: those that the problem asks for.
+    shares : of the contact's time that each phase lasts, by which freezes on the way come when they do; none:
+        those of a point mass.
+    after : whether the position after the expected target is among the variables.
 
     Attributes
     ----------
-    contact : state at contact, from which all collisions start.
-    expected, scenarios : the collisions.
-    elements, stages : of the phases of every collision, and their collocation points.
-    shares : as above; empty if nothing is frozen during contact.
-    guarded : True if elements were given: an earlier plan was inaccurate on the problem's. As its force may
-        have pulled within a phase, collisions then have constraints against that.
-    first : first instants of the collisions, if a term needs them.
+    elements, stages : of every collision's phases, and their collocation points.
+    shares : of the phases, where something is frozen on the way.
+    guarded : the elements are given, and finer, because a plan was wrong on others: it may have pulled within
+        a phase.
     """
 
     def __init__(
         self, b: Builder, contact: Contact, elements: Elements = (), shares: Shares = (), *, after: bool
     ) -> None:
-        self._b, self.contact, p = b, contact, b.problem
+        super().__init__(b, contact)
+        p = b.problem
         self.guarded = bool(elements)
         self.shares = shares or (guessed_shares(p) if p.freezes else ())
         self.elements = elements or contact_elements(p, self.shares)
@@ -64,10 +143,9 @@ class ContactSet:
             kind: Callable[..., Collision] = Collision
             if p.frozen is not None:
                 kind = partial(FrozenCollision, shares=self.shares)
-            with_target = [scenario for scenario in p.scenarios if not scenario.missing]
             self.scenarios = [
                 kind(b, contact, self.stages, number=k, scenario=s, after=labels, **common)
-                for k, s in enumerate(with_target, start=1)
+                for k, s in enumerate(self.hit, start=1)
             ]
             own = b.limits.of_y if after else None
             self.expected = kind(b, contact, self.stages, number=0, after=own, **common)
@@ -75,43 +153,16 @@ class ContactSet:
             self.expected = InstantImpact(b, contact)
         self.first: list[FirstInstant] = []
         if p.first_instant:
-            self.first = [FirstInstant(b, contact, c.law, c.suffix) for c in self.lasting]
-
-    @property
-    def collisions(self) -> list[Any]:
-        """All collisions, the expected one first."""
-        return [self.expected, *self.scenarios]
-
-    @property
-    def lasting(self) -> list[Collision]:
-        """Collisions with a duration."""
-        return [c for c in self.collisions if isinstance(c, Collision)]
-
-    @cached_property
-    def mass(self) -> float:
-        """Effective mass [kg] of the robot at its striker, where inverse kinematics reaches the target."""
-        return mass_at_contact(self._b.problem)
+            lasting = [c for c in self.collisions if isinstance(c, Collision)]
+            self.first = [FirstInstant(b, contact, c.law, c.suffix) for c in lasting]
 
     # ------------------------------------------------------------------ constraints
-    def add_feedforward(self, torque: Index) -> None:
-        """Constrains the feed-forward to the torque at contact.  torque (n,) : numbers of block outputs."""
-        self._b.rows.add(
-            term="feed-forward that makes the robot coast",
-            place="contact",
-            components=self._b.robot.joint_names,
-            outputs=torque,
-            affine=-self.contact.feedforward[0],
-            lower=0,
-            upper=0,
-            measure=percent("of the joint's limit off"),
-        )
-
     def add_rows(self) -> None:
-        """Adds the blocks, each with the instances of all collisions, and the collisions' constraints."""
+        """One block for all collisions, each with its constraints."""
         b = self._b
         slots: dict[str, list[Any]] = {}
         parameters: dict[str, list[Any]] = {}
-        first: list[dict[str, int]] = []  # of each collision: number of its first instance in each block
+        first: list[dict[str, int]] = []
         for collision in self.collisions:
             found = collision.instances()
             first.append({name: len(slots.get(name, ())) for name in found})
@@ -135,46 +186,36 @@ class ContactSet:
                 each.add_rows(at + k * b.blocks[-1].n_out)
 
     def renew(self, *, anew: bool) -> None:
-        """Updates the parameters of all collisions to the builder's problem, as of `Collision.renew`."""
-        self.__dict__.pop("mass", None)  # is computed again
-        for collision in self.lasting:
+        """Renews all collisions (:meth:`impactopt.transcription.collision.Collision.renew`)."""
+        self.__dict__.pop("mass", None)
+        lasting = [c for c in self.collisions if isinstance(c, Collision)]
+        for collision in lasting:
             collision.renew(self.mass, anew=anew)
-        for first, collision in zip(self.first, self.lasting, strict=False):
+        for first, collision in zip(self.first, lasting, strict=False):
             first.law = collision.law
 
     def _follow_force(self, b: Builder) -> None:
-        """Writes parameters of the block ``force``, and bounds of durations, for the builder's problem."""
         numbers = [numbers for c in self.collisions for numbers in c.force_numbers()]
         b.block("force").take_parameters(np.array(numbers))
         for collision in self.collisions:
             collision.follow()
 
     def _follow_first(self, b: Builder) -> None:
-        """Writes the parameters of the block ``first`` for the builder's problem."""
         b.block("first").take_parameters(np.array([first.instance()[1] for first in self.first]))
 
     def output(self, collision: int, stage: int, part: str) -> Index:
-        """Numbers of the outputs that are a ``part`` of the block ``force``, at a stage of a collision.
+        """Numbers of outputs of the block ``force``, whose ``part`` they are: at a stage of a collision.
 
-        Needs :meth:`add_rows` first, and a collision with a duration.
+        Once constraints are there, and of collisions that last.
         """
         size = self._b.block("force").n_out
         at = self._at["force"] + (collision * len(self.stages) + stage) * size
         return np.asarray(at + self._b.parts("force")[part])
 
     def drives(self) -> list[DrivePoint]:
-        """Torques and joint motions at collocation points; none of an impact without duration."""
-        return [point for collision in self.lasting for point in collision.drives()]
-
-    def contact_ends(self) -> list[ContactEnd]:
-        """States at the beginning and the end of all contacts."""
-        return [collision.contact_end() for collision in self.collisions]
+        return [point for c in self.collisions if isinstance(c, Collision) for point in c.drives()]
 
     def first_instants(self) -> list[tuple[Place, Index]]:
-        """First instants of contact, at which accelerations jump.
-
-        Place, and numbers (n,) of the outputs that are the rotors' part of gear loads.
-        """
         return [(first.place, first.rotors) for first in self.first]
 
     @property
@@ -184,23 +225,17 @@ class ContactSet:
         return self.output(0, self.expected.end[-2], "penetration")
 
     def determined(self) -> list[Determined]:
-        """Variables that can be eliminated: those of all collisions, and the feed-forward."""
-        found = [each for part in (*self.collisions, *self.first) for each in part.determined()]
-        return [*found, determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
+        """Determined variables of all collisions, and of the feed-forward."""
+        parts = [*self.collisions, *self.first]
+        return [*(each for part in parts for each in part.determined()), *super().determined()]
 
-    # ------------------------------------------------------------------ solution
+    # ------------------------------------------------------------------ numbers
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """Write the contact's initial guess to x (n,), from coordinates y, rates (ny,) and legs (nl,)."""
-        self.contact.u0.write(x, rates)
+        super().guess(x, y, rates, legs)
         for part in (*self.collisions, *self.first):
             part.guess(x, y, rates, legs)
 
     def drifted(self, x: Array) -> Shares | None:
-        """Shares of the contact's time at solver variables x (n,), if the model should be frozen by these.
-
-        None if nothing is frozen during contact, or they differ by `DRIFT` at most from those that it was
-        frozen by.
-        """
         if not self.shares or not isinstance(self.expected, Collision):
             return None
         times = np.concatenate([T.read(x)[0] for T in self.expected.T])
@@ -209,12 +244,8 @@ class ContactSet:
             return None
         return tuple(float(share) for share in found)
 
-    def impulse(self, x: Array) -> float:
-        """Impulse to the expected target [N s], at solver variables x (n,)."""
-        return float(self.expected.impulse.evaluate(x)[0])
-
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
-        """Contact data of plans and strikes, from solver variables x (n,) and the blocks' outputs."""
+        """Contact data of plans and strikes, for solver variables (n,) and the blocks' outputs."""
         approach = approaches(outputs)
         compression, restitution = self.expected.durations(x)
         scenarios = [

@@ -85,7 +85,7 @@ def add_nodes(
             lower=b.limits.extension.minimum,
             measure=percent("too near to straight", of=b.limits.extension.minimum),
         )
-        add_cone(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force, fading)
+        add_cone_rows(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force, fading)
         torques.append(at + part["torque"])
     return torques
 
@@ -96,7 +96,7 @@ def node_numbers(b: Builder) -> Array:
     return np.concatenate([limits, rates, b.limits.units, b.coordinates.start_determinants])
 
 
-def add_cone(
+def add_cone_rows(
     b: Builder,
     wrench: Affine,
     place: Place | str,

@@ -15,9 +15,10 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
+from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_conditions import add_balance, add_touch_rows
 from impactopt.transcription.contact_program import BodyState, ContactProgram
-from impactopt.transcription.contact_set import ContactSet
+from impactopt.transcription.contact_set import Hit
 from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
 from impactopt.transcription.layout import Affine, Array, Measure, Place, along, by_leg
 from impactopt.transcription.mesh import Elements, Shares
@@ -30,7 +31,7 @@ class StrikeTranscription(ContactProgram):
     """NLP of a problem's impact, and the groups that its solution is decoded from.
 
     It has the problem's terms and objectives, except those of a whole motion only.
-    elements, shares : of the contact, as of `ContactSet`.
+    elements, shares : of the contact, as of `Hit`.
     """
 
     def __init__(
@@ -52,11 +53,11 @@ class StrikeTranscription(ContactProgram):
         # T = 1 s, so that y' is the rate; no acceleration, as at the end of a swing
         still, one = Affine.zeros(b.ny), Affine.constant(1.0)
         state = ContactState(self.y[0], coasting.u0[0], still, one, self.legs[0], self.w[0])
-        super().__init__(b, ContactSet(b, Contact(state, *coasting), elements, shares, after=True))
+        super().__init__(b, Hit(b, Contact(state, *coasting), elements, shares, after=True))
         node = [state.y, state.y1, state.y2, state.legs, state.w, state.T]
         (torque,) = add_nodes(b, [node], ["contact"])
         self._node = node
-        self.hit.add_feedforward(torque)
+        self.hit.add_feedforward_rows(torque)
         add_touch_rows(b, state)
         self.hit.add_rows()
         self._add_after(fastest)
@@ -84,7 +85,7 @@ class StrikeTranscription(ContactProgram):
         the position's equation.
         """
         b, labels, far = self.builder, self.coordinates.labels, along(self.coordinates.labels, "off")
-        hits = self.hit.lasting
+        hits = [hit for hit in self.hit.collisions if isinstance(hit, Collision)]
         if hits:
             at = b.add_block("link", [slots for hit in hits for slots in hit.link_after()], np.zeros(0))
             for k, hit in enumerate(hits):

@@ -25,10 +25,11 @@ from impactopt.solvers.program import Determined
 from impactopt.transcription.blocks import ExtraBlock, extra_blocks, own_blocks, stance_blocks
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import SeparationBlock
+from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import typical_state
 from impactopt.transcription.contact_conditions import add_balance, add_clearance, add_touch_rows
 from impactopt.transcription.contact_program import BodyState, ContactProgram
-from impactopt.transcription.contact_set import ContactSet
+from impactopt.transcription.contact_set import Hit
 from impactopt.transcription.contact_state import Contact, add_coasting
 from impactopt.transcription.layout import (
     Affine,
@@ -130,7 +131,7 @@ class Transcription(ContactProgram):
     """NLP of a whole motion, and the parts that its solution is decoded from.
 
     nodes : nodes in addition to the ends and middles of the splines' intervals.
-    elements, shares : of the contact, as of `ContactSet`.
+    elements, shares : of the contact, as of `Hit`.
 
     Attributes
     ----------
@@ -155,7 +156,7 @@ class Transcription(ContactProgram):
         self.before = PhaseSequence(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
         self.swing = cast(Swing, self.before.phases[problem.blow])
         contact = Contact(self.swing.end, *add_coasting(b))
-        super().__init__(b, ContactSet(b, contact, elements, shares, after=False))
+        super().__init__(b, Hit(b, contact, elements, shares, after=False))
         self.after = [
             PhaseSequence(b, after, lambda _, ends: FollowThrough(b, nodes.follow, ends=ends), nodes)
         ]
@@ -300,7 +301,7 @@ class Transcription(ContactProgram):
                     upper=limit,
                     measure=strong,
                 )
-        self.hit.add_feedforward(outputs[contact])
+        self.hit.add_feedforward_rows(outputs[contact])
 
     def _add_links(self) -> None:
         """Adds constraints that link motions after contact to the end of the contact, or of coasting.
@@ -463,7 +464,7 @@ def statement_of(t: Transcription) -> str:
     for (term, place), found in groupby(t.rows.origins, lambda origin: (origin.term, origin.place.name)):
         components = tuple(origin.component for origin in found)
         constraints.append([term, place, component_lists.setdefault(components, len(component_lists))])
-    collisions = t.hit.lasting
+    collisions = [c for c in t.hit.collisions if isinstance(c, Collision)]
     # Separating directions at the solution. An evaluation that starts from those of an earlier round may find
     # a local maximum of the separation, which is not the distance.
     directions = [

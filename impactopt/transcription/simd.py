@@ -254,7 +254,7 @@ def in_lanes(functions: Sequence[ca.Function], lanes: int = LANES) -> list[Nativ
         function's columns.
     """
     tables = {f: found for f in functions if (found := instruction_table(f, _OPERANDS)) is not None}
-    # 16 bits are enough for most functions, and halve the table
+    # 16 bits halve the table, if all places fit
     short = all(table.places <= 1 << 16 for table in tables.values())
     place = "uint16_t" if short else "uint32_t"
     code, loops = _code(tables, lanes, place), _loops(lanes, place)

@@ -218,7 +218,7 @@ class Transcription(ContactProgram):
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         return [spot for follow in self.follows for spot in follow.spots()]
 
-    def torque_profiles(self) -> list[TorqueProfile]:
+    def torque_courses(self) -> list[TorqueProfile]:
         """Torques over limit of all motions; the program must have them as variables."""
         return torque_profiles(self.builder, self.swing, self.follows, self.torques)
 

@@ -36,7 +36,7 @@ class TorqueRate(Term):
         joints = np.flatnonzero(np.isfinite(limit))
         rate = limit[joints] / program.robot.torque_limit[joints]
         labels = [names[j] for j in joints]
-        for course in program.torque_profiles():
+        for course in program.torque_courses():
             steps = zip(pairwise(course.nodes), pairwise(course.torques), strict=True)
             for (a, b), (one, two) in steps:
                 step, most = (two - one)[joints], course.T.apply(np.ones((len(joints), 1))) * (rate * (b - a))

@@ -1,4 +1,4 @@
-"""Functions in lanes: for every instance what CasADi's own function of one instance gives."""
+"""Vectorized functions against CasADi's own functions of one instance."""
 
 from __future__ import annotations
 

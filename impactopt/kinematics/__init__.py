@@ -1,3 +1,1 @@
-"""Kinematics of a robot on its stance: independent coordinates, inverse kinematics, splines, support
-polygon, wrench cone.
-"""
+"""Kinematics of a robot on its stance: coordinates, inverse kinematics, splines, support of soles."""

@@ -1,20 +1,17 @@
-"""Independent coordinates of a robot whose soles are held: the base's pose and the joints outside its legs.
+"""Independent coordinates of a robot on fixed soles: the base's pose and the joints outside its legs.
 
-Of a robot that nothing holds they are the base's pose and all joints.
-
-References and distances between bodies ask for thousands of them, so what all have in common is kept.
-
-A motion that is written in these coordinates y keeps its soles where they are at *every* instant, not only at
-an optimizer's nodes: the legs follow from y by inverse kinematics, and their velocities and accelerations by
-the sole's constraint
+A motion in these coordinates y keeps its soles in place at *every* instant, not only at an optimizer's nodes.
+The legs follow from y by inverse kinematics, and their velocities and accelerations from the sole's
+constraint
 
     J_leg qdot_leg = -V,      J_leg qddot_leg = -(A + Jdot qdot),
 
-with V and A the twist and the acceleration that the coordinates alone would give the sole.  Both sides are
-written in the base's own frame, where J_leg depends on the joints between base and sole only.
+with V and A the twist and the acceleration that the sole would have if the leg's joints were at rest. Both
+sides are written in the base's own frame, where J_leg depends on the joints between base and sole only.
 
-A chain of more than six joints is held by its last six. Those before them are coordinates as the others: the
-first of a leg of seven, a waist that leads to both legs. A hand that holds on is one more sole.
+The dependent joints of a chain are its last six. Those before them are coordinates: the first joint of a leg
+of seven, or a waist that leads to both legs. A hand that holds on is treated as a sole. Of a free-floating
+robot the coordinates are the base's pose and all joints.
 """
 
 from __future__ import annotations
@@ -37,8 +34,8 @@ from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.tools import check_held
 
 __all__ = [
-    "Closing",
     "Index",
+    "LegClosure",
     "Limb",
     "StanceCoordinates",
     "base_motion",
@@ -52,24 +49,32 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-_STEPS = 50  # of Newton, at most
-_LONGEST = 0.3  # [rad] of a Newton step
-_NEAR = 1e-6  # [m, rad]: Newton's next step leaves its square, so it is the last
-_OFF = 1e-6  # [m, rad] and no more, where Newton ends without getting there
-_AHEAD = ((1.0,), (-1.0, 2.0), (1.0, -3.0, 3.0))  # a polynomial through the last ones, one step ahead
+# Newton's method for a leg's inverse kinematics
+_MAX_STEPS = 50
+_LARGEST_STEP = 0.3  # [rad] of a joint
+_CONVERGED = 1e-6  # [m, rad] error before the last step: quadratic convergence leaves about its square
+_TOLERANCE = 1e-6  # [m, rad] error that is accepted after the last permitted step
 _DAMPING = 1e-12 * np.eye(6)  # a stretched leg's Jacobian is singular
+# weights of the last one, two or three solutions that extrapolate them by a polynomial to the next instant
+_EXTRAPOLATION = ((1.0,), (-1.0, 2.0), (1.0, -3.0, 3.0))
 
 
 class Limb(NamedTuple):
-    """A limb that holds a frame in its place in the world, by six joints: their columns (6,) in v."""
+    """Limb whose last six joints keep a frame at its placement in the world.
+
+    columns (6,) : of these joints in v.
+    """
 
     frame: str
     placement: pin.SE3
     columns: Index
 
 
-class Closing:
-    """Inverse kinematics of a stance's legs, and velocities and accelerations from the soles' constraint."""
+class LegClosure:
+    """Inverse kinematics of a stance's legs, and their rates and accelerations from the soles' constraint.
+
+    It holds all that is common to the thousands of postures of references and clearance checks.
+    """
 
     def __init__(
         self,
@@ -81,8 +86,8 @@ class Closing:
         independent: Index,
         join: Callable[[Array, Array], Array],
     ) -> None:
-        """base : number of the base's coordinates, 6 or 0.  independent : columns in v of the other joints
-        that are coordinates.  join : q of coordinates (ny,) and legs (nl,).
+        """base : number of the base's coordinates, 6 or 0.  independent : columns in v of joints that are
+        coordinates.  join : function that gives q (nq,) of coordinates (ny,) and legs (nl,).
         """
         self._model, self._data, self._base, self._join = model, data, base, join
         self._frames = [model.getFrameId(limb.frame) for limb in limbs]
@@ -95,21 +100,26 @@ class Closing:
         self._independent = independent
         of_column = {joint.idx_v: joint for joint in model.joints if joint.nv}
         joints = [of_column[int(column)] for column in self._dependent]
-        turning = all(joint.nq == 1 for joint in joints)  # no joint without limits, which has two numbers
-        self._places = np.array([joint.idx_q for joint in joints], dtype=np.intp) if turning else None
+        # indices in q of the leg joints; None if one is continuous, as Pinocchio has (cos, sin) of its angle
+        # in q
+        simple = all(joint.nq == 1 for joint in joints)
+        self._leg_indices = np.array([joint.idx_q for joint in joints], dtype=np.intp) if simple else None
 
     def legs(self, y: Array, guess: Array) -> Array:
         """`StanceCoordinates.solve_legs`."""
         return self._close(self._join(y, guess), y, guess)
 
     def _close(self, q: Array, y: Array, guess: Array) -> Array:
-        """Legs (nl,) of coordinates (ny,), which a configuration (nq,) has already: it gets the legs too."""
+        """Legs (nl,) of coordinates y (ny,) by Newton's method; InputError if it does not converge.
+
+        q (nq,) : a configuration with these coordinates; the legs are written to it.
+        """
         legs = np.array(guess, dtype=float)
         if not self._limbs:
             return legs
         model, data, worst = self._model, self._data, np.inf
-        for _ in range(_STEPS):
-            self._put(q, y, legs)
+        for _ in range(_MAX_STEPS):
+            self._set_legs(q, y, legs)
             pin.computeJointJacobians(model, data, q)
             worst = 0.0
             for frame, placement, columns, own in self._limbs:
@@ -118,38 +128,40 @@ class Closing:
                 worst = max(worst, float(np.abs(error).max()))
                 jac = pin.getFrameJacobian(model, data, frame, pin.LOCAL)[:, columns]
                 step = dgesv(jac.T @ jac + _DAMPING, jac.T @ error)[2]
-                legs[own] += np.minimum(np.maximum(step, -_LONGEST), _LONGEST)
-            if worst < _NEAR:
+                legs[own] += np.minimum(np.maximum(step, -_LARGEST_STEP), _LARGEST_STEP)
+            if worst < _CONVERGED:
                 break
-        if worst < _OFF:
-            self._put(q, y, legs)
+        if worst < _TOLERANCE:
+            self._set_legs(q, y, legs)
             return legs
         raise InputError(
             f"the legs cannot hold the soles in place here (off by {worst:.2g} m or rad): the base is out of "
             "the legs' reach"
         )
 
-    def _put(self, q: Array, y: Array, legs: Array) -> None:
-        """Give a configuration (nq,) of coordinates (ny,) other legs (nl,)."""
-        if self._places is None:
+    def _set_legs(self, q: Array, y: Array, legs: Array) -> None:
+        """Write legs (nl,) to a configuration (nq,) of coordinates y (ny,)."""
+        if self._leg_indices is None:
             q[:] = self._join(y, legs)
         else:
-            q[self._places] = legs
+            q[self._leg_indices] = legs
 
-    def follow(self, rows: Array, guess: Array) -> Iterator[tuple[Array, Array]]:
-        """Configuration (nq,) and legs (nl,) of one row of coordinates (k, ny) after the other, each near the
-        next.
+    def follow(self, coordinates: Array, guess: Array) -> Iterator[tuple[Array, Array]]:
+        """Configurations (nq,) and legs (nl,) along a continuous motion in coordinates (k, ny), one by one.
+
+        guess (nl,) : of the first legs. Those of the others are extrapolated from up to three before.
         """
-        # all at once, as one by one this takes as long as the legs do
-        q = self._join(rows, np.zeros((len(rows), len(self._dependent))))
-        known = [guess]
-        for k, y in enumerate(rows):
-            legs = self._close(q[k], y, np.array(_AHEAD[len(known) - 1]) @ np.array(known))
-            known = [*(known if k else ())[-2:], legs]
+        # All configurations without legs in one call: one by one they take as long as the legs.
+        q = self._join(coordinates, np.zeros((len(coordinates), len(self._dependent))))
+        previous = [guess]
+        for k, y in enumerate(coordinates):
+            weights = np.array(_EXTRAPOLATION[len(previous) - 1])
+            legs = self._close(q[k], y, weights @ np.array(previous))
+            previous = [*(previous if k else ())[-2:], legs]
             yield q[k], legs
 
     def jacobians(self, q: Array) -> Array:
-        """(6 a sole, nv) of the fixed soles, each in its own frame, at a pin configuration."""
+        """(6 a sole, nv) of the fixed soles, each in its own frame, at a Pinocchio configuration."""
         model, data = self._model, self._data
         pin.computeJointJacobians(model, data, q)
         out = np.zeros((6 * len(self._frames), model.nv))
@@ -163,7 +175,7 @@ class Closing:
         return q, *self.rates(q, y, yd, ydd)[:2]
 
     def rates(self, q: Array, y: Array, yd: Array, ydd: Array) -> tuple[Array, Array, Array]:
-        """v and a (nv,) at a configuration (nq,), whose coordinates are y (ny,), and the soles' Jacobians."""
+        """v and a (nv,) at a configuration q (nq,) of coordinates y (ny,), and Jacobians (6 a sole, nv)."""
         model, data, b = self._model, self._data, self._base
         v, a = np.zeros(model.nv), np.zeros(model.nv)
         if b:
@@ -173,14 +185,14 @@ class Closing:
         if self._frames:
             block = jac[:, self._dependent]
             v[self._dependent] = solved(block, -jac @ v)
-            pin.forwardKinematics(model, data, q, v, a)
+            pin.forwardKinematics(model, data, q, v, a)  # a has no legs yet: A + Jdot qdot
             drift = [pin.getFrameAcceleration(model, data, k, pin.LOCAL).vector for k in self._frames]
             a[self._dependent] = solved(block, -np.concatenate(drift))
         return v, a, jac
 
 
 def solved(matrix: Array, right: Array) -> Array:
-    """Solution of a linear system, as of `np.linalg.solve`, whose checks take longer than solving it."""
+    """Solution of a linear system; `np.linalg.solve`'s checks would take longer than a small one."""
     _, _, found, singular = dgesv(matrix, right)
     if singular:
         raise np.linalg.LinAlgError("Singular matrix")
@@ -188,9 +200,9 @@ def solved(matrix: Array, right: Array) -> Array:
 
 
 def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
-    """Free-flyer velocity and acceleration (6,), in its own frame, of (p, roll, pitch, yaw) and rates.
+    """Velocity and acceleration (6,) of the free-flyer, in its own frame.
 
-    The numeric twin of the symbolic map.
+    y, yd, ydd (6,) : (p, roll, pitch, yaw) and time derivatives. `StanceCoordinates.base_motion` is symbolic.
     """
     rotation = pin.rpy.rpyToMatrix(y[3:6])
     jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
@@ -204,13 +216,13 @@ def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
 
 
 def base_rates(y: Array, v: Array) -> Array:
-    """ydot (6,) of the base, of a Pinocchio velocity; the inverse of `base_motion`."""
+    """ydot (6,) of the base from a Pinocchio velocity v (nv,); inverts `base_motion`."""
     jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
     return np.append(pin.rpy.rpyToMatrix(y[3:6]) @ v[:3], solved(jac, v[3:6]))
 
 
 def independent_rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
-    """ydot (ny) of a Pinocchio velocity."""
+    """ydot (ny,) from a Pinocchio velocity v (nv,)."""
     own = v[c.base + c.independent]
     return np.append(base_rates(y, v), own) if c.base else own
 
@@ -218,7 +230,7 @@ def independent_rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
 def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:
     """Row and column order in which Gaussian elimination needs no pivoting at any of the sample matrices.
 
-    Complete pivoting on the least of the samples' normalised magnitudes; with a fixed order the symbolic
+    Complete pivoting on the least of the samples' normalised magnitudes. With a fixed order a symbolic
     elimination has no branches.
     """
     work = [m / np.abs(m).max() for m in matrices]
@@ -236,9 +248,9 @@ def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:
 
 
 def solve_in_order(a: Any, b: Any, order: tuple[Index, Index]) -> tuple[Any, Any]:
-    """x of  a x = b  (SX, a square) by elimination in a fixed order, and the product of the pivots.
+    """Solution x (n, k) of  a x = b  (SX) by Gaussian elimination in a fixed order, and the pivots' product.
 
-    Structural zeros are skipped.
+    a (n, n), b (n, k). The product is the determinant up to its sign. Structural zeros are skipped.
     """
     rows, cols = order
     n, k_rhs = a.shape[0], b.shape[1]
@@ -272,10 +284,12 @@ def solve_in_order(a: Any, b: Any, order: tuple[Index, Index]) -> tuple[Any, Any
 
 @dataclass(frozen=True)
 class Leg:
-    """One fixed sole, or hand, with the last six joints of the chain from the base to it.
+    """Fixed sole or hand, and the chain from the base to it.
 
-    sole : None of a hand.  frame : that is held.  joints : (6,) into the robot's joints.  before : (k,) those
-    between base and them.  placement : pin.SE3 of the frame in the world.
+    sole : None of a hand.  frame : its frame, which is fixed.  placement : pin.SE3 of the frame in the world.
+    joints (6,) : dependent joints, the chain's last, as indices of the robot's joints.  before (k,) : those
+        before them.
+    order : elimination order of their Jacobian.
     """
 
     name: str
@@ -298,25 +312,24 @@ class Leg:
 
 
 class StanceCoordinates:
-    """The map from independent coordinates to the robot's full motion, symbolic and numeric.
+    """Map from independent coordinates to the robot's full motion, symbolic and numeric.
 
     Attributes
     ----------
     ny, nl : number of independent coordinates, and of dependent leg joints (6 a fixed sole or hand).
     soles, legs, hands : fixed soles; legs of soles and, after them, of hands; the legs of hands alone.
-    drifts : nothing holds the base, so that the joints' motion moves it: its momentum is conserved.
+    drifts : True of a free-floating robot: joints move its base, and momentum is conserved.
     independent : (ny - 6 or ny,) indices of the independent joints among the robot's joints.
-    undriven : indices in v of what no motor moves but the soles' wrenches: the base, and soles' hinges.
+    undriven : indices in v of unactuated coordinates, which only the soles' wrenches move: base, soles'
+        hinges.
     labels : names of the independent coordinates.
-    posture : (nq,) that it was made with.  start, start_legs : (ny,), (nl,) its coordinates and legs.
+    posture : (nq,) the given one.  start, start_legs : (ny,), (nl,) its coordinates and legs.
     """
 
     def __init__(
         self, robot: Robot, soles: tuple[Sole, ...], posture: Array, hands: tuple[Striker, ...] = ()
     ) -> None:
-        """``posture`` (nq,): pin configuration with the soles in place; it fixes where soles and hands are
-        held.
-        """
+        """posture (nq,) : Pinocchio configuration; its placements of soles and hands are the fixed ones."""
         self.robot, self.soles, self.posture = robot, soles, posture
         self.model, self.data = robot.model, robot.model.createData()
         self.base = 6 if robot.floating else 0
@@ -342,9 +355,8 @@ class StanceCoordinates:
             self.legs.append(Leg(name, sole, frame, chain[-LEG:], chain[:-LEG], order, placement))
         self.hands = [leg for leg in self.legs if leg.sole is None]
         self.drifts = bool(self.base) and not self.legs
-        held = {int(j) for leg in self.legs for j in leg.joints}
         self.dependent = np.array([j for leg in self.legs for j in leg.joints], dtype=np.intp)
-        self.independent = np.array([j for j in range(robot.n) if j not in held], dtype=np.intp)
+        self.independent = np.setdiff1d(np.arange(robot.n, dtype=np.intp), self.dependent)
         self.undriven = np.append(np.arange(self.base), self.base + np.flatnonzero(robot.hinges))
         self.ny, self.nl = self.base + len(self.independent), len(self.dependent)
         base_labels = ["base x", "base y", "base z", "base roll", "base pitch", "base yaw"][: self.base]
@@ -361,7 +373,7 @@ class StanceCoordinates:
         ).ravel()
 
     def _leg_samples(self, frame: str, chain: Index, posture: Array) -> list[Array]:
-        """Jacobians (6, 6) of the last joints of a chain (k,), at postures near this one."""
+        """Jacobians (6, 6) of a chain's last joints, at this posture and four random ones near it."""
         rng = np.random.default_rng(0)
         out = []
         angles = self.robot.joint_positions(posture)[chain]
@@ -394,12 +406,12 @@ class StanceCoordinates:
             v = ca.mtimes(rb.velocity_map(), qd)[:6]
             a = rb.acceleration(qd, qdd)[:6]
             self.base_motion = ca.Function("base_motion", [rb.q, qd, qdd], [v, a])
-        # in the base's own frame: the base at the world's origin, unturned
+        # for calls with the base at the world's origin, without rotation: then all is in the base's own frame
         self._sole = []
         for leg in self.legs:
             rotation, point = rb.frame(leg.frame)
-            moved = [self.base + int(j) for j in (*leg.before, *leg.joints)]
-            jac = rb.jacobian(leg.frame)[:, moved]
+            chain = [self.base + int(j) for j in (*leg.before, *leg.joints)]
+            jac = rb.jacobian(leg.frame)[:, chain]
             twist = rb.frame_velocity(leg.frame, rb.v)
             acc = rb.frame_acceleration(leg.frame, rb.v, rb.a)
             self._sole.append(
@@ -420,8 +432,10 @@ class StanceCoordinates:
         return self.embed(y[: self.base], y[self.base :], legs)
 
     def sole_terms(self, k: int, y: Any, legs: Any, v: Any, a: Any) -> Any:
-        """Rotation, point, Jacobian of the leg's own joints, twist and acceleration of sole k in the base's
-        own frame; and the Jacobian of the joints before them.
+        """Kinematics of sole k in the base's own frame, SX.
+
+        Rotation, position, Jacobian of the dependent joints, twist, acceleration, and Jacobian of the joints
+        before these.
         """
         q = self.embed(ca.SX.zeros(self.base), y[self.base :], legs)
         rotation, point, jac, twist, acc = self._sole[k](q, v, a)
@@ -430,7 +444,7 @@ class StanceCoordinates:
     def velocity(self, y: Any, legs: Any, rates: Any) -> Any:
         """Pinocchio velocities v = N(y) ydot (nv, k) that keep the fixed soles at rest, SX.
 
-        ``rates`` (ny, k): one ydot a column.
+        rates (ny, k) : a ydot in each column.
         """
         k = rates.shape[1]
         if not self.base:
@@ -455,17 +469,15 @@ class StanceCoordinates:
     def motion(self, y: Any, legs: Any, yd: Any, ydd: Any) -> tuple[Any, Any]:
         """Pinocchio v and a (nv,) that keep the fixed soles at rest, SX.
 
-        y (ny,), legs (nl,), yd, ydd (ny,): coordinates, dependent joints, rates [1/s] and second rates
-        [1/s^2].
+        y (ny,), legs (nl,) : coordinates and dependent joints.  yd, ydd (ny,) : time derivatives of y.
         """
         v = self.velocity(y, legs, yd)
         if not self.base:
             return v, self.embed(None, ydd, ca.SX(0, 1))
         still = ca.SX.zeros(self.nl)
         q = self.configuration(y, legs)
-        a_base = self.base_motion(q, self.embed(yd[:6], yd[6:], still), self.embed(ydd[:6], ydd[6:], still))[
-            1
-        ]
+        qd, qdd = self.embed(yd[:6], yd[6:], still), self.embed(ydd[:6], ydd[6:], still)
+        a_base = self.base_motion(q, qd, qdd)[1]
         accs = []
         for s, leg in enumerate(self.legs):
             _, _, jac, _, acc, _ = self.sole_terms(s, y, legs, v, self.embed(a_base, ydd[6:], still))
@@ -473,10 +485,8 @@ class StanceCoordinates:
         return v, self.embed(a_base, ydd[6:], ca.vertcat(*accs))
 
     def leg_determinants(self, legs: Any) -> Any:
-        """Determinant, up to its sign, of each constrained leg's Jacobian (a leg), SX; zero at a straight
-        knee.
-        """
-        # what is before a leg's own joints turns its Jacobian as a whole
+        """Determinants (legs,), up to their signs, of the legs' Jacobians, SX; zero at a straight knee."""
+        # any coordinates: joints before a leg's own rotate its Jacobian, which leaves the determinant
         nothing, anywhere = ca.SX.zeros(self.rb.nv), ca.SX(self.start)
         out = []
         for s, leg in enumerate(self.legs):
@@ -485,9 +495,9 @@ class StanceCoordinates:
         return ca.vertcat(*out)
 
     def sole_twists(self, y: Any, legs: Any, yd: Any, rates: Any) -> Any:
-        """Twists (6 a fixed sole) [m/s, rad/s], in the base's own frame, SX.
+        """Twists (6 a fixed sole) [m/s, rad/s] in the base's own frame, SX.
 
-        They are for leg rates (nl,) that need not be right.
+        rates (nl,) : of the legs; these need not keep the soles at rest.
         """
         still, nothing = ca.SX.zeros(self.nl), ca.SX.zeros(self.rb.nv)
         base = self.base_motion(self.configuration(y, still), self.embed(yd[:6], yd[6:], still), nothing)[0]
@@ -495,7 +505,7 @@ class StanceCoordinates:
         return ca.vertcat(*[self.sole_terms(k, y, legs, v, nothing)[3] for k in range(len(self.legs))])
 
     def upper_motion(self, y: Any, yd: Any, ydd: Any) -> tuple[Any, Any, Any]:
-        """q, v, a (SX) with the leg joints left out (zero): enough for frames that no stance leg carries."""
+        """q, v, a (nv,) with leg joints at zero, SX; right for frames that no leg of the stance moves."""
         still = ca.SX.zeros(self.nl)
         q = self.configuration(y, still)
         if not self.base:
@@ -505,14 +515,14 @@ class StanceCoordinates:
         return q, self.embed(v, yd[6:], still), self.embed(a, ydd[6:], still)
 
     def closure(self, y: Any, legs: Any) -> Any:
-        """Pose error of the fixed soles (6 a sole), SX: position [m], rotation vector [rad] to first
-        order.
-        """
+        """Pose errors of the fixed soles (6 a sole), SX: position [m]; rotation [rad], to first order."""
         q = self.configuration(y, legs)
         out = []
         for leg in self.legs:
             rotation, point = self.rb_frame(leg.frame, q)
-            d = ca.mtimes(rotation, ca.DM(leg.placement.rotation.T))
+            d = ca.mtimes(
+                rotation, ca.DM(leg.placement.rotation.T)
+            )  # error rotation; w: its antisymmetric part
             w = 0.5 * ca.vertcat(d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1])
             out += [point - ca.DM(leg.placement.translation), w]
         return ca.vertcat(*out)
@@ -531,7 +541,7 @@ class StanceCoordinates:
         if not self.legs:
             return ca.SX.zeros(nv)
         zero_v, base, leg_tau = ca.SX.zeros(nv), ca.SX.zeros(6), []
-        others = [ca.SX(0.0)] * self.robot.n  # on the joints that are coordinates
+        others = [ca.SX(0.0)] * self.robot.n  # torques of joints that are coordinates
         for k, leg in enumerate(self.legs):
             rotation, point, jac, _, _, before = self.sole_terms(k, y, legs, zero_v, zero_v)
             w = wrenches[6 * k : 6 * k + 6]
@@ -546,10 +556,10 @@ class StanceCoordinates:
 
     # ------------------------------------------------------------------ numeric
     @cached_property
-    def closing(self) -> Closing:
+    def leg_closure(self) -> LegClosure:
         """Numerical solver of the legs' closure."""
         limbs = [Limb(leg.frame, leg.placement, self.base + leg.joints) for leg in self.legs]
-        return Closing(
+        return LegClosure(
             self.model,
             self.data,
             limbs,
@@ -559,42 +569,42 @@ class StanceCoordinates:
         )
 
     def split(self, q_pin: Array) -> tuple[Array, Array]:
-        """(y, legs) of a pin configuration."""
+        """Coordinates y (ny,) and legs (nl,) of a Pinocchio configuration (nq,)."""
         q = self.rb.from_pin(q_pin)
         joints = q[self.base :]
         return np.concatenate([q[: self.base], joints[self.independent]]), joints[self.dependent]
 
     def join(self, y: Array, legs: Array) -> Array:
-        """pin configuration (nq,) of (y, legs), or (k, nq) of rows of them."""
+        """Pinocchio configuration (nq,) of y (ny,) and legs (nl,), or (k, nq) of k of them."""
         joints = np.zeros((*y.shape[:-1], self.robot.n))
         joints[..., self.independent], joints[..., self.dependent] = y[..., self.base :], legs
         return self.rb.to_pin(np.concatenate([y[..., : self.base], joints], axis=-1))
 
     def solve_legs(self, y: Array, guess: Array) -> Array:
-        """Leg joints (nl,) that put every fixed sole in its place; Newton from ``guess``.
+        """Leg joints (nl,) that put every fixed sole in its place, by Newton's method from ``guess``.
 
         Raises InputError if a sole cannot be reached.
         """
-        return self.closing.legs(y, guess)
+        return self.leg_closure.legs(y, guess)
 
     def sole_jacobians(self, q: Array) -> tuple[Array, list[Any]]:
-        """Jacobians of the fixed soles, stacked (6 a sole, nv), and their placements, at a pin configuration.
+        """Jacobians (6 a sole, nv) of the fixed soles and their placements, at a Pinocchio configuration.
 
         The Jacobians are in each sole's own frame, the placements in the world.
         """
-        jac = self.closing.jacobians(q)
+        jac = self.leg_closure.jacobians(q)
         pin.updateFramePlacements(self.model, self.data)
         return jac, [self.data.oMf[self.model.getFrameId(leg.frame)].copy() for leg in self.legs]
 
     def complete_motion(self, y: Array, yd: Array, ydd: Array, legs: Array) -> tuple[Array, Array, Array]:
-        """pin q, v, a of independent coordinates and rates; the legs' part is from the soles' constraint."""
-        return self.closing.motion(y, yd, ydd, legs)
+        """Pinocchio's q, v, a of coordinates and derivatives; those of legs by the soles' constraint."""
+        return self.leg_closure.motion(y, yd, ydd, legs)
 
 
 def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
-    """CasADi function (q, v, a) -> point [m], velocity [m/s], acceleration [m/s^2] of the striking point.
+    """CasADi function (q, v, a) -> position, velocity, acceleration of the striking point.
 
-    World axes.
+    (3,) each, along the world's axes [m], [m/s], [m/s^2].
     """
     rb, frame = c.rb, f"striker:{striker}"
     _, point = rb.frame(frame)

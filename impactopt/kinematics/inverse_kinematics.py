@@ -20,12 +20,15 @@ from impactopt.robots.tools import inside
 __all__ = ["Reach", "inverse_kinematics", "reach"]
 
 Array = NDArray[np.float64]
-FARAWAY = 50.0  # [rad], [m] bound of what has none
+UNBOUNDED = 50.0  # [rad, m] stands for an infinite bound
 
 
 class Reach(NamedTuple):
-    """The posture (nq,) found; how far [m] its striking point is off, soles and all; how far [m] its centre
-    of mass is outside the support polygon, < 0 inside."""
+    """Result of `reach`.
+
+    q (nq,) : the posture.  off : largest error of striking point and soles [m, rad].
+    outside : distance of the centre of mass from the support polygon, negative inside [m].
+    """
 
     q: Array
     off: float
@@ -43,11 +46,12 @@ def reach(
     lean: float = 0.0,
     joint_margin: float = 0.02,
 ) -> Reach:
-    """The best posture near a guess (nq,) with the striking point at `point` (3,) [m].
+    """Least-squares posture near a guess (nq,) with the striking point at `point` (3,) [m].
 
-    held : soles, each a frame and its pin.SE3 in the world.  polygon : (k, 2) that the centre of mass is to
-    be above, (0, 2): none is asked for.  lean [m] : how far outside it may be.  joint_margin [rad] : inside
-    the limits.
+    held : fixed soles, each a frame and its pin.SE3 in the world.
+    polygon (k, 2) : that the centre of mass should be above; (0, 2): none.  lean : by which it may be outside
+        [m].
+    joint_margin : distance from joint limits [rad].
     """
     model, data = robot.model, robot.model.createData()
     fid = model.getFrameId(f"striker:{striker}")
@@ -59,16 +63,16 @@ def reach(
         q = pin.integrate(model, guess, step)
         pin.forwardKinematics(model, data, q)
         pin.updateFramePlacements(model, data)
-        rows = [pin.log6(data.oMf[f].actInv(placement)).vector for f, placement in frames]
+        residuals = [pin.log6(data.oMf[f].actInv(placement)).vector for f, placement in frames]
         centre = np.array(pin.centerOfMass(model, data, q))[:2]
-        rows += [point - data.oMf[fid].translation, np.maximum(offset - lean - inward @ centre, 0.0)]
-        return np.concatenate([*rows, 1e-4 * step])
+        residuals += [point - data.oMf[fid].translation, np.maximum(offset - lean - inward @ centre, 0.0)]
+        return np.concatenate([*residuals, 1e-4 * step])  # the last makes the solution unique
 
     angles = robot.joint_positions(guess)
     slack = np.minimum(joint_margin, (robot.upper - robot.lower) / 4)
-    lower, upper = np.full(robot.nv, -FARAWAY), np.full(robot.nv, FARAWAY)
-    upper[base:] = np.minimum(robot.upper - slack - angles, FARAWAY)
-    lower[base:] = np.minimum(np.maximum(robot.lower + slack - angles, -FARAWAY), upper[base:] - 1e-9)
+    lower, upper = np.full(robot.nv, -UNBOUNDED), np.full(robot.nv, UNBOUNDED)
+    upper[base:] = np.minimum(robot.upper - slack - angles, UNBOUNDED)
+    lower[base:] = np.minimum(np.maximum(robot.lower + slack - angles, -UNBOUNDED), upper[base:] - 1e-9)
     start = np.clip(np.zeros(robot.nv), lower, upper)
     found = least_squares(errors, start, bounds=(lower, upper), xtol=1e-10, ftol=1e-12, max_nfev=80)
     q, off = pin.integrate(model, guess, found.x), np.abs(errors(found.x)[: 6 * len(frames) + 3]).max()
@@ -79,8 +83,11 @@ def reach(
     return Reach(q, float(off), outside)
 
 
-TURNING, WISH = 100, 0.1  # steps that also turn the hand, and how much that is damped
-ASIDE, ABOUT = 0.1, 0.3  # [rad] how far postures are drawn from the guess: the first one that turns; others
+FACING_STEPS = 100  # first steps of each attempt, in which the striker's orientation is an aim too
+FACING_DAMPING = 0.1  # of orientation; position and soles have 1e-8, so that these come first
+# [rad] standard deviation of random joint offsets from the guess: in the first attempt, if it has an
+# orientation to reach, and in later attempts
+FIRST_SPREAD, SPREAD = 0.1, 0.3
 
 
 def inverse_kinematics(
@@ -95,40 +102,44 @@ def inverse_kinematics(
     starts: int = 8,
     tolerance: float = 1e-8,
 ) -> Array:
-    """A pin configuration (nq,) with the striking point at ``point`` (3,) [m], the soles in place.
+    """Pinocchio configuration (nq,) with the striking point at ``point`` (3,) [m] and the soles in place.
 
-    also : other strikers, each with its place.
-    Joints are inside their limits by ``margin`` [rad].  facing : an axis of the striker's frame, and the
-    direction (world) that it is to have, as nearly as may be; unit vectors (3,).
+    Damped least squares on soles and striking point, from ``guess`` (nq,) and then from random postures about
+    it.
 
-    Damped least squares on soles and striking point, from ``guess`` and then from postures about it. The
-    soles of ``coordinates`` stay.
+    also : other strikers, each with its point.
+    facing : axis of the striker's frame, and its desired direction in the world; unit vectors (3,). It is
+        approximated, not reached.
+    margin : distance of joints from their limits [rad].
+    starts : number of attempts.  tolerance : largest error of point and soles [m, rad].
 
     Raises
     ------
-    InputError : nothing found; says how near the best posture came and where the striking point starts.
+    InputError : no posture found; the message has the smallest error, and the striking point of the guess.
     """
     robot, model = coordinates.robot, coordinates.model
     data = model.createData()
     aims = [(striker, point), *also]
     hands = [(model.getFrameId(f"striker:{name}"), point) for name, point in aims]
     lower, upper = inside(robot, margin)
-    # a continuous joint takes two numbers of q, and has no limits
+    # a continuous joint has (cos, sin) of its angle in q, and no limits
     joints = robot.joint_models
     limited = np.array([k for k, j in enumerate(joints) if j.nq == 1], dtype=np.intp)
     place = np.array([joints[k].idx_q for k in limited], dtype=np.intp)
     rng = np.random.default_rng(0)
     base = coordinates.base
-    # the base moves last: a reach with the arm keeps the centre of mass over the feet
+    # weights of a step (larger: cheaper). The base is expensive, as a reach with the arm keeps the centre of
+    # mass over the feet.
     ease = np.ones(model.nv)
     ease[:base] = 0.02
     best_gap = np.inf
     for k in range(starts):
         q = guess.copy()
-        if k or facing is not None:  # what is in a plane of symmetry would stay there
-            drawn = (ABOUT if k else ASIDE) * rng.standard_normal(robot.n)
-            q = pin.integrate(model, q, np.concatenate([np.zeros(base), drawn]))
-        for turn in range(200):
+        # off the guess: an arm in its plane of symmetry would stay there, whatever the orientation
+        if k or facing is not None:
+            offsets = (SPREAD if k else FIRST_SPREAD) * rng.standard_normal(robot.n)
+            q = pin.integrate(model, q, np.concatenate([np.zeros(base), offsets]))
+        for iteration in range(200):
             q[place] = np.clip(q[place], lower[limited], upper[limited])
             pin.computeJointJacobians(model, data, q)
             pin.updateFramePlacements(model, data)
@@ -140,37 +151,38 @@ def inverse_kinematics(
             for fid, point in reversed(hands):
                 errors.append(point - data.oMf[fid].translation)
                 hand = pin.getFrameJacobian(model, data, fid, pin.LOCAL_WORLD_ALIGNED)
-                hand = np.reshape(hand, (6, model.nv))  # pin drops an axis where nv is 1
+                hand = np.reshape(hand, (6, model.nv))  # Pinocchio drops an axis if nv is 1
                 jacs.append(hand[:3])
             off = float(np.abs(np.concatenate(errors)).max())
             best_gap = min(best_gap, off)
-            turning = facing is not None and turn < TURNING
-            if off < tolerance and not turning:
+            orienting = facing is not None and iteration < FACING_STEPS
+            if off < tolerance and not orienting:
                 return q
             damping = np.full(6 * len(coordinates.legs) + 3 * len(hands), 1e-8)
-            if facing is not None and turning:
+            if facing is not None and orienting:  # fid, hand: of the striker, the last in the loop above
                 axis = data.oMf[fid].rotation @ facing[0]
-                sides = across(axis)  # turning about the axis changes nothing
-                errors.append(sides @ _turn(axis, facing[1], sides[0]))
+                sides = across(axis)  # two components: a rotation about the axis changes nothing
+                errors.append(sides @ _least_rotation(axis, facing[1], sides[0]))
                 jacs.append(sides @ hand[3:])
-                damping = np.concatenate([damping, [WISH, WISH]])
+                damping = np.concatenate([damping, [FACING_DAMPING, FACING_DAMPING]])
             e, jac = np.concatenate(errors), np.vstack(jacs)
-            # joints at a limit that would leave it are held for this step
+            # Active set: joints at a limit that the step would violate are fixed, and the step is computed
+            # again.
             step = np.zeros(model.nv)
             free = np.ones(model.nv, dtype=bool)
-            for _hold in range(3):
+            for _ in range(3):
                 j = jac[:, free]
                 step[:] = 0.0
                 jw = j * ease[free]
                 step[free] = jw.T @ np.linalg.solve(jw @ j.T + np.diag(damping), e)
                 joint = step[base:][limited]
-                out = np.zeros(robot.n, dtype=bool)
-                out[limited] = ((q[place] >= upper[limited] - 1e-9) & (joint > 0)) | (
+                violates = np.zeros(robot.n, dtype=bool)
+                violates[limited] = ((q[place] >= upper[limited] - 1e-9) & (joint > 0)) | (
                     (q[place] <= lower[limited] + 1e-9) & (joint < 0)
                 )
-                if not (out & free[base:]).any():
+                if not (violates & free[base:]).any():
                     break
-                free[base:] &= ~out
+                free[base:] &= ~violates
             q = pin.integrate(model, q, np.clip(step, -0.15, 0.15))
     pin.framesForwardKinematics(model, data, guess)
     fid, point = hands[0]
@@ -184,10 +196,13 @@ def inverse_kinematics(
     ) from None
 
 
-def _turn(axis: Array, direction: Array, across: Array) -> Array:
-    """The least rotation (3,) [rad] from one unit vector to another; ``across``: one at right angles."""
-    cross, along = np.cross(axis, direction), float(axis @ direction)
+def _least_rotation(axis: Array, direction: Array, across: Array) -> Array:
+    """Rotation vector (3,) [rad] from ``axis`` to ``direction``; ``across``: at right angles to ``axis``.
+
+    Unit vectors (3,). Opposite ones have no unique rotation; then it is half a turn about ``across``.
+    """
+    cross, cosine = np.cross(axis, direction), float(axis @ direction)
     sine = float(np.linalg.norm(cross))
     if sine < 1e-9:
-        return np.zeros(3) if along > 0 else np.pi * across
-    return np.asarray(cross * (np.arctan2(sine, along) / sine))
+        return np.zeros(3) if cosine > 0 else np.pi * across
+    return np.asarray(cross * (np.arctan2(sine, cosine) / sine))

@@ -1,8 +1,8 @@
-"""Striking point of a constrained robot: place, effective mass, mobility, coasting torque; wrenches at rest.
+"""Striking point of a constrained robot: position, effective mass, mobility; torques and wrenches at rest.
 
-In numbers for one configuration, by Pinocchio and least squares. For many of them, and for gradients,
-there are compiled graphs, `impactopt.collision.effective_mass` and `impactopt.collide.contact_states`; tests
-hold them to this.
+Numeric, for one configuration, by Pinocchio and least squares. `impactopt.collision.effective_mass` and
+`impactopt.collide.contact_states` have compiled graphs for many configurations and for gradients; tests
+compare them with this module.
 """
 
 from __future__ import annotations
@@ -26,36 +26,41 @@ Array = NDArray[np.float64]
 
 
 def across(direction: Array) -> Array:
-    """(2, 3) rows: two unit vectors at right angles to a direction (3,) and to each other."""
+    """(2, 3) Two unit vectors at right angles to a direction (3,) and to each other."""
     return np.asarray(np.linalg.svd(direction.reshape(1, 3))[2][1:])
 
 
 def striking_point(robot: Robot, striker: str, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Its place (3,) [m] in the world, at a configuration (nq,)."""
+    """Position (3,) [m] of a striker's striking point in the world, at a configuration q (nq,)."""
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, q)
     return np.array(data.oMf[model.getFrameId(robot.striker(striker).model_frame)].translation)
 
 
 def static_wrenches(c: StanceCoordinates, y: Array, legs: Array) -> Array:
-    """Sole wrenches (6 a sole) of least norm that carry the robot at rest. Hands and hinges bear nothing."""
+    """Sole wrenches (6 a sole) of least norm that carry the robot at rest; zero on hands and about hinges."""
     if not c.legs:
         return np.zeros(0)
     q = c.join(y, legs)
     tau = c.robot.generalized_gravity(c.model.createData(), q)
     jac = c.sole_jacobians(q)[0][: 6 * len(c.soles), c.undriven]
-    lever = np.array([1, 1, 1, 10, 10, 10] * len(c.soles))  # moments cost more: keep the CoP in the sole
+    # moments weigh more, which keeps the centre of pressure inside the sole
+    lever = np.array([1, 1, 1, 10, 10, 10] * len(c.soles))
     found = np.linalg.lstsq(jac.T / lever, tau[c.undriven], rcond=None)[0] / lever
     return np.concatenate([found, np.zeros(6 * len(c.hands))])
 
 
-_DEPENDENT = 1e-12  # of the largest: a robot of few joints has rows that depend on each other
+# Singular values below this fraction of the largest count as zero: with few joints, constraints may be
+# dependent.
+_DEPENDENT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A model at one configuration: inertia (nv, nv), Jacobian (c, nv) of the frames that are held, and
-    linear Jacobian (3, nv) of the striking point; world axes.
+    """Dynamics of a model with fixed frames, at one configuration, in world axes.
+
+    inertia (nv, nv); held (c, nv) : Jacobian of the fixed frames; hand (3, nv) : linear Jacobian of the
+    striking point.
     """
 
     inertia: Array
@@ -64,25 +69,28 @@ class Held:
 
     @classmethod
     def at(cls, model: pin.Model, q: Array, frames: Sequence[str], striker: str) -> Held:
-        """Quantities at a configuration (nq,), with frames by their names in the model."""
+        """Dynamics at a configuration q (nq,).  frames : fixed ones.  striker : striking point's frame."""
         inertia = mass_matrix(model, model.createData(), q)
-        rows = _jacobians(model, q, [*frames, striker])
-        return cls(inertia, rows[:-6], rows[-6:-3])
+        jacobians = _jacobians(model, q, [*frames, striker])
+        return cls(inertia, jacobians[:-6], jacobians[-6:-3])
 
     def inverse_mass(self) -> Array:
-        """J P J' (3, 3) [1/kg]: P is the inverse inertia of the robot as it is held, its joints free.
+        """Inverse operational-space inertia J P J' (3, 3) [1/kg] of the striking point.
+
+        P = H^-1 - H^-1 J_c' (J_c H^-1 J_c')^-1 J_c H^-1 is the inverse inertia of the robot with its fixed
+        frames.
 
         1 / (n' J P J' n) is the effective mass along n (the paper's virtual mass, its section III).
         """
         return np.asarray(self.hand @ self.by_impulses(self.hand))
 
-    def by_impulses(self, rows: Array, compliance: Array | float = 0.0) -> Array:
-        """P rows' (nv, k): velocities by a unit impulse along each of some rows (k, nv).
+    def by_impulses(self, jacobian: Array, compliance: Array | float = 0.0) -> Array:
+        """P J' (nv, k): velocities after unit impulses along the rows of a Jacobian J (k, nv).
 
-        compliance : of what is held, (c,), as `Stance.compliance` has it of a frame.
+        compliance (c,) : added to the diagonal of J_c H^-1 J_c', as of `Stance.compliance`.
         """
-        moves = np.linalg.solve(self.inertia, np.vstack([self.held, rows]).T)
-        held, free = np.split(moves, [len(self.held)], axis=1)
+        responses = np.linalg.solve(self.inertia, np.vstack([self.held, jacobian]).T)  # H^-1 [J_c' J']
+        held, free = np.split(responses, [len(self.held)], axis=1)
         inner = self.held @ held + compliance * np.eye(len(self.held))
         return np.asarray(free - held @ np.linalg.lstsq(inner, self.held @ free, rcond=_DEPENDENT)[0])
 
@@ -96,11 +104,11 @@ def striking_velocity(
     *,
     stance: Stance | None = None,
 ) -> Array:
-    """Velocity (nv) of least kinetic energy with the striking point at `speed` [m/s] along the normal.
+    """Velocity (nv,) of least kinetic energy with the striking point at `speed` [m/s] along the normal.
 
-    What the stance holds (None: all soles, or the fixed base) is at rest, and so is the striking point across
-    the normal (3,); its rotation is free. The least energy makes heavy links move little, whatever the
-    joints' units.
+    Frames fixed by the stance (None: all soles, or the fixed base) are at rest. The striking point does not
+    move at right angles to the normal (3,); its rotation is free. Least energy, unlike a least norm, does not
+    depend on the joints' units, and makes heavy links move little.
 
     Raises
     ------
@@ -113,15 +121,15 @@ def striking_velocity(
     frames = held_by.constraint_frames(robot)
     body = Held.at(robot.model, q, frames, robot.striker(striker).model_frame)
     J = np.vstack([body.held, body.hand])
-    wanted = np.concatenate([np.zeros(len(body.held)), speed * n])
-    # v = H^-1 J' x
-    spread = np.linalg.solve(body.inertia, J.T)
-    v = spread @ np.linalg.lstsq(J @ spread, wanted, rcond=_DEPENDENT)[0]
-    off = float(np.abs(J @ v - wanted).max())
+    required = np.concatenate([np.zeros(len(body.held)), speed * n])
+    # minimum of v'Hv/2 subject to J v = required: v = H^-1 J' (J H^-1 J')^-1 required
+    responses = np.linalg.solve(body.inertia, J.T)
+    v = responses @ np.linalg.lstsq(J @ responses, required, rcond=_DEPENDENT)[0]
+    off = float(np.abs(J @ v - required).max())
     if not off <= 1e-6 * max(1.0, abs(speed)):
         raise InputError(
-            f"q: here {striker!r} cannot move along {np.round(n, 3).tolist()} with what is held at rest (off "
-            f"by {off:.2g} m/s): choose another posture"
+            f"q: here {striker!r} cannot move along {np.round(n, 3).tolist()} with the stance's frames at "
+            f"rest (off by {off:.2g} m/s): choose another posture"
         )
     return np.array(v)
 
@@ -129,9 +137,9 @@ def striking_velocity(
 def holding_torque(
     robot: Robot, q: ArrayLike, v: ArrayLike | None = None, *, stance: Stance | None = None
 ) -> Array:
-    """Torque (n) [N m] that keeps all velocities as they are, on a stance.
+    """Torque (n,) [N m] at which the robot does not accelerate, on a stance.
 
-    The least-norm solution (tau, lambda) of S' tau + J_c' lambda = c + g at q (nq), v (nv; None: at rest).
+    The least-norm solution (tau, lambda) of S' tau + J_c' lambda = c + g at q (nq,), v (nv,; None: at rest).
 
     Raises
     ------
@@ -149,7 +157,7 @@ def holding_torque(
 
 
 def _jacobians(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
-    """(6 a frame, nv), one below the other."""
+    """Stacked Jacobians (6 a frame, nv) of frames, in world axes."""
     data = model.createData()
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)

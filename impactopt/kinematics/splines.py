@@ -1,10 +1,9 @@
-"""Cubic B-splines: the shape of wind-up, strike and follow-through.
+"""Cubic B-splines of motions, and Radau IIA collocation.
 
-A cubic spline is used because at a break it depends on three control points only (so a node of the program
-touches few variables), its acceleration is piecewise linear (so a torque that is inside its limit at the
-nodes is nearly so between them), and control points bound the curve (so position and velocity limits hold
-between the nodes as well).  Breaks are graded: short intervals about the contact, where everything happens
-fast.
+Reasons for cubic splines: At a break a spline depends on three control points only, so a node of the program
+has few variables. Accelerations are piecewise linear, so a torque within its limit at the nodes is nearly so
+between them. Control points bound the curve, so limits of position and velocity hold everywhere. Breaks are
+graded, with short intervals near the contact, where motions are fastest.
 """
 
 from __future__ import annotations
@@ -19,7 +18,10 @@ Array = NDArray[np.float64]
 
 
 def graded_breaks(intervals: int, ratio: float, *, fine_end: bool) -> Array:
-    """(intervals + 1,) breaks on [0, 1]; lengths grow geometrically by ``ratio`` in all from the fine end."""
+    """Breaks (intervals + 1,) on [0, 1] with geometrically growing lengths.
+
+    ratio : of the longest interval to the shortest, which is at the end if ``fine_end``, else at the start.
+    """
     lengths = ratio ** np.linspace(0.0, 1.0, intervals)
     lengths /= lengths.sum()
     breaks = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -28,33 +30,30 @@ def graded_breaks(intervals: int, ratio: float, *, fine_end: bool) -> Array:
 
 
 def knots(breaks: Array) -> Array:
-    """Clamped knot vector (N + 7,) of the cubic splines with these breaks."""
+    """Clamped knot vector (N + 7,) of cubic splines with N + 1 breaks."""
     return np.concatenate([[breaks[0]] * 3, breaks, [breaks[-1]] * 3])
 
 
 def basis(breaks: Array, s: ArrayLike) -> tuple[Array, Array, Array]:
-    """Weights (k, N + 3) of the control points in value, first and second derivative in s."""
+    """Weights (k, N + 3) of the control points in value, first and second derivative by s, at s (k,)."""
     curve = BSpline(knots(breaks), np.eye(len(breaks) + 2), 3)
     at = np.atleast_1d(np.asarray(s, dtype=float))
     return curve(at), curve(at, 1), curve(at, 2)
 
 
 def rate_weights(breaks: Array) -> Array:
-    """(N + 2,) factors: the curve's velocity in s has the control points  factor_j (c_{j+1} - c_j).
-
-    They bound it.
-    """
+    """Factors (N + 2,) of the derivative's control points  factor_j (c_{j+1} - c_j),  which bound it."""
     t = knots(breaks)
     return np.asarray(3.0 / (t[4:-1] - t[1:-4]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class CubicSpline:
-    """A C2 curve over s in [0, 1].
+    """C2 curve over s in [0, 1]; time is t = duration * s.
 
     control : (N + 3, d) control points; the first and the last are the curve's ends.
     breaks : (N + 1,) from 0 to 1.
-    duration : [s]; time is t = duration * s.
+    duration : [s].
     """
 
     control: Array
@@ -71,7 +70,7 @@ class CubicSpline:
     def fit(
         cls, values: Array, breaks: Array, start_rate: Array, end_rate: Array, duration: float
     ) -> CubicSpline:
-        """The interpolant of ``values`` (N + 1, d) at the breaks with given end velocities (d,) [1/s]."""
+        """Interpolant of ``values`` (N + 1, d) at the breaks with given end velocities (d,) [1/s]."""
         value, rate, _ = basis(breaks, breaks)
         a = np.vstack([value, rate[:1] / duration, rate[-1:] / duration])
         b = np.vstack([values, start_rate, end_rate])
@@ -81,9 +80,9 @@ class CubicSpline:
 def quintic(
     start: Array, start_rate: Array, end: Array, end_rate: Array, duration: float, s: ArrayLike
 ) -> Array:
-    """Positions (k, d) at s in [0, 1] of the quintic with zero end accelerations.
+    """Positions (k, d) at s (k,) in [0, 1] of the quintic with zero accelerations at both ends.
 
-    It is the minimum-jerk curve when the rates [1/s] are zero.
+    start, end (d,); start_rate, end_rate (d,) [1/s]. Without rates it is the minimum-jerk curve.
     """
     s = np.atleast_1d(np.asarray(s, dtype=float))[:, None]
     v0, v1, gap = start_rate * duration, end_rate * duration, end - start
@@ -95,8 +94,9 @@ def quintic(
 
 @dataclass(frozen=True)
 class Radau:
-    """Radau IIA collocation: stage times c and the matrix A; stiffly accurate, so a stiff servo mode is
-    damped, not rung.
+    """Radau IIA collocation: stage times c (s,) and matrix A (s, s).
+
+    It is stiffly accurate, so a stiff mode of the servo is damped instead of oscillating.
 
     Source: Hairer & Wanner, Solving ODEs II, tables IV.5.5 and IV.5.6.
     """

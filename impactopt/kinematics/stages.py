@@ -1,7 +1,8 @@
-"""Motion on fixed soles, in stages: numbers that functions are written with and differentiated by.
+"""Motion on fixed soles in stages, for derivatives with fewer operations.
 
-A leg's rates and accelerations depend on its angles and the base's motion alone, the base's motion on its own
-coordinates. An expression in all coordinates at once hides that from whoever differentiates it.
+Rates and accelerations of a leg depend only on its angles and the base's motion, and the base's motion on its
+own coordinates. One expression of all coordinates would hide this structure from differentiation. Stages keep
+it; `impactopt.transcription.structured.derivatives` applies the chain rule to them.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ __all__ = ["Stage", "motion_in_stages", "velocity_in_stages"]
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """Symbols (k,), and what they stand for: of variables, parameters and the stages before.
+    """Intermediate quantity of a function: symbols (k,), and the expression (k,) that they replace.
 
-    zero : (k,) of these and the symbols, linear in the symbols, zero where they are right; in place of the
-        derivatives of what they stand for. blocks : the matrices (m, m) of its slope by the symbols that
-        stand on the diagonal, each with its elimination order; there is nothing beside them.
+    The expression is one of variables, parameters and symbols of earlier stages.
+
+    zero (k,) : implicit definition, from which derivatives are taken instead: an expression of the same and
+        of the symbols, linear in these, that is zero where symbols and expression are equal.
+    blocks : diagonal blocks (m, m) of its Jacobian by the symbols, which is block diagonal, each with its
+        elimination order.
     """
 
     symbols: Any
@@ -32,7 +36,7 @@ class Stage:
 
 
 def velocity_in_stages(c: StanceCoordinates, y: Any, legs: Any, rates: Any) -> tuple[Any, list[Stage]]:
-    """`StanceCoordinates.velocity` of one ydot (ny,): v (nv,), and the stages that it is written with."""
+    """`StanceCoordinates.velocity` of one ydot (ny,) in stages: v (nv,), and the stages."""
     if not c.base:
         return c.velocity(y, legs, rates), []
     v, _, stages = _in_stages(c, y, legs, rates, None)
@@ -42,13 +46,14 @@ def velocity_in_stages(c: StanceCoordinates, y: Any, legs: Any, rates: Any) -> t
 def motion_in_stages(
     c: StanceCoordinates, y: Any, legs: Any, rates: Any, second: Any
 ) -> tuple[Any, Any, list[Stage]]:
-    """`StanceCoordinates.motion`: v and a (nv,), and the stages that they are written with."""
+    """`StanceCoordinates.motion` in stages: v and a (nv,), and the stages."""
     return (*c.motion(y, legs, rates, second), []) if not c.base else _in_stages(c, y, legs, rates, second)
 
 
 def _in_stages(
     c: StanceCoordinates, y: Any, legs: Any, rates: Any, second: Any
 ) -> tuple[Any, Any, list[Stage]]:
+    """v, a (None if ``second`` is None) and stages: base motion, leg rates, leg accelerations."""
     q, still = c.configuration(y, legs), ca.SX.zeros(c.nl)
     nothing = ca.SX.zeros(c.rb.nv)
     qd = c.embed(rates[:6], rates[6:], still)
@@ -67,9 +72,10 @@ def _in_stages(
 def _of_legs(
     c: StanceCoordinates, name: str, motion: Any, y: Any, legs: Any, term: int
 ) -> tuple[tuple[Any, Any], list[Stage]]:
-    """v and a with symbols for what the legs do, and the stage that says what: they keep the soles at rest.
+    """v and a with symbols for the legs' rates or accelerations, and the stage that defines these.
 
-    motion : v and a of what the legs do (nl,).  term : of `sole_terms`, what has to be zero.
+    motion : function that gives v and a from legs' rates or accelerations (nl,).
+    term : index in `StanceCoordinates.sole_terms` of the quantity that has to be zero: twist or acceleration.
     """
     symbols, count = ca.SX.sym(name, c.nl), range(len(c.legs))
     found = motion(symbols)

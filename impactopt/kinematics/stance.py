@@ -1,8 +1,8 @@
-"""Stance of the robot in an impact: soles, fixed exactly or by the paper's virtual base, or a fixed base.
+"""Stances: soles and hands that are fixed, exactly or by the paper's virtual base, or a fixed base.
 
-The virtual base (paper, eqs. 1-4) adds a mass M_g and an inertia I_g E to each fixed sole. That equals
-holding the sole by a constraint with the compliance 1/M_g, 1/I_g on the diagonal of its inverse inertia J
-H^-1 J^T, without the rounding errors of huge masses in H; M_g to infinity is the exact constraint.
+The virtual base (paper, eqs. 1-4) adds a mass M_g and an inertia I_g E to each fixed sole. This is equivalent
+to a constraint with the compliances 1/M_g and 1/I_g on the diagonal of its inverse inertia J H^-1 J^T, which
+avoids the rounding errors of huge masses in H. M_g to infinity is the exact constraint.
 """
 
 from __future__ import annotations
@@ -24,38 +24,40 @@ class Stance(ABC):
 
     @abstractmethod
     def soles(self, robot: Robot) -> tuple[Sole, ...]:
-        """The soles that are held, in the robot's order; InputError if the robot cannot stand like this."""
+        """Fixed soles, in the robot's order; InputError if the robot cannot stand like this."""
 
     def sole_names(self, robot: Robot) -> tuple[str, ...]:
-        """Names of the soles that are held."""
+        """Names of the fixed soles."""
         return tuple(sole.name for sole in self.soles(robot))
 
     def sole_frames(self, robot: Robot) -> tuple[str, ...]:
-        """Frames of the soles that are held."""
+        """Frames of the fixed soles."""
         return tuple(sole.frame for sole in self.soles(robot))
 
     def held_hands(self, robot: Robot) -> tuple[Striker, ...]:
-        """The hands that are held; InputError for one that the robot has not."""
+        """Fixed hands; InputError for an unknown one."""
         return ()
 
     def hand_frames(self, robot: Robot) -> tuple[str, ...]:
-        """Frames of the hands that are held; InputError for one that the robot has not."""
+        """Frames of the fixed hands; InputError for an unknown one."""
         return tuple(hand.model_frame for hand in self.held_hands(robot))
 
     def constraint_frames(self, robot: Robot) -> tuple[str, ...]:
-        """Frames of the model that are held in all six directions: soles first, then hands."""
+        """Frames of the model that are fixed in all six directions: soles first, then hands."""
         return self.sole_frames(robot) + self.hand_frames(robot)
 
     @property
     def compliance(self) -> NDArray[np.float64]:
-        """(6,) of each constrained frame, LOCAL_WORLD_ALIGNED: acceleration it yields by per force [1/kg;
-        1/(kg m2)]."""
+        """Compliance (6,) of each fixed frame in world axes, acceleration over force.
+
+        [1/kg] in translation, [1/(kg m2)] in rotation.
+        """
         return np.zeros(6)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _OnSoles(Stance):
-    """Soles, and hands that support the robot, held exactly, or by a virtual base.
+    """Fixed soles, and hands that support the robot; exactly, or by a virtual base.
 
     Attributes
     ----------
@@ -99,7 +101,7 @@ class _OnSoles(Stance):
 
 @dataclass(frozen=True, kw_only=True)
 class BothSoles(_OnSoles):
-    """All of the robot's soles are held."""
+    """All soles of the robot are fixed."""
 
     def soles(self, robot: Robot) -> tuple[Sole, ...]:
         _check_floating(robot)
@@ -110,7 +112,7 @@ class BothSoles(_OnSoles):
 
 @dataclass(frozen=True, kw_only=True)
 class OneSole(_OnSoles):
-    """One sole, given by its name, is held; the others are free."""
+    """One sole, given by its name, is fixed; the others are free."""
 
     name: str = field(kw_only=False)
 
@@ -121,7 +123,7 @@ class OneSole(_OnSoles):
 
 @dataclass(frozen=True, kw_only=True)
 class FixedBase(Stance):
-    """The root link is part of the ground: for robots without a free-flyer."""
+    """Root link fixed to the ground: for robots without a free-flyer."""
 
     def soles(self, robot: Robot) -> tuple[Sole, ...]:
         if robot.floating:
@@ -134,9 +136,9 @@ class FixedBase(Stance):
 
 @dataclass(frozen=True, kw_only=True)
 class Free(Stance):
-    """Nothing holds the robot: it floats freely, as a space robot or one in flight does.
+    """Free-floating robot, such as one in space or in flight.
 
-    Its base is moved by the joints' reaction, by gravity and by the blow.
+    The joints' reaction, gravity and the impact move its base.
     """
 
     def soles(self, robot: Robot) -> tuple[Sole, ...]:

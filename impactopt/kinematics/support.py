@@ -1,9 +1,9 @@
 """Support of soles on level ground: polygon, ZMP, contact wrench cone.
 
-A wrench (f, m) at the sole's frame can be transmitted by unilateral frictional forces at the corners if and
-only if it lies in the cone spanned by them; CoP, friction and yaw torsion are bounded *together* (torsion
-capacity vanishes as the CoP nears a corner). Source: Caron, Pham, Nakamura, "Stability of surface contacts
-for humanoid robots", ICRA 2015, whose closed form for a rectangle the tests compare with.
+Unilateral frictional forces at the corners can transmit a wrench (f, m) at the sole's frame if and only if it
+lies in the cone spanned by them. The cone bounds centre of pressure (CoP), friction and yaw torsion
+*together*; torsion capacity vanishes as the CoP nears a corner. Source: Caron, Pham, Nakamura, "Stability of
+surface contacts for humanoid robots", ICRA 2015, whose closed form for a rectangle the tests compare with.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 from impactopt.errors import InputError
 
 Array = NDArray[np.float64]
-_ON_LINE = 1e-9  # [m] corners nearer to a line than this lie on it
+_ON_LINE = 1e-9  # [m] a corner nearer to a line than this lies on it
 
 
 def inward_edges(polygon: Array) -> tuple[Array, Array]:
@@ -29,14 +29,15 @@ def inward_edges(polygon: Array) -> tuple[Array, Array]:
 
 
 def shrink(polygon: ArrayLike, margin: float) -> Array:
-    """The convex polygon (k, 2) [m], counter-clockwise, with every edge moved inwards by ``margin`` [m]."""
+    """Convex polygon (k, 2) [m], counter-clockwise, with every edge moved inwards by ``margin`` [m].
+
+    It may have fewer corners, as short edges can vanish. InputError if nothing is left.
+    """
     p = np.array(polygon, dtype=float)
     if margin == 0.0:
         return p
     inward, offset = inward_edges(p)
-    for normal, least in zip(
-        inward, offset + margin, strict=True
-    ):  # an edge shorter than the margin may vanish
+    for normal, least in zip(inward, offset + margin, strict=True):
         p = _clip(p, p @ normal - least)
     if len(p) < 3:
         raise InputError(
@@ -50,7 +51,7 @@ def _clip(corners: Array, inside: Array) -> Array:
     out: list[Array] = []
     for k in range(len(corners)):
         a, b = inside[k - 1], inside[k]
-        if min(a, b) < -_ON_LINE and max(a, b) > _ON_LINE:  # the edge that ends here is cut
+        if min(a, b) < -_ON_LINE and max(a, b) > _ON_LINE:  # the line cuts the edge that ends at corner k
             out.append(corners[k - 1] + a / (a - b) * (corners[k] - corners[k - 1]))
         if b >= -_ON_LINE:
             out.append(corners[k])
@@ -58,12 +59,12 @@ def _clip(corners: Array, inside: Array) -> Array:
 
 
 def contact_wrench_cone(polygon: ArrayLike, friction: float, *, margin: float = 0.0) -> Array:
-    """Rows F (k, 6) with  F @ (f, m) >= 0  exactly for the wrenches that the sole can transmit.
+    """Facets F (k, 6) of the contact wrench cone:  F @ (f, m) >= 0  for what the sole can transmit only.
 
-    polygon (c, 2) [m]: corners in the sole's frame, counter-clockwise; friction: coefficient of the pyramid
-    inscribed along the sole's axes (|f_x|, |f_y| <= mu f_z); margin [m]: how far the CoP stays inside. Rows
-    are scaled so that a unit normal force at the middle gives values of the order of one (forces [N], moments
-    [N m]).
+    polygon (c, 2) : corners in the sole's frame, counter-clockwise [m].
+    friction : coefficient mu of the pyramid |f_x|, |f_y| <= mu f_z along the sole's axes.
+    margin : distance of the CoP from the edges [m].
+    Facets are scaled so that a unit normal force at the middle gives values of order one.
     """
     if not friction > 0:
         raise InputError(f"friction must be positive, not {friction}")
@@ -71,15 +72,17 @@ def contact_wrench_cone(polygon: ArrayLike, friction: float, *, margin: float = 
     return _facets(tuple(map(tuple, corners.tolist())), float(friction)).copy()
 
 
-@functools.lru_cache(maxsize=64)  # asked for at every node of a program, for the same few soles
+@functools.lru_cache(maxsize=64)  # every node of a program needs those of the same few soles
 def _facets(corners: tuple[tuple[float, float], ...], friction: float) -> Array:
+    # rays of the cone: forces along the four edges of the friction pyramid at each corner
     rays = []
     for x, y in corners:
         for fx, fy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
             f = np.array([friction * fx, friction * fy, 1.0])
             rays.append(np.concatenate([f, np.cross([x, y, 0.0], f)]))
     r = np.array(rays)
-    # every ray has f_z = 1, so the cone is the one over the 5-dimensional polytope of the other components
+    # Every ray has f_z = 1, so the cone's facets are those of the 5-dimensional polytope of the other
+    # components.
     size = np.maximum(np.abs(np.delete(r, 2, axis=1)).max(axis=0), _ON_LINE)
     points = np.delete(r, 2, axis=1) / size
     try:
@@ -88,18 +91,19 @@ def _facets(corners: tuple[tuple[float, float], ...], friction: float) -> Array:
         raise InputError(
             "the sole's polygon is degenerate: give at least three corners that span an area"
         ) from error
-    facets = np.unique(np.round(hull.equations, 10), axis=0)  # one simplex per row: coplanar ones coincide
-    rows = np.zeros((len(facets), 6))
-    rows[:, [0, 1, 3, 4, 5]] = -facets[:, :5] / size
-    rows[:, 2] = -facets[:, 5]
-    return rows
+    # Qhull cuts a facet into simplices, which have equal equations: normal (5,) and offset, <= 0 inside
+    equations = np.unique(np.round(hull.equations, 10), axis=0)
+    facets = np.zeros((len(equations), 6))
+    facets[:, [0, 1, 3, 4, 5]] = -equations[:, :5] / size
+    facets[:, 2] = -equations[:, 5]
+    return facets
 
 
-MERGED = 1e-6  # [m] a corner nearer than this to the line of its neighbours is no corner
+COLLINEAR = 1e-6  # [m] a corner nearer than this to the line of its neighbours is no corner
 
 
 def corners_at(polygon: Array, placement: Any) -> Array:
-    """Corners (k, 3) [m] of a sole's polygon (k, 2) at the sole's placement, a pin.SE3."""
+    """World positions (k, 3) [m] of the corners of a sole's polygon (k, 2); ``placement``: pin.SE3."""
     flat = np.column_stack([polygon, np.zeros(len(polygon))])
     return np.asarray(flat @ placement.rotation.T + placement.translation)
 
@@ -115,13 +119,13 @@ def support_polygon(robot: Any, coordinates: Any) -> Array:
 
 
 def convex_polygon(points: Array) -> Array:
-    """Convex hull (k, 2) [m] of points (n, 2), counter-clockwise; none of its corners is inside an edge."""
+    """Convex hull (k, 2) [m] of points (n, 2), counter-clockwise, without corners inside an edge."""
     hull = list(points[ConvexHull(points).vertices])
     k = 0
-    while k < len(hull):  # rounding decides whether a corner in the middle of an edge belongs to the hull
+    while k < len(hull):  # by rounding a point in the middle of an edge may be a corner of the hull
         before, after = hull[k - 1], hull[(k + 1) % len(hull)]
-        way, arm = (after - before) / np.linalg.norm(after - before), hull[k] - before
-        if len(hull) > 3 and abs(way[0] * arm[1] - way[1] * arm[0]) < MERGED:
+        along, arm = (after - before) / np.linalg.norm(after - before), hull[k] - before
+        if len(hull) > 3 and abs(along[0] * arm[1] - along[1] * arm[0]) < COLLINEAR:
             hull.pop(k)
         else:
             k += 1
@@ -129,7 +133,7 @@ def convex_polygon(points: Array) -> Array:
 
 
 def overlap(one: Array, other: Array) -> bool:
-    """True if two convex polygons (k, 2) [m], counter-clockwise, overlap: no edge parts them."""
+    """True if two convex polygons (k, 2) [m], counter-clockwise, overlap: no edge separates them."""
     for a, b in ((one, other), (other, one)):
         inward, offset = inward_edges(a)
         if (b @ inward.T < offset).all(axis=0).any():

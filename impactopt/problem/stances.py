@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, check_array, shortened
-from impactopt.kinematics.coordinates import Closing, Limb, StanceCoordinates
+from impactopt.kinematics.coordinates import LegClosure, Limb, StanceCoordinates
 from impactopt.kinematics.stance import BothSoles, OneSole, Stance
 from impactopt.kinematics.support import corners_at, overlap
 from impactopt.problem.scenario import Phase
@@ -157,7 +157,7 @@ def stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64
     for (one, a), (other, b) in combinations(corners.items(), 2):
         if overlap(a, b):
             raise InputError(f"stances: soles {one} and {other} overlap after steps of {steps}")
-    closing = Closing(c.model, c.data, limbs, base=c.base, independent=c.base + c.independent, join=c.join)
+    closing = LegClosure(c.model, c.data, limbs, base=c.base, independent=c.base + c.independent, join=c.join)
     mean = np.mean([moved.get(leg.name, np.zeros(2)) for leg in c.legs], axis=0)
     lower, upper = c.robot.lower[c.dependent], c.robot.upper[c.dependent]
     for down in _LOWER:

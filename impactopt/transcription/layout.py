@@ -1,14 +1,15 @@
-"""Layout of a program: groups of variables, affine expressions in them, constraints, limits, eliminations.
+"""Layout of an NLP: variables, affine expressions, constraints, limits, order of elimination.
 
-The solver sees scaled variables; everything built from a :class:`Group` is in physical units, because a
-group's affine expressions carry its scale.
+**Units.** The solver sees scaled variables. Expressions of a :class:`Group` carry its scale, so that
+everything built from them is in physical units.
 
-A constraint knows its term, its component, its place, whose time is a function of the solution's durations,
-and the measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 % over its limit".
+**Messages.** A constraint has a term, a place (whose time depends on the solution's durations), a component
+and a measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 % over its limit".
 
-Each part of a program says which of its variables constraints determine, and whose `Turn` they are. Two
-orders hang on that: which variables go first, as others follow from them; and who takes constraints first,
-where a constraint would do for several.
+**Elimination.** Each part of a program lists variables that its equality constraints determine, with a
+`Turn`. The turn fixes the order in which variables are eliminated, since some follow from others. A second
+order (`by_choice`) fixes which variables are assigned constraints first, if a constraint could determine
+several.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Affine:
-    """``size`` affine expressions  c + sum_k v_k x[col_k]  of the decision variables, as triplets."""
+    """``size`` affine expressions  const + V x  of the decision vector x; sparse V (size, n) as triplets."""
 
     size: int
     rows: NDArray[np.intp]
@@ -90,7 +91,7 @@ class Affine:
 
     @classmethod
     def of_matrix(cls, matrix: Any, const: Array) -> Affine:
-        """matrix (size, n), sparse, times the variables, plus const (size,)."""
+        """Expressions  matrix x + const  of a sparse matrix (size, n) and const (size,)."""
         entries = sp.coo_array(matrix)
         rows, cols = (np.asarray(i, dtype=np.intp) for i in (entries.row, entries.col))
         return cls(len(const), rows, cols, np.asarray(entries.data), np.asarray(const))
@@ -128,14 +129,16 @@ class Affine:
 
 
 def select(expression: Affine, keep: NDArray[np.intp]) -> Affine:
-    out = [np.flatnonzero(expression.rows == k) for k in keep]
-    where = np.concatenate(out) if out else np.zeros(0, dtype=np.intp)
-    rows = np.repeat(np.arange(len(keep)), [len(o) for o in out])
-    return Affine(len(keep), rows, expression.cols[where], expression.vals[where], expression.const[keep])
+    """Expressions with numbers ``keep``, in this order; a number may be repeated."""
+    found = [np.flatnonzero(expression.rows == k) for k in keep]
+    triplets = np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
+    rows = np.repeat(np.arange(len(keep)), [len(each) for each in found])
+    cols, vals = expression.cols[triplets], expression.vals[triplets]
+    return Affine(len(keep), rows, cols, vals, expression.const[keep])
 
 
 def add(parts: Sequence[Affine]) -> Affine:
-    """The sum of one expression or more, of one size."""
+    """Sum of one or more expressions of the same size."""
     if len(sizes := dict.fromkeys(p.size for p in parts)) > 1:
         raise ValueError(f"affine expressions of sizes {' and '.join(map(str, sizes))} do not add")
     return Affine(
@@ -148,7 +151,7 @@ def add(parts: Sequence[Affine]) -> Affine:
 
 
 def stack(parts: Sequence[Affine]) -> Affine:
-    """One tall expression from several."""
+    """Concatenation of several expressions."""
     offset = np.cumsum([0] + [p.size for p in parts])
     none = np.zeros(0, dtype=np.intp)
     return Affine(
@@ -162,9 +165,9 @@ def stack(parts: Sequence[Affine]) -> Affine:
 
 @dataclass(frozen=True)
 class Group:
-    """Variables of one kind: ``count`` vectors of length ``size``.
+    """Variables of one kind: ``count`` vectors of length ``size``, from ``offset`` on in the decision vector.
 
-    ``scale`` turns solver units to physical ones.
+    Physical values are the solver's times ``scale`` (size,).
     """
 
     name: str
@@ -195,7 +198,7 @@ class Group:
 
 @dataclass
 class Layout:
-    """The decision vector: groups one behind the other, with their bounds in solver units."""
+    """Decision vector of n variables: consecutive groups, with their bounds in solver units."""
 
     groups: dict[str, Group] = field(default_factory=dict)
     n: int = 0
@@ -232,14 +235,14 @@ class Layout:
         return np.concatenate([np.zeros(0), *self._upper])
 
     def bounds(self, group: Group) -> tuple[float, float]:
-        """Bounds of a group of one variable, physical units."""
+        """Bounds of a group of one variable, in physical units."""
         if group.count * group.size != 1:
             raise ValueError(f"{group.name} has more than one variable")
         scale = float(group.scale[0])
         return float(self.lower[group.offset]) * scale, float(self.upper[group.offset]) * scale
 
     def bound(self, group: Group, lower: ArrayLike, upper: ArrayLike) -> None:
-        """Other bounds, as of :meth:`add`."""
+        """Replace a group's bounds; as of :meth:`add`."""
         k = list(self.groups).index(group.name)
         for store, bound in ((self._lower, lower), (self._upper, upper)):
             shape = group.count, group.size
@@ -257,31 +260,30 @@ Index = NDArray[np.intp]
 
 
 def by_leg(joints: Index) -> list[Index]:
-    """Numbers of leg joints (6 a leg), leg by leg."""
+    """Indices of leg joints (6 a leg), split by leg."""
     return list(joints.reshape(-1, 6))
 
 
 def along(labels: Sequence[str], phrase: str) -> list[Measure]:
-    """Measures of constraints in [m] for directions x, y, z, else in [rad], told apart by the labels' last
-    words.
-    """
-    return [millimetres(phrase) if _straight(name) else degrees(phrase) for name in labels]
+    """Measures of constraints in [m] for labels that end in x, y or z, else in [rad]."""
+    return [millimetres(phrase) if _is_length(name) else degrees(phrase) for name in labels]
 
 
 def rates(labels: Sequence[str]) -> list[Measure]:
-    """Measures of constraints in [m/s] or [rad/s], likewise."""
-    return [Measure("m/s" if _straight(name) else "rad/s", 1.0, "off") for name in labels]
+    """Measures of constraints in [m/s] for labels that end in x, y or z, else in [rad/s]."""
+    return [Measure("m/s" if _is_length(name) else "rad/s", 1.0, "off") for name in labels]
 
 
-def _straight(label: str) -> bool:
+def _is_length(label: str) -> bool:
     return label.split()[-1] in ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A constraint's origin: term, place and component, and how its violation is reported.
+    """Origin of a constraint: its term, place and component, and the measure of its violation.
 
-    whole : what the component is a part of, and what messages name in its place; None: the component.
+    whole : name that messages use in place of the component, such as the sole of a facet; None: the
+    component.
     """
 
     term: str
@@ -294,7 +296,7 @@ class Row:
         return _joined(self.term, self.place.name, self.component)
 
     def told(self, x: Array, amount: float) -> tuple[str, str]:
-        """Name of this constraint and amount of its violation in words, at solver variables (n,)."""
+        """Name of this constraint, and the amount of its violation in words, at solver variables x (n,)."""
         by = f"by {amount:.3g}" if self.measure is None else self.measure.told(x, amount)
         component = self.component if self.whole is None else self.whole
         return _joined(self.term, self.place.told(x), component), by
@@ -306,7 +308,12 @@ def _joined(*parts: str) -> str:
 
 @dataclass
 class Rows:
-    """Constraints under construction: each is at most one block output plus an affine expression of x."""
+    """Constraints under construction.
+
+    A constraint is  lower <= out[output] + affine <= upper,  with one output of a block (number -1: none) and
+    an affine expression. Each call of :meth:`add` appends an entry to the lists, and as many origins as
+    constraints.
+    """
 
     outputs: list[Index] = field(default_factory=list)
     affine: list[Affine] = field(default_factory=list)
@@ -315,16 +322,16 @@ class Rows:
     origins: list[Row] = field(default_factory=list)
 
     def copy(self) -> Rows:
-        """The same constraints, to which others can be added."""
+        """Copy to which other constraints can be added."""
         return Rows(*(list(getattr(self, f.name)) for f in fields(self)))
 
     def bound(self, k: int, lower: ArrayLike, upper: ArrayLike) -> None:
-        """Other bounds for what call number ``k`` of :meth:`add` added, none of which it dropped."""
+        """Replace the bounds of the constraints of call number ``k`` of :meth:`add`, which dropped none."""
         for sides, given in ((self.lower, lower), (self.upper, upper)):
             sides[k] = np.broadcast_to(np.asarray(given, dtype=float), sides[k].shape)
 
     def add_each(self, origins: Sequence[Row], *, outputs: Index, lower: float) -> None:
-        """Append constraints of these origins:  lower <= out[outputs]."""
+        """Append constraints  lower <= out[outputs],  with their origins."""
         n = len(origins)
         self.outputs.append(np.asarray(outputs, dtype=np.intp))
         self.affine.append(Affine.zeros(n))
@@ -347,8 +354,8 @@ class Rows:
     ) -> None:
         """Append ``len(components)`` constraints  lower <= out[outputs] + affine <= upper.
 
-        measure : of all, or one a constraint; place as text: one without a time; whole : of :class:`Row`.
-        Rows that are unbounded on both sides are dropped.
+        measure : one for all constraints, or one for each.  place : text is a place without a time.
+        whole : as of :class:`Row`. Constraints without a finite bound are dropped.
         """
         n = len(components)
         lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
@@ -367,30 +374,32 @@ class Rows:
         self.affine.append(lin)
         self.lower.append(lo)
         self.upper.append(hi)
-        where = Place.plain(place) if isinstance(place, str) else place
+        spot = Place.plain(place) if isinstance(place, str) else place
         measures = [measure] * n if measure is None or isinstance(measure, Measure) else measure
-        self.origins.extend(Row(term, where, components[int(k)], measures[int(k)], whole) for k in keep)
+        self.origins.extend(Row(term, spot, components[int(k)], measures[int(k)], whole) for k in keep)
 
 
-GRAVITY = 9.81
-LEVER = 0.1  # [m] scale of sole moments against forces
-BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
-FREE_BOX = np.array([10.0, 10.0, 10.0, 3.0, 1.2, 3.0])  # the same of one that nothing holds
+GRAVITY = 9.81  # [m/s^2] for the robot's weight, which scales forces; its model may have another gravity
+LEVER = 0.1  # [m] scale of sole moments relative to forces
+# [m, rad] largest deviation of the base from its start: of a robot on soles, and of a free-floating one
+BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])
+FREE_BOX = np.array([10.0, 10.0, 10.0, 3.0, 1.2, 3.0])
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 class Limits:
-    """Read by all parts of a program.
+    """Bounds and scales that all parts of a program share.
 
     Attributes
     ----------
     torque, velocity, position, cone, balance, incidence, extension : the problem's terms.
-    weight : of the robot [N].  units : of base rows, weight [N] and lever [m].  unbalanced : how their
-        violation is reported.
+    weight : of the robot [N].
+    units (2,) : scales of the base's equations of motion, weight [N] and lever [m].
+    unbalanced : measures of their violations.
     wrench_scale (6 a sole) : of sole wrenches [N, N m].
     y_lower, y_upper (ny,), legs_lower, legs_upper (nl,) : of the coordinates and the legs.
     rate_limit (n,) : of the joints [rad/s].
-    of_y, of_legs, of_wrenches : what every group of coordinates, of legs and of sole wrenches has.
+    of_y, of_legs, of_wrenches : arguments of `Layout.add` for groups of coordinates, legs and sole wrenches.
     """
 
     def __init__(self, problem: ImpactProblem, coordinates: StanceCoordinates) -> None:
@@ -424,30 +433,31 @@ class Turn(IntEnum):
     """Order of elimination of determined variables; lower ones are eliminated first."""
 
     NODE = 0  # legs at a node, and the first sole's wrench
-    LIFTED = 1  # what equals outputs of blocks
+    LIFTED = 1  # variables that equal outputs of blocks
     RATE = 2  # the rate at contact
     FEEDFORWARD = 3  # the torque that makes the robot coast
     STAGE_LEGS = 4  # legs and reference's legs at a collocation point
     ELEMENT = 5  # motion, force, target and wrenches of an element, one element after the other
-    AFTER = 6  # what a collision leaves behind: where a follow-through starts, or a position
+    AFTER = 6  # state after a collision: start of a follow-through, or a position
 
 
-_FIRST_CHOICE = (
+# Order in which variables are assigned the constraints that determine them.
+_ASSIGNMENT_ORDER = (
     Turn.NODE,
     Turn.LIFTED,
     Turn.STAGE_LEGS,
     Turn.ELEMENT,
     Turn.FEEDFORWARD,
     Turn.AFTER,
-    Turn.RATE,  # of constraints that a collision's legs and motion have left
+    Turn.RATE,  # last: it takes a constraint that a collision's legs and motion have left
 )
 
 
 def determined(turn: Turn, variables: Index, step: int = 0) -> Determined:
-    """Variables of one system of constraints.  step : within a turn, those of a lower one go first."""
+    """Variables of one system of constraints.  step : order of elimination within a turn."""
     return Determined((turn, step), variables)
 
 
 def by_choice(found: Iterable[Determined]) -> list[Determined]:
-    """Determined variables in the order in which they take constraints: by turn, then part by part."""
-    return sorted(found, key=lambda each: _FIRST_CHOICE.index(Turn(each.rank[0])))
+    """Determined variables in the order in which they are assigned constraints: by turn, then as given."""
+    return sorted(found, key=lambda each: _ASSIGNMENT_ORDER.index(Turn(each.rank[0])))

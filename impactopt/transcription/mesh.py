@@ -1,8 +1,8 @@
-"""Mesh of a program: breaks of the splines, collocation points of the contact phases; its refinement.
+"""Mesh of an NLP: nodes of the motions, collocation points of the contact phases, and nodes to be added.
 
-A program holds torques and the ground's wrench to their limits at its nodes. Between two of them the motion
-is a spline, and what it needs is not: right after a blow, where accelerations are largest, the ZMP can leave
-the soles on its way from one node to the next.
+Limits on torques and sole wrenches are constraints at the nodes only. Between nodes the motion is a spline,
+but the torques and wrenches that it needs are not: right after an impact, where accelerations are largest,
+the ZMP can leave the soles between two nodes.
 """
 
 from __future__ import annotations
@@ -25,16 +25,19 @@ from impactopt.transcription.contact_guess import mass_at_contact, natural_durat
 from impactopt.transcription.plan import Piece, Plan, Trajectory, gear_share
 
 Array = NDArray[np.float64]
-STEP = 1e-3  # [s] at which a motion is looked at: as the servo's reference is sampled
-_SHARE, _TORQUE = 0.5, 0.01  # of the room to all torque, and of the limit: what may be given up between nodes
-_FRICTION = 1.1  # of the friction coefficient that a plan may use: what it may use between nodes
-_ROUNDING = 1e-6  # of the weight, by which a cone's constraints may be off
-GEAR = 0.03  # of what a gear may bear: what it may carry more between nodes, or collocation points
+# Tolerances between nodes, wider than the constraints at the nodes.
+_MARGIN_LOSS = 0.5  # fraction of a margin that may be lost: of torques, normal forces, and joint ranges
+_TORQUE_LOSS = 0.01  # of the torque limit; the least tolerance, if the problem leaves no margin
+_FRICTION_EXCESS = 1.1  # times the problem's friction coefficient
+_CONE_ROUNDING = 1e-6  # of the weight
+GEAR = 0.03  # of a gear's limit; also between collocation points
 
 
 class MoreNodes(NamedTuple):
-    """Places on [0, 1] of nodes beside the ends and middles of a spline's intervals: of the swing, of all
-    ways to rest, and of each stance phase beside the one with the blow.
+    """Nodes in addition to the ends and middles of splines' intervals, as fractions of a phase.
+
+    swing, follow : of the swing, and of all motions to rest.
+    stands : of each stance phase; empty of the one with the impact.
     """
 
     swing: tuple[float, ...] = ()
@@ -46,7 +49,7 @@ class MoreNodes(NamedTuple):
         return len(self.swing) + len(self.follow) + sum(map(len, self.stands))
 
     def of_stand(self, number: int) -> tuple[float, ...]:
-        """Places of a stance phase beside the one with the blow."""
+        """Additional nodes of a stance phase without the impact."""
         return self.stands[number] if number < len(self.stands) else ()
 
 
@@ -54,20 +57,22 @@ NO_MORE = MoreNodes()
 
 
 def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
-    """Nodes to add: those known, and the middle between two nodes where the plan leaves its limits.
+    """The ``known`` additional nodes, and the middle between any two nodes where the plan violates limits.
 
-    It is looked at every millisecond. That is where a sole gives up more than half of a margin that it has at
-    the nodes: of its centre of pressure to its own edges, or of its least normal force; or uses a tenth more
-    friction than it may; where torques give up half of the room to all that the motors have; where a joint of
-    a constrained leg is faster than it may be, or gives up half of its distance to a limit; and where a gear
-    carries 3 % more than it may.
+    The plan is checked every millisecond, which is the step of its reference. A violation between nodes is
+
+    * a sole that loses more than half of its margin of the centre of pressure, or of the least normal force,
+      or uses 10 % more friction than allowed;
+    * torques above the limit by more than half of the rest to the motors' maximum;
+    * a joint of a closed leg that is too fast, or loses half of its distance from the ends of its range;
+    * a gear with 3 % more than its limit.
     """
     blow, found = plan.problem.blow, dict[tuple[int, int], set[float]]()
     for piece in plan.pieces():
-        found[piece.phase, piece.number] = set(_middles_outside(plan, plan.reference, piece))
-    if plan.abort is not None:
+        found[piece.phase, piece.number] = set(_middles_violated(plan, plan.reference, piece))
+    if plan.abort is not None:  # the abort motion has the follow-through's nodes
         for piece in plan.pieces(missed=True)[len(plan.before) + 1 :]:
-            middles = _middles_outside(plan, plan.missed_reference, piece)
+            middles = _middles_violated(plan, plan.missed_reference, piece)
             found[piece.phase, piece.number] |= set(middles)
     stands = [
         {*known.of_stand(k), *(found[0 if k < blow else 2, k] if k != blow else ())}
@@ -80,80 +85,87 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     )
 
 
-def _middles_outside(plan: Plan, way: Trajectory, piece: Piece) -> list[float]:
-    """Middles between nodes between which a piece of a reference is out of its limits."""
+def _middles_violated(plan: Plan, reference: Trajectory, piece: Piece) -> list[float]:
+    """Middles between those neighbouring nodes of a piece between which the reference violates a limit."""
     p, c = plan.problem, plan.problem.stance_coordinates[piece.number]
-    own = way.phase == piece.phase
-    if way.stance.size:
-        own &= way.stance == piece.number
+    own = reference.phase == piece.phase
+    if reference.stance.size:
+        own &= reference.stance == piece.number
     nodes, duration = piece.nodes, piece.spline.duration
-    at = np.flatnonzero(own & (way.time <= piece.start + duration))
+    at = np.flatnonzero(own & (reference.time <= piece.start + duration))
+    torque = reference.torque[at]
     limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)
-    ratio = np.abs(way.torque[at] / p.robot.torque_limit).max(axis=1, initial=0.0)
-    outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
-    # the others' positions and rates are bounded by their splines' control points
-    outside |= (np.abs(way.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
-    lower, upper = inside(p.robot, _SHARE * p.term(PositionLimit).margin)
-    angles = p.robot.ranges.positions(p.robot.joint_positions(way.q[at]))
+    ratio = np.abs(torque / p.robot.torque_limit).max(axis=1, initial=0.0)
+    violated = ratio > limit + max(_MARGIN_LOSS * (1.0 - limit), _TORQUE_LOSS)
+    # Rates and positions of leg joints only: those of others are bounded everywhere by control points.
+    violated |= (np.abs(reference.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
+    lower, upper = inside(p.robot, _MARGIN_LOSS * p.term(PositionLimit).margin)
+    angles = p.robot.ranges.positions(p.robot.joint_positions(reference.q[at]))
     legs = c.dependent[~p.robot.hinges[c.dependent]]  # hinges keep a quarter of their range at the nodes
-    of_nodes = [*legs, *range(p.robot.n, len(lower))]  # and tendons
-    outside |= ((angles < lower) | (angles > upper))[:, of_nodes].any(axis=1)
-    outside |= gear_share(p, way.torque[at], way.a[at, joints]) > 1.0 + GEAR
-    outside |= _soles_outside(p, piece.number, way.sole_wrench[at])
-    time = (way.time[at[outside]] - piece.start) / duration
+    constrained_at_nodes = [*legs, *range(p.robot.n, len(lower))]  # leg joints and tendons
+    violated |= ((angles < lower) | (angles > upper))[:, constrained_at_nodes].any(axis=1)
+    violated |= gear_share(p, torque, reference.a[at, joints]) > 1.0 + GEAR
+    violated |= _soles_violated(p, piece.number, reference.sole_wrench[at])
+    time = (reference.time[at[violated]] - piece.start) / duration
     between = np.searchsorted(nodes, time, side="right").clip(1, len(nodes) - 1)
     return [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
 
 
-def _soles_outside(problem: ImpactProblem, number: int, wrenches: Array) -> NDArray[np.bool_]:
-    """Instants (k,) at which some sole that stands in a stance phase keeps too little of its limits.
+def _soles_violated(problem: ImpactProblem, number: int, wrenches: Array) -> NDArray[np.bool_]:
+    """Mask (k,) of instants at which a standing sole of a stance phase exceeds its tolerances.
 
-    wrenches (k, 6 a sole) : of all soles. One that may bear nothing has no friction to speak of then.
+    wrenches (k, 6 a sole) : of all soles of the problem. Friction of a sole that lifts off or touches down in
+    the phase is not checked while it carries almost nothing.
     """
     robot, cone = problem.robot, problem.term(ContactWrenchCone)
     least, standing = least_kept(cone.margin), problem.standing
     on, fades = np.flatnonzero(standing[number]), fading(standing)[number]
     soles, own = problem.soles, wrenches.reshape(len(wrenches), -1, 6)
-    outside = (cop_margin(robot, [soles[k].polygon for k in on], own[:, on]) < least).any(axis=1)
+    violated = (cop_margin(robot, [soles[k].polygon for k in on], own[:, on]) < least).any(axis=1)
     for k in on:
-        bears = own[:, k, 2] >= (BEARS * weight_of(robot) if fades[k] else -np.inf)
+        loaded = own[:, k, 2] >= (BEARS * weight_of(robot) if fades[k] else -np.inf)
         if not fades[k]:
-            outside |= own[:, k, 2] < _SHARE * cone.minimum_force
-        rows = contact_wrench_cone(soles[k].polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
-        outside |= bears & (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)
-    return np.asarray(outside)
+            violated |= own[:, k, 2] < _MARGIN_LOSS * cone.minimum_force
+        friction = _FRICTION_EXCESS * cone.friction
+        facets = contact_wrench_cone(soles[k].polygon, friction, margin=max(least, 0.0))
+        violated |= loaded & (own[:, k] @ facets.T < -_CONE_ROUNDING * weight_of(robot)).any(axis=1)
+    return np.asarray(violated)
 
 
-Elements = tuple[tuple[float, ...], ...]  # lengths of each phase's, as fractions of it
-Shares = tuple[
-    float, ...
-]  # of the contact's time that each phase lasts; where something is frozen on the way
-SNAP = 0.1  # of a segment between freezes: an element is not shorter
+Elements = tuple[tuple[float, ...], ...]  # lengths of each phase's collocation elements, as fractions of it
+Shares = tuple[float, ...]  # fraction of the contact's time that each phase lasts
+_SHORTEST_ELEMENT = 0.1  # of a segment between two freezes
 
 
 @dataclass(frozen=True)
 class CollocationPoint:
-    """One collocation point of the collision."""
+    """One collocation point (stage) of the collision.
+
+    In its element, with u the velocity and ' = d/ds, s in [0, 1] in the phase:
+    u' = weights . u_members + start u_previous,  and the displacement d grows by quadrature . u_members.
+    """
 
     phase: int
     phase_name: str
     place: float  # s in the phase
-    weights: Array  # (stages,) of this element's stages in u', d u/ds
-    start: float  # weight of the element's start value in u'
+    weights: Array  # (stages,)
+    start: float
     members: tuple[int, ...]  # indices of this element's stages
-    previous: int  # index of the stage the element starts from, -1 at contact
-    quadrature: Array  # (stages,) weights of the element's u in d
+    previous: int  # index of the stage that the element starts from, -1 at contact
+    quadrature: Array  # (stages,)
     new_phase: bool  # the element begins a phase, so d starts from zero
 
     @property
     def name(self) -> str:
-        return f"{self.phase_name}, {100 * self.place:.3g} %"  # short elements: several within one per cent
+        # three digits: a short element has several points within one per cent
+        return f"{self.phase_name}, {100 * self.place:.3g} %"
 
 
 def collision_mesh(
     elements: Sequence[tuple[float, ...]], radau: Radau, names: Sequence[str] = Target.phases
 ) -> list[CollocationPoint]:
-    """Stages of the contact's phases; ``elements``: their lengths, as fractions of a phase."""
+    """Collocation points of the contact's phases.  elements : their lengths, as fractions of a phase."""
+    # u_i = u_start + h sum_j a_ij u'_j, solved for the u'
     inverse = np.linalg.inv(radau.a)
     stages: list[CollocationPoint] = []
     for phase, name in enumerate(names):
@@ -180,29 +192,31 @@ def collision_mesh(
 
 
 def lagrange(places: Sequence[float], at: float) -> Array:
-    """Weights (k,) of values at k places in the polynomial through them, at one place."""
+    """Lagrange polynomials (k,) of k places, evaluated at one place."""
     x = np.asarray(places)
-    gaps, ahead = x[:, None] - x + np.eye(len(x)), at - x + np.zeros((len(x), 1))
-    np.fill_diagonal(ahead, 1.0)
-    return np.asarray(np.prod(ahead / gaps, axis=1))
+    denominators, numerators = x[:, None] - x + np.eye(len(x)), at - x + np.zeros((len(x), 1))
+    np.fill_diagonal(numerators, 1.0)
+    return np.asarray(np.prod(numerators / denominators, axis=1))
 
 
-APART = (0.5, 0.5)  # elements of a phase without force
+_GAP_ELEMENTS = (0.5, 0.5)  # of a phase in which striker and target are apart, which has no force
 
 
 def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
-    """Elements of each phase of a problem's contact; halved if its target has events, and once more where it
-    is met several times, as force rises and falls in one phase then.
+    """Collocation elements of each phase of a problem's contact.
 
-    Where an event may come at once, the phase before it is one element. Where something is frozen on the
-    way, segments begin with elements; ``shares`` : if the phases' are not those of a point mass.
+    They are halved if the target has events, and once more if it is met several times, as the force then
+    rises and falls in one phase. If an event may come at once, the phase before it is one element. If the
+    model is frozen again during contact, each segment between freezes begins with an element.
+
+    shares : of the phases; by default those of a point mass.
     """
     target, (first, last) = problem.target, problem.collision_elements
     if target.guards:
         first, last = halved((first, last))
     if problem.planned_touches > 1:
         first, last = halved((first, last))
-    before = [APART if phase.apart else first for phase in problem.contact_phases[:-1]]
+    before = [_GAP_ELEMENTS if phase.apart else first for phase in problem.contact_phases[:-1]]
     if target.at_once:
         before[0] = (1.0,)
     own = (*before, last)
@@ -211,52 +225,59 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
     shares = shares or guessed_shares(problem)
     begins = [place_of(k / problem.freezes, shares) for k in range(1, problem.freezes)]
     return tuple(
-        _cut(lengths, [s for at, s in begins if at == phase], SNAP / (problem.freezes * share))
+        _cut(lengths, [s for at, s in begins if at == phase], _SHORTEST_ELEMENT / (problem.freezes * share))
         for phase, (lengths, share) in enumerate(zip(own, shares, strict=True))
     )
 
 
 def guessed_shares(problem: ImpactProblem) -> Shares:
-    """Fraction of the contact's time that each phase lasts, as a point mass meets the target."""
+    """Fraction of the contact's time that each phase lasts when a point mass hits the target."""
     durations = natural_durations(problem.law, problem.target, mass_at_contact(problem), 1)
     return tuple(float(share) for share in durations / durations.sum())
 
 
 def place_of(fraction: float, shares: Shares) -> tuple[int, float]:
-    """Phase, and place in it, of a fraction of the contact's time."""
+    """Phase index and fraction of that phase, of a fraction of the contact's time."""
     ends = np.cumsum(shares)
     phase = min(int(np.searchsorted(ends, fraction)), len(ends) - 1)
     return phase, float((fraction - ends[phase]) / shares[phase] + 1)
 
 
 def segment_of(phase: int, begin: float, end: float, shares: Shares, freezes: int) -> int:
-    """Index of the segment between freezes that an element with these ends belongs to."""
+    """Index of the segment between freezes that contains the middle of an element.
+
+    begin, end : of the element, fractions of its phase.
+    """
     before = float(np.cumsum([0.0, *shares])[phase])
     middle = before + shares[phase] * (begin + end) / 2
     return min(int(middle * freezes), freezes - 1)
 
 
-def _cut(lengths: tuple[float, ...], places: Sequence[float], near: float) -> tuple[float, ...]:
-    """Elements of a phase, cut at places but where an end is near; ends of its own that are near give way."""
-    kept = [s for s in places if near < s < 1 - near]
-    own = [s for s in np.cumsum(lengths)[:-1] if min((abs(s - k) for k in kept), default=1.0) > near]
-    return tuple(float(h) for h in np.diff([0.0, *sorted([*own, *kept]), 1.0]))
+def _cut(lengths: tuple[float, ...], places: Sequence[float], shortest: float) -> tuple[float, ...]:
+    """Element lengths of a phase with additional breaks at these places.
+
+    No break is nearer than ``shortest`` to the phase's ends, and the phase's own breaks nearer than that to
+    an additional one are removed.
+    """
+    added = [s for s in places if shortest < s < 1 - shortest]
+    own = [s for s in np.cumsum(lengths)[:-1] if min((abs(s - k) for k in added), default=1.0) > shortest]
+    return tuple(float(h) for h in np.diff([0.0, *sorted([*own, *added]), 1.0]))
 
 
 def halved(elements: Elements) -> Elements:
-    """Each of them in two."""
+    """Elements that are each cut into two equal ones."""
     return tuple(tuple(h / 2 for h in lengths for _ in range(2)) for lengths in elements)
 
 
 def contact_mesh(problem: ImpactProblem, elements: Elements | None = None) -> list[CollocationPoint]:
-    """Stages of the contact of a problem; ``elements``: if not those that it asks for."""
+    """Collocation points of a problem's contact.  elements : by default those of `contact_elements`."""
     radau = Radau.of_stages(problem.collision_stages)
     names = [phase.name for phase in problem.contact_phases]
     return collision_mesh(elements or contact_elements(problem), radau, names)
 
 
 def percentage(s: float, more: Collection[float]) -> str:
-    """Name of a place on [0, 1]; one of ``more`` has more digits, as others are near it."""
+    """Name of a place on [0, 1]; with more digits for additional nodes, which have others near them."""
     return f"{100 * s:.2f} %" if s in more else f"{100 * s:.0f} %"
 
 

@@ -1,7 +1,8 @@
-"""Motion phases: swing, follow-through and abort motion, cubic splines in y with legs and wrenches at nodes.
+"""Motion phases of the NLP: swing, follow-through and abort motion.
 
-There is one after the expected blow and, where a problem asks for it, one for a blow that met nothing. Where
-soles lift off or touch down, there are more (`impactopt.transcription.stance_change`).
+Each is a cubic spline in the independent coordinates y. Legs and sole wrenches are variables of its nodes.
+The optional abort motion follows if nothing is hit. If soles lift off or touch down, there are phases before
+and after these (`impactopt.transcription.stance_change`).
 """
 
 from __future__ import annotations
@@ -46,10 +47,12 @@ def add_nodes(
     closed: int = 0,
     fading: Collection[str] = (),
 ) -> list[Index]:
-    """Nodes of the block ``node`` with their constraints, but for those of torque; the torques' outputs.
+    """Adds the block ``node`` and its constraints except torque limits; returns outputs (n,) of torques.
 
-    instances : y, y', y'', legs, sole wrench, T of each.  closed : so many of the last have the posture
-    of another, whose constraints close their legs.  fading : names of soles that may bear nothing.
+    instances : y, y', y'', legs, sole wrench, T of each node.
+    closed : number of nodes at the end of ``instances`` that share the posture of another one. They get no
+        constraints that close their legs, as these would be redundant.
+    fading : names of soles whose normal force may go to zero.
     """
     c, part = b.coordinates, b.parts("node")
     first, torques = b.add_block("node", instances, node_numbers(b)), []
@@ -57,6 +60,7 @@ def add_nodes(
     fast = percent("over its limit", of=b.limits.velocity.fraction)
     for i, (place, slots) in enumerate(zip(places, instances, strict=True)):
         at = first + i * b.blocks[-1].n_out
+        # equal bounds, of zero, make these equality constraints, except that of the rates of leg joints
         for term, name, components, bound, measure in (
             ("closed legs", "closure", closure, 0.0, along(closure, "open")),
             (b.limits.velocity.name, "leg_rate", c.leg_labels, b.limits.velocity.fraction, fast),
@@ -87,7 +91,7 @@ def add_nodes(
 
 
 def node_numbers(b: Builder) -> Array:
-    """Parameters of the block ``node``."""
+    """Parameters p of the block ``node``."""
     limits, rates = b.robot.torque_limit, b.robot.velocity_limit[b.coordinates.dependent]
     return np.concatenate([limits, rates, b.limits.units, b.coordinates.start_determinants])
 
@@ -100,24 +104,26 @@ def add_cone_rows(
     minimum_force: float,
     fading: Collection[str] = (),
 ) -> None:
-    """Rows: each sole's wrench (6 a sole) is in its cone, its normal force [N] no less than the least, or
-    than none if it is ``fading``; a wrench that is zero has no rows.
+    """Constrains each sole's wrench (6 a sole) to its contact wrench cone, and its normal force from below.
+
+    margin : of the cone [m].  minimum_force : normal force [N], except of ``fading`` soles.
     """
     for k, leg in enumerate(b.coordinates.legs):
         if leg.sole is None:  # a hand: see `Grip`
             continue
         w = wrench[6 * k : 6 * k + 6]
-        if leg.name in fading and not w.cols.size:
+        if leg.name in fading and not w.cols.size:  # the wrench is identically zero
             continue
-        rows = contact_wrench_cone(leg.sole.polygon, b.limits.cone.friction, margin=margin) / b.limits.weight
+        facets = contact_wrench_cone(leg.sole.polygon, b.limits.cone.friction, margin=margin)
+        facets = facets / b.limits.weight
         normal, sole = w[2:3] * (1 / b.limits.weight), leg.end
         b.rows.add(
             term=b.limits.cone.name,
             place=place,
-            components=[f"{sole}, facet {i}" for i in range(len(rows))],
-            affine=w.apply(rows),
+            components=[f"{sole}, facet {i}" for i in range(len(facets))],
+            affine=w.apply(facets),
             lower=0,
-            measure=[_outside_cone(row * b.limits.weight, normal, b.limits.cone.friction) for row in rows],
+            measure=[_outside_cone(f * b.limits.weight, normal, b.limits.cone.friction) for f in facets],
             whole=sole,
         )
         if leg.name in fading:
@@ -133,35 +139,43 @@ def add_cone_rows(
 
 
 def _outside_cone(facet: Array, normal: Affine, friction: float) -> Measure:
-    """Measure of a facet (6,) of the cone of corners' forces; ``normal``: normal force over weight."""
-    along_sole, tilting = np.hypot(*facet[:2]), np.hypot(*facet[3:5])
-    if along_sole < 1e-9 and abs(facet[5]) < 1e-9:
-        return Measure("mm", 1e3 / tilting, "outside", normal, 0.05)  # moment over force: the CoP
+    """Measure of the violation of a facet f (6,) of the cone, f.w >= 0.  normal : normal force over weight.
+
+    A facet without shear and torsion bounds the centre of pressure, one without moments of tilting and
+    torsion the friction; the others combine these.
+    """
+    shear, tilting = np.hypot(*facet[:2]), np.hypot(*facet[3:5])
+    if shear < 1e-9 and abs(facet[5]) < 1e-9:
+        return Measure("mm", 1e3 / tilting, "outside", normal, 0.05)  # moment over normal force
     if tilting < 1e-9 and abs(facet[5]) < 1e-9:
-        return Measure("%", 100 / along_sole / friction, "beyond its friction", normal, 0.05)
+        return Measure("%", 100 / shear / friction, "beyond its friction", normal, 0.05)
     return Measure("%", 100 / max(facet[2], 1e-3), "beyond its friction and torsion", normal, 0.05)
 
 
-REST, FREE, COASTING = "rest", "free", "coasting"  # how a spline may begin or end
+# End conditions of a spline: zero velocity and acceleration; none; zero acceleration.
+REST, FREE, COASTING = "rest", "free", "coasting"
 
 
-def _control_points(end: str | Affine, known: dict[str, int]) -> int:
-    """Number of control points at an end that are no variables of their own."""
-    return known[end] if isinstance(end, str) else 1
+def _control_points(end: str | Affine, fixed: dict[str, int]) -> int:
+    """Number of control points at an end that its condition determines; one if it is given coordinates."""
+    return fixed[end] if isinstance(end, str) else 1
 
 
 class MotionPhase:
-    """Takes a builder; hands back places, slots of blocks, and what constraints determine.
+    """Variables and constraints of one motion phase of the NLP.
 
     Attributes
     ----------
-    kind : first word of its variables' names.  name : what constraints and messages call it.
-    phase : what the problem asks of it.
-    breaks : of the spline, from 0 to 1.  nodes (k,) : where legs and sole wrenches are, and constraints hold.
-    more : which of these are beside the ends and middles of the spline's intervals.
+    kind : first word of its variables' names.  name : its name in constraints and messages.
+    phase : the problem's settings of it.
+    breaks : of the spline, from 0 to 1.  nodes (k,) : fractions at which constraints hold, and at which legs
+        and sole wrenches are variables.
+    more : nodes that are neither ends nor middles of the spline's intervals.
+    lead : number of control points at the start that are no variables.
     c, legs, w, T : variables: control points, legs and sole wrenches at the nodes, duration [s].
-    drift, bend : of a base that nothing holds: its part of the control points that an end at rest, or
-        without acceleration, gives for joints; and its y'' at the nodes, which their forces determine.
+    drift, bend : variables of a free-floating base, else None. Its motion follows from its dynamics, so a
+        resting or coasting end determines control points of the joints only; ``drift`` has the base's
+        components of those. ``bend`` is the base's y'' at the nodes.
     unloaded : components of the sole wrenches that are zero, by the number of the node.
     """
 
@@ -175,16 +189,22 @@ class MotionPhase:
         b: Builder,
         names: tuple[str, str],
         phase: Phase,
-        mesh: tuple[Array, Array, tuple[float, ...]],
+        more: tuple[float, ...],
         begins: str | Affine,
         ends: str | Affine,
+        *,
+        fine_end: bool,
     ) -> None:
-        """names : first word of its variables' names, and `name`.  mesh : `breaks`, `nodes`, `more`.
+        """names : `kind` and `name`.  fine_end : the shortest interval is the last one, not the first.
 
-        begins : `REST`, `FREE` or the coordinates (ny) that it begins at.  ends : likewise, or `COASTING`.
+        begins : `REST`, `FREE`, or coordinates (ny) of its first point.  ends : likewise, or `COASTING`.
         """
         self.kind, self.name = names
-        self.phase, (self.breaks, self.nodes, self.more) = phase, mesh
+        self.phase, self.more = phase, more
+        self.breaks = graded_breaks(phase.intervals, phase.grading, fine_end=fine_end)
+        regular = with_middles(self.breaks)
+        # a start at rest has no node: the posture there is given
+        self.nodes = np.union1d(regular[1:] if begins == REST else regular, more)
         self._begins, self._ends = begins, ends
         self._at: dict[float, tuple[Affine, Affine, Affine]] = {}
         self.unloaded: dict[int, Index] = {}
@@ -199,7 +219,7 @@ class MotionPhase:
         self.T = b.duration(f"{self.kind} duration", self.phase.duration, 0.1)
         self.drift: Group | None = None
         self.bend: Group | None = None
-        self._drifting: tuple[int, ...] = ()
+        self._drifting: tuple[int, ...] = ()  # control points whose base part is in `drift`
         if b.coordinates.drifts:
             self._drifting = ((2,) if begins == REST else ()) + {
                 REST: (self._last - 1, self._last),
@@ -213,10 +233,10 @@ class MotionPhase:
     def control(self, j: int) -> Affine:
         """Control point j = 0 .. N+2 of the spline.
 
-        Three that are the same make a start or an end at rest. A last one on the line of those before it
-        makes an end without acceleration: the reference coasts from contact on, so the torque that the swing
-        ends with is the feed-forward of the collision: it does not jump, and a target that comes late meets
-        the same motion.
+        At rest the first or last three are equal. At a coasting end the last one continues the line of those
+        before it, which makes the acceleration zero there. The reference then coasts from contact on with the
+        torque that the swing ends with as feed-forward. So the torque does not jump at contact, and a target
+        that comes late meets the same motion.
         """
         point = self._control(j)
         if self.drift is None or j not in self._drifting:
@@ -232,29 +252,30 @@ class MotionPhase:
             return self.c[-1]
         if isinstance(self._ends, Affine):
             return self._ends
+        # equal last control points of the velocity: factors[k] (c_(k+1) - c_k) are these
         factors = rate_weights(self.breaks)
         step = self.control(j - 1) - self.control(j - 2)
         return self.control(j - 1) + step * float(factors[-2] / factors[-1])
 
     def at(self, s: float) -> tuple[Affine, Affine, Affine]:
-        """y, y', y'' at s."""
-        if s not in self._at:  # constraints, prices and places ask for the same few
+        """y, y', y'' at s in [0, 1]."""
+        if s not in self._at:  # many constraints and terms use the same nodes
             y, yd, ydd = (
-                add([self.control(int(j)) * row[0, j] for j in np.flatnonzero(row[0])])
-                for row in basis(self.breaks, s)
+                add([self.control(int(j)) * weights[0, j] for j in np.flatnonzero(weights[0])])
+                for weights in basis(self.breaks, s)
             )
             self._at[s] = y, yd, ydd
         return self._at[s]
 
     # ------------------------------------------------------------------ nodes
     def wrench(self, k: int) -> Affine:
-        """Sole wrenches (6 a sole) at a node."""
+        """Sole wrenches (6 a sole) at a node, without their unloaded components."""
         w = self.w[k]
-        on = ~np.isin(w.rows, self.unloaded.get(k, ()))
-        return w if on.all() else Affine(w.size, w.rows[on], w.cols[on], w.vals[on], w.const)
+        loaded = ~np.isin(w.rows, self.unloaded.get(k, ()))
+        return w if loaded.all() else Affine(w.size, w.rows[loaded], w.cols[loaded], w.vals[loaded], w.const)
 
     def at_node(self, k: int) -> tuple[Affine, Affine, Affine]:
-        """y, y', y'' at a node."""
+        """y, y', y'' at a node; y'' of a free-floating base is the variable `bend`."""
         y, y1, y2 = self.at(float(self.nodes[k]))
         return y, y1, y2 if self.bend is None else stack([self.bend[k], y2[6:]])
 
@@ -262,39 +283,45 @@ class MotionPhase:
         return Place(f"{self.name}, {percentage(s, self.more)}", f"{self.name} at {{s}}", self.T[0] * s)
 
     def instances(self) -> tuple[list[list[Affine]], list[Place]]:
-        """Slots of the block ``node``, and the places of its instances."""
+        """Inputs of the block ``node`` at each node, and the nodes' places."""
         slots = [[*self.at_node(k), self.legs[k], self.wrench(k), self.T[0]] for k in range(len(self.nodes))]
         return slots, [self.place_at(s) for s in self.nodes]
 
     def motion(self) -> list[tuple[Place, list[Affine]]]:
-        """Places of its nodes with y, y', y'', legs and T [s], that y' and y'' are of."""
+        """Places of the nodes with y, y', y'', legs and T [s], by which ydot = y'/T and yddot = y''/T^2."""
         return [(place, [*slots[:4], slots[5]]) for slots, place in zip(*self.instances(), strict=True)]
 
     def spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
-        """Places of its nodes with coordinates and legs, from a fraction of it on."""
+        """Places of the nodes with coordinates and legs, from fraction ``since`` of the phase on."""
         return [
             (self.place_at(s), [self.at(s)[0], self.legs[k]]) for k, s in enumerate(self.nodes) if s >= since
         ]
 
-    def _bearing(self, k: int) -> Index:
-        """Components of the first sole that bears load at a node, if any does."""
+    def _loaded_sole(self, k: int) -> Index:
+        """Components (6,) of the first loaded sole's wrench at a node; (0,) if all are unloaded."""
         soles = np.arange(self.w.size).reshape(-1, 6)
         return next((own for own in soles if not np.isin(own, self.unloaded.get(k, ())).any()), np.arange(0))
 
     def determined(self) -> list[Determined]:
-        """Variables determined at each node: each leg, and the wrench of a sole that bears load."""
+        """Variables that can be eliminated at each node.
+
+        Closure determines a leg, and the base's equations of motion the wrench of one loaded sole, or the
+        acceleration of a free-floating base.
+        """
         found = [
-            [*by_leg(self.legs.index(k)), self.w.index(k)[self._bearing(k)]] for k in range(self.w.count)
+            [*by_leg(self.legs.index(k)), self.w.index(k)[self._loaded_sole(k)]] for k in range(self.w.count)
         ]
         if self.bend is not None:
             found = [[self.bend.index(k)] for k in range(self.bend.count)]
         return [each for parts in found for each in at_node(parts)]
 
     # ------------------------------------------------------------------ constraints
-    def add_rate_rows(self, b: Builder) -> None:
-        """Velocity control points within the limit; multiplied by T they are linear. Those that are zero by
-        construction, at rest, have no rows.
+    def add_rate_limits(self, b: Builder) -> None:
+        """Bounds the velocity spline's control points, and so the velocity everywhere between them.
+
+        Multiplied by T, |c'_j| / T <= limit is linear in the variables.
         """
+        # at rest, control points of the velocity are zero by construction: no constraints
         js = range(max(self.lead - 1, 0), self._last - 2 * (self._ends == REST))
         c, velocity = b.coordinates, b.limits.velocity
         joints = np.arange(c.base, c.ny)
@@ -302,62 +329,56 @@ class MotionPhase:
         names = c.labels[c.base :]
         factors = rate_weights(self.breaks)
         shortest, longest = b.layout.bounds(self.T)
-        fixed = shortest == longest
         for j in js:
             step = (self.control(j + 1) - self.control(j))[joints] * (factors[j] / limit)
-            # where the velocity's control point pulls most: the mean of its knots
+            # for messages: the Greville abscissa, the mean of the knots, where this control point weighs most
             s = float(knots(self.breaks)[j + 2 : j + 4].mean())
             name = f"{self.name}, control point {j}"
             place = Place(name, f"{self.name} at about {{s}}", self.T[0] * s)
-            fast = Measure("%", 100.0, "over its limit", self.T[0])
-            if fixed:
-                bound = float(longest)
+            if shortest == longest:  # T is a number: one two-sided constraint instead of two
+                constraints = [(name, step, -longest, longest)]
+            else:
+                time = stack([self.T[0]] * len(joints))
+                constraints = [
+                    (f"{name}, forward", step - time, -np.inf, 0.0),
+                    (f"{name}, backward", -step - time, -np.inf, 0.0),
+                ]
+            for own_name, affine, lower, upper in constraints:
                 b.rows.add(
                     term=velocity.name,
-                    place=place,
+                    place=replace(place, name=own_name),
                     components=names,
-                    affine=step,
-                    lower=-bound,
-                    upper=bound,
-                    measure=fast,
-                )
-                continue
-            time = stack([self.T[0]] * len(joints))
-            for sign, way in ((1.0, "forward"), (-1.0, "backward")):
-                b.rows.add(
-                    term=velocity.name,
-                    place=replace(place, name=f"{name}, {way}"),
-                    components=names,
-                    affine=step * sign - time,
-                    upper=0,
-                    measure=fast,
+                    affine=affine,
+                    lower=lower,
+                    upper=upper,
+                    measure=Measure("%", 100.0, "over its limit", self.T[0]),
                 )
 
-    def add_momentum_rows(self, b: Builder) -> None:
-        """Rows: the momentum of a robot that nothing holds is what it was at the phase's start, and what
-        gravity adds.
+    def add_momentum_conservation(self, b: Builder) -> None:
+        """Constrains the momentum of a free-floating robot: h(s) = h(0) + s T m g.
 
-        They hold in the middles of the spline's intervals and at its end: as many places as the base has
-        control points that are not known. A phase that begins at rest has none at first.
+        It is collocated in the middles of the spline's intervals and at its end: as many points as the base
+        has unknown control points.
         """
         middles = (self.breaks[1:] + self.breaks[:-1]) / 2
-        first = [0.0] if self._begins == FREE else []
-        spots = [*first, *middles.tolist(), 1.0]
-        at = b.add_block("momentum", [[*self.at(s)[:2], self.T[0]] for s in spots], b.limits.units)
-        outputs = [at + 6 * i + np.arange(6) for i in range(len(spots))]
+        start = [0.0] if self._begins == FREE else []  # from rest, h(0) = 0
+        fractions = [*start, *middles.tolist(), 1.0]
+        at = b.add_block("momentum", [[*self.at(s)[:2], self.T[0]] for s in fractions], b.limits.units)
+        outputs = [at + 6 * i + np.arange(6) for i in range(len(fractions))]
         measure = [replace(each, unit=f"{each.unit} s") for each in b.limits.unbalanced]
-        before = Affine.zeros(6)
-        if first:
-            told: dict[str, Any] = {"term": "momentum", "place": self.place_at(0.0), "labels": DIRECTIONS}
-            before = b.lift(f"{self.kind} momentum", outputs[0], **told)[0]
-        pull = np.append(np.array(b.robot.model.gravity.linear) / GRAVITY, np.zeros(3))
-        for s, out in list(zip(spots, outputs, strict=True))[len(first) :]:
+        initial = Affine.zeros(6)
+        if start:  # a variable, since each of the constraints below needs it
+            origin: dict[str, Any] = {"term": "momentum", "place": self.place_at(0.0), "labels": DIRECTIONS}
+            initial = b.lift(f"{self.kind} momentum", outputs[0], **origin)[0]
+        # the block divides by the weight, m * GRAVITY
+        gravity = np.append(np.array(b.robot.model.gravity.linear) / GRAVITY, np.zeros(3))
+        for s, out in list(zip(fractions, outputs, strict=True))[len(start) :]:
             b.rows.add(
                 term="momentum",
                 place=self.place_at(s),
                 components=DIRECTIONS,
                 outputs=out,
-                affine=-before - stack([self.T[0]] * 6) * (s * pull),
+                affine=-initial - stack([self.T[0]] * 6) * (s * gravity),
                 lower=0,
                 upper=0,
                 measure=measure,
@@ -365,11 +386,11 @@ class MotionPhase:
 
     # ------------------------------------------------------------------ numbers
     def guess(self, x: Array, curve: CubicSpline) -> None:
-        """Write a spline and its duration, as far as its control points are variables."""
+        """Write a spline and its duration into solver variables x (n,)."""
         points = curve.control[self.lead : self.lead + self.c.count].copy()
-        if self._ends == REST:
+        if self._ends == REST:  # the last variable stands for the last three control points: take the end
             points[-1] = curve.control[-1]
-        if self.drift is not None and self.bend is not None:
+        if self.drift is not None and self.bend is not None:  # it does not for the base, which drifts
             points[-1, :6] = curve.control[self.lead + self.c.count - 1, :6]
             self.drift.write(x, curve.control[list(self._drifting), :6])
             second = curve.sample(self.nodes * curve.duration)[2] * curve.duration**2
@@ -378,36 +399,34 @@ class MotionPhase:
         self.T.write(x, curve.duration)
 
     def wrenches(self, x: Array) -> Array:
-        """Sole wrenches (k, 6 a sole) at the nodes."""
+        """Sole wrenches (k, 6 a sole) at the nodes, of solver variables x (n,)."""
         found = self.w.read(x)
         for k, zero in self.unloaded.items():
             found[k, zero] = 0.0
         return found
 
     def spline(self, x: Array) -> CubicSpline:
-        """The spline that solver variables (n,) stand for."""
+        """The spline of solver variables x (n,)."""
         points = np.array([self.control(j).evaluate(x) for j in range(len(self.breaks) + 2)])
         return CubicSpline(control=points, breaks=self.breaks, duration=float(self.T.read(x)[0, 0]))
 
 
 def at_node(parts: list[Index]) -> list[Determined]:
-    """Variables that a node's constraints determine, in order; the last of all nodes in one step."""
+    """Variables that a node's constraints determine, in the order of their elimination.
+
+    Steps count up to -1, so that the last part of every node is eliminated in the same step.
+    """
     return [determined(Turn.NODE, part, k) for k, part in enumerate(parts, -len(parts))]
 
 
 class Swing(MotionPhase):
-    """A cubic spline from rest that ends without acceleration; it hands back the state at contact.
+    """Motion to contact, usually from rest; it ends without acceleration.
 
-    more : nodes beside the ends and middles of its intervals.  begins : as of `MotionPhase`.
+    more : nodes in addition to the ends and middles of the intervals.  begins : as of `MotionPhase`.
     """
 
     def __init__(self, b: Builder, more: tuple[float, ...] = (), begins: str | Affine = REST) -> None:
-        phase = b.problem.swing
-        breaks = graded_breaks(phase.intervals, phase.grading, fine_end=True)
-        places = with_middles(breaks)
-        places = places[1:] if begins == REST else places  # the start is given
-        mesh = breaks, np.union1d(places, more), more
-        super().__init__(b, ("swing", "swing"), phase, mesh, begins, COASTING)
+        super().__init__(b, ("swing", "swing"), b.problem.swing, more, begins, COASTING, fine_end=True)
 
     @property
     def end(self) -> ContactState:
@@ -416,10 +435,10 @@ class Swing(MotionPhase):
 
 
 class FollowThrough(MotionPhase):
-    """A clamped cubic spline to rest; it hands back where it starts.
+    """Motion from the state after contact to rest.
 
-    more : nodes beside the ends and middles of its intervals.  ends : as of `MotionPhase`.
-    kind : first word of its variables' names; name : what constraints and messages call it.
+    more : nodes in addition to the ends and middles of the intervals.  ends : as of `MotionPhase`.
+    kind, name : as of `MotionPhase`.
     """
 
     def __init__(
@@ -431,26 +450,24 @@ class FollowThrough(MotionPhase):
         name: str = "follow-through",
         ends: str | Affine = REST,
     ) -> None:
-        phase = b.problem.follow
-        breaks = graded_breaks(phase.intervals, phase.grading, fine_end=False)
-        mesh = breaks, np.union1d(with_middles(breaks), more), more
-        super().__init__(b, (kind, name), phase, mesh, FREE, ends)
+        super().__init__(b, (kind, name), b.problem.follow, more, FREE, ends, fine_end=False)
 
     @property
     def start(self) -> tuple[Affine, Affine, Affine]:
-        """y and y' at its start, and the duration [s] that y' is of."""
+        """y and y' at the start, and the duration T [s]: ydot = y'/T."""
         y, y1, _ = self.at(0.0)
         return y, y1, self.T[0]
 
     def determined(self) -> list[Determined]:
-        """And the control points that the state at its start determines: position and rate."""
+        """Variables as of `MotionPhase`, and two control points: position and rate after contact."""
         first = np.concatenate([self.c.index(0), self.c.index(1)])
         return [*super().determined(), determined(Turn.AFTER, first)]
 
 
 class AbortMotion(FollowThrough):
-    """Motion to rest of a robot that has hit nothing, and coasts for ``after`` [s] from contact on until it
-    detects that. It has one more node, at the end of coasting, with a sole wrench of its own.
+    """Motion to rest if nothing is hit, which the robot detects ``after`` [s] past the planned contact.
+
+    Until then it coasts. The end of coasting is one more node, with its own sole wrench.
     """
 
     def __init__(
@@ -461,13 +478,13 @@ class AbortMotion(FollowThrough):
         self.coast_w = b.layout.add("coasting sole wrench", 1, b.nw, **b.limits.of_wrenches)
 
     def coasting_node(self) -> tuple[list[Affine], Place]:
-        """Slots of the block ``node`` where coasting ends, without acceleration; and its place."""
+        """Inputs of the block ``node`` at the end of coasting, where y'' = 0, and the node's place."""
         y, y1, T = self.start
         slots = [y, y1, Affine.zeros(y.size), self.legs[0], self.coast_w[0], T]
         return slots, Place.plain("end of coasting, if nothing is hit")
 
     def link(self, contact: Contact) -> list[list[Affine]]:
-        """Slots of the block ``link``: it starts where coasting ends."""
+        """Inputs of the block ``link``: the motion starts at the end of coasting."""
         u0 = contact.u0[0]
         return contact.link(self.start, (Affine.constant(self.after), Affine.zeros(1)), (u0, u0), u0)
 

@@ -1,8 +1,7 @@
-"""Objective of a program: minus the weighted sum of the problem's objectives, plus small regularizing costs.
+"""Objective of an NLP: minus the weighted sum of the problem's objectives, plus small regularizing costs.
 
-Every objective is affine or quadratic in the variables. What is neither is an output of a block first, with a
-variable that equals it (:meth:`impactopt.transcription.builder.Builder.lift`); only what a problem asks for
-is there.
+It is quadratic in the variables. Another function is an output of a block, with a variable that equals it
+(:meth:`impactopt.transcription.builder.Builder.lift`); it is in the program only if an objective needs it.
 """
 
 from __future__ import annotations
@@ -25,36 +24,39 @@ from impactopt.transcription.motion_phase import MotionPhase
 
 @dataclass(frozen=True)
 class Quantity:
-    """Quantity that an objective weighs: an affine expression plus the squares of a group of variables."""
+    """Quantity of an objective: an affine expression plus the sum of squares of a group of variables."""
 
     affine: Affine
     squares: Group | None = None
 
     def evaluate(self, x: Array) -> float:
-        """Its value for solver variables (n,)."""
+        """Value at solver variables x (n,)."""
         squared = float(np.sum(self.squares.read(x) ** 2)) if self.squares is not None else 0.0
         return float(self.affine.evaluate(x)[0]) + squared
 
 
 def quantities(program: Any, objectives: tuple[Objective, ...]) -> list[tuple[Objective, Quantity]]:
-    """Objectives with their quantities; adds what they need to the program, which they get to see whole."""
+    """Objectives with their quantities, which may add variables and constraints to the program."""
     return [(o, _quantity(program, o)) for o in objectives]
 
 
 def _quantity(program: Any, objective: Objective) -> Quantity:
     found = objective.quantity(program)
-    whole = found if isinstance(found, Quantity) else Quantity(found)
-    if not isinstance(whole.affine, Affine) or whole.affine.size != 1:
+    quantity = found if isinstance(found, Quantity) else Quantity(found)
+    if not isinstance(quantity.affine, Affine) or quantity.affine.size != 1:
         raise InputError(
             f"{type(objective).__name__}.quantity gave {found!r}; give one affine expression, such as "
             "program.swing_T[0], or an impactopt.transcription.objective.Quantity"
         )
-    return whole
+    return quantity
 
 
 @dataclass(frozen=True)
 class Prices:
-    """1/2 x'Qx + q'x + constant [N s], small beside the objectives: what makes the optimum unique."""
+    """Regularizing cost  1/2 x'Qx + q'x + constant  [N s], which makes the optimum unique.
+
+    quadratic (n, n) : Q.  linear (n,) : q.
+    """
 
     quadratic: Any
     linear: Array
@@ -66,7 +68,7 @@ class Prices:
         )
 
     def evaluate(self, x: Array) -> float:
-        """Their sum [N s] for solver variables (n,)."""
+        """Cost [N s] at solver variables x (n,)."""
         return float(x @ (self.quadratic @ x) / 2 + self.linear @ x) + self.constant
 
 
@@ -76,16 +78,19 @@ def assemble(
     """Objective, Q and q of :class:`impactopt.transcription.structured.StructuredProgram` [N s]."""
     objective, diagonal = Affine.constant(prices.constant), np.zeros(layout.n)
     for o, quantity in wanted:
-        worth = -o.weight if o.cost else o.weight
-        objective = objective - quantity.affine * worth
+        gain = -o.weight if o.cost else o.weight  # the program minimizes, so gains are subtracted
+        objective = objective - quantity.affine * gain
         if (group := quantity.squares) is not None:
             span = slice(group.offset, group.offset + group.count * group.size)
-            diagonal[span] -= 2 * worth * np.tile(group.scale**2, group.count)
+            diagonal[span] -= 2 * gain * np.tile(group.scale**2, group.count)
     return objective, prices.quadratic + sp.diags_array(diagonal), prices.linear
 
 
 def wrench_prices(b: Builder, groups: list[tuple[Group, int]]) -> Array:
-    """Diagonal (n,) of the price of sole wrenches: the mean of so many nodes as each group comes with."""
+    """Diagonal (n,) of the price of sole wrenches.
+
+    groups : groups of wrenches, each with a number of nodes by which its price is divided.
+    """
     diagonal = np.zeros(b.layout.n)
     for group, nodes in groups:
         span = slice(group.offset, group.offset + group.count * group.size)
@@ -96,9 +101,9 @@ def wrench_prices(b: Builder, groups: list[tuple[Group, int]]) -> Array:
 def motion_prices(
     b: Builder, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase], wrenches: list[Group]
 ) -> Prices:
-    """Small prices of accelerations, of sole wrenches, and of ending away from the start posture.
+    """Small prices of accelerations, sole wrenches, and the distance of the end posture from the start.
 
-    to_rest : those of the motions that end at rest.  wrenches : the means of these groups.
+    to_rest : those of the motions that end at rest.  wrenches : groups whose mean squares are priced.
     """
     p = b.problem
     prices = MotionPrices(acceleration=p.smoothness, end=p.return_price)
@@ -114,31 +119,37 @@ def style_prices(b: Builder, motions: Sequence[MotionPhase], to_rest: Sequence[M
 def _priced(
     b: Builder, prices: MotionPrices, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase]
 ) -> Prices:
-    """Integrals by the nodes' shares of a phase; its typical duration makes all of it quadratic."""
+    """Cost of prices of integrals over motions, and of the end posture.
+
+    Integrals become sums over the nodes, |M x + constants|^2 / 2. With the duration as a variable they were
+    not quadratic, so each phase's mean permitted duration T stands for it.
+    """
     n, c = b.layout.n, b.coordinates
     speeds = np.full(b.ny, prices.speed)
-    speeds[: c.base] *= not c.drifts  # the blow says how fast it drifts
+    speeds[: c.base] *= not c.drifts  # after contact the impact fixes how fast a free-floating base drifts
     speeds[c.base :] += prices.idle_speed * b.problem.idle_joints[c.independent]
-    priced: list[Affine] = []
+    residuals: list[Affine] = []
     for motion in motions:
         T = float(np.mean(motion.phase.duration))
         for s, length in zip(motion.nodes, np.gradient(motion.nodes), strict=True):
-            _, rate, bend = motion.at(s)
+            _, y1, y2 = motion.at(s)
+            # integral of (y''/T^2)^2 dt, dt = T ds
             if prices.acceleration:
-                priced.append(bend * np.sqrt(2 * prices.acceleration * length / T**3))
+                residuals.append(y2 * np.sqrt(2 * prices.acceleration * length / T**3))
             if speeds.any():
-                priced.append(rate * np.sqrt(2 * speeds * length / T))
-        for s, end in pairwise(motion.breaks) if prices.jerk else ():  # of a cubic it is constant there
+                residuals.append(y1 * np.sqrt(2 * speeds * length / T))
+        # the jerk of a cubic spline is constant in an interval: y''' = step / (end - s)
+        for s, end in pairwise(motion.breaks) if prices.jerk else ():
             step = motion.at(float(end))[2] - motion.at(float(s))[2]
-            priced.append(step * np.sqrt(2 * prices.jerk / (T**5 * (end - s))))
+            residuals.append(step * np.sqrt(2 * prices.jerk / (T**5 * (end - s))))
     m = sp.csr_array((0, n))
     constants = np.zeros(0)
-    if priced:
-        weighted = stack(priced)
-        m, constants = weighted.matrix(n), weighted.const
+    if residuals:
+        stacked = stack(residuals)
+        m, constants = stacked.matrix(n), stacked.const
     linear, constant = m.T @ constants, float(constants @ constants) / 2
     diagonal = np.zeros(n)
-    for motion in to_rest:  # price (y_end - y_start)^2
+    for motion in to_rest:  # price (y_end - y_start)^2, without the pose of a free-floating base
         known = 6 * c.drifts
         end, start = motion.c.index(-1)[known:], b.y0[known:]
         diagonal[end] += 2 * prices.end

@@ -1,6 +1,6 @@
-"""Planned motion or strike as numbers: references for the robot's servo, predictions, loads.
+"""Planned motion or strike as arrays: servo references, predicted contact, loads.
 
-This is the border to everything that checks, draws or executes a plan: arrays only, no CasADi.
+Everything that checks, draws or executes a plan reads it from here, without CasADi.
 """
 
 from __future__ import annotations
@@ -43,12 +43,14 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-MOMENT_COST = 10.0  # [1/m] of a correction of moments against one of forces
+MOMENT_COST = 10.0  # [1/m] weight of a wrench correction's moments relative to its forces
 
 
 class Completed(NamedTuple):
-    """Rows of q (k, nq), v and a (k, nv), torque (k, n) [N m], ground wrench (k, 6) about the world's origin,
-    and wrenches (k, 6 a sole, 6 a hand) in the soles' and hands' own frames [N, N m].
+    """Full motion at k instants, with the torques and wrenches that it needs.
+
+    q (k, nq), v and a (k, nv), torque (k, n) [N m]; ground (k, 6): ground wrench about the world's origin
+    [N, N m]; sole_wrench (k, 6 a sole, 6 a hand), in the frames of soles and hands [N, N m].
     """
 
     q: Array
@@ -70,10 +72,12 @@ def complete_reference(
 ) -> Completed:
     """Full motion, torques and wrenches of a motion in independent coordinates.
 
-    y, yd, ydd (k, ny) are independent coordinates, rates and second rates. wrench (k, 6 a sole) is corrected
-    to balance the base and hinges of soles, by as little as it takes: each sole takes its part of what is
-    lacking by the load that it bears, so that one that bears little keeps its centre of pressure. legs (nl,)
-    starts their inverse kinematics. coordinates: if not those of the stance with the blow.
+    y, yd, ydd (k, ny) : independent coordinates and their first and second time derivatives.
+    wrench (k, 6 a sole) : wrenches, interpolated between nodes. They get the smallest correction that
+        balances the unactuated coordinates (base, hinges of soles). It is distributed among soles by
+        their loads, so that the centre of pressure of a lightly loaded sole hardly moves.
+    legs (nl,) : initial guess of the legs' inverse kinematics.
+    coordinates : by default those of the stance phase with the impact.
     """
     c, robot = coordinates or problem.coordinates, problem.robot
     model, data = robot.model, robot.model.createData()
@@ -81,21 +85,23 @@ def complete_reference(
     q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
     torque, corrected = np.zeros((n, robot.n)), np.zeros((n, 6 * len(c.legs)))
     cost = _correction_costs(c, wrench, BEARS * weight_of(robot))
-    rows = np.hstack([y, yd, ydd, wrench])
-    moves = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))[:n]  # at rest one row is as the one before
-    kept = np.flatnonzero(moves)
-    for k, (whole, _) in zip(kept.tolist(), c.closing.follow(y[kept], legs), strict=True):
-        q[k] = whole
-        v[k], a[k], jac = c.closing.rates(whole, y[k], yd[k], ydd[k])
+    # a robot at rest repeats its state over many instants: each distinct state is computed once
+    state = np.hstack([y, yd, ydd, wrench])
+    changes = np.append(True, (state[1:] != state[:-1]).any(axis=1))[:n]
+    distinct = np.flatnonzero(changes)
+    for k, (configuration, _) in zip(distinct.tolist(), c.leg_closure.follow(y[distinct], legs), strict=True):
+        q[k] = configuration
+        v[k], a[k], jac = c.leg_closure.rates(configuration, y[k], yd[k], ydd[k])
         tau = robot.inverse_dynamics(data, q[k], v[k], a[k])
         if c.legs:
-            # least |cost dw|^2 with B' dw = miss: dw = C^-2 B (B' C^-2 B)^-1 miss, base = B' C^-1
+            # minimize |C dw|^2 subject to B' dw = unbalanced, where B are the columns of the contact Jacobian
+            # that belong to unactuated coordinates: dw = C^-2 B (B' C^-2 B)^-1 unbalanced.  base = B' C^-1
             base = jac[:, c.undriven].T / cost[k]
-            miss = tau[c.undriven] - jac[:, c.undriven].T @ wrench[k]
-            corrected[k] = wrench[k] + base.T @ solved(base @ base.T, miss) / cost[k]
+            unbalanced = tau[c.undriven] - jac[:, c.undriven].T @ wrench[k]
+            corrected[k] = wrench[k] + base.T @ solved(base @ base.T, unbalanced) / cost[k]
             tau = tau - jac.T @ corrected[k]
         torque[k] = tau[c.base :]
-    last = np.maximum.accumulate(np.where(moves, np.arange(n), 0))
+    last = np.maximum.accumulate(np.where(changes, np.arange(n), 0))  # the distinct state that holds at each
     q, v, a, torque, corrected = (part[last] for part in (q, v, a, torque, corrected))
     return Completed(q, v, a, torque, total_ground_wrench(c, corrected), corrected)
 
@@ -103,77 +109,83 @@ def complete_reference(
 def drifting_reference(
     problem: ImpactProblem, sample: Callable[[Array], Sequence[Array]], time: Array, *, backward: bool
 ) -> Completed:
-    """Full motion and torques of a robot that nothing holds, whose base follows from the joints' motion.
+    """Full motion and torques of a free-floating robot, whose base follows from the motion of its joints.
 
-    sample : y, yd, ydd (k, ny) at times (k,) [s].  The base's state is that of the first time, or, going
-    ``backward``, of the last one; from there its momentum changes by gravity alone. Between times it is
-    integrated by the classical Runge-Kutta method, so it is as exact as the joints are.
+    sample : function that gives y, yd, ydd (k, ny) at times (k,) [s].
+    backward : the base's state is given at the last time instead of the first.
+
+    From the given state on, only gravity changes the momentum. Velocities of the base follow from it
+    (centroidal momentum matrix), and its pose by the classical Runge-Kutta method with one step between two
+    times.
     """
     c, robot = problem.coordinates, problem.robot
     model, data = robot.model, robot.model.createData()
     order = np.arange(len(time))[:: -1 if backward else 1]
     y, yd, ydd = (np.array(part) for part in sample(time)[:3])
-    none, pull = np.zeros(0), np.append(np.array(model.gravity.linear), np.zeros(3))
-    pull *= sum(inertia.mass for inertia in model.inertias)
+    no_legs, weight = np.zeros(0), np.append(np.array(model.gravity.linear), np.zeros(3))
+    weight *= sum(inertia.mass for inertia in model.inertias)  # (6,) wrench about the centre of mass
 
     def velocity(y: Array, yd: Array, momentum: Array) -> Array:
-        q, v = c.join(y, none), np.append(np.zeros(6), yd[6:])
-        pin.ccrba(model, data, q, v)
+        """v (nv,) with the joints' rates, and the base's for this momentum (6,) about the centre of mass."""
+        q, v = c.join(y, no_legs), np.append(np.zeros(6), yd[6:])
+        pin.ccrba(model, data, q, v)  # data.Ag: momentum matrix (6, nv); data.hg: momentum at v
         v[:6] = solved(np.array(data.Ag[:, :6]), momentum - np.array(data.hg.vector))
         return v
 
     start = order[0]
-    q, v, _ = c.complete_motion(y[start], yd[start], ydd[start], none)
+    q, v, _ = c.complete_motion(y[start], yd[start], ydd[start], no_legs)
     momentum = np.array(pin.computeCentroidalMomentum(model, data, q, v).vector)
+    # classical Runge-Kutta method for the base's pose; the joints' motion is known at all its stages
     middles, middle_rates, _ = sample((time[1:] + time[:-1]) / 2)[:3]
     for one, other in pairwise(order.tolist()):
         h, between = time[other] - time[one], min(one, other)
-        base, steps = y[one, :6], list[Array]()
-        for share, (joints, joint_rates) in (
+        base, slopes = y[one, :6], list[Array]()
+        for fraction, (joints, joint_rates) in (
             (0.0, (y[one], yd[one])),
             (0.5, (middles[between], middle_rates[between])),
             (0.5, (middles[between], middle_rates[between])),
             (1.0, (y[other], yd[other])),
         ):
-            at = np.append(base + share * h * steps[-1] if steps else base, joints[6:])
-            since = time[one] + share * h - time[start]
-            steps.append(base_rates(at, velocity(at, joint_rates, momentum + since * pull)))
-        y[other, :6] = base + h / 6 * (steps[0] + 2 * steps[1] + 2 * steps[2] + steps[3])
+            stage = np.append(base + fraction * h * slopes[-1] if slopes else base, joints[6:])
+            elapsed = time[one] + fraction * h - time[start]
+            slopes.append(base_rates(stage, velocity(stage, joint_rates, momentum + elapsed * weight)))
+        y[other, :6] = base + h / 6 * (slopes[0] + 2 * slopes[1] + 2 * slopes[2] + slopes[3])
     q, v = c.join(y, np.zeros((len(y), 0))), np.zeros((len(y), model.nv))
     a, torque = np.zeros_like(v), np.zeros((len(y), robot.n))
     for k in range(len(y)):
-        v[k] = velocity(y[k], yd[k], momentum + (time[k] - time[start]) * pull)
+        v[k] = velocity(y[k], yd[k], momentum + (time[k] - time[start]) * weight)
         a[k, 6:] = ydd[k, 6:]
-        force = robot.inverse_dynamics(data, q[k], v[k], a[k])  # with the base's acceleration still zero
-        of_base = mass_matrix(model, data, q[k])[:, :6]
-        a[k, :6] = -solved(of_base[:6], force[:6])
-        torque[k] = force[6:] + of_base[6:] @ a[k, :6]
+        # the equations of motion are linear in the base's acceleration: its six equations have no torque
+        force = robot.inverse_dynamics(data, q[k], v[k], a[k])  # while a[k, :6] = 0
+        base_columns = mass_matrix(model, data, q[k])[:, :6]
+        a[k, :6] = -solved(base_columns[:6], force[:6])
+        torque[k] = force[6:] + base_columns[6:] @ a[k, :6]
     return Completed(q, v, a, torque, np.zeros((len(y), 6)), np.zeros((len(y), 0)))
 
 
 def _correction_costs(c: StanceCoordinates, wrench: Array, least: float) -> Array:
-    """(k, 6 a sole, 6 a hand) Weights of a correction's components, whose squares are minimized.
+    """(k, 6 a sole, 6 a hand) Weights C of a wrench correction d, which minimizes |C d|^2.
 
-    A correction is shared as the load is: what minimizes the sum of d_i^2 / load_i. ``least`` [N] is the load
-    that a sole counts for at least. A hand that holds on counts for a sole of mean load.
+    The minimum of the sum of d_i^2 / load_i distributes d in proportion to the loads. ``least`` [N] bounds
+    the load of a sole from below. A hand counts as a sole of mean load.
     """
     standing = np.array([leg.sole is not None for leg in c.legs], dtype=bool)
     load = np.maximum(wrench[:, 2::6], least)
     load[:, ~standing] = load[:, standing].mean(axis=1, keepdims=True) if standing.any() else least
-    six = np.array([1.0, 1.0, 1.0, MOMENT_COST, MOMENT_COST, MOMENT_COST])
-    return np.asarray((six / np.sqrt(load)[:, :, None]).reshape(len(wrench), -1))
+    component_costs = np.array([1.0, 1.0, 1.0, MOMENT_COST, MOMENT_COST, MOMENT_COST])
+    return np.asarray((component_costs / np.sqrt(load)[:, :, None]).reshape(len(wrench), -1))
 
 
 def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Array:
     """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches.
 
-    The soles are where they are held. What hands hold on to is not the ground.
+    Wrenches of hands are left out: what they hold on to is not the ground.
     """
     placements = [leg.placement for leg in coordinates.legs if leg.sole is not None]
     total = np.zeros((len(wrenches), 6))
-    for k, place in enumerate(placements):
-        # the dual action: wrenches to the world's axes and origin
-        total += wrenches[:, 6 * k : 6 * k + 6] @ place.toDualActionMatrix().T
+    for k, placement in enumerate(placements):
+        # the dual action transforms wrenches from the sole's frame to the world's
+        total += wrenches[:, 6 * k : 6 * k + 6] @ placement.toDualActionMatrix().T
     return total
 
 
@@ -191,12 +203,14 @@ def sampled(start: float, end: float, step: float) -> Array:
 class Trajectory:
     """Reference trajectory of the servo, the only part of a plan that reaches a simulation.
 
-    time (k,) [s], ascending, an instant twice where the reference jumps; phase (k,): 0 swing, 1 collision, 2
-    follow-through; q (k, nq) pin configurations; v (k, nv) pin velocities; a (k, nv); torque (k, n)
-    feed-forward [N m]; ground (k, 6) total ground wrench about the world's origin that the feed-forward
-    assumes [N, N m], sole_wrench (k, 6 a sole, 6 a hand that holds on) its parts, in own frames; (0, 0): not
-    known. contact_start, contact_end, end [s]: when the plan expects contact to begin and to end,
-    and the motion to be over. stance (k,): number of the stance phase; (0,): there is one stance.
+    time (k,) [s] : ascending; an instant stands twice where the reference jumps.
+    phase (k,) : 0 swing, 1 collision, 2 follow-through.
+    q (k, nq), v (k, nv), a (k, nv) : Pinocchio's configurations, velocities, accelerations.
+    torque (k, n) : feed-forward [N m].
+    ground (k, 6) : total ground wrench about the world's origin that the feed-forward assumes [N, N m].
+    sole_wrench (k, 6 a sole, 6 a hand that holds on) : its parts, in their own frames; (0, 0): unknown.
+    contact_start, contact_end, end : [s] planned begin and end of contact, and end of the motion.
+    stance (k,) : number of the stance phase; (0,): there is one stance.
     """
 
     time: Array = field(repr=False)
@@ -215,10 +229,11 @@ class Trajectory:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedStand:
-    """Stance phase beside the one with the blow.
+    """Stance phase other than the one with the impact.
 
-    number : of the phase.  spline : in the coordinates of its stance.  nodes (k,) : places of the program's
-    nodes, fractions of it; wrench (k, 6 a sole) there, in each sole's frame [N, N m].
+    number : index of the phase.  spline : in the coordinates of its stance.  nodes (k,) : nodes of the
+    nonlinear program, fractions of the phase; wrench (k, 6 a sole) : at the nodes, in each sole's frame
+    [N, N m].
     """
 
     number: int
@@ -228,8 +243,10 @@ class PlannedStand:
 
 
 class Piece(NamedTuple):
-    """Spline of a plan: phase (0 before, 2 after contact), number of its stance phase, its start [s], nodes
-    and sole wrenches there.
+    """Spline of a plan, with sole wrenches.
+
+    phase : 0 before, 2 after contact.  number : index of the stance phase.  start : [s] since the motion's.
+    nodes (k,) : fractions of the spline.  wrench (k, 6 a sole) : at the nodes.
     """
 
     phase: int
@@ -240,13 +257,14 @@ class Piece(NamedTuple):
     wrench: Array
 
     def sample(self, time: Array) -> tuple[Array, Array, Array, Array]:
-        """y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) at times (k,) [s] since the motion's start;
-        before and after the piece those of its ends.
+        """y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) at times (k,) [s] since the motion's start.
+
+        Wrenches are linear between nodes. Before and after the piece, values at its ends hold.
         """
         ts, nw = np.asarray(time, dtype=float), self.wrench.shape[1]
         local = np.clip(ts - self.start, 0.0, self.spline.duration)
-        at = self.nodes * self.spline.duration
-        w = [np.interp(local, at, k) for k in self.wrench.T]
+        node_times = self.nodes * self.spline.duration
+        w = [np.interp(local, node_times, component) for component in self.wrench.T]
         return *self.spline.sample(local), np.stack(w, axis=1) if nw else np.zeros((len(ts), 0))
 
 
@@ -254,8 +272,8 @@ class Piece(NamedTuple):
 class Motion:
     """Motion of the bodies at k instants.
 
-    time (k,) [s].  phase (k,) : 0 before, 1 in, 2 after contact.  q (k, nq) : Pinocchio's configurations.
-    travel (k,) [m] : of the target along its normal.
+    time (k,) [s].  phase (k,) : 0 before, 1 during, 2 after contact.  q (k, nq) : Pinocchio's configurations.
+    travel (k,) : displacement of the target along its normal [m].
     """
 
     time: Array = field(repr=False)
@@ -266,14 +284,18 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedCollision:
-    """The collision that the plan predicts, at its m collocation points.
+    """Predicted collision of a plan, at contact and at the m collocation points.
 
-    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N], forces (m + 1, strikers) of each;
-    target_speed (m + 1,) [m/s] of its surface; outcome: what the blow has brought the target, by name and
-    unit (``speed_m_s`` of a free mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n)
-    [N m], servo and feed-forward; ground (m, 6) wrench about the world's origin [N, N m]; sole_wrench (m, 6 a
-    sole, 6 a hand that holds on), in own frames. velocity, acceleration (m + 1, n) of the joints, the first
-    at once after contact, when a damped contact has a force already; (0, 0): not known.
+    time (m + 1,) : [s] since contact.
+    force (m + 1,), forces (m + 1, strikers) : [N] total contact force, and that on each striker.
+    target_speed (m + 1,) : of the target's surface [m/s].
+    outcome : effect on the target, by name and unit (``speed_m_s`` of a free mass, ``depth_m`` of a nail,
+        ``broken`` of a board).
+    torque (m + 1, n) : servo and feed-forward [N m].
+    ground (m, 6) : ground wrench about the world's origin [N, N m].
+    sole_wrench (m, 6 a sole, 6 a hand that holds on) : in their own frames [N, N m].
+    velocity, acceleration (m + 1, n) : of the joints; (0, 0): unknown. The first is the limit from the right:
+        the force of a damped contact jumps at contact.
     """
 
     time: Array = field(repr=False)
@@ -290,9 +312,9 @@ class PlannedCollision:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedScenario:
-    """Prediction of the plan for a hit of the :class:`impactopt.Scenario` of this name.
+    """Predicted collision with the target of the :class:`impactopt.Scenario` of this name.
 
-    impulse [N s] to that target.
+    impulse : to that target [N s].
     """
 
     name: str
@@ -300,7 +322,7 @@ class PlannedScenario:
     collision: PlannedCollision
 
     def summary(self, *, torque_limit: Array, polygon: Array) -> dict[str, Any]:
-        """The numbers of ``summary.json``; torque_limit (n,) [N m]; polygon (k, 2) [m], of the soles."""
+        """Entries of ``summary.json``.  torque_limit (n,) [N m]; polygon (k, 2) [m]: support polygon."""
         hit = self.collision
         out = {
             "name": self.name,
@@ -319,17 +341,17 @@ class Plan:
 
     Attributes
     ----------
-    problem : what it was planned for.
+    problem : the problem that it solves.
     swing, follow : splines in the independent coordinates, from start to contact and from there to rest.
     compression, restitution : [s] durations of the contact's phases.
-    swing_nodes, follow_nodes : (k,) places of the program's nodes, fractions of each spline from 0 to 1.
+    swing_nodes, follow_nodes : (k,) nodes of the nonlinear program, fractions of each spline from 0 to 1.
     swing_wrench, follow_wrench : (k, 6 a sole) wrenches at these nodes, in each sole's frame [N, N m]. In
         contact the reference keeps the last one of the swing.
-    collision : what is predicted of the contact.
+    collision : prediction of the contact.
     hand_speed : [m/s] along the normal, at contact.
     impulse : [N s] to the target.
-    scenarios : what is predicted of other targets, in the problem's order, without those that are missing.
-    coast_wrench : (6 a sole) where a robot that has hit nothing ceases to coast; None as of `abort`.
+    scenarios : predictions for other targets, in the problem's order, without missing ones.
+    coast_wrench : (6 a sole) at the end of coasting, if nothing is hit; None without an abort motion.
     abort, abort_wrench : the abort motion, as `follow` and `follow_wrench`; None if the problem has none.
     before, after, after_abort : stance phases before the swing, after the follow-through and after the abort
         motion.
@@ -356,7 +378,7 @@ class Plan:
     after_abort: tuple[PlannedStand, ...] = ()
 
     def __repr__(self) -> str:
-        """One line: its arrays would fill pages."""
+        """One line without the arrays."""
         return (
             f"<Plan of {self.problem.name!r}: {self.impulse:.2f} N s, contact at {self.contact_start:.3g} s>"
         )
@@ -367,7 +389,7 @@ class Plan:
 
     @cached_property
     def reference(self) -> Trajectory:
-        """The servo's reference every millisecond; InputError where legs do not reach."""
+        """The servo's reference every millisecond; InputError if legs do not reach their soles."""
         return self.trajectory()
 
     @cached_property
@@ -377,7 +399,7 @@ class Plan:
 
     @property
     def swing_start(self) -> float:
-        """End of the stance phases before the one with the blow [s]."""
+        """End of the stance phases before the one with the impact [s]."""
         return float(sum(stand.spline.duration for stand in self.before))
 
     @property
@@ -394,12 +416,12 @@ class Plan:
         return self.end()
 
     def end(self, *, missed: bool = False) -> float:
-        """End of the motion [s]; ``missed``: of that of a robot that hits nothing."""
+        """End of the motion [s]; ``missed``: of the motion if nothing is hit."""
         last = self.pieces(missed=missed)[-1]
         return last.start + last.spline.duration
 
     def pieces(self, *, missed: bool = False) -> list[Piece]:
-        """All splines in the order of time; ``missed``: those of a robot that hits nothing."""
+        """All splines in the order of time; ``missed``: those of the motion if nothing is hit."""
         out, start = [], 0.0
         for stand in self.before:
             out.append(Piece(0, stand.number, stand.spline, start, stand.nodes, stand.wrench))
@@ -422,9 +444,11 @@ class Plan:
     ) -> tuple[Array, Array, Array, Array]:
         """Reference y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) of a phase.
 
-        time (k,) [s] : since the motion's start.
-        phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through,
-        then rest; ``missed``: coasting as long as it takes to notice, and the abort motion, instead.
+        time (k,) : [s] since the motion's start.
+        phase : 0 swing; 1 contact, in which the reference coasts at its velocity at contact; 2 follow-through
+            and rest.
+        missed : nothing is hit. The reference coasts until the robot detects that, then follows the abort
+            motion.
         """
         if phase == 1:
             ts = np.asarray(time, dtype=float)
@@ -432,14 +456,16 @@ class Plan:
             y = end + rate * (ts[:, None] - self.contact_start)
             wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
             if missed and self.coast_wrench is not None:
-                way = (ts - self.contact_start) / (self.segment(2, missed=True)[1] - self.contact_start)
-                wrenches += way[:, None] * (self.coast_wrench - self.swing_wrench[-1])
+                coasting = self.segment(2, missed=True)[1] - self.contact_start
+                fraction = (ts - self.contact_start) / coasting
+                wrenches += fraction[:, None] * (self.coast_wrench - self.swing_wrench[-1])
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
         return Piece(phase, self.problem.blow, *self.segment(phase, missed=missed)).sample(time)
 
     def segment(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float, Array, Array]:
-        """Spline, start [s], nodes and sole wrenches there of the swing (phase 0) or the follow-through (2);
-        ``missed``: of the abort motion.
+        """Spline, start [s], nodes and sole wrenches at them: swing (phase 0) or follow-through (2).
+
+        missed : the abort motion instead of the follow-through; InputError if the plan has none.
         """
         if phase == 0:
             return self.swing, self.swing_start, self.swing_nodes, self.swing_wrench
@@ -448,7 +474,7 @@ class Plan:
         after = self.problem.abort_after
         if self.abort is None or self.abort_wrench is None or after is None:
             raise InputError(
-                "this plan has no motion for a blow that meets nothing: solve the problem with a scenario "
+                "this plan has no abort motion for a missed target: solve the problem with a scenario "
                 "Scenario(name=..., missing=True, abort_after=0.025)"
             )
         return self.abort, self.contact_start + after, self.follow_nodes, self.abort_wrench
@@ -463,23 +489,25 @@ class Plan:
     ) -> Trajectory:
         """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
 
-        missed : the reference of a robot that hits nothing: the same until it notices, then the abort motion.
-        known : the other reference of this plan with this step, if it is known: their swing is the same.
+        missed : nothing is hit: the same reference until the robot detects that, then the abort motion.
+        known : the reference of this plan with this step and the other ``missed``, if already computed. Both
+            have the same swing.
 
-        Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse
-        dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes. A
-        base that nothing holds is integrated from contact, backward through the swing, and from after it on.
-        The instants of contact and of its end are there twice: the reference jumps from the coasting one to
+        Legs follow by inverse kinematics, so that soles stay in place. The feed-forward is inverse dynamics
+        under the planned sole wrenches, which are corrected between nodes to balance the base. A
+        free-floating base is integrated from contact: backward through the swing, forward after it.
+        The begin and the end of contact stand twice, because the reference jumps from the coasting one to
         the predicted state.
         """
         problem, pieces = self.problem, self.pieces(missed=missed)
         t0, t1, rest = self.contact_start, self.segment(2, missed=missed)[1], self.end(missed=missed)
         q = problem.start_posture
-        parts: list[tuple[Any, ...]] = []
+        parts: list[tuple[Any, ...]] = []  # of each piece: phase, times, and the fields of Completed
         stance = np.zeros(0, dtype=np.intp)
         for piece in pieces[: len(self.before) + 1] if known is None else ():
             times = sampled(piece.start, piece.start + piece.spline.duration, step)
-            times = times if piece.number == problem.blow else times[:-1]  # the last one is the next one's
+            # pieces share their ends: the instant is kept in the later one
+            times = times if piece.number == problem.blow else times[:-1]
             parts.append((0, times, *self._completed(piece, times, q)))
             stance = np.append(stance, np.full(len(times), piece.number))
             q = parts[-1][2][-1]
@@ -491,10 +519,10 @@ class Plan:
         contact = sampled(t0, t1, step)
         legs = self.coordinates.split(q)[1]
         if self.coordinates.drifts:
-            rows = drifting_reference(problem, partial(self.independent, 1), contact, backward=False)
+            coasting = drifting_reference(problem, partial(self.independent, 1), contact, backward=False)
         else:
-            rows = complete_reference(problem, *self.independent(1, contact, missed=missed), legs)
-        parts.append((1, contact, *self._of_all_soles(problem.blow, rows)))
+            coasting = complete_reference(problem, *self.independent(1, contact, missed=missed), legs)
+        parts.append((1, contact, *self._of_all_soles(problem.blow, coasting)))
         stance = np.append(stance, np.full(len(contact), problem.blow))
         for piece in pieces[len(self.before) + 1 :]:
             end = piece.start + piece.spline.duration + (hold if piece is pieces[-1] else 0.0)
@@ -505,8 +533,9 @@ class Plan:
             q = parts[-1][2][-1] if self.after else q
         phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
         time, q, v, a_, torque, ground, wrench = (np.concatenate([p[k] for p in parts]) for k in range(1, 8))
-        # held while in contact: the collision model counts on what makes the robot coast at contact. Beyond
-        # the planned contact nothing does, and postures on the way differ: there it is what coasting needs
+        # In contact the feed-forward is constant, as the collision model assumes: the torque that makes the
+        # robot coast at contact. If nothing is hit, coasting goes on after the planned contact; there the
+        # feed-forward is what each posture needs.
         torque[(phases == 1) & (time <= self.contact_end)] = self.collision.torque[0]
         return Trajectory(
             time=time,
@@ -524,20 +553,21 @@ class Plan:
         )
 
     def _completed(self, piece: Piece, times: Array, near: Array) -> Completed:
-        """Full motion of a piece at times (k,) [s], with legs near those of a configuration (nq,)."""
+        """Full motion of a piece at times (k,) [s].  near (nq,): initial guess of the legs' kinematics."""
         c = self.problem.stance_coordinates[piece.number]
         if c.drifts:
             return drifting_reference(self.problem, piece.sample, times, backward=piece.phase == 0)
-        rows = complete_reference(self.problem, *piece.sample(times), c.split(near)[1], c)
-        return self._of_all_soles(piece.number, rows)
+        completed = complete_reference(self.problem, *piece.sample(times), c.split(near)[1], c)
+        return self._of_all_soles(piece.number, completed)
 
-    def _of_all_soles(self, number: int, rows: Completed) -> Completed:
-        """Rows with the wrenches of all soles that stand at some time; those of the others are zero."""
+    def _of_all_soles(self, number: int, completed: Completed) -> Completed:
+        """Same motion with sole wrenches as of `_wrench_of_all`."""
         if not self.problem.stances:
-            return rows
-        return rows._replace(sole_wrench=self._wrench_of_all(number, rows.sole_wrench))
+            return completed
+        return completed._replace(sole_wrench=self._wrench_of_all(number, completed.sole_wrench))
 
     def _wrench_of_all(self, number: int, wrench: Array) -> Array:
+        """Wrenches (k, 6 a sole of the problem), zero of soles that do not stand in this stance phase."""
         own = [sole.name for sole in self.problem.stance_coordinates[number].soles]
         out = np.zeros((len(wrench), len(self.problem.soles), 6))
         for k, sole in enumerate(self.problem.soles):
@@ -550,15 +580,15 @@ class Plan:
     ) -> Motion:
         """Expected motion of the robot's bodies, about every ``step`` [s] from start to rest.
 
-        In contact the robot is slower than the servo's reference: between the states before and after it goes
-        the cubic that has both states' rates.
+        In contact the contact force slows the robot below the servo's reference, so there the motion is the
+        cubic Hermite interpolant of the states before and after contact.
 
-        missed : after a blow that meets nothing, from the planned contact on; before it all is as planned.
-        reference : :meth:`trajectory`, if it is known: then the postures are its, at its instants.
+        missed : nothing is hit; the motion from the planned contact on (before, it is as planned).
+        reference : result of :meth:`trajectory`, if already computed, whose instants and postures are used.
 
         Raises
         ------
-        InputError : the legs do not reach.
+        InputError : the legs do not reach their soles.
         """
         t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
         within = sampled(t0, t1, step)
@@ -573,11 +603,11 @@ class Plan:
                 pieces = [piece for piece in self.pieces(missed=missed) if piece.phase == phase]
                 times = [sampled(p.start, p.start + p.spline.duration, step) for p in pieces]
                 times = [*(at[:-1] for at in times[:-1]), times[-1]]
-                rows = [
+                postures = [
                     self.closed(piece.sample(at)[0], self.problem.stance_coordinates[piece.number])
                     for piece, at in zip(pieces, times, strict=True)
                 ]
-                parts.append((np.concatenate(times), np.concatenate(rows)))
+                parts.append((np.concatenate(times), np.concatenate(postures)))
         if missed:
             parts = [(np.zeros(0), np.zeros((0, self.problem.robot.nq))), parts[-1]]
         (before, q_before), (after, q_after) = parts
@@ -590,33 +620,35 @@ class Plan:
         )
 
     def through_contact(self, s: Array, *, missed: bool = False) -> Array:
-        """Independent coordinates (k, ny) at fractions s (k,) of the contact."""
+        """Independent coordinates (k, ny) at fractions s (k,) of the contact: a cubic Hermite interpolant."""
         t0, (_, t1, _, _) = self.contact_start, self.segment(2, missed=missed)
         (y0,), (u0,), _, _ = self.independent(0, np.array([t0]), missed=missed)
         (y1,), (u1,), _, _ = self.independent(2, np.array([t1]), missed=missed)
-        span, way, at = t1 - t0, y1 - y0, s[:, None]
-        bend = at * (1 - at) * ((1 - at) * (span * u0 - way) - at * (span * u1 - way))
-        return np.asarray(y0 + at * way + bend)
+        span, chord, at = t1 - t0, y1 - y0, s[:, None]
+        bend = at * (1 - at) * ((1 - at) * (span * u0 - chord) - at * (span * u1 - chord))
+        return np.asarray(y0 + at * chord + bend)
 
     def travel(self, time: Array) -> Array:
-        """Travel (k,) [m] of the target along the normal at times [s] since the motion's start.
+        """Displacement (k,) [m] of the target along the normal at times (k,) [s] since the motion's start.
 
-        Before contact it comes as fast as it does then, and after it a free one goes on so.
+        Before contact its speed is that at contact; after the contact a free target keeps its last speed.
         """
         hit, since = self.collision, np.asarray(time) - self.contact_start
         if len(hit.time) < 2:
             return np.zeros(len(since))
-        gone = np.concatenate(
+        # the speed, integrated by the trapezoidal rule
+        displacement = np.concatenate(
             [[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)]
         )
         last = 0.0 if self.problem.target.stays else float(hit.target_speed[-1])
         before = float(self.problem.target.speed_before()) * np.minimum(since, 0.0)
-        within = np.interp(since, hit.time, gone, left=0.0)
+        within = np.interp(since, hit.time, displacement, left=0.0)
         return before + within + last * np.maximum(since - hit.time[-1], 0.0)
 
     def stances(self) -> list[dict[str, Any]]:
-        """Stance phases with the soles that stand in each, from when till when [s], and how far [m] those
-        that have stepped are from where they stood at the start; nothing where the problem has none.
+        """Stance phases as in ``summary.json``; none if the problem has one stance.
+
+        Standing soles, begin and end [s], and displacements [m] of soles from their places at the start.
         """
         out = []
         displacements = places_of_soles(self.problem.stances, [sole.name for sole in self.problem.soles])
@@ -629,7 +661,7 @@ class Plan:
         return out
 
     def landing_speeds(self) -> dict[str, float]:
-        """Planned speed [m/s] of the corner that is fastest of each sole that touches down, by name."""
+        """Planned speed [m/s] of the fastest corner of each sole that touches down, by the sole's name."""
         p, out = self.problem, dict[str, float]()
         robot, data = p.robot, p.robot.model.createData()
         for one, other in pairwise(self.pieces()):
@@ -647,69 +679,68 @@ class Plan:
         return out
 
     def closed(self, y: Array, coordinates: StanceCoordinates | None = None) -> Array:
-        """Configurations (k, nq) of independent coordinates (k, ny), one near the next; coordinates : if not
-        those of the stance with the blow.
+        """Configurations (k, nq) of independent coordinates (k, ny) along a continuous motion.
+
+        coordinates : by default those of the stance phase with the impact.
         """
         c = coordinates or self.coordinates
-        return np.array([q for q, _ in c.closing.follow(y, c.start_legs)]).reshape(len(y), c.model.nq)
+        return np.array([q for q, _ in c.leg_closure.follow(y, c.start_legs)]).reshape(len(y), c.model.nq)
 
     def margins(
         self,
         collision: PlannedCollision | None = None,
         reference: Trajectory | None = None,
     ) -> dict[str, dict[str, float]]:
-        """Planned ZMP margin [m] and torque demand over limit, in swing, collision, follow-through, and from
-        the planned contact on if nothing is hit.
+        """Planned ZMP margin [m] and torque demand over limit, by phase.
 
-        Of an impact without duration the plan knows neither, so there is no number for the collision.
+        Phases are ``swing``, ``collision`` (not of an impact without duration), ``follow``, and ``missed``:
+        from the planned contact on, if nothing is hit.
 
         collision : the planned one at more instants than the program has, such as `ContactError.finer`.
-        reference : a coarser one instead, without the missed blow.
+        reference : a coarser one, used in place of the plan's; then ``missed`` is left out.
         """
         ref = self.reference if reference is None else reference
         limit = self.problem.robot.torque_limit
         phase = ref.phase
         hit = self.collision if collision is None else collision
-        inside = [
-            self._inside(ref, phase == 0),
+        zmp_margins = [
+            self._zmp_margin(ref, phase == 0),
             margin_of(self.polygon, hit.ground),
-            self._inside(ref, phase == 2),
+            self._zmp_margin(ref, phase == 2),
         ]
         during = hit.torque if len(hit.ground) else hit.torque[:0]
         torques = [ref.torque[phase == 0], during, ref.torque[phase == 2]]
         if self.abort is not None and reference is None:
             missed = self.missed_reference
-            inside.append(self._inside(missed, missed.phase > 0))
+            zmp_margins.append(self._zmp_margin(missed, missed.phase > 0))
             torques.append(missed.torque[missed.phase > 0])
         names = ("swing", "collision", "follow", "missed")[: len(torques)]
         ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True) if len(t)}
         out = {"torque_ratio": ratio}
         if len(self.polygon):
             out["zmp_margin_m"] = {
-                n: float(found.min()) for n, found in zip(names, inside, strict=True) if len(found)
+                n: float(found.min()) for n, found in zip(names, zmp_margins, strict=True) if len(found)
             }
         return out
 
-    def _inside(self, way: Trajectory, chosen: NDArray[np.bool_]) -> Array:
-        """Distance (k,) [m] of the ZMP from the edges of what stands, at the chosen instants of a
-        reference.
-        """
-        if not way.stance.size:
-            return margin_of(self.polygon, way.ground[chosen])
-        out = np.zeros(len(way.time))
+    def _zmp_margin(self, reference: Trajectory, chosen: NDArray[np.bool_]) -> Array:
+        """ZMP margins (k,) [m] in the support polygon of each instant's stance phase, at chosen instants."""
+        if not reference.stance.size:
+            return margin_of(self.polygon, reference.ground[chosen])
+        out = np.zeros(len(reference.time))
         for k, c in enumerate(self.problem.stance_coordinates):
-            own = way.stance == k
-            out[own] = margin_of(support_polygon(self.problem.robot, c), way.ground[own])
+            own = reference.stance == k
+            out[own] = margin_of(support_polygon(self.problem.robot, c), reference.ground[own])
         return out[chosen]
 
     def sole_margins(self, collision: PlannedCollision | None = None) -> dict[str, Any]:
-        """Planned margins of each sole by itself, and what is asked of them, as ``summary.json`` has them.
+        """Planned margins of each sole and the required ones, as in ``summary.json``; empty without soles.
 
-        ``sole_cop_margin_mm`` and ``sole_force_N`` by sole and phase: the least distance of its centre of
-        pressure from its own edges (:func:`impactopt.robots.loads.cop_margin`) and its least normal
-        force, every millisecond of swing and follow-through, at the instants of the collision that are known,
-        and after a blow that meets nothing. ``sole_cop_margin_asked_mm`` by phase, ``sole_force_asked_N``.
-        Nothing of a robot without soles.
+        ``sole_cop_margin_mm`` and ``sole_force_N``, by sole and phase: the smallest distance of its centre of
+        pressure from its own edges (:func:`impactopt.robots.loads.cop_margin`) and its smallest normal force.
+        They are taken every millisecond of swing and follow-through, at the known instants of the collision,
+        and after a missed target. ``sole_cop_margin_asked_mm``, by phase, and ``sole_force_asked_N`` are the
+        problem's requirements.
 
         collision : as of :meth:`margins`.
         """
@@ -719,20 +750,23 @@ class Plan:
         ref = self.reference
         hit = self.collision if collision is None else collision
         of_hit = self._wrench_of_all(p.blow, hit.sole_wrench) if p.stances else hit.sole_wrench
+        # of each phase: wrenches (k, 6 a sole), and indices of stance phases (k,), or (0,) if there is one
+        # stance
         parts = {
             "swing": (ref.sole_wrench[ref.phase == 0], ref.stance[ref.phase[: len(ref.stance)] == 0]),
             "collision": (of_hit, np.full(len(of_hit), p.blow)),
             "follow": (ref.sole_wrench[ref.phase == 2], ref.stance[ref.phase[: len(ref.stance)] == 2]),
         }
         if self.abort is not None:
-            way = self.missed_reference
-            parts["missed"] = way.sole_wrench[way.phase > 0], way.stance[way.phase[: len(way.stance)] > 0]
+            missed = self.missed_reference
+            after = missed.phase > 0
+            parts["missed"] = missed.sole_wrench[after], missed.stance[after[: len(missed.stance)]]
         labels = np.repeat(list(parts), [len(part) for part, _ in parts.values()])
         wrench = np.concatenate([part for part, _ in parts.values()])
         wrench = wrench.reshape(len(labels), -1, 6)[:, : len(p.soles)]
         stance = np.concatenate([numbers for _, numbers in parts.values()])
         margins = cop_margin(p.robot, [sole.polygon for sole in p.soles], wrench)
-        asked = {name: cone.collision_margin if name == "collision" else cone.margin for name in parts}
+        required = {name: cone.collision_margin if name == "collision" else cone.margin for name in parts}
         return {
             **least_margins(
                 [sole.name for sole in p.soles],
@@ -741,44 +775,50 @@ class Plan:
                 {name: labels == name for name in parts},
                 *((p.standing, stance) if p.stances else ()),
             ),
-            "sole_cop_margin_asked_mm": {n: 1e3 * m for n, m in asked.items() if m is not None},
+            "sole_cop_margin_asked_mm": {n: 1e3 * m for n, m in required.items() if m is not None},
             "sole_force_asked_N": cone.minimum_force,
         }
 
 
-STEP = 5e-3  # [s] of motions, whose loads change from one node to the next: a completed millisecond is dear
+# [s] Sampling of motions for loads. These change no faster than the nodes are apart, and inverse kinematics
+# and dynamics of every millisecond would be slow.
+LOAD_STEP = 5e-3
 
 
-def motion_loads(robot: Robot, way: Trajectory, hit: PlannedCollision) -> DriveLoads:
+def motion_loads(robot: Robot, reference: Trajectory, hit: PlannedCollision) -> DriveLoads:
     """Loads of a reference before and after contact, and of the collision, at all known instants."""
-    phase, base = way.phase, robot.nv - robot.n
-    rates, outside = way.v[:, base:], phase != 1
+    phase, base = reference.phase, robot.nv - robot.n
+    rates, outside = reference.v[:, base:], phase != 1
     jump = rates[phase == 2][0] - rates[phase == 0][-1]
-    return _loads(robot, (way.torque[outside], rates[outside], way.a[outside, base:]), hit, jump)
+    motion = reference.torque[outside], rates[outside], reference.a[outside, base:]
+    return _loads(robot, motion, hit, jump)
 
 
 def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> list[DriveLoads]:
-    """Loads of a plan's motions every `STEP`, including the one that meets nothing, and of these collisions
-    with its targets.
+    """Loads of a plan's motions every `LOAD_STEP`, including the abort motion, and of its collisions.
+
+    hits : with the expected target, then with those of scenarios.
     """
     expected, *others = hits
-    ways = [plan.trajectory(step=STEP, hold=STEP)]
+    references = [plan.trajectory(step=LOAD_STEP, hold=LOAD_STEP)]
     if plan.abort is not None:
-        ways.append(plan.trajectory(step=STEP, hold=STEP, missed=True, known=ways[0]))
-    out = [motion_loads(robot, way, expected) for way in ways]
+        missed = plan.trajectory(step=LOAD_STEP, hold=LOAD_STEP, missed=True, known=references[0])
+        references.append(missed)
+    out = [motion_loads(robot, reference, expected) for reference in references]
     still = np.zeros(robot.nv)
     return out + [strike_loads(robot, still, still, hit) for hit in others]
 
 
 def strike_loads(robot: Robot, before: Array, after: Array, hit: PlannedCollision) -> DriveLoads:
-    """Loads of a collision alone, with the robot's velocities (nv,) before and after it."""
+    """Loads of a collision alone.  before, after (nv,): the robot's velocities."""
     none = np.zeros((0, robot.n))
     return _loads(robot, (none, none, none), hit, (after - before)[-robot.n :])
 
 
 def gear_share(problem: ImpactProblem, torque: Array, acceleration: Array) -> Array:
-    """(k,) Largest load of a gear over what the problem allows, of torques and accelerations (k, n) of the
-    joints; zeros where it bounds none.
+    """(k,) Largest ratio of a gear's load to the problem's limit; zeros if it has none.
+
+    torque, acceleration (k, n) : of the joints.
     """
     term, robot = problem.extra(GearLoad), problem.robot
     if term is None or not term.active or not acceleration.size:
@@ -787,9 +827,9 @@ def gear_share(problem: ImpactProblem, torque: Array, acceleration: Array) -> Ar
     return np.asarray(np.abs(load).max(axis=1, initial=0.0))
 
 
-def _loads(robot: Robot, way: tuple[Array, ...], hit: PlannedCollision, jump: Array) -> DriveLoads:
-    """way, hit : torque, velocity and acceleration of the joints, (k, n) each."""
-    parts = [way, (hit.torque, hit.velocity, hit.acceleration)][: 1 + bool(hit.acceleration.size)]
+def _loads(robot: Robot, motion: tuple[Array, ...], hit: PlannedCollision, jump: Array) -> DriveLoads:
+    """motion : torque, velocity, acceleration (k, n) of the joints.  jump (n,) : of velocities, at impact."""
+    parts = [motion, (hit.torque, hit.velocity, hit.acceleration)][: 1 + bool(hit.acceleration.size)]
     torque, velocity, acceleration = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     gear = gear_torque(robot, torque, acceleration)
     return DriveLoads.of(robot, gear=gear, torque=torque, velocity=velocity, jump=jump)
@@ -797,12 +837,13 @@ def _loads(robot: Robot, way: tuple[Array, ...], hit: PlannedCollision, jump: Ar
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedStrike:
-    """State in which a robot hits, and the plan's prediction of the impact.
+    """Planned impact alone: the robot's state at contact, and the prediction of the collision.
 
-    posture (nq,) and velocity (nv,), pin's, at contact; posture_after, velocity_after at separation. torque
-    (n,) [N m] that makes the robot coast at contact, and ground (6,) [N, N m], the total ground wrench about
-    the world's origin then. compression, restitution [s]; hand_speed [m/s] along the normal at contact;
-    impulse [N s] to the target; collision, scenarios: as of :class:`impactopt.Plan`.
+    posture (nq,), velocity (nv,) : Pinocchio's, at contact; posture_after, velocity_after : at separation.
+    torque (n,) : feed-forward that makes the robot coast at contact [N m]; ground (6,) : the total ground
+        wrench about the world's origin then [N, N m].
+    compression, restitution : [s].  hand_speed : along the normal at contact [m/s].  impulse : to the target
+        [N s].  collision, scenarios : as of :class:`impactopt.Plan`.
     """
 
     problem: ImpactProblem
@@ -820,10 +861,9 @@ class PlannedStrike:
     scenarios: tuple[PlannedScenario, ...] = ()
 
     def margins(self) -> dict[str, Any]:
-        """Torque demand over limit and ZMP margin [m] at contact and in the collision; capture point [m].
+        """Torque demand over limit and ZMP margin [m] at contact and in the collision; capture margin [m].
 
-        The capture point's is that of the state after contact. An impact without duration has no torque and
-        no ZMP.
+        The capture point is that after contact. An impact without duration has no torque and no ZMP.
         """
         limit, hit = self.problem.robot.torque_limit, self.collision
         lasts = len(hit.ground) > 0 or not self.problem.robot.floating

@@ -1,6 +1,6 @@
-"""Joints that no motor moves, and the torque profiles of the others.
+"""Torque constraints of unactuated joints, and torque profiles of motions.
 
-Of a spring and a damper, the torque that the motion needs is that of the two; of a sole's hinge it is none.
+An unactuated joint has the torque of its spring and damper; the hinge of a sole has none.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from impactopt.transcription.plan import complete_reference
 
 __all__ = [
     "SpringPoint",
-    "TorqueCourse",
+    "TorqueProfile",
     "add_hinges",
     "add_springs",
     "follow_springs",
     "swing_springs",
-    "torque_courses",
+    "torque_profiles",
 ]
 
 
-class TorqueCourse(NamedTuple):
-    """The torques of a phase.
+class TorqueProfile(NamedTuple):
+    """Torques of a motion phase at its nodes.
 
-    nodes (k,) : in it, from 0 to 1.  torques : over limit (n,) at each node.  T (1,) : its duration [s].
-    place_at : the place of a node, as constraints have it.
+    nodes (k,) : fractions of the phase.  torques : over limit (n,) at each node.  T (1,) : duration [s].
+    place_at : function that gives a node's place for messages.
     """
 
     nodes: Array
@@ -41,21 +41,20 @@ class TorqueCourse(NamedTuple):
     place_at: Callable[[float], Place]
 
 
-def torque_courses(
+def torque_profiles(
     b: Builder, swing: MotionPhase, follows: Sequence[MotionPhase], torques: Sequence[Affine]
-) -> list[TorqueCourse]:
-    """Torque profiles of the swing, whose initial torque is given where it starts at rest, and of each motion
-    to rest.
+) -> list[TorqueProfile]:
+    """Torque profiles of the swing and of each motion to rest.
 
-    torques : over limit, at the nodes of all of these, one motion after the other.
+    torques : over limit, at the nodes of these motions, concatenated.
     """
     first, nodes, own = len(swing.nodes), swing.nodes, list(torques[: len(swing.nodes)])
-    if nodes[0]:  # at rest before it
+    if nodes[0]:  # a swing from rest has no node at its start, where the torque is known
         nodes, own = np.append(0.0, nodes), [Affine.constant(start_torque(b)), *own]
-    out = [TorqueCourse(nodes, own, swing.T[0], swing.place_at)]
+    out = [TorqueProfile(nodes, own, swing.T[0], swing.place_at)]
     for motion in follows:
         last = first + len(motion.nodes)
-        out.append(TorqueCourse(motion.nodes, list(torques[first:last]), motion.T[0], motion.place_at))
+        out.append(TorqueProfile(motion.nodes, list(torques[first:last]), motion.T[0], motion.place_at))
         first = last
     return out
 
@@ -68,15 +67,12 @@ def start_torque(b: Builder) -> Array:
     return np.asarray(torque / b.robot.torque_limit)
 
 
-# weights of an interval's begin, middle and end: Simpson's rule, exact for the splines' cubics
+# weights of an interval's begin, middle and end: Simpson's rule, exact for cubics such as the splines'
 SIMPSON = (1 / 6, 4 / 6, 1 / 6)
 
 
 class SpringPoint(NamedTuple):
-    """Torques over limit (n,), and the motion that they are of: at a place, or means over an interval.
-
-    y, y1 (ny,), T : the coordinates, and their rate y'/T.
-    """
+    """Torques over limit (n,), y and y' (ny,), and duration T [s]: at a node, or means over an interval."""
 
     place: Place
     torque: Affine
@@ -86,31 +82,32 @@ class SpringPoint(NamedTuple):
 
 
 def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
-    """Spring constraints of a motion to contact: means over the spline's intervals, and its end.
+    """Points of spring constraints of a motion to contact: means over the spline's intervals, and its end.
 
-    Accelerations of a spline are linear in an interval, those of a spring are not. Where their means are
-    right, so are the speeds at the intervals' ends, and with them the blow.
+    Accelerations of the spline are linear in an interval, those of a spring are not. With the right means,
+    the speeds at the intervals' ends are right, and so is the speed at contact.
 
     torques : over limit, at the motion's nodes.
     """
     out = []
     for one, other in pairwise(motion.breaks):
-        three = []
+        samples = []
         for s in (one, (one + other) / 2, other):
             near = np.flatnonzero(np.isclose(motion.nodes, s))
             torque = torques[near[0]] if near.size else Affine.constant(start_torque(b))
-            three.append((torque, *motion.at(s)[:2]))
+            samples.append((torque, *motion.at(s)[:2]))
         torque, y, y1 = (
             add([part * w for part, w in zip(parts, SIMPSON, strict=True)])
-            for parts in zip(*three, strict=True)
+            for parts in zip(*samples, strict=True)
         )
         out.append(SpringPoint(motion.place_at((one + other) / 2), torque, y, y1, motion.T[0]))
     return [*out, *follow_springs(motion, torques)[-1:]]
 
 
 def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
-    """Spring constraints of a motion to rest: the ends of the spline's intervals. With means it would
-    oscillate.
+    """Points of spring constraints of a motion to rest: the ends of the spline's intervals.
+
+    With means over intervals the motion would oscillate.
     """
     return [
         SpringPoint(motion.place_at(s), torque, *motion.at(s)[:2], motion.T[0])
@@ -120,29 +117,30 @@ def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[Sprin
 
 
 def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> None:
-    """Adds spring constraints at some points: torque = torque at rest - stiffness x turn - damping x rate.
+    """Adds spring constraints: torque = torque at rest - stiffness x deflection - damping x rate.
 
-    In contact the servo's own law is that of the spring.
+    None are needed in contact: a spring is modelled as a servo with its stiffness and damping as gains, and
+    the contact's equations have the servo's law.
 
-    gains : logarithms of the factors on them that are chosen.
+    gains : logarithms of factors on stiffness and damping, if these are variables.
     """
     robot, c = b.robot, b.coordinates
     passive = np.flatnonzero(robot.sprung)
     if not passive.size:
         return
     own = c.independent
-    given = [(gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd)]
+    stiffness, damping = ((gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd))
     slots: list[list[Any]] = [[point.y, point.y1, point.T, gains] for point in points]
-    at = b.add_block("spring", slots, np.concatenate([b.y0[c.base :], *given]))
+    at = b.add_block("spring", slots, np.concatenate([b.y0[c.base :], stiffness, damping]))
     rest, m = start_torque(b)[passive], b.ny - c.base
-    which = np.array([int(np.flatnonzero(own == k)[0]) for k in passive])
+    position = np.array([int(np.flatnonzero(own == k)[0]) for k in passive])  # in the block's outputs (m,)
     names = [robot.joint_names[k] for k in passive]
     for k, point in enumerate(points):
         b.rows.add(
             term="spring of a joint",
             place=point.place,
             components=names,
-            outputs=at + m * k + which,
+            outputs=at + m * k + position,
             affine=point.torque[passive] * -1.0,
             lower=-rest,
             upper=-rest,
@@ -151,9 +149,9 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
 
 
 def add_hinges(b: Builder, points: Sequence[tuple[Place, Affine]]) -> None:
-    """Adds constraints at places with these torques over limit (n,): those of soles' hinges are zero.
+    """Constrains the torques of soles' hinges to zero, at places with torques over limit (n,).
 
-    In contact the servo's own law is that: feed-forward and gains are zero.
+    None are needed in contact, where the servo's law gives zero: feed-forward and gains of hinges are zero.
     """
     free = np.flatnonzero(b.robot.hinges)
     for place, torque in points:

@@ -1,7 +1,7 @@
-"""The program of a blow alone: the state at contact, and the collision that it leads to.
+"""NLP of an impact alone: the state at contact and the collision.
 
-No swing need reach that state and no follow-through has to stop what it leaves behind, so its optimum is a
-bound on what a whole motion brings, found with a fraction of the variables; and it is a start for the motion.
+Without swing and follow-through it has a fraction of a whole motion's variables. Its optimum bounds that of
+the motion, and is an initial guess for it.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from impactopt.transcription.plan import PlannedStrike, total_ground_wrench
 
 
 class StrikeTranscription(ContactProgram):
-    """The program of one problem's strike, with the groups that its solution is read from.
+    """NLP of a problem's impact, and the groups that its solution is decoded from.
 
-    Terms and objectives are the problem's, but for those that only a whole motion has.
+    It has the problem's terms and objectives, except those of a whole motion only.
     elements, shares : of the contact, as of `ContactSet`.
     """
 
@@ -50,6 +50,7 @@ class StrikeTranscription(ContactProgram):
         fastest = np.full(b.ny, np.inf)
         fastest[c.base :] = limits.rate_limit[c.independent]
         coasting = add_coasting(b, {"lower": -fastest, "upper": fastest})
+        # T = 1 s, so that y' is the rate; no acceleration, as at the end of a swing
         still, one = Affine.zeros(b.ny), Affine.constant(1.0)
         state = ContactState(self.y[0], coasting.u0[0], still, one, self.legs[0], self.w[0])
         super().__init__(b, ContactSet(b, Contact(state, *coasting), elements, shares, after=True))
@@ -61,8 +62,8 @@ class StrikeTranscription(ContactProgram):
         self.hit.add_rows()
         self._add_after(fastest)
         if c.legs:
-            left = self.expected.state_after
-            self.angular_momentum = add_balance(b, state, left, self.hit.scenarios)
+            after = self.expected.state_after
+            self.angular_momentum = add_balance(b, state, after, self.hit.scenarios)
         self._finish(
             tuple(term for term in problem.active_terms if not term.whole_motion),
             tuple(o for o in problem.objectives if not o.whole_motion),
@@ -78,7 +79,11 @@ class StrikeTranscription(ContactProgram):
         return [*at_node([*by_leg(self.legs.index(0)), self.w.index(0)[:6]]), *self.hit.determined()]
 
     def _add_after(self, fastest: Array) -> None:
-        """The state that each target leaves behind is one to go on from."""
+        """Adds the position after each collision as a variable, and rate limits after the expected one.
+
+        fastest (ny,) : rate limits.  Of the three outputs a coordinate of the block ``link``, the second is
+        the position's equation.
+        """
         b, labels, far = self.builder, self.coordinates.labels, along(self.coordinates.labels, "off")
         hits = [hit for hit in self.hit.collisions if isinstance(hit, Collision)]
         if hits:
@@ -97,24 +102,25 @@ class StrikeTranscription(ContactProgram):
         )
 
     def _prices(self) -> Prices:
-        """Costs of sole wrenches, and of the least accelerations that lead from rest to the state at contact.
+        """Prices of sole wrenches, and of the least accelerations from rest to the state at contact.
 
-        A coordinate that has to go the way d to the rate u in the time T accelerates with at least
-        integral a^2 dt = 12 d^2/T^3 - 12 d u/T^2 + 4 u^2/T (the cubic).
+        A coordinate that moves by d from rest to the rate u in time T has at least
+        integral a^2 dt = 12 d^2/T^3 - 12 d u/T^2 + 4 u^2/T, which a cubic attains.
         """
         p, n = self.problem, self.layout.n
         T, linear, diagonal = float(np.mean(p.swing.duration)), np.zeros(n), np.zeros(n)
         y, u = self.y.index(0), self.u0.index(0)
-        way, both, rate = (2 * p.smoothness * k for k in (12 / T**3, -6 / T**2, 4 / T))
-        diagonal[y], diagonal[u] = way, rate
-        linear[y], linear[u] = -way * self.y0, -both * self.y0
-        mixed = sp.csr_array((np.full(len(y), both), (y, u)), shape=(n, n))
-        of_swing = (self.w, 2 * p.swing.intervals)  # one of its nodes
+        # second derivatives by d, by d and u, and by u, with d = y - y0
+        dd, du, uu = (2 * p.smoothness * k for k in (12 / T**3, -6 / T**2, 4 / T))
+        diagonal[y], diagonal[u] = dd, uu
+        linear[y], linear[u] = -dd * self.y0, -du * self.y0
+        mixed = sp.csr_array((np.full(len(y), du), (y, u)), shape=(n, n))
+        of_swing = (self.w, 2 * p.swing.intervals)  # priced as one of the swing's nodes
         diagonal += wrench_prices(
             self.builder, [of_swing, *[(hit.w, hit.w.count) for hit in self.hit.collisions]]
         )
         quadratic = sp.diags_array(diagonal) + mixed + mixed.T
-        return Prices(quadratic, linear, way / 2 * float(self.y0 @ self.y0))
+        return Prices(quadratic, linear, dd / 2 * float(self.y0 @ self.y0))
 
     def swing_spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
         return [(Place.plain("contact"), [self.contact_state[0], self.contact_legs])]
@@ -133,12 +139,13 @@ class StrikeTranscription(ContactProgram):
 
     def travel(self, x: Array, time: Array) -> Array:
         hit = self.decode(x).collision
-        gone = float(np.diff(hit.time) @ (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)
-        return np.where(np.asarray(time) > 0, gone, 0.0)
+        # by the trapezoidal rule; the two states are at contact and at separation
+        displacement = float(np.diff(hit.time) @ (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)
+        return np.where(np.asarray(time) > 0, displacement, 0.0)
 
     # ------------------------------------------------------------------ solution
     def decode(self, x: Array) -> PlannedStrike:
-        """The strike that solver variables (n,) stand for."""
+        """The planned impact of solver variables x (n,)."""
         c, still = self.coordinates, np.zeros(len(self.y0))
         before = self.y[0], self.u0[0], self.contact_legs
         states = [[e.evaluate(x) for e in state] for state in (before, self.expected.state_after[:3])]

@@ -1,19 +1,16 @@
-"""A nonlinear program made of small compiled blocks on affine lifts of the variables.
+"""Nonlinear program (NLP) assembled from small compiled blocks.
 
-Every nonlinear function is ``block(S x + c)`` with a constant sparse S, so the Jacobian's and the Hessian's
-nonzeros are a *constant* linear map of the blocks' own nonzeros.  That map is built once; an evaluation is:
-lift, call the compiled blocks without Python in the loop, and add their numbers up, run by run.
+**Assembly.** Every nonlinear function is ``block(z)`` of a lift z = S x + c of the decision vector x, with a
+constant sparse S. By the chain rule the nonzeros of Jacobian and Hessian are sums of the blocks' nonzeros
+times constant factors. These scatter-adds are planned once. An evaluation then computes the lift, calls the
+compiled blocks, and adds up their nonzeros.
 
-With respect to what it is written with, a function has few derivatives, and so has each stage. Together they
-take fewer operations than those of the function with all that is in it written out.
+**Runs.** Neighbours in a block's output mostly are neighbours in the matrix. So a scatter-add is stored as
+runs of neighbours, at four numbers a run; a sparse matrix for the same map has two numbers for each product.
+The map is read from memory in every iteration, and its size decides the time.
 
-What stands side by side in a function's output mostly belongs side by side in the matrix. A run says so in
-four numbers, where a sparse matrix that does the same needs two for every product; they are read as quickly
-as memory gives them, once in every iteration.
-
-Blocks take z = S x + c, so the nonzeros of both matrices are sums of multiples of the blocks' own nonzeros,
-with factors that never change. They are added up in runs: a block's variables that stand side by side are
-mostly variables of the program side by side.
+**Stages.** A block may be written with intermediate quantities (`Stage`), each a function of few others. The
+derivatives of function and stages, chained, take fewer operations than those of one large expression.
 """
 
 from __future__ import annotations
@@ -54,22 +51,26 @@ __all__ = [
 def derivatives(z: Any, out: Any, weights: Any, stages: Sequence[Stage] = ()) -> list[Any]:
     """``out`` (m,) of z (n,), its Jacobian (m, n) and the Hessian (n, n) of ``weights . out``, SX.
 
-    stages : what ``out`` is written with; each may be written with those before it.
+    stages : intermediate quantities that ``out`` is written with; each may depend on those before it.
     """
     symbols = [stage.symbols for stage in stages]
     both = ca.vertcat(z, *symbols)
+    # derivatives by z and the stages' symbols, as if these were independent
     jac = ca.jacobian(out, both)
-    slopes = ca.gradient(ca.dot(weights, out), both)
-    hess = ca.jacobian(slopes, both)
+    gradient = ca.gradient(ca.dot(weights, out), both)
+    hess = ca.jacobian(gradient, both)
+    # Eliminate stages from the last to the first. With s(u), u all before the stage, and S = ds/du:
+    #   J <- J_u + J_s S,   H <- H_uu + S'H_su + H_us S + S'H_ss S + sum_i (df/ds_i) d2s_i/du2
     for k in reversed(range(len(stages))):
         before = ca.vertcat(z, *symbols[:k])
         n = before.numel()
-        inner, bends = _slopes_and_bends(before, stages[k], slopes[n:])
-        hess += bends
-        crossed = ca.mtimes(inner.T, hess[n:, :n])
-        hess = hess[:n, :n] + crossed + crossed.T + ca.mtimes(ca.mtimes(inner.T, hess[n:, n:]), inner)
+        inner, curvature = _stage_derivatives(before, stages[k], gradient[n:])
+        hess += curvature
+        mixed = ca.mtimes(inner.T, hess[n:, :n])
+        hess = hess[:n, :n] + mixed + mixed.T + ca.mtimes(ca.mtimes(inner.T, hess[n:, n:]), inner)
         jac = jac[:, :n] + ca.mtimes(jac[:, n:], inner)
-        slopes = slopes[:n] + ca.mtimes(inner.T, slopes[n:])
+        gradient = gradient[:n] + ca.mtimes(inner.T, gradient[n:])
+    # replace the stages' symbols by their expressions of z
     values: list[Any] = []
     for k, stage in enumerate(stages):
         values += ca.substitute([stage.expression], symbols[:k], values)
@@ -77,72 +78,80 @@ def derivatives(z: Any, out: Any, weights: Any, stages: Sequence[Stage] = ()) ->
     return found
 
 
-def _slopes_and_bends(before: Any, stage: Stage, along: Any) -> tuple[Any, Any]:
-    """Slopes (k, n) of a stage's numbers, and what its second derivatives add to a Hessian (n + k, n + k) by
-    what is before them and by them, where they are weighted with ``along`` (k,).
+def _stage_derivatives(before: Any, stage: Stage, adjoint: Any) -> tuple[Any, Any]:
+    """Jacobian (k, n) of a stage's k symbols, and its curvature (n + k, n + k), to be added to a Hessian.
+
+    before (n,) : variables and symbols that it depends on.  adjoint (k,) : gradient of the function by the
+    stage's symbols, which weights the second derivatives.
     """
-    weights = ca.SX.sym("along", along.numel())
+    weights = ca.SX.sym("along", adjoint.numel())
     if stage.zero is None:
-        bends = ca.jacobian(ca.gradient(ca.dot(weights, stage.expression), before), before)
-        k = along.numel()
-        bends = ca.diagcat(bends, ca.SX(k, k))
-        return ca.jacobian(stage.expression, before), ca.substitute(bends, weights, along)
+        curvature = ca.jacobian(ca.gradient(ca.dot(weights, stage.expression), before), before)
+        k = adjoint.numel()
+        curvature = ca.diagcat(curvature, ca.SX(k, k))
+        return ca.jacobian(stage.expression, before), ca.substitute(curvature, weights, adjoint)
+    # Implicit function theorem: zero(u, s) = 0 with block diagonal M = dzero/ds has ds/du = -M^-1 dzero/du.
+    # The adjoint M^-T (df/ds) weights the second derivatives of `zero`, by u and s.
     both, first = ca.vertcat(before, stage.symbols), 0
-    right, slopes, adjoint = ca.jacobian(stage.zero, before), [], []
+    by_before, slopes, adjoints = ca.jacobian(stage.zero, before), [], []
     for matrix, (rows, columns) in stage.blocks:
         at = slice(first, first + matrix.size1())
-        moved = [j for j in range(before.numel()) if right[at, j].nnz()]
-        solved = solve_in_order(matrix, -right[at, moved], (rows, columns))[0]
+        nonzero = [j for j in range(before.numel()) if by_before[at, j].nnz()]
+        solved = solve_in_order(matrix, -by_before[at, nonzero], (rows, columns))[0]
         part = ca.SX(matrix.size1(), before.numel())
-        part[:, moved] = solved
+        part[:, nonzero] = solved
         slopes.append(ca.sparsify(part))
-        # the same pivots eliminate the transposed
-        adjoint.append(solve_in_order(matrix.T, along[at], (columns, rows))[0])
+        # the transposed matrix has the same pivots, with rows and columns swapped
+        adjoints.append(solve_in_order(matrix.T, adjoint[at], (columns, rows))[0])
         first = at.stop
-    bends = ca.jacobian(ca.gradient(ca.dot(weights, stage.zero), both), both)
-    return ca.vertcat(*slopes), -ca.substitute(bends, weights, ca.vertcat(*adjoint))
+    curvature = ca.jacobian(ca.gradient(ca.dot(weights, stage.zero), both), both)
+    return ca.vertcat(*slopes), -ca.substitute(curvature, weights, ca.vertcat(*adjoints))
 
 
-Places = npt.NDArray[np.int32]
+Int32 = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Runs (k,): ``factor`` times each of ``length`` entries, from ``entry`` on, goes to the places from
-    ``place`` on. shape : numbers of all places and of all entries.
+    """Scatter-add in k runs: for i < length,  out[destination + i] += factor * entries[source + i].
+
+    source, destination, length, factor : (k,) of each run.  shape : sizes of ``out`` and of ``entries``.
     """
 
-    entry: Places
-    place: Places
-    length: Places
+    source: Int32
+    destination: Int32
+    length: Int32
     factor: Array
     shape: tuple[int, int]
 
     @classmethod
-    def make(cls, entry: Index, place: Index, length: Index, factor: Array, shape: tuple[int, int]) -> Runs:
+    def make(
+        cls, source: Index, destination: Index, length: Index, factor: Array, shape: tuple[int, int]
+    ) -> Runs:
         """Makes runs from index arrays of any integer type."""
-        return cls(entry.astype(np.int32), place.astype(np.int32), length.astype(np.int32), factor, shape)
+        runs = source.astype(np.int32), destination.astype(np.int32), length.astype(np.int32)
+        return cls(*runs, factor, shape)
 
     def add_to(self, out: Array, entries: Array) -> None:
-        """Add the sums of these entries to ``out``."""
+        """Add the scattered entries to ``out``."""
         library = _library()
         if library is None:
             out += self._matrix @ entries
             return
-        runs = (address(a) for a in (self.entry, self.place, self.length, self.factor))
-        library.runs_add(ctypes.c_int64(self.entry.size), *runs, address(entries), address(out))
+        runs = (address(a) for a in (self.source, self.destination, self.length, self.factor))
+        library.runs_add(ctypes.c_int64(self.source.size), *runs, address(entries), address(out))
 
     @functools.cached_property
     def _matrix(self) -> sp.csr_array:
         within = count_up(self.length)
-        at = np.repeat(self.place, self.length) + within, np.repeat(self.entry, self.length) + within
+        at = np.repeat(self.destination, self.length) + within, np.repeat(self.source, self.length) + within
         return sp.csr_array((np.repeat(self.factor, self.length), at), shape=self.shape)
 
 
-def with_transposed(values: Array, across: Places) -> Array:
+def with_transposed(values: Array, across: Int32) -> Array:
     """Values (nnz,) of the sum of a matrix with a symmetric pattern and its transpose.
 
-    across (nnz,) : of each place the one across the diagonal.
+    across (nnz,) : for each nonzero, the number of the one mirrored at the diagonal.
     """
     library = _library()
     if library is None:
@@ -152,110 +161,120 @@ def with_transposed(values: Array, across: Places) -> Array:
     return out
 
 
-def count_up(lengths: Index | Places) -> Index:
-    """0, 1, ... length - 1 of each, one after the other."""
+def count_up(lengths: Index | Int32) -> Index:
+    """Ranges 0, 1, ... length - 1 of all lengths, concatenated."""
     ends = np.append(0, np.cumsum(lengths))
     return np.arange(int(ends[-1])) - np.repeat(ends[:-1], lengths)
 
 
 def union(first: Index, length: Index | int = 1) -> Index:
-    """The numbers (sorted, each once) in the runs that begin with ``first``."""
+    """Integers in the ranges  first ... first + length - 1,  sorted, each once."""
     length = np.broadcast_to(length, first.shape)
     order = np.argsort(first)
     start, end = first[order], np.maximum.accumulate(first[order] + length[order])
-    begins = np.append(True, start[1:] > end[:-1])[: start.size]
+    begins = np.append(True, start[1:] > end[:-1])[: start.size]  # of ranges that overlap none before them
     start, end = start[begins], end[np.append(begins[1:], True)[: end.size]]
     return np.repeat(start, end - start) + count_up(end - start)
 
 
 @functools.cache
 def _library() -> Any:
-    """C library, if there is a compiler; None: sparse products replace it."""
+    """C library; None without a compiler: then sparse products replace it."""
     return native_library(__package__, "scatter_add")
 
 
 class JacobianMap:
-    """Map of the blocks' Jacobians to that of the constraints g = out[...] + A x."""
+    """Scatter-add of the blocks' Jacobians to that of the constraints g = out[...] + A x, which is (m, n)."""
 
-    def __init__(self, blocks: Sequence[Block], lift: sp.csr_array, row_of: Index, linear: sp.csr_array):
-        """lift : S, of the inputs of all blocks.  row_of : each output's row; -1: none.  linear : A."""
+    def __init__(
+        self, blocks: Sequence[Block], lift: sp.csr_array, constraint_of: Index, linear: sp.csr_array
+    ):
+        """lift : S, of the inputs of all blocks.  linear : A (m, n).
+        constraint_of : number of the constraint that each output is in; -1: none.
+        """
         self._entries, starts = _shared([b.jacobian for b in blocks])
         self._shape = m, _ = linear.shape
-        parts, z, out = [], 0, 0
+        parts, z, out = [], 0, 0  # offsets of the block's inputs and outputs in those of all blocks
         for b, start in zip(blocks, starts, strict=False):
             rows, columns = b.jac_pattern
             instance = np.arange(b.count)[:, None]
-            row, column = row_of[out + instance * b.n_out + rows], z + instance * b.n_in + columns
+            # (instances, nonzeros of one): row in the constraints' Jacobian, column among the blocks' inputs
+            row, column = constraint_of[out + instance * b.n_out + rows], z + instance * b.n_in + columns
+            # a run: nonzeros of one column whose outputs are in consecutive constraints
             below = (columns[1:] == columns[:-1]) & (row[:, 1:] == row[:, :-1] + 1) & (row[:, :-1] >= 0)
             first, length = _runs(row.shape, below)
             row, column = row.ravel()[first], column.ravel()[first]
             first, length, row, column = (a[row >= 0] for a in (first, length, row, column))
-            owner, x, factor = _terms(lift, column)
+            # chain rule: input z_j = S_j x sends its column of the block's Jacobian to each x that it has
+            owner, x, factor = _lift_terms(lift, column)
             parts.append((start + first[owner], x * m + row[owner], length[owner], factor))
             z, out = z + b.count * b.n_in, out + b.count * b.n_out
-        entry, place, length, factor = _joined(parts)
-        at, values = _placed(linear)
-        places = union(np.concatenate([place, at]), np.concatenate([length, np.ones_like(at)]))
-        self._linear = np.bincount(np.searchsorted(places, at), values, places.size)
-        self._made = sp.csc_array((self._linear, *_csc(places, self._shape)), shape=self._shape)
-        shape = places.size, self._entries.size
-        self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
+        source, linear_index, length, factor = _concatenated(parts)
+        at, values = _linear_indices(linear)
+        pattern = union(np.concatenate([linear_index, at]), np.concatenate([length, np.ones_like(at)]))
+        self._linear = np.bincount(np.searchsorted(pattern, at), values, pattern.size)  # A in that pattern
+        self._template = sp.csc_array((self._linear, *_csc(pattern, self._shape)), shape=self._shape)
+        shape = pattern.size, self._entries.size
+        self._sums = Runs.make(source, np.searchsorted(pattern, linear_index), length, factor, shape)
 
     def matrix(self) -> sp.csc_array:
         """Jacobian for the blocks' latest values."""
         values = self._linear.copy()
         self._sums.add_to(values, self._entries)
-        return _with(self._made, values)
+        return _with_values(self._template, values)
 
 
 class HessianMap:
-    """Map of the lower triangles of the blocks' Hessians to the Hessian of sigma x'Qx/2 + multipliers . out.
+    """Scatter-add of the blocks' Hessians to that of sigma x'Qx/2 + multipliers . out, which is (n, n).
 
-    An entry off the diagonal of z stands for the one across it, too, and so does what it is a part of in x.
-    So entries are added up on one side, those of the diagonal halved, and the whole is that and its
-    transpose.
+    The lower triangle L of a block contributes S'(L + L' - diag L)S. So S'(L - diag L / 2)S is added up,
+    together with Q/2, and the Hessian is that matrix plus its transpose.
     """
 
     def __init__(self, blocks: Sequence[Block], lift: sp.csr_array, quadratic: sp.csc_array):
         """lift : S, of the inputs of all blocks.  quadratic : Q (n, n)."""
         self._entries, starts = _shared([b.hessian for b in blocks])
         self._shape = n, _ = quadratic.shape
-        parts, z, alike = [], 0, _alike(lift)
+        parts, z, continues = [], 0, _continues(lift)
         for b, start in zip(blocks, starts, strict=False):
             rows, columns = b.hess_pattern
             instance = np.arange(b.count)[:, None] * b.n_in
+            # (instances, nonzeros of one): row and column among the inputs of all blocks
             row, column = z + instance + rows, z + instance + columns
+            # a run: consecutive nonzeros of one column below the diagonal (diagonal ones are halved), whose
+            # rows have the same lift, of consecutive variables
             below = (columns[1:] == columns[:-1]) & (rows[1:] == rows[:-1] + 1) & (rows[:-1] > columns[:-1])
-            first, length = _runs(row.shape, below & alike[row[:, 1:]])
+            first, length = _runs(row.shape, below & continues[row[:, 1:]])
             row, column = row.ravel()[first], column.ravel()[first]
-            of_column, c, factor = _terms(lift, column)
-            of_term, r, by = _terms(lift, row[of_column])
+            # chain rule on both sides: each pair of a variable in the column's lift and one in the row's
+            of_column, c, factor = _lift_terms(lift, column)
+            of_term, r, row_factor = _lift_terms(lift, row[of_column])
             owner = of_column[of_term]
-            by = by * factor[of_term] * np.where(row == column, 0.5, 1.0)[owner]
-            parts.append((start + first[owner], c[of_term] * n + r, length[owner], by))
+            row_factor = row_factor * factor[of_term] * np.where(row == column, 0.5, 1.0)[owner]
+            parts.append((start + first[owner], c[of_term] * n + r, length[owner], row_factor))
             z += b.count * b.n_in
-        entry, place, length, factor = _joined(parts)
-        at, values = _placed(quadratic)
-        one, other = (_pattern(p, self._shape) for p in (union(place, length), union(at)))
-        whole = sp.csc_array(one + one.T + other)
-        self._made = whole
-        places = np.repeat(np.arange(n), np.diff(whole.indptr)) * n + whole.indices
-        numbers = sp.csc_array((np.arange(places.size), whole.indices, whole.indptr), self._shape)
+        source, linear_index, length, factor = _concatenated(parts)
+        at, values = _linear_indices(quadratic)
+        half, other = (_pattern(p, self._shape) for p in (union(linear_index, length), union(at)))
+        self._template = template = sp.csc_array(half + half.T + other)
+        pattern = np.repeat(np.arange(n), np.diff(template.indptr)) * n + template.indices
+        # transposing a matrix that holds the nonzeros' own numbers gives the number of each mirrored one
+        numbers = sp.csc_array((np.arange(pattern.size), template.indices, template.indptr), self._shape)
         self._across = numbers.T.tocsc().data.astype(np.int32)
-        self._half = np.bincount(np.searchsorted(places, at), 0.5 * values, places.size)
-        shape = places.size, self._entries.size
-        self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
+        self._half = np.bincount(np.searchsorted(pattern, at), 0.5 * values, pattern.size)  # Q/2
+        shape = pattern.size, self._entries.size
+        self._sums = Runs.make(source, np.searchsorted(pattern, linear_index), length, factor, shape)
 
     def matrix(self, sigma: float) -> sp.csc_array:
         """Hessian for the blocks' latest values."""
         values: Array = np.multiply(sigma, self._half)
         self._sums.add_to(values, self._entries)
         values = with_transposed(values, self._across)
-        return _with(self._made, values)
+        return _with_values(self._template, values)
 
 
 def _shared(functions: Sequence[BatchedFunction]) -> tuple[Array, Index]:
-    """One array that these functions write to from now on, and where each begins in it."""
+    """One array that all these functions write to from now on, and the offset of each in it."""
     starts = np.cumsum([0, *[f.size for f in functions]])
     entries = np.zeros(int(starts[-1]))
     for f, start in zip(functions, starts, strict=False):
@@ -263,23 +282,23 @@ def _shared(functions: Sequence[BatchedFunction]) -> tuple[Array, Index]:
     return entries, starts
 
 
-def _with(matrix: sp.csc_array, values: Array) -> sp.csc_array:
-    """The same pattern with other values: SciPy's own way looks at the whole pattern again."""
+def _with_values(matrix: sp.csc_array, values: Array) -> sp.csc_array:
+    """Matrix of the same pattern with other values, without SciPy's constructor, which checks the pattern."""
     out = copy.copy(matrix)
     out.data = values
     return out
 
 
-def _terms(lift: sp.csr_array, z: Index) -> tuple[Index, Index, Array]:
-    """Terms of these inputs: the position in z, the variable, and its coefficient."""
+def _lift_terms(lift: sp.csr_array, z: Index) -> tuple[Index, Index, Array]:
+    """Nonzeros of rows z of the lift: position in z, variable, coefficient; (k,) each."""
     count = lift.indptr[z + 1] - lift.indptr[z]
     owner = np.repeat(np.arange(len(z)), count)
     at = lift.indptr[z][owner] + count_up(count)
     return owner, lift.indices[at].astype(np.intp), lift.data[at]
 
 
-def _alike(lift: sp.csr_array) -> npt.NDArray[np.bool_]:
-    """Mask of the inputs that have the coefficients of the input before, each of the next variable."""
+def _continues(lift: sp.csr_array) -> npt.NDArray[np.bool_]:
+    """Mask of the rows of the lift that are the row before, shifted by one variable."""
     count = np.diff(lift.indptr)
     owner = np.repeat(np.arange(count.size), count)
     out = np.append(False, count[1:] == count[:-1])[: count.size]
@@ -291,9 +310,10 @@ def _alike(lift: sp.csr_array) -> npt.NDArray[np.bool_]:
 
 
 def _runs(shape: tuple[int, ...], follows: npt.NDArray[np.bool_]) -> tuple[Index, Index]:
-    """Beginnings and lengths of the runs of entries.
+    """Beginnings and lengths of runs of nonzeros; none crosses from one instance to the next.
 
-    shape : instances and entries of each; follows : which of the entries after the first goes on.
+    shape : (instances, nonzeros of one).  follows (instances, nonzeros - 1) : mask of nonzeros that continue
+    the run of the one before.
     """
     begins = np.ones(shape, dtype=bool)
     begins[:, 1:] = ~follows
@@ -301,32 +321,32 @@ def _runs(shape: tuple[int, ...], follows: npt.NDArray[np.bool_]) -> tuple[Index
     return first, np.diff(np.append(first, begins.size))
 
 
-def _joined(parts: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
-    """Entries, places, lengths and factors of all parts."""
+def _concatenated(parts: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """Sources, linear indices, lengths and factors of all parts."""
     none = np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0)
     return tuple(np.concatenate(of) for of in zip(none, *parts, strict=True))
 
 
-def _placed(matrix: sp.sparray) -> tuple[Index, Array]:
-    """Places ``column * rows + row`` of a matrix's entries, and their values."""
+def _linear_indices(matrix: sp.sparray) -> tuple[Index, Array]:
+    """Linear indices ``column * rows + row`` of a matrix's nonzeros, and their values."""
     entries = matrix.tocoo()
     rows, columns = entries.coords
     return columns.astype(np.intp) * matrix.shape[0] + rows, entries.data
 
 
-def _csc(places: Index, shape: tuple[int, int]) -> tuple[Index, Index]:
-    """Rows, and starts of columns, of the places ``column * rows + row``, which are in order."""
-    columns, rows = np.divmod(places, shape[0])
+def _csc(linear_indices: Index, shape: tuple[int, int]) -> tuple[Index, Index]:
+    """``indices`` and ``indptr`` of the CSC matrix whose nonzeros have these sorted linear indices."""
+    columns, rows = np.divmod(linear_indices, shape[0])
     starts = np.searchsorted(columns, np.arange(shape[1] + 1))
     return rows.astype(np.int32), starts.astype(np.int32)
 
 
-def _pattern(places: Index, shape: tuple[int, int]) -> sp.csc_array:
-    return sp.csc_array((np.ones(places.size), *_csc(places, shape)), shape)
+def _pattern(linear_indices: Index, shape: tuple[int, int]) -> sp.csc_array:
+    return sp.csc_array((np.ones(linear_indices.size), *_csc(linear_indices, shape)), shape)
 
 
 class StructuredProgram:
-    """The assembled program; implements :class:`impactopt.solvers.program.NonlinearProgram`."""
+    """Assembled NLP; implements :class:`impactopt.solvers.program.NonlinearProgram`."""
 
     def __init__(
         self,
@@ -339,9 +359,9 @@ class StructuredProgram:
         linear: Array,
         determined: Sequence[Determined] = (),
     ) -> None:
-        """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``rows`` and the layout's bounds.
+        """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to constraints ``rows`` and the layout's bounds.
 
-        determined : variables that equality constraints of their own determine.
+        determined : variables that the solver can eliminate by equality constraints.
         """
         self.determined = tuple(determined)
         self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(rows.origins)
@@ -351,37 +371,38 @@ class StructuredProgram:
         self._lift, self._lift_const = lift.matrix(n), lift.const
         self._z_offset = np.cumsum([0] + [b.count * b.n_in for b in blocks])
         self._out_offset = np.cumsum([0] + [b.count * b.n_out for b in blocks])
-        linear_rows = stack(rows.affine)
-        self._row_out = np.concatenate([np.zeros(0, dtype=np.intp), *rows.outputs])
-        self._nonlinear = np.flatnonzero(self._row_out >= 0)
-        self._of_nonlinear = self._row_out[self._nonlinear]
-        taken, times = np.unique(self._of_nonlinear, return_counts=True)
-        if (times > 1).any():
-            twice = self._nonlinear[self._of_nonlinear == taken[times > 1][0]]
+        affine = stack(rows.affine)
+        # number of the block output in each constraint; -1: the constraint is affine
+        output_of = np.concatenate([np.zeros(0, dtype=np.intp), *rows.outputs])
+        self._nonlinear = np.flatnonzero(output_of >= 0)  # constraints with an output
+        self._of_nonlinear = output_of[self._nonlinear]  # and that output
+        outputs, uses = np.unique(self._of_nonlinear, return_counts=True)
+        if (uses > 1).any():
+            twice = self._nonlinear[self._of_nonlinear == outputs[uses > 1][0]]
             one, other = (self.origins[i] for i in twice[:2])
             raise InputError(
                 f"one output of a block is in two constraints, {one!s} and {other!s}: give the block that "
                 "output twice, or lift it"
             )
-        self.m = len(self._row_out)
-        self._rows_matrix, self._rows_const = linear_rows.matrix(n), linear_rows.const
+        self.m = len(output_of)
+        self._affine_matrix, self._affine_const = affine.matrix(n), affine.const
         self.g_lower = np.concatenate([np.zeros(0), *rows.lower])
         self.g_upper = np.concatenate([np.zeros(0), *rows.upper])
-        self._at: tuple[Array, list[Array]] | None = None  # where functions were last asked for
+        self._at: tuple[Array, list[Array]] | None = None  # last x with its lift, which all functions need
         self._c = np.zeros(n)
         np.add.at(self._c, objective.cols, objective.vals)
         self._c += linear
         self._c0, self._Q = float(objective.const.sum()), sp.csc_array(quadratic)
-        self._curvature = self._Q.copy()  # without the zeros of places that clearance may couple
+        # Q has explicit zeros, which reserve the pattern for couplings by clearance; products skip them
+        self._curvature = self._Q.copy()
         self._curvature.eliminate_zeros()
-        self.seconds = 0.0
+        self.seconds = 0.0  # spent on evaluations
 
     def take_numbers(self, layout: Layout, blocks: Sequence[Block], rows: Rows) -> None:
-        """The numbers of another program of the same structure, whose blocks and constraints are the first of
-        this one's; the others keep theirs.
+        """Take over bounds, constants and parameters of another program of the same structure.
 
-        Blocks and constraints touch the same variables, with the same weights, and the objective is the same:
-        what differs are bounds, constants and parameters.
+        Its blocks and constraints correspond to the first ones of this program; the rest is kept. Variables,
+        their coefficients and the objective have to be the same.
         """
         self.x_lower, self.x_upper = layout.lower, layout.upper
         for mine, other in zip(self.blocks, blocks, strict=False):
@@ -392,11 +413,11 @@ class StructuredProgram:
             found = np.concatenate([np.zeros(0), *given])
             setattr(self, name, np.concatenate([found, getattr(self, name)[len(found) :]]))
         constants = np.concatenate([np.zeros(0), *(affine.const for affine in rows.affine)])
-        self._rows_const = np.concatenate([constants, self._rows_const[len(constants) :]])
+        self._affine_const = np.concatenate([constants, self._affine_const[len(constants) :]])
         self._at = None
 
     def same_numbers(self, other: StructuredProgram) -> bool:
-        """True if bounds, constants, weights and parameters equal those of another program, to rounding."""
+        """True if bounds, constants, coefficients and parameters equal another program's, up to rounding."""
         mine, its = self._numbers(), other._numbers()
         return len(mine) == len(its) and all(
             a.shape == b.shape and np.allclose(a, b, rtol=1e-12, atol=1e-12)
@@ -404,10 +425,10 @@ class StructuredProgram:
         )
 
     def _numbers(self) -> list[Array]:
-        matrices = self._lift, self._rows_matrix, self._Q
+        matrices = self._lift, self._affine_matrix, self._Q
         return [
             *(self.x_lower, self.x_upper, self.g_lower, self.g_upper),
-            *(self._lift_const, self._rows_const, self._c, np.array([self._c0])),
+            *(self._lift_const, self._affine_const, self._c, np.array([self._c0])),
             *(part for matrix in matrices for part in (matrix.data, matrix.indices, matrix.indptr)),
             *(b.parameters for b in self.blocks),
         ]
@@ -415,15 +436,16 @@ class StructuredProgram:
     # ------------------------------------------------------------------ evaluation
     @cached_property
     def _jacobian(self) -> JacobianMap:
-        row_of_out = np.full(int(self._out_offset[-1]), -1, dtype=np.intp)
-        row_of_out[self._of_nonlinear] = self._nonlinear
-        return JacobianMap(self.blocks, self._lift, row_of_out, self._rows_matrix)
+        constraint_of = np.full(int(self._out_offset[-1]), -1, dtype=np.intp)
+        constraint_of[self._of_nonlinear] = self._nonlinear
+        return JacobianMap(self.blocks, self._lift, constraint_of, self._affine_matrix)
 
     @cached_property
     def _hessian(self) -> HessianMap:
         return HessianMap(self.blocks, self._lift, self._Q)
 
     def _lifted(self, x: Array) -> list[Array]:
+        """Inputs z (count, n_in) of each block."""
         if self._at is not None and np.array_equal(self._at[0], x):
             return self._at[1]
         z = self._lift @ x + self._lift_const
@@ -435,11 +457,11 @@ class StructuredProgram:
         return parts
 
     def outputs(self, x: Array) -> dict[str, Array]:
-        """Every block's outputs, name -> (count, n_out); of several of one name the last's."""
+        """Outputs of all blocks, name -> (count, n_out); of several with one name, the last one's."""
         return {b.name: b.value(z).copy() for b, z in zip(self.blocks, self._lifted(x), strict=True)}
 
     def all_outputs(self, x: Array) -> Array:
-        """Outputs of all blocks one after the other, as constraints and lifted variables number them."""
+        """Outputs of all blocks, concatenated: the numbering that constraints and lifted variables use."""
         return np.concatenate([b.value(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)])
 
     def objective(self, x: Array) -> float:
@@ -450,7 +472,7 @@ class StructuredProgram:
 
     def constraints(self, x: Array) -> Array:
         t = time.perf_counter()
-        g = self._rows_matrix @ x + self._rows_const
+        g = self._affine_matrix @ x + self._affine_const
         if self.blocks:
             g[self._nonlinear] += self.all_outputs(x)[self._of_nonlinear]
         self.seconds += time.perf_counter() - t
@@ -458,7 +480,7 @@ class StructuredProgram:
 
     def jacobian(self, x: Array) -> sp.csc_array:
         t = time.perf_counter()
-        found = self._jacobian  # blocks write where it reads
+        found = self._jacobian  # before the blocks are called: it sets the array that they write to
         for b, z in zip(self.blocks, self._lifted(x), strict=True):
             b.jacobian(z)
         out = found.matrix()
@@ -467,7 +489,8 @@ class StructuredProgram:
 
     def hessian(self, x: Array, sigma: float, multipliers: Array) -> sp.csc_array:
         t = time.perf_counter()
-        found, lam = self._hessian, np.zeros(int(self._out_offset[-1]))
+        found = self._hessian  # before the blocks are called: it sets the array that they write to
+        lam = np.zeros(int(self._out_offset[-1]))  # multiplier of each output's constraint
         lam[self._of_nonlinear] = multipliers[self._nonlinear]
         for b, z, o in zip(self.blocks, self._lifted(x), self._out_offset, strict=False):
             b.hessian(z, lam[o : o + b.count * b.n_out].reshape(b.count, b.n_out))
@@ -480,11 +503,11 @@ class StructuredProgram:
         return str(self.origins[i])
 
     def row_group(self, i: int) -> tuple[str, str]:
-        """Its term and place: the constraints that one message stands for."""
+        """Term and place of constraint i; a message names one constraint of such a group."""
         return self.origins[i].term, self.origins[i].place.name
 
     def describe_violation(self, i: int, x: Array, amount: float) -> tuple[str, str]:
-        """Row i at x, and how far it is from being met: as a person reads it."""
+        """Name of constraint i with its time at x, and the amount of its violation in words."""
         return self.origins[i].told(x, amount)
 
     def variable_name(self, j: int) -> str:
@@ -497,7 +520,7 @@ def derivative_functions(name: str, z: Any, p: Any, out: Any, through: Sequence[
     ``name`` (z, p) -> out, ``name_jac`` (z, p) -> d out/dz,
     ``name_hess`` (z, p, lam) -> lower triangle of d2(lam.out)/dz2.
 
-    through : what ``out`` is written with.
+    through : stages that ``out`` is written with.
     """
     lam = ca.SX.sym("lam", out.numel())
     out, jac, hess = derivatives(z, ca.densify(out), lam, through)

@@ -1,15 +1,16 @@
-"""Transcribes an impact problem to a nonlinear program, and its solution back to a plan.
+"""Transcription of an impact problem to a nonlinear program (NLP), and of its solution to a plan.
 
-Phases: swing (rest to contact), compression, restitution, follow-through (the predicted state after contact
-to rest).  Swing and follow-through are cubic splines in the independent coordinates; their legs and sole
-wrenches are variables of the nodes.  The two contact phases are Radau IIA collocation of the frozen dynamics
-with their durations as variables.
+Phases: swing (rest to contact), contact (compression and restitution), follow-through (from the predicted
+state after contact to rest). Swing and follow-through are cubic splines in the independent coordinates, with
+legs and sole wrenches as variables of their nodes. The contact phases are Radau IIA collocation, with their
+durations as variables.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from itertools import groupby
 from typing import Any, cast
 
@@ -50,12 +51,12 @@ from impactopt.transcription.plan import Piece, Plan
 from impactopt.transcription.simd import in_lanes
 from impactopt.transcription.springs import (
     SpringPoint,
-    TorqueCourse,
+    TorqueProfile,
     follow_springs,
     swing_springs,
-    torque_courses,
+    torque_profiles,
 )
-from impactopt.transcription.stance_change import Course
+from impactopt.transcription.stance_change import PhaseSequence
 from impactopt.transcription.structured import derivative_functions
 
 __all__ = ["Transcription", "block_functions", "statement_of"]
@@ -69,17 +70,17 @@ def block_functions(
     report: Callable[[str], None] | None = None,
     elements: Elements = (),
 ) -> dict[str, Any]:
-    """The compiled blocks (value, Jacobian, Hessian) of a problem, from the cache where they are in it.
+    """The compiled blocks (value, Jacobian, Hessian) of a problem; from the cache, if they are in it.
 
-    elements : of the contact, if not those that the problem asks for; a peak of its forces depends on them.
+    elements : of the contact, if not the problem's; the block of the peak force depends on them.
     """
     robot = problem.robot
     edges = len(support_polygon(robot, coordinates))
+    # `recipe` has what shapes every block, and `keys` what shapes single ones besides: the key of the cache
     recipe = (*_coordinates_recipe(coordinates), problem.striker, edges)
     target = problem.target
     frozen = () if problem.frozen is None else (problem.frozen,)
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
-    groups: list[FunctionGroup] = []
     springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
     rubs = () if problem.friction is None else ("rubs",)
@@ -91,28 +92,33 @@ def block_functions(
         name: ExtraBlock(keys.get(name, ()), build)
         for name, build in own_blocks(problem, coordinates, edges).items()
     }
-    for name, block in {**found, **extra_blocks(problem, coordinates, elements)}.items():
-
-        def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
-            b = block.build()
-            return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
-
-        groups.append(
-            FunctionGroup(name=f"{robot.name}-{name}", recipe=(name, *recipe, *block.key), build=functions)
+    found |= extra_blocks(problem, coordinates, elements)
+    blocks = [(name, (*recipe, *block.key), block.build) for name, block in found.items()]
+    soles = [(sole.frame, len(sole.polygon)) for sole in problem.soles]
+    blocks += [
+        (name, (*_coordinates_recipe(c), *soles), build)
+        for name, (c, build) in stance_blocks(problem).items()
+    ]
+    groups = [
+        FunctionGroup(
+            name=f"{robot.name}-{name}", recipe=(name, *key), build=partial(_functions, name, build)
         )
-    for name, (c, build) in stance_blocks(problem).items():
-
-        def of_stance(name: str = name, build: Callable[[], BlockExpression] = build) -> list[Any]:
-            b = build()
-            return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
-
-        key = name, *_coordinates_recipe(c), *((sole.frame, len(sole.polygon)) for sole in problem.soles)
-        groups.append(FunctionGroup(name=f"{robot.name}-{name}", recipe=key, build=of_stance))
+        for name, key, build in blocks
+    ]
     return cached_groups(groups, report=report)
 
 
+def _functions(name: str, build: Callable[[], BlockExpression]) -> list[Any]:
+    """Value, Jacobian and Hessian of a block, for several instances at once."""
+    b = build()
+    return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
+
+
 def _coordinates_recipe(c: StanceCoordinates) -> tuple[Any, ...]:
-    """Recipe of a block beside its formula: the model, and what its legs hold how."""
+    """Part of a block's cache key: robot model, and the frames and placements of the closed legs.
+
+    Placements are rounded, so that rounding errors of a stance compile nothing anew.
+    """
     return (
         model_hash(c.robot.model, c.robot.springs),
         tuple((leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12))) for leg in c.legs),
@@ -122,18 +128,18 @@ def _coordinates_recipe(c: StanceCoordinates) -> tuple[Any, ...]:
 
 
 class Transcription(ContactProgram):
-    """The program of one problem, with the parts that its solution is read from.
+    """NLP of a whole motion, and the parts that its solution is decoded from.
 
-    nodes : beside the ends and middles of the splines' intervals.
+    nodes : nodes in addition to the ends and middles of the splines' intervals.
     elements, shares : of the contact, as of `ContactSet`.
 
     Attributes
     ----------
-    swing, follow, abort : the motions; the last one for a blow that meets nothing, if a scenario asks for it.
-    follows : those after contact.
-    before, after : the stance phases up to contact, and those after it, of each of `follows`.
-    torques : over limit, at each node of swing and follows, if something asks for torques as variables; else
-        at contact alone.
+    swing, follow, abort : the motions; `abort` is None unless a scenario requires an abort motion.
+    follows : the motions after contact.
+    before, after : sequence of stance phases up to contact, and those after it, one for each of `follows`.
+    torques : over limit (n,), at each node of the swing and of `follows` if a term or an objective needs
+        torques as variables, else at contact only.
     """
 
     def __init__(
@@ -147,15 +153,17 @@ class Transcription(ContactProgram):
     ) -> None:
         b, self.nodes = Builder(problem, coordinates, functions), nodes
         before, after = range(problem.blow + 1), range(problem.blow, max(1, len(problem.stances)))
-        self.before = Course(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
+        self.before = PhaseSequence(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
         self.swing = cast(Swing, self.before.phases[problem.blow])
         contact = Contact(self.swing.end, *add_coasting(b))
         super().__init__(b, ContactSet(b, contact, elements, shares, after=False))
-        self.after = [Course(b, after, lambda _, ends: FollowThrough(b, nodes.follow, ends=ends), nodes)]
+        self.after = [
+            PhaseSequence(b, after, lambda _, ends: FollowThrough(b, nodes.follow, ends=ends), nodes)
+        ]
         self.follow = cast(FollowThrough, self.after[0].phases[problem.blow])
         self.abort: AbortMotion | None = None
         if (late := problem.abort_after) is not None:
-            aborted = Course(
+            aborted = PhaseSequence(
                 b,
                 after,
                 lambda _, ends: AbortMotion(b, nodes.follow, after=late, ends=ends),
@@ -171,13 +179,13 @@ class Transcription(ContactProgram):
         add_clearance(b, self.swing, self.follow, self.hit.expected.target_state)
         self.hit.add_rows()
         self._add_links()
-        if coordinates.drifts:  # after the links, which determine where the follow-through starts
-            self.swing.add_momentum_rows(b)
-            self.follow.add_momentum_rows(b)
+        if coordinates.drifts:  # after the links, whose constraints determine the start of the follow-through
+            self.swing.add_momentum_conservation(b)
+            self.follow.add_momentum_conservation(b)
         if coordinates.legs:
             y, y1, T = self.follow.start
-            left = [y, y1, self.follow.legs[0], T]
-            self.angular_momentum = add_balance(b, contact.state, left, self.hit.scenarios)
+            separation = [y, y1, self.follow.legs[0], T]
+            self.angular_momentum = add_balance(b, contact.state, separation, self.hit.scenarios)
         self._finish(problem.active_terms, problem.objectives)
 
     # ------------------------------------------------------------------ for terms and objectives
@@ -188,35 +196,35 @@ class Transcription(ContactProgram):
 
     @property
     def swing_nodes(self) -> Array:
-        """Places of the swing's nodes in it, from 0 to 1."""
+        """Nodes of the swing, fractions of it."""
         return self.swing.nodes
 
     @property
     def follow_nodes(self) -> Array:
-        """Places of the nodes of the motions to rest in them, from 0 to 1."""
+        """Nodes of the motions to rest, fractions of these."""
         return self.follow.nodes
 
     def swing_place(self, s: float) -> Place:
-        """A place in the swing."""
+        """Place of fraction s of the swing, for messages."""
         return self.swing.place_at(s)
 
     def swing_spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
         return self.swing.spots(since)
 
     def swing_motion(self) -> list[tuple[Place, list[Affine]]]:
-        """Places of the swing's nodes with y, y', y'', legs and T [s], that y' and y'' are of."""
+        """Places of the swing's nodes with y, y', y'', legs and T [s]; ydot = y'/T."""
         return self.swing.motion()
 
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         return [spot for follow in self.follows for spot in follow.spots()]
 
-    def torque_courses(self) -> list[TorqueCourse]:
-        """Torques over limit of all motions, of a program that has them as variables."""
-        return torque_courses(self.builder, self.swing, self.follows, self.torques)
+    def torque_courses(self) -> list[TorqueProfile]:
+        """Torques over limit of all motions; the program must have them as variables."""
+        return torque_profiles(self.builder, self.swing, self.follows, self.torques)
 
     # ------------------------------------------------------------------ constraints
     def _add_motions(self) -> None:
-        """One block for the nodes of all motions, and of coasting in contact; and what bounds the splines."""
+        """Adds one block for the nodes of all motions and the end of coasting, and bounds of the splines."""
         b, limits = self.builder, self.builder.limits
         instances, places = self.swing.instances()
         for follow in self.follows:
@@ -235,8 +243,9 @@ class Transcription(ContactProgram):
             fading=self.before.fading(self.problem.blow),
         )
         self._slots = instances, places
-        self._add_torque_rows(places, outputs)
+        self._add_torque_limits(places, outputs)
         joints = np.arange(self.coordinates.base, b.ny)
+        # the swing's last control point is no variable, so its position limits are no bounds of variables
         b.rows.add(
             term=limits.position.name,
             place="contact",
@@ -246,29 +255,29 @@ class Transcription(ContactProgram):
             upper=limits.y_upper[joints],
             measure=degrees("outside"),
         )
-        self.swing.add_rate_rows(b)
+        self.swing.add_rate_limits(b)
         for follow in self.follows:
-            follow.add_rate_rows(b)
-        for course in (self.before, *self.after):
-            course.add_stands()
-            course.add_changes()
+            follow.add_rate_limits(b)
+        for sequence in (self.before, *self.after):
+            sequence.add_stands()
+            sequence.add_changes()
 
     @property
     def torques_lifted(self) -> bool:
-        """True if the torques at the nodes are variables, as a term beside their limit needs them."""
+        """True if torques at the nodes are variables, because more than the torque limit needs them."""
         p = self.problem
         if self.robot.passive.any() or any(term.needs_torques for term in p.active_terms):
             return True
         return any(o.needs_torques for o in p.objectives)
 
-    def _add_torque_rows(self, places: list[Place], outputs: list[Index]) -> None:
-        """``outputs``: the torques over limit at each node."""
+    def _add_torque_limits(self, places: list[Place], outputs: list[Index]) -> None:
+        """Adds torque limits.  outputs : for each node, numbers (n,) of its torques among block outputs."""
         b, torque_limit = self.builder, self.builder.limits.torque
         limit, names = torque_limit.fraction, self.robot.joint_names
         strong = percent("over its limit", of=limit)
         contact = len(self.swing.nodes) - 1
         for i, (place, torque) in enumerate(zip(places, outputs, strict=True)):
-            if i == contact:  # there it is the variable `feedforward`, which has the limit as its bounds
+            if i == contact:  # the torque is the variable `feedforward`, whose bounds are the limit
                 self.torques.append(self.feedforward[0])
             elif self.torques_lifted:
                 group = b.lift(
@@ -295,7 +304,11 @@ class Transcription(ContactProgram):
         self.hit.add_feedforward_rows(outputs[contact])
 
     def _add_links(self) -> None:
-        """Links the motions after contact to the end of the contact, or of coasting."""
+        """Adds constraints that link motions after contact to the end of the contact, or of coasting.
+
+        An instance of the block ``link`` has three outputs for each coordinate: the rate at contact, then
+        position and rate after contact.
+        """
         b, hit = self.builder, self.hit
         instances = hit.expected.link(self.follow.start)
         for other in hit.scenarios:
@@ -303,17 +316,17 @@ class Transcription(ContactProgram):
         if self.abort is not None:
             instances += self.abort.link(hit.contact)
         at = b.add_block("link", instances, np.zeros(0))
-        labels, places = self.coordinates.labels, at + 3 * np.arange(b.ny)
+        labels, first = self.coordinates.labels, at + 3 * np.arange(b.ny)
         far, fast = along(labels, "off"), rates(labels)
-        b.equal("collision starts from the swing's end", "rate", labels, places, fast)
-        b.equal("follow-through starts from the predicted state", "position", labels, places + 1, far)
-        b.equal("follow-through starts from the predicted state", "rate", labels, places + 2, fast)
+        b.equal("collision starts from the swing's end", "rate", labels, first, fast)
+        b.equal("follow-through starts from the predicted state", "position", labels, first + 1, far)
+        b.equal("follow-through starts from the predicted state", "rate", labels, first + 2, fast)
         if self.abort is not None:
-            after = places + 3 * b.ny * len(hit.collisions)
+            after = first + 3 * b.ny * len(hit.collisions)
             b.equal("abort motion starts where coasting ends", "position", labels, after + 1, far)
             b.equal("abort motion starts where coasting ends", "rate", labels, after + 2, fast)
         for other in hit.scenarios:
-            outputs = places + 1 + 3 * b.ny * other.number
+            outputs = first + 1 + 3 * b.ny * other.number
             b.equal("state after contact", f"position{other.suffix}", labels, outputs, far)
 
     # ------------------------------------------------------------------ structure
@@ -340,33 +353,32 @@ class Transcription(ContactProgram):
         coasting = [] if self.abort is None else [self.abort.coast_w]
         wrenches = [part.w for part in (self.swing, *self.follows, *self.hit.collisions)]
         motions, b = [self.swing, *self.follows], self.builder
+        # the price of coming to rest is on the last stance phase: the follow-through, if none comes after it
         to_rest = self.follows if len(self.after[0].numbers) == 1 else []
         self._style = style_prices(b, motions, to_rest)
         prices = motion_prices(b, motions, to_rest, [*wrenches, *coasting])
-        for course in (self.before, *self.after):
-            for k, phase in course.stands.items():
+        for sequence in (self.before, *self.after):
+            for k, phase in sequence.stands.items():
                 last = [phase] if k == len(self.problem.stances) - 1 else []
-                prices = prices + motion_prices(course.builders[k], [phase], last, [phase.w])
-                self._style = self._style + style_prices(course.builders[k], [phase], last)
+                prices = prices + motion_prices(sequence.builders[k], [phase], last, [phase.w])
+                self._style = self._style + style_prices(sequence.builders[k], [phase], last)
         return prices + self._style
 
     def _determined(self) -> list[Determined]:
         found = [*self.swing.determined(), *self.hit.determined()]
         for follow in self.follows:
             found += follow.determined()
-        for course in (self.before, *self.after):
-            found += [each for phase in course.stands.values() for each in phase.determined()]
+        for sequence in (self.before, *self.after):
+            found += [each for phase in sequence.stands.values() for each in phase.determined()]
         return [*found, determined(Turn.RATE, self.u0.index(0))]
 
     # ------------------------------------------------------------------ solution
     def worth(self, x: Array) -> float:
-        """Weighted sum of the objectives [N s], without prices, for solver variables (n,)."""
+        """Weighted sum of the objectives [N s] at solver variables x (n,), without prices."""
         return sum((-o.weight if o.cost else o.weight) * q.evaluate(x) for o, q in self.objectives)
 
     def price_shares(self, x: Array) -> tuple[float, float]:
-        """Shares of the objectives that all prices on motion take, and those of its style alone, for solver
-        variables (n,).
-        """
+        """Prices of the motion over the objectives' sum, at solver variables x (n,): all, and style only."""
         worth = self.worth(x)
         if not worth:
             return np.inf, np.inf
@@ -385,12 +397,15 @@ class Transcription(ContactProgram):
                 BodyState(2 + missed, place.name, begin + s * curve.duration, self.posture(x, slots))
                 for s, (place, slots) in zip(nodes, follow.spots(), strict=True)
             ]
-        for missed, course in enumerate(self.after):
-            out += self._stand_states(x, course, plan.pieces(missed=bool(missed)), 2 + missed)
+        for missed, sequence in enumerate(self.after):
+            out += self._stand_states(x, sequence, plan.pieces(missed=bool(missed)), 2 + missed)
         return out + self._stand_states(x, self.before, plan.pieces(), 0)
 
-    def _stand_states(self, x: Array, course: Course, pieces: list[Piece], phase: int) -> list[BodyState]:
-        found = iter(course.spots())
+    def _stand_states(
+        self, x: Array, sequence: PhaseSequence, pieces: list[Piece], phase: int
+    ) -> list[BodyState]:
+        """States of the phases without the impact."""
+        found = iter(sequence.spots())  # of all these phases; each takes as many as it has nodes
         of_number = {piece.number: piece for piece in pieces}
         return [
             BodyState(
@@ -399,23 +414,24 @@ class Transcription(ContactProgram):
                 of_number[k].start + s * of_number[k].spline.duration,
                 self.posture(x, slots),
             )
-            for k, stand in course.stands.items()
+            for k, stand in sequence.stands.items()
             for s, (place, slots) in zip(stand.nodes, found, strict=False)
         ]
 
     def body_spots(self) -> list[tuple[Place, list[Affine]]]:
-        stands = [spot for course in (self.before, *self.after) for spot in course.spots()]
+        stands = [spot for sequence in (self.before, *self.after) for spot in sequence.spots()]
         return [*super().body_spots(), *stands]
 
     def travel(self, x: Array, time: Array) -> Array:
         return self.decode(x).travel(time)
 
     def decode(self, x: Array) -> Plan:
-        """The plan that solver variables (n,) stand for."""
+        """The plan of solver variables x (n,)."""
         abort, nodes, wrench = self.abort, self.swing.nodes, self.swing.wrenches(x)
         if nodes[0]:
+            # A swing from rest has no node at its start: the first node's wrench, which respects the torque
+            # limits, holds there too, and the reference corrects it to balance the robot.
             nodes = np.append(0.0, nodes)
-            # that of the first node, which the torque limits allow; the reference balances it
             wrench = np.vstack([wrench[:1], wrench])
         return Plan(
             problem=self.problem,
@@ -436,34 +452,38 @@ class Transcription(ContactProgram):
 
 
 def statement_of(t: Transcription) -> str:
-    """JSON summary of a program, for a reader that knows nothing of this package.
+    """JSON summary of a program, which a reader understands without this package.
 
-    `groups`: name, count and size of the variables, in their order. `rows`: term, place and the number of a
-    list of `components`. `more`: nodes beside those of the mesh, as of `MoreNodes`. `elements`, `guarded`,
-    `shares`, `shortest`: of the contact, its least durations [s] by collision. `apart`: rows between bodies.
+    `groups`: name, count and size of the groups of variables, in their order. `rows`: constraints, by term,
+    place and the index of a list in `components`. `more`: nodes in addition to the mesh's, as of `MoreNodes`.
+    `elements`, `guarded`, `shares`, `shortest`: of the contact; its least durations [s] by collision.
+    `apart`: clearance constraints.
     """
-    lists: dict[tuple[str, ...], int] = {}
-    rows = []
-    for (term, place), found in groupby(t.rows.origins, lambda row: (row.term, row.place.name)):
-        components = tuple(row.component for row in found)
-        rows.append([term, place, lists.setdefault(components, len(lists))])
+    component_lists: dict[tuple[str, ...], int] = {}  # each list once, with its index
+    constraints = []
+    for (term, place), found in groupby(t.rows.origins, lambda origin: (origin.term, origin.place.name)):
+        components = tuple(origin.component for origin in found)
+        constraints.append([term, place, component_lists.setdefault(components, len(component_lists))])
     collisions = [c for c in t.hit.collisions if isinstance(c, Collision)]
-    # directions as they are now: begun at those of a first round, other distances than the least are found
-    ways = [way.tolist() for block in t.blocks if isinstance(block, SeparationBlock) for way in block.of.ways]
-    held: list[dict[str, Any]] = [
-        {**row._asdict(), **kept._asdict(), "way": way}
-        for (row, kept), way in zip(t.apart_rows.items(), ways, strict=True)
+    # Separating directions at the solution. An evaluation that starts from those of an earlier round may find
+    # a local maximum of the separation, which is not the distance.
+    directions = [
+        d.tolist() for block in t.blocks if isinstance(block, SeparationBlock) for d in block.of.ways
+    ]
+    clearance: list[dict[str, Any]] = [
+        {**constraint._asdict(), **held._asdict(), "way": direction}
+        for (constraint, held), direction in zip(t.apart_rows.items(), directions, strict=True)
     ]
     return json.dumps(
         {
             "groups": [[g.name, g.count, g.size] for g in t.layout.groups.values()],
-            "rows": rows,
-            "components": list(lists),
+            "rows": constraints,
+            "components": list(component_lists),
             "more": [list(t.nodes.swing), list(t.nodes.follow), *map(list, t.nodes.stands)],
             "elements": t.hit.elements if collisions else [],
             "guarded": t.hit.guarded,
             "shares": list(t.hit.shares),
             "shortest": [c.shortest for c in collisions],
-            "apart": held,
+            "apart": clearance,
         }
     )

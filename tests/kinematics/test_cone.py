@@ -59,13 +59,13 @@ def test_torsion_and_cop_bounds_are_carons_closed_form_for_a_rectangle(seed: int
     """For given (f, m_x, m_y) the cone leaves exactly the interval of m_z of Caron et al. 2015."""
     rng = np.random.default_rng(seed)
     long, wide, mu = rng.uniform(0.05, 0.15), rng.uniform(0.03, 0.08), rng.uniform(0.2, 1.2)
-    rows = contact_wrench_cone([[long, wide], [-long, wide], [-long, -wide], [long, -wide]], mu)
+    facets = contact_wrench_cone([[long, wide], [-long, wide], [-long, -wide], [long, -wide]], mu)
     fz = rng.uniform(100, 900)
     for _ in range(20):
         fx, fy = rng.uniform(-1.2, 1.2, size=2) * mu * fz
         mx, my = rng.uniform(-1.2, 1.2) * wide * fz, rng.uniform(-1.2, 1.2) * long * fz
-        rest = rows[:, :5] @ [fx, fy, fz, mx, my]
-        k = rows[:, 5]
+        rest = facets[:, :5] @ [fx, fy, fz, mx, my]
+        k = facets[:, 5]
         tol = 1e-12
         low = float(np.max(-rest[k > tol] / k[k > tol]))
         high = float(np.min(-rest[k < -tol] / k[k < -tol]))
@@ -83,39 +83,39 @@ def test_a_wrench_is_in_the_cone_if_and_only_if_corner_forces_make_it(seed: int,
     rng = np.random.default_rng(seed)
     mu = rng.uniform(0.3, 1.0)
     polygon = random_polygon(rng, corners)
-    rows, rays = contact_wrench_cone(polygon, mu), corner_rays(polygon, mu)
+    facets, rays = contact_wrench_cone(polygon, mu), corner_rays(polygon, mu)
     middle = rays.mean(axis=1)
     some = rays @ rng.dirichlet(np.full(rays.shape[1], 0.2))
     # a wrench of the cone, pushed out of it (or not) along a random direction
     size = np.array([mu, mu, 1, 0.1, 0.1, 0.1])
     wrench = some + rng.uniform(0, 0.5) * size * rng.standard_normal(6)
     for w in (some, middle, wrench):
-        value = float((rows @ w).min())
+        value = float((facets @ w).min())
         if abs(value) < 1e-9:
             continue
         answer = linprog(np.zeros(rays.shape[1]), A_eq=rays, b_eq=w, bounds=(0, None), method="highs")
         assert (value > 0) == (answer.status == 0)
-    assert (rows @ some).min() > -1e-12
-    assert (rows @ middle).min() > 1e-3  # scaled: well inside is of the order of one
-    assert (rows @ -middle).min() < 0
+    assert (facets @ some).min() > -1e-12
+    assert (facets @ middle).min() > 1e-3  # scaled: well inside is of the order of one
+    assert (facets @ -middle).min() < 0
 
 
 def test_the_cone_is_a_cone_about_the_normal_force() -> None:
-    rows = contact_wrench_cone(RECTANGLE, 0.7)
+    facets = contact_wrench_cone(RECTANGLE, 0.7)
     push = np.array([0, 0, 1, 0, 0, 0.0])
-    assert (rows @ push > 0).all()
-    assert (rows @ -push < 0).all()
-    np.testing.assert_array_equal(rows @ np.zeros(6), 0)
+    assert (facets @ push > 0).all()
+    assert (facets @ -push < 0).all()
+    np.testing.assert_array_equal(facets @ np.zeros(6), 0)
 
 
 def test_torsion_vanishes_at_a_corner_and_is_largest_in_the_middle() -> None:
     """Why the three cannot be bounded one by one."""
-    rows, mu = contact_wrench_cone(RECTANGLE, 0.5), 0.5
+    facets, mu = contact_wrench_cone(RECTANGLE, 0.5), 0.5
 
     def torsion(x: float, y: float) -> float:
         lever = np.array([0, 0, 1, y, -x, 0])
-        slope = rows[:, 5]
-        return float(np.min((rows @ lever)[slope < -1e-12] / -slope[slope < -1e-12]))
+        slope = facets[:, 5]
+        return float(np.min((facets @ lever)[slope < -1e-12] / -slope[slope < -1e-12]))
 
     assert torsion(0, 0) == pytest.approx(mu * (0.11 + 0.06))
     assert torsion(0.11, 0.06) == pytest.approx(0, abs=1e-9)
@@ -127,12 +127,12 @@ def test_torsion_vanishes_at_a_corner_and_is_largest_in_the_middle() -> None:
 def test_a_margin_keeps_the_cop_that_far_from_every_edge(seed: int, corners: int, keep: float) -> None:
     rng = np.random.default_rng(seed)
     polygon = random_polygon(rng, corners)
-    rows = contact_wrench_cone(polygon, 0.6, margin=keep)
+    facets = contact_wrench_cone(polygon, 0.6, margin=keep)
     points = polygon.mean(axis=0) + rng.uniform(-0.15, 0.15, size=(40, 2))
     far = depth(polygon, points) - keep
     for (x, y), inside in zip(points, far, strict=True):
         if abs(inside) > 1e-6:
-            assert bool((rows @ [0, 0, 1, y, -x, 0]).min() > 0) == (inside > 0)
+            assert bool((facets @ [0, 0, 1, y, -x, 0]).min() > 0) == (inside > 0)
 
 
 @pytest.mark.parametrize("friction", [0.0, -0.5, np.nan])

@@ -1,4 +1,4 @@
-"""Independent coordinates: held soles stay where they are; the symbolic half agrees with the numeric one."""
+"""Independent coordinates: fixed soles stay in place; symbolic and numeric maps agree."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_legs_that_share_a_motor_hold_one_sole_and_not_two() -> None:
         make_case(biped(followers=YAW), "half_sitting")
 
 
-def test_coordinates_are_the_base_and_the_joints_outside_the_held_legs(case: Case) -> None:
+def test_coordinates_are_the_base_and_the_joints_outside_the_legs(case: Case) -> None:
     c, robot = case.c, case.robot
     assert c.ny + c.nl == robot.nv
     assert len(c.labels) == c.ny
@@ -156,11 +156,11 @@ def test_split_and_join_are_inverse(case: Case) -> None:
         np.testing.assert_allclose(c.join(back_y, back_legs), q, atol=1e-12)
 
 
-# ---- held soles
+# ---- fixed soles
 
 
 def test_completed_motions_leave_the_soles_at_rest(standing: Case) -> None:
-    """By Pinocchio: no velocity, no acceleration of any held sole, and each where the posture had it."""
+    """By Pinocchio: no velocity and acceleration of any fixed sole, and each where the posture had it."""
     c, model, rng = standing.c, standing.robot.model, np.random.default_rng(1)
     data, start = model.createData(), model.createData()
     pin.framesForwardKinematics(model, start, standing.posture)
@@ -360,7 +360,7 @@ def test_the_order_pivots_on_what_is_large_in_every_sample() -> None:
     assert two[rows[0], cols[0]] == 1.0
 
 
-# ---- what nothing holds
+# ---- free-floating robots
 
 
 def test_without_a_sole_all_joints_are_coordinates() -> None:
@@ -375,7 +375,7 @@ def test_without_a_sole_all_joints_are_coordinates() -> None:
     np.testing.assert_allclose(independent_rates(c, y, v), rates, atol=1e-12)
 
 
-# ---- what cannot stand
+# ---- robots that cannot stand
 
 
 def reduced(*joints: str, waist: bool = False) -> Robot:
@@ -388,7 +388,7 @@ def reduced(*joints: str, waist: bool = False) -> Robot:
     return Robot.from_model(model, soles=full.soles, postures={"zero": {}}, **limits)
 
 
-def test_a_leg_with_too_few_joints_is_told_what_it_lacks() -> None:
+def test_a_leg_with_too_few_joints_is_an_input_error() -> None:
     for robot, told in (
         (biped(5, hinge=None), r"sole 'left' has 5 joints.*left knee.*hinge = \"x\""),
         (
@@ -422,7 +422,7 @@ def test_a_sole_on_a_hinge_is_not_lifted() -> None:
 # ---- statics and reach, which stand on the coordinates
 
 
-def test_hinges_bear_nothing_at_rest() -> None:
+def test_hinges_carry_no_torque_at_rest() -> None:
     c = (case := made("biped on hinged soles")).c
     y, legs = c.split(case.posture)
     w = static_wrenches(c, y, legs)

@@ -1,4 +1,4 @@
-"""Legs of one instant after the other, each from the two before: as those that are found by themselves."""
+"""Legs along a motion, whose guesses are extrapolated, against legs solved one by one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Motion = tuple[StanceCoordinates, Array, Array]
 
 @pytest.fixture(params=[6, 7], ids=["legs of six", "legs of seven"])
 def moving(request: pytest.FixtureRequest) -> Motion:
-    """Coordinates, those of a base that shifts, squats and turns (k, ny), and the legs to start from."""
+    """Stance coordinates, a motion y (k, ny) of a base that shifts, squats and turns, and first legs."""
     robot = biped(request.param)
     posture = robot.posture("half_sitting")
     c = StanceCoordinates(robot, robot.soles, posture)
@@ -30,25 +30,25 @@ def moving(request: pytest.FixtureRequest) -> Motion:
     return c, y + at * way, legs
 
 
-def test_they_are_those_of_one_instant_after_the_other(moving: Motion) -> None:
+def test_legs_along_a_motion_are_those_solved_one_by_one(moving: Motion) -> None:
     c, y, legs = moving
-    found, before = np.array([leg for _, leg in c.closing.follow(y, legs)]), legs
-    for k, row in enumerate(y):
-        before = c.solve_legs(row, before)
+    found, before = np.array([leg for _, leg in c.leg_closure.follow(y, legs)]), legs
+    for k, coordinates in enumerate(y):
+        before = c.solve_legs(coordinates, before)
         np.testing.assert_allclose(found[k], before, atol=1e-11)
 
 
-def test_a_base_out_of_reach_is_told(moving: Motion) -> None:
+def test_a_base_out_of_reach_is_an_input_error(moving: Motion) -> None:
     c, y, legs = moving
     y = y.copy()
     y[-1, 2] += 1.0
     with pytest.raises(InputError, match="out of the legs' reach"):
-        np.array(list(c.closing.follow(y, legs)))
+        np.array(list(c.leg_closure.follow(y, legs)))
 
 
-def test_an_arm_has_none() -> None:
+def test_an_arm_has_no_legs() -> None:
     robot = arm()
     posture = robot.posture(next(iter(robot.postures)))
     c = StanceCoordinates(robot, (), posture)
-    found = [leg for _, leg in c.closing.follow(np.zeros((3, c.ny)), np.zeros(0))]
+    found = [leg for _, leg in c.leg_closure.follow(np.zeros((3, c.ny)), np.zeros(0))]
     assert np.array(found).shape == (3, 0)

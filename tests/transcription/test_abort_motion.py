@@ -38,7 +38,7 @@ def test_the_abort_motion_goes_on_from_coasting_and_comes_to_rest(punch: Solutio
     missed, model = punch.missed_trajectory, punch.problem.robot.model
     last, first = np.flatnonzero(missed.phase == 1)[-1], np.flatnonzero(missed.phase == 2)[0]
     assert missed.time[last] == missed.time[first] == missed.contact_end
-    # the program's rows hold to its tolerance; a blow, in contrast, changes some rate by far more
+    # the program's constraints hold to its tolerance; an impact changes some rate by far more
     step = np.abs(pin.difference(model, missed.q[last], missed.q[first])).max()
     assert step < 1e-4 and np.abs(missed.v[last] - missed.v[first]).max() < 1e-3
     hit = punch.trajectory
@@ -55,7 +55,7 @@ def test_the_abort_motion_goes_on_from_coasting_and_comes_to_rest(punch: Solutio
     np.testing.assert_allclose(tau[:6], [*(turn @ force.linear), *(turn @ force.angular)], atol=1e-6)
 
 
-def test_its_nodes_have_the_rows_of_a_follow_through(biped_transcription: Transcription) -> None:
+def test_its_nodes_have_the_constraints_of_a_follow_through(biped_transcription: Transcription) -> None:
     scenario = Scenario(name="gone", missing=True, abort_after=0.02)
     program = changed(biped_transcription, scenarios=(scenario,)).program
     places: dict[str, set[str]] = {}
@@ -84,7 +84,7 @@ def test_the_punch_into_the_air_stands(punch: Solution) -> None:
     assert np.abs(done - follow).max() > 0.1
 
 
-def test_who_hits_does_not_abort(punch: Solution) -> None:
+def test_a_robot_that_hits_does_not_abort(punch: Solution) -> None:
     with_abort = punch.validate(engine="mujoco", step=5e-4, settle=0.0)
     without = punch.validate(engine="mujoco", step=5e-4, settle=0.0, missed=None)
     np.testing.assert_array_equal(with_abort.q, without.q)

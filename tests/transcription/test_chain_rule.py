@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 def written_out(expressions: list[Any], stages: tuple[Stage, ...]) -> list[Any]:
-    """Expressions with what the stages stand for in place of their symbols."""
+    """Expressions with the stages' expressions in place of their symbols."""
     for stage in reversed(stages):
         expressions = ca.substitute(expressions, [stage.symbols], [stage.expression])
     return expressions

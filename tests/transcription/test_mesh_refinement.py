@@ -1,4 +1,4 @@
-"""What a plan does between its program's nodes, and the nodes that are added there."""
+"""Limits between a program's nodes, and nodes that are added there."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ def test_torques_between_nodes_by_inverse_dynamics(arm_plan: Planned, fraction: 
         ratio = np.array([np.abs(tau / limit).max() for _, tau in forces(plan, curve, at)])
         expected.append(middles_of(nodes, at[ratio > 1.2 * fraction]))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(between, "_SHARE", 0.0)
-        patch.setattr(between, "_TORQUE", 0.2 * fraction)
+        patch.setattr(between, "_MARGIN_LOSS", 0.0)
+        patch.setattr(between, "_TORQUE_LOSS", 0.2 * fraction)
         assert nodes_to_add(plan, NO_MORE) == MoreNodes(*expected)
     assert bool(expected[0]) == (fraction < 1.0)
     assert nodes_to_add(plan, NO_MORE) == NO_MORE  # half of the room up to all that there is
@@ -131,7 +131,7 @@ def test_each_sole_between_nodes_by_its_legs_torques(biped_plan: Planned, margin
 
 
 def test_a_correction_between_nodes_is_shared_as_the_load_is(biped_plan: Planned) -> None:
-    """A sole that bears a tenth takes less of what is lacking, and its centre of pressure stays."""
+    """A sole with a tenth of the load gets less of the correction, and its centre of pressure stays."""
     plan = biped_plan.plan
     c = plan.coordinates
     y, legs = c.split(plan.problem.start_posture)
@@ -148,7 +148,7 @@ def test_a_correction_between_nodes_is_shared_as_the_load_is(biped_plan: Planned
     np.testing.assert_allclose(found[0, 9:11] / found[0, 8], moved[0, 9:11] / moved[0, 8], atol=5e-3)
 
 
-def test_legs_between_nodes_are_no_faster_than_they_may_be(biped_plan: Planned) -> None:
+def test_legs_between_nodes_keep_their_velocity_limits(biped_plan: Planned) -> None:
     """Their rates follow from the soles', so no control point bounds them."""
     plan = biped_plan.plan
     c, robot, places = plan.coordinates, plan.problem.robot, each_millisecond(plan.follow)
@@ -179,7 +179,7 @@ def test_a_program_with_more_nodes_starts_where_the_old_one_ended(biped_plan: Pl
     plan = new.decode(x)
     np.testing.assert_array_equal(plan.swing.control, biped_plan.plan.swing.control)
     np.testing.assert_array_equal(plan.follow.control, biped_plan.plan.follow.control)
-    # old rows are as they were, with their multipliers; new ones are met about as well as legs in between
+    # old constraints keep values and multipliers; new ones are met about as well as legs in between
     names = {str(row): i for i, row in enumerate(old.program.origins)}
     assert len(names) == old.program.m
     g, before = new.program.constraints(x), old.program.constraints(result.x)
@@ -231,7 +231,7 @@ def with_more(t: Transcription, *things: Objective | Term, **changes: Any) -> Tr
 
 
 def check_carried_over(old: Transcription) -> None:
-    """Each variable, row and multiplier of a program is in the finer one, and at the same place."""
+    """Each variable, constraint and multiplier of a program is in the finer one, at the same place."""
     new, rng = finer(old), np.random.default_rng(0)
     x = old.with_lifted(first_iterate(old) + 0.02 * rng.standard_normal(old.program.n))
     y, z = rng.standard_normal(old.program.m), rng.standard_normal(old.program.n)
@@ -265,7 +265,7 @@ def check_carried_over(old: Transcription) -> None:
     names = {str(row): i for i, row in enumerate(new.program.origins)}
     assert len(names) == new.program.m
     same = {names[str(row)]: i for i, row in enumerate(old.program.origins) if str(row) in names}
-    if TorqueRate not in map(type, old.problem.terms):  # whose rows are from one node to the next
+    if TorqueRate not in map(type, old.problem.terms):  # whose constraints connect neighbouring nodes
         assert len(same) == old.program.m
     np.testing.assert_array_equal(of_rows[list(same)], y[list(same.values())])
     assert np.count_nonzero(of_rows) == len(same)
@@ -307,8 +307,8 @@ def test_more_nodes_go_together_with_everything_on_two_legs(biped_transcription:
 def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A problem whose torques are a little over their limit between the nodes, where nothing is given up."""
     monkeypatch.setattr(reconstruction, "block_functions", lambda *_: arm_transcription.functions)
-    monkeypatch.setattr(between, "_SHARE", 0.0)
-    monkeypatch.setattr(between, "_TORQUE", 1e-6)
+    monkeypatch.setattr(between, "_MARGIN_LOSS", 0.0)
+    monkeypatch.setattr(between, "_TORQUE_LOSS", 1e-6)
     return dataclasses.replace(
         arm_transcription.problem,
         swing=Phase(duration=0.4, intervals=6),
@@ -350,7 +350,7 @@ def test_nodes_are_added_where_effort_counts(
     assert len(solution.attempts) > 1 and solution.attempts[-1].kept
 
 
-def test_nodes_and_rows_between_bodies_are_added_together(coarse: Any) -> None:
+def test_nodes_and_clearance_constraints_are_added_together(coarse: Any) -> None:
     """In one attempt, as a motion whose bodies are in each other is no answer yet."""
     post = Obstacle(name="post", start=(0.65, 0.14, 0.85), end=(0.65, 0.34, 0.85), radius=0.03)
     none = TargetBody(shape="none")  # before it the arm is nowhere over its limits
@@ -388,7 +388,7 @@ def test_a_solution_that_keeps_its_limits_is_the_plain_one(coarse: Any) -> None:
     assert solution.nodes == NO_MORE and len(solution.attempts) == 1
 
 
-def test_a_plan_that_cannot_be_looked_at_is_not_lost(coarse: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_that_cannot_be_checked_is_not_lost(coarse: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def unreachable(*_: Any) -> MoreNodes:
         raise InputError("a leg does not reach")
 

@@ -88,7 +88,7 @@ def test_idle_joints_are_those_of_the_other_arm_and_the_head() -> None:
     assert idle == {n for n in robot.joint_names if n.startswith(("arm_left", "head"))}
 
 
-def test_an_unknown_style_is_told(arm_plan: Planned) -> None:
+def test_an_unknown_style_is_an_input_error(arm_plan: Planned) -> None:
     with pytest.raises(InputError, match=r"unknown style 'naturl' .did you mean 'natural'"):
         replace(arm_plan.problem, style="naturl")
 

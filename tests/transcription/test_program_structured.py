@@ -68,7 +68,7 @@ class Pair:
         two, two_out = block("two", (1, 2), 2, 0, 1)
         self.blocks, outputs = [one, two], ca.vertcat(one_out, two_out)
         rows, wanted = Rows(), []
-        # not all outputs are rows, their order is mixed, and a row may be affine or both
+        # not all outputs are in constraints, their order is mixed; a constraint may be affine, or both
         chosen = rng.permutation(outputs.numel())[:-3]
         for k, some in enumerate(np.array_split(chosen, 3)):
             affine = slot(len(some)) if k != 1 else None
@@ -177,7 +177,7 @@ def test_outputs_are_by_block_and_instance() -> None:
     assert {k: v.shape for k, v in out.items()} == {"one": (3, 3), "two": (1, 2)}
 
 
-def test_a_program_of_affine_rows_alone() -> None:
+def test_a_program_of_affine_constraints_alone() -> None:
     layout = Layout()
     x = layout.add("x", 1, 2)
     rows = Rows()
@@ -191,10 +191,10 @@ def test_a_program_of_affine_rows_alone() -> None:
     assert result.objective == pytest.approx(6.0, abs=1e-6)
 
 
-# ---- rows and names
+# ---- constraints and names
 
 
-def test_rows_without_bounds_are_dropped_and_the_others_keep_their_names() -> None:
+def test_constraints_without_bounds_are_dropped_and_the_others_keep_their_names() -> None:
     layout = Layout()
     x = layout.add("x", 1, 3)
     rows = Rows()
@@ -221,7 +221,7 @@ def test_rows_without_bounds_are_dropped_and_the_others_keep_their_names() -> No
     np.testing.assert_array_equal(program.g_upper, [np.inf, 2, 0])
 
 
-def test_dropped_rows_of_a_block_leave_the_others_in_place() -> None:
+def test_dropped_constraints_of_a_block_leave_the_others_in_place() -> None:
     layout = Layout()
     group = layout.add("x", 1, 3)
     z, p = ca.SX.sym("z", 3), ca.SX.sym("p", 0)
@@ -276,7 +276,7 @@ def test_derivative_functions_are_the_jacobian_and_the_lower_hessian(seed: int) 
 
 @given(seeds)
 @settings(max_examples=10, deadline=None)
-def test_derivatives_through_inner_numbers_are_those_of_the_whole(seed: int) -> None:
+def test_derivatives_in_stages_are_those_of_the_whole(seed: int) -> None:
     rng = np.random.default_rng(seed)
     z, p, s = ca.SX.sym("z", 5), ca.SX.sym("p", 2), ca.SX.sym("s", 2)
     of_z = ca.vertcat(z[0] + z[1] * z[2] * p[0], ca.sin(z[3]) / z[1])

@@ -1,4 +1,4 @@
-"""Sums in runs: what C and sparse products make of them, against sums one by one."""
+"""Scatter-adds in runs, in C and by sparse products, against sums one by one."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from impactopt.transcription import structured as scatter_add
 from impactopt.transcription.structured import Runs, count_up, union, with_transposed
 
 seeds = st.integers(0, 2**31)
+scatter_add._library()  # compiled and loaded before Hypothesis times an example
 
 
 @given(seeds, st.booleans())
-def test_runs_add_what_they_say(seed: int, compiled: bool) -> None:
+def test_runs_against_sums_one_by_one(seed: int, compiled: bool) -> None:
     rng = np.random.default_rng(seed)
-    count, entries, places = int(rng.integers(0, 9)), rng.standard_normal(20), 30
+    count, entries, size = int(rng.integers(0, 9)), rng.standard_normal(20), 30
     length = rng.integers(0, 6, count)
-    entry, place = rng.integers(0, 14, count), rng.integers(0, 24, count)
-    factor, out = rng.standard_normal(count), rng.standard_normal(places)
+    source, destination = rng.integers(0, 14, count), rng.integers(0, 24, count)
+    factor, out = rng.standard_normal(count), rng.standard_normal(size)
     expected = out.copy()
-    for e, p, n, f in zip(entry, place, length, factor, strict=True):
+    for e, p, n, f in zip(source, destination, length, factor, strict=True):
         for i in range(n):
             expected[p + i] += f * entries[e + i]
     with pytest.MonkeyPatch.context() as patch:
         if not compiled:
             patch.setattr(scatter_add, "_library", lambda: None)
-        Runs.make(entry, place, length, factor, (places, entries.size)).add_to(out, entries)
+        Runs.make(source, destination, length, factor, (size, entries.size)).add_to(out, entries)
     np.testing.assert_allclose(out, expected, atol=1e-12)
 
 

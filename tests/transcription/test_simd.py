@@ -1,4 +1,4 @@
-"""Functions in lanes: for every instance what CasADi's own function of one instance gives."""
+"""Vectorized functions against CasADi's own functions of one instance."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from impactopt.codegen.cache import cached
 from impactopt.codegen.compiler import NativeCode, find_compiler
 from impactopt.errors import NoCompilerWarning
 from impactopt.transcription import simd
-from impactopt.transcription import simd as instruction_table
 from impactopt.transcription.batched import BatchedFunction
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.simd import LANES, in_lanes
@@ -27,7 +26,7 @@ from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
-JOINED = {instruction_table.SUM_OF_PRODUCT, instruction_table.PRODUCT_LESS, instruction_table.LESS_PRODUCT}
+JOINED = {simd.SUM_OF_PRODUCT, simd.PRODUCT_LESS, simd.LESS_PRODUCT}
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 
@@ -67,7 +66,7 @@ def every_operation() -> Any:
 def test_every_operation_gives_in_lanes_what_it_gives_alone(
     cache: Path, monkeypatch: pytest.MonkeyPatch, window: int, count: int
 ) -> None:
-    monkeypatch.setattr(instruction_table, "WINDOW", window)
+    monkeypatch.setattr(simd, "WINDOW", window)
     functions = derivative_functions("all", *every_operation())
     found, rng = compiled(*functions, count=count), np.random.default_rng(0)
     for plain in functions:
@@ -96,9 +95,9 @@ def test_a_product_and_the_sum_with_it_are_one_operation_and_equal_ones_are_done
     function = ca.Function("f", [ca.vertcat(*x)], [ca.vertcat(*out)])
     expected = [
         *[
-            (instruction_table.SUM_OF_PRODUCT, 1),
-            (instruction_table.LESS_PRODUCT, 1),
-            (instruction_table.PRODUCT_LESS, 1),
+            (simd.SUM_OF_PRODUCT, 1),
+            (simd.LESS_PRODUCT, 1),
+            (simd.PRODUCT_LESS, 1),
         ],
         *[(ca.OP_MUL, 1), (ca.OP_ADD, 1), (ca.OP_ASSIGN, 1)],
     ]
@@ -110,7 +109,7 @@ def test_a_product_and_the_sum_with_it_are_one_operation_and_equal_ones_are_done
 
 def runs(function: Any) -> list[tuple[int, int]]:
     """Kind and number of operations of each run."""
-    made = instruction_table.arranged(function, simd._OPERANDS)
+    made = simd.instruction_table(function, simd._OPERANDS)
     assert made is not None
     out, words = [], made.words.tolist()
     while words:
@@ -128,10 +127,10 @@ def test_operations_of_a_kind_come_together_as_far_as_the_window_reaches(
     out = [f(x[k]) for k in range(30) for f in (ca.sin, ca.exp)]
     function = ca.Function("f", [x], [ca.vertcat(*out)])
     assert len(runs(function)) == 2
-    monkeypatch.setattr(instruction_table, "WINDOW", 10)
+    monkeypatch.setattr(simd, "WINDOW", 10)
     few = runs(function)
     assert 4 <= len(few) <= 20
-    monkeypatch.setattr(instruction_table, "WINDOW", 1)
+    monkeypatch.setattr(simd, "WINDOW", 1)
     assert len(runs(function)) == 60
 
 

@@ -60,7 +60,9 @@ def solved(request: pytest.FixtureRequest) -> Planned:
 # ---- the program
 
 
-def test_the_first_iterate_is_inside_its_bounds_and_finite_in_all_rows(transcription: Transcription) -> None:
+def test_the_first_iterate_is_inside_its_bounds_and_all_constraints_finite(
+    transcription: Transcription,
+) -> None:
     program, x = transcription.program, first_iterate(transcription)
     check_program(program, x)
     assert (x >= program.x_lower).all()
@@ -76,7 +78,7 @@ def test_jacobian_and_hessian_agree_with_differences(transcription: Transcriptio
     check_derivatives(program, x + away * np.random.default_rng(0).standard_normal(program.n))
 
 
-def test_every_row_and_every_variable_has_a_name_of_its_own(transcription: Transcription) -> None:
+def test_every_constraint_and_every_variable_has_a_unique_name(transcription: Transcription) -> None:
     program = transcription.program
     for count, name in ((program.m, program.row_name), (program.n, program.variable_name)):
         names = [name(i) for i in range(count)]
@@ -86,20 +88,21 @@ def test_every_row_and_every_variable_has_a_name_of_its_own(transcription: Trans
 
 def test_names_say_what_where_and_which(biped_transcription: Transcription) -> None:
     program = biped_transcription.program
-    rows = [program.row_name(i) for i in range(program.m)]
+    names = [program.row_name(i) for i in range(program.m)]
     problem = biped_transcription.problem
     for term in (TorqueLimit, VelocityLimit, ContactWrenchCone, Incidence):
-        assert any(row.startswith(problem.term(term).name) for row in rows)
+        assert any(name.startswith(problem.term(term).name) for name in names)
     for joint in problem.robot.joint_names:
-        assert any(row.startswith("torque limit, swing") and row.endswith(joint) for row in rows)
+        assert any(name.startswith("torque limit, swing") and name.endswith(joint) for name in names)
         assert any(
-            row.startswith("torque limit in collision, compression") and row.endswith(joint) for row in rows
+            name.startswith("torque limit in collision, compression") and name.endswith(joint)
+            for name in names
         )
-    assert any(row.startswith("capture point") for row in rows)
+    assert any(name.startswith("capture point") for name in names)
     assert any("elbow" in program.variable_name(j) for j in range(program.n))
 
 
-def test_every_variable_is_in_a_row_or_in_the_objective(transcription: Transcription) -> None:
+def test_every_variable_is_in_a_constraint_or_in_the_objective(transcription: Transcription) -> None:
     program, rng = transcription.program, np.random.default_rng(1)
     x = first_iterate(transcription) + 0.01 * rng.standard_normal(program.n)
     used = np.asarray(abs(program.jacobian(x)).sum(axis=0)).ravel() + np.abs(program.gradient(x))
@@ -200,7 +203,7 @@ def test_the_hand_meets_the_point_along_the_normal(solved: Planned) -> None:
     np.testing.assert_allclose(data.oMf[frame].translation, problem.point, atol=1e-5)
     speed = pin.getFrameVelocity(model, data, frame, pin.LOCAL_WORLD_ALIGNED).linear
     assert problem.normal @ speed == pytest.approx(solved.plan.hand_speed, rel=1e-5)
-    # one row for each tangent, so the length of both is within sqrt(2)
+    # one constraint for each tangent, so the length of both is within sqrt(2)
     across = speed - problem.normal * (problem.normal @ speed)
     assert np.linalg.norm(across) <= np.sqrt(2) * problem.term(Incidence).speed + 1e-5
 
@@ -251,7 +254,7 @@ def test_the_planned_collision_is_inside_its_limits(solved: Planned) -> None:
 
 
 def test_the_trajectory_is_the_robots_own_dynamics(solved: Planned) -> None:
-    """Feed-forward and ground wrench carry the motion: rnea = S'tau + J'w, soles where they are held."""
+    """Feed-forward and ground wrench carry the motion: rnea = S'tau + J'w, soles in place."""
     problem, t = solved.problem, solved.trajectory
     robot, c = problem.robot, problem.coordinates
     model, data = robot.model, robot.model.createData()
@@ -269,7 +272,7 @@ def test_the_trajectory_is_the_robots_own_dynamics(solved: Planned) -> None:
         if not c.legs:
             np.testing.assert_allclose(tau, t.torque[k], atol=1e-9)
             continue
-        # seen from the world's origin the base's six rows are the whole robot's balance
+        # seen from the world's origin the base's six equations are the whole robot's balance
         pin.forwardKinematics(model, data, t.q[k], t.v[k], t.a[k])
         base = data.oMi[1]
         wrench = base.act(pin.Force(tau[:6])).vector
@@ -292,7 +295,7 @@ def test_reference_velocities_are_those_of_its_positions(solved: Planned) -> Non
 
 
 def test_a_motion_begins_with_the_inner_forces_of_its_first_node(biped_plan: Planned) -> None:
-    """Soles that push each other apart do so at rest, too, and what they bear together is the weight."""
+    """Soles that push each other apart do so at rest, too, and together they carry the weight."""
     t, x = biped_plan.transcription, biped_plan.result.x.copy()
     wrenches = t.swing.w.read(x).copy()
     wrenches[:, [1, 7]] += [40.0, -40.0]
@@ -398,8 +401,8 @@ def test_what_cannot_be_met_is_named(arm_plan: Planned) -> None:
     assert "hit point" in result.message or "velocity limit" in result.message
 
 
-def test_the_soles_rows_in_contact_can_be_left_out(biped_transcription: Transcription) -> None:
-    """And no others: what is left are the same rows, in the same order."""
+def test_the_soles_constraints_in_contact_can_be_left_out(biped_transcription: Transcription) -> None:
+    """And no others: the rest are the same constraints, in the same order."""
     cone = dataclasses.replace(biped_transcription.problem.term(ContactWrenchCone), collision_margin=None)
     others = [t for t in biped_transcription.problem.terms if not isinstance(t, ContactWrenchCone)]
     without = changed(biped_transcription, terms=(*others, cone))

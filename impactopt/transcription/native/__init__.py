@@ -1,1 +1,1 @@
-"""C for constant maps."""
+"""C sources of scatter-adds and instruction tables."""

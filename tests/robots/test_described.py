@@ -271,7 +271,7 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
             ('type="revolute"', 'type="continuous"'),
             ('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>'),
         ],
-        "turns without end",
+        "is continuous",
     ),
     "`<mimic>` of a joint that does not": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j"/></joint></robot>')],
@@ -327,7 +327,7 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`gravcomp` of some": (
         [('<body name="two"', '<body gravcomp="1" name="two"')],
-        "'two' have a gravcomp.*lock",
+        "'two' have another gravcomp.*lock",
     ),
     "`stiffness`, ": ([(J2, f'stiffness="9" springref=".5" {J2}')], ""),
     "`stiffness` that": ([(J2, f'stiffness="9 1" {J2}')], "'j2' has a spring whose torque is not linear"),

@@ -152,7 +152,7 @@ class RigidBody:
         return pack_entries((6, self.nv), _dynamics.centroidal_map(self._crba()))
 
     def centroidal_momentum(self, v: Any) -> Any:
-        """A_g v, SX (6), [linear [kg m/s]; angular, about the centre of mass [kg m2/s]]; A_g is not formed."""
+        """A_g v, SX (6), without A_g: [linear [kg m/s]; angular, about the centre of mass [kg m2/s]]."""
         return pack_vector(_dynamics.centroidal_momentum(self._composites, self._link_velocities(v)))
 
     # ------------------------------------------------------------ coordinates

@@ -578,7 +578,7 @@ def test_a_strike_has_no_motion(arm: Solution, tmp_path: Path) -> None:
     save_record(made, tmp_path / "strike")
     done = runner.invoke(app, ["export", str(tmp_path / "strike"), "--to", "csv"])
     assert (
-        done.exit_code == 2 and "strike, the blow alone" in done.stderr and done.stderr.count("error:") == 1
+        done.exit_code == 2 and "strike, the impact alone" in done.stderr and done.stderr.count("error:") == 1
     )
 
 

@@ -395,7 +395,7 @@ def test_a_leg_with_too_few_joints_is_told_what_it_lacks() -> None:
             reduced("left ankle roll", "left hip yaw"),
             r"sole 'left' has 4 joints.*needs 6 or more, or 5 and a",
         ),
-        (reduced("left ankle roll", waist=True), r"of the last 6 that lead to sole 'left', waist pitch move"),
+        (reduced("left ankle roll", waist=True), r"of the last 6 before sole 'left', waist pitch also move"),
     ):
         with pytest.raises(InputError, match=told):
             StanceCoordinates(robot, robot.soles, next(iter(robot.postures.values())))

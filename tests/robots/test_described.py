@@ -379,7 +379,7 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`<option>` with `density`": (
         [("<option/>", '<option density="1000" wind="1 0 0"/>')],
-        "drag of a medium",
+        "fluid drag",
     ),
     "`damping`, `frictionloss`, `armature`, `stiffness` of a free": (
         [('type="free"', 'type="free" damping="1"')],

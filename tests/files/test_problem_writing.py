@@ -370,7 +370,7 @@ def test_a_robot_made_in_python_cannot_be_written(nailing: ImpactProblem) -> Non
     model = nailing.robot.model.copy()
     model.gravity.linear = np.array([0, 0, -1.62])
     moon = dataclasses.replace(nailing, robot=dataclasses.replace(nailing.robot, model=model))
-    with pytest.raises(InputError, match="'planar_arm' is changed in what a file cannot say"):
+    with pytest.raises(InputError, match="'planar_arm' has changes that a file cannot contain"):
         write_problem(moon)
 
 

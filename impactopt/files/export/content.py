@@ -357,8 +357,6 @@ def body_name(robot: Robot, joint: int) -> str:
 def _numbers(thing: ContactLaw | Target) -> dict[str, float]:
     """Parameters of a law or a target, by their keys in problem files."""
     kind: Any = type(thing)
-    described = (
-        abouts(kind) if dataclasses.is_dataclass(kind) else ()
-    )  # a user's own law may be another class
-    keys = {field.name: about.key_of(field.name) for field, about in described}
+    known = dataclasses.is_dataclass(kind)  # a user's own law may be none
+    keys = {field.name: about.key_of(field.name) for field, about in (abouts(kind) if known else ())}
     return {keys.get(name, name): value for name, value in thing.parameters.items()}

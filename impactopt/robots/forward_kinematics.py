@@ -24,7 +24,7 @@ class ForwardKinematics:
 
     def __init__(self, model: pin.Model) -> None:
         joints = range(1, model.njoints)
-        self._free = [j for j in joints if model.joints[j].nv == 6]
+        self._free = [j for j in joints if model.joints[j].nv == 6]  # the free-flyer, or none
         axes = {j: axis_of(model, j) for j in joints if j not in self._free}
         fixed = [axes[j].placement if j in axes else model.jointPlacements[j] for j in joints]
         self._rotation = np.array([place.rotation for place in fixed]).reshape(-1, 3, 3)
@@ -52,11 +52,13 @@ class ForwardKinematics:
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
         """Rotations (k, joints, 3, 3) and translations (k, joints, 3) [m] at configurations q (k, nq)."""
-        position = self._ratio * q[:, self._q]
+        position = self._ratio * q[:, self._q]  # (k, joints) angle or travel, unused for the free-flyer
         angle = np.where(self._turns, position, 0.0)
         cosine, sine = np.cos(angle), np.sin(angle)
+        # a continuous joint has its cosine and sine in q
         cosine[:, self._unbounded] = q[:, self._q[self._unbounded]]
         sine[:, self._unbounded] = q[:, self._q[self._unbounded] + 1]
+        # placement of each joint in its parent: local (k, joints, 3, 3), shift (k, joints, 3)
         along, across, turned = self._parts
         local = along + cosine[:, :, None, None] * across + sine[:, :, None, None] * turned
         shift = self._translation + self._slide * position[:, :, None]

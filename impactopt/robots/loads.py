@@ -157,6 +157,7 @@ def cop_margin(robot: Robot, corners: Sequence[Array], wrench: Array) -> Array:
         force, moment = wrench[:, k, 2], np.stack([-wrench[:, k, 4], wrench[:, k, 3]], axis=1)
         lacking = np.maximum(BEARS * weight_of(robot) - force, 0.0)
         cop = (moment + lacking[:, None] * polygon.mean(axis=0)) / (force + lacking)[:, None]
+        # distances (k, c) from the edges, along their inward normals
         edge = np.roll(polygon, -1, axis=0) - polygon
         inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
         out[:, k] = (cop @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1)

@@ -271,6 +271,8 @@ def _joints_of_tendon(c: Compiled, t: int) -> tuple[str, ...]:
             bodies.append(int(mj.site_bodyid[i]))
         elif kind in (int(kinds.mjWRAP_SPHERE), int(kinds.mjWRAP_CYLINDER)):
             bodies.append(int(mj.geom_bodyid[i]))
+    # A spatial tendon is changed by all joints between the bodies that it passes. One to a body that is not
+    # the robot's would fix a floating robot.
     inside = [c.body[b][0] for b in bodies if b in c.body]
     if c.floating and any(inside) and len(inside) < len(bodies) + bodies.count(0):
         raise InputError(

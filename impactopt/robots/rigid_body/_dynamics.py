@@ -121,7 +121,7 @@ class Kinematics:
 
 
 class Velocities:
-    """Link velocities, in link frames, for one v (a list of nv numbers)."""
+    """Link velocities, in link frames, for one v (a list of nv numbers); each is computed once, on demand."""
 
     def __init__(self, kinematics: Kinematics, v: Vector) -> None:
         self.kinematics, self.tree, self.v = kinematics, kinematics.tree, v
@@ -136,6 +136,7 @@ class Velocities:
                 if joint.kind is Kind.FREE:
                     self._angular[j] = self.v[joint.v + 3 : joint.v + 6]
                     continue
+                # the parent's, plus the joint's own rate about z
                 x, y, z = self.kinematics.from_parent(j, self._angular[joint.parent])
                 turning = joint.kind is Kind.REVOLUTE
                 self._angular[j] = [x, y, z + joint.along(self.v)] if turning else [x, y, z]
@@ -149,6 +150,7 @@ class Velocities:
                 if joint.kind is Kind.FREE:
                     self._linear[j] = self.v[joint.v : joint.v + 3]
                     continue
+                # the velocity of the parent's point at this origin, plus the joint's own rate along z
                 above = add(
                     self._linear[joint.parent], cross(self.angular(joint.parent), self.kinematics.offset(j))
                 )
@@ -177,6 +179,7 @@ class Accelerations:
         self.kinematics, self.tree = velocities.kinematics, velocities.tree
         self._angular: dict[int, Vector] = {0: zero_vector()}
         self._spin: dict[int, Matrix] = {0: [zero_vector() for _ in range(3)]}
+        # with gravity as an upward acceleration of the universe (Featherstone 2008, section 5.3), and without
         self._linear: dict[bool, dict[int, Vector]] = {
             False: {0: zero_vector()},
             True: {0: scale(-1.0, self.tree.gravity)},
@@ -192,6 +195,7 @@ class Accelerations:
                     continue
                 x, y, z = self.kinematics.from_parent(j, self._angular[joint.parent])
                 if joint.kind is Kind.REVOLUTE:
+                    # w x (0, 0, rate), as the axis turns with the link, and the joint's own about z
                     w, rate = self.velocities.angular(j), joint.along(self.velocities.v)
                     x, y, z = x + w[1] * rate, y - w[0] * rate, z + joint.along(self.a)
                 self._angular[j] = [x, y, z]
@@ -310,6 +314,7 @@ class Factor:
         return pack_entries((self.nv, len(columns)), entries)
 
     def _half(self, b: dict[int, Number]) -> dict[int, Number]:
+        """L^-T b by substitution from the leaves to the root; nonzeros spread to ancestors only."""
         y = dict(b)
         for k in range(self.nv - 1, -1, -1):
             if k in y:
@@ -319,6 +324,7 @@ class Factor:
         return y
 
     def _back(self, y: dict[int, Number]) -> dict[int, Number]:
+        """L^-1 D^-1 y by substitution from the root to the leaves."""
         x: dict[int, Number] = {}
         for k in range(self.nv):
             value: Number = y[k] / self._D[k] if k in y else 0.0
@@ -334,6 +340,7 @@ def tree_entries(parents: list[int], H: Any) -> dict[tuple[int, int], Number]:
     """The upper triangle of H, SX (nv, nv), checked to have the tree's pattern."""
     upper = {place: x for place, x in unpack_entries(H).items() if place[0] <= place[1] and not is_zero(x)}
     for i, j in upper:
+        # i has to be an ancestor of j
         k = j
         while k > i:
             k = parents[k]
@@ -459,6 +466,7 @@ class MassMatrix:
         else:
             force, moment, own = [0.0, 0.0, m], [hy, 0.0 - hx, 0.0], m
         ratio, j = joints[i].ratio, i
+        # a follower has no motor of its own: its armature is in that of its leader
         self._add(k, k, ratio**2 * own + (0.0 if joints[i].follows else self.tree.armature[k]))
         while j and joints[j].kind is not Kind.FREE:
             # to the parent's frame: the same force, its moment about the parent's origin
@@ -475,10 +483,11 @@ class MassMatrix:
                 # A follower above or below its leader has the same velocity k: H_ij and H_ji of the two
                 # joints both fall on the diagonal.
                 self._add(row, k, 2.0 * entry if row == k else entry)
-        own_force, own_moment = self.root_forces.get(k, (zero_vector(), zero_vector()))
+        # what has arrived at the root, in addition to that of followers with the same velocity
+        root_force, root_moment = self.root_forces.get(k, (zero_vector(), zero_vector()))
         self.root_forces[k] = (
-            add(own_force, scale(ratio, force)),
-            add(own_moment, scale(ratio, moment)),
+            add(root_force, scale(ratio, force)),
+            add(root_moment, scale(ratio, moment)),
         )
 
     def _add(self, i: int, j: int, number: Number) -> None:
@@ -494,6 +503,7 @@ def rnea(accelerations: Accelerations, *, gravity: bool) -> Vector:
     and the moment about its origin h x a + (the axial vector of U S). So no link's linear velocity is needed.
     """
     kinematics, tree = accelerations.kinematics, accelerations.tree
+    # of each link alone, about its origin
     forces: list[Vector] = [zero_vector()]
     moments: list[Vector] = [zero_vector()]
     for i, joint in enumerate(tree.joints[1:], start=1):
@@ -567,12 +577,14 @@ def centroidal_map(mass_matrix: MassMatrix) -> dict[tuple[int, int], Number]:
 def centroidal_momentum(composites: CompositeInertias, velocities: Velocities) -> Vector:
     """Six numbers A_g v = [linear [kg m/s]; angular [kg m2/s]] from the links' momenta, without A_g."""
     kinematics, tree = composites.kinematics, composites.tree
+    # momentum of each link about its origin: m u + w x h, and I w + h x u
     linear: list[Vector] = [zero_vector()]
     angular: list[Vector] = [zero_vector()]
     for i, joint in enumerate(tree.joints[1:], start=1):
         u, w, h = velocities.linear(i), velocities.angular(i), joint.first_moment
         linear.append(add(scale(joint.mass, u), cross(w, h)))
         angular.append(add(times(tensor_matrix(joint.tensor), w), cross(h, u)))
+    # added up to the root, each moved to its parent's frame
     for i in range(len(tree) - 1, 0, -1):
         joint = tree.joints[i]
         if joint.kind is not Kind.FREE:

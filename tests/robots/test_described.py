@@ -247,7 +247,7 @@ def _between(link: str) -> list[Edit]:
     ]
 
 
-# by the beginning of a line's first column: edits of the file above; of what is told, or refused, a part
+# by the beginning of a line's first column: edits of the file above; a part of the note, or of the refusal
 URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     "`<inertial>`": ([('<mass value="1.0"/>', '<mass value="3.0"/>')], ""),
     "`<joint>` of type revolute": ([('<axis xyz="0 1 0"/>', '<axis xyz="1 1 0"/>')], ""),
@@ -439,7 +439,7 @@ def test_what_of_a_file_is_read_is_as_the_tables_say(
     notes = "; ".join(robot.source.notes)
     assert bool(re.search(said, notes)) if said else not notes
     assert (_shape(robot) != _shape(plain)) == becomes.startswith("read")
-    assert bool(said) == ("told" in becomes)
+    assert bool(said) == ("noted" in becomes)
 
 
 @pytest.mark.skipif(not hasattr(mujoco, "mj_printSchema"), reason="this MuJoCo does not tell its language")

@@ -101,7 +101,9 @@ def hinged(model: pin.Model, soles: Sequence[Sole]) -> pin.Model:
         place, whole = pin.SE3(place), pin.Inertia(model.inertias[foot])
         model = model.copy()
         model.inertias[foot] = _part(whole, 1 - SOLE_SHARE)
-        axis, mark = pin.SE3(_to_axis("xyz".index(sole.hinge)), np.zeros(3)), f"sole:{sole.name}"
+        # a rotation whose z is the hinge's axis
+        turn = np.roll(np.eye(3), "xyz".index(sole.hinge) + 1, axis=0)
+        axis, mark = pin.SE3(turn, np.zeros(3)), f"sole:{sole.name}"
         joint = (sole.hinge_joint, torque, HINGE_SPEED, sole.hinge_range)
         model = with_joint(model, sole.frame, axis, joint, mark, place.actInv(_part(whole, SOLE_SHARE)))
         # the sole's frame moves with the hinge's joint
@@ -170,11 +172,6 @@ def hinge_torque(model: pin.Model) -> float:
 def _part(body: Any, share: float) -> Any:
     """pin.Inertia of a share of a body, with the same centre of mass."""
     return pin.Inertia(share * body.mass, body.lever, share * np.array(body.inertia))
-
-
-def _to_axis(k: int) -> Array:
-    """The rotation (3, 3) whose z is the k-th axis."""
-    return np.roll(np.eye(3), k - 2, axis=0) if k < 2 else np.eye(3)
 
 
 GRIP_SPEED = 60.0  # [rad/s] of a tool in a soft grip: a limit that no impact reaches

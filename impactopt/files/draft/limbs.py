@@ -117,7 +117,10 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
     feet = (
         limb
         for limb in limbs_of(model)
-        if len(limb.own) > 1 and not _is_head(model, limb) and not _on_a_spine(model, limb)
+        # arms on a common trunk are no legs, which have no joints in common
+        if len(limb.own) > 1
+        and not _is_head(model, limb)
+        and (limb.own == limb.path or not _named(model, limb, _ARMS))
     )
     highest = lowest + FOOT_HEIGHT * robot_height
     found = tuple(limb for limb in feet if heights(limb.tip).min() < highest)
@@ -176,11 +179,6 @@ def _heights(data: Any, pieces: Mapping[int, tuple[Piece, ...]], joint: int) -> 
 
 def _is_head(model: pin.Model, limb: Limb) -> bool:
     return _named(model, limb, _HEADS)
-
-
-def _on_a_spine(model: pin.Model, limb: Limb) -> bool:
-    """True if it is an arm on a common trunk: legs have no joints in common."""
-    return limb.own != limb.path and _named(model, limb, _ARMS)
 
 
 def _named(model: pin.Model, limb: Limb, names: re.Pattern[str]) -> bool:

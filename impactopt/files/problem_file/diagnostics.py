@@ -112,9 +112,10 @@ def _mistake(model: type[BaseModel], e: Mapping[str, Any]) -> Mistake:
         wanted = context.get("min_length", context.get("max_length"))
         text = f"has {context['actual_length']} values; give {wanted}"
     elif e["type"] in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
-        text = f"{value}; give a number {_range(section, e['loc'][sections:]) or _bound(e)}"
+        bound = " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in context.items() if key in _SIGNS)
+        text = f"{value}; give a number {_range(section, e['loc'][sections:]) or bound}"
     elif e["type"] == "literal_error":
-        near = did_you_mean(str(e["input"]), _choices(context))
+        near = did_you_mean(str(e["input"]), re.findall(r"'([^']*)'", str(context["expected"])))
         text = f"{value} is unknown{near}; give {context['expected']}"
     else:
         text = f"{value}; {_KINDS.get(e['type'], e['msg'])}"
@@ -155,14 +156,6 @@ def range_of(info: FieldInfo) -> str:
     limits = [m for m in info.metadata if isinstance(m, (Gt, Ge, Lt, Le))]
     bounds = [(key, getattr(m, key)) for m in limits for key in _SIGNS if hasattr(m, key)]
     return " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in bounds)
-
-
-def _bound(e: Mapping[str, Any]) -> str:
-    return " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in e["ctx"].items() if key in _SIGNS)
-
-
-def _choices(context: Mapping[str, Any]) -> list[str]:
-    return re.findall(r"'([^']*)'", str(context.get("expected", "")))
 
 
 def _show(value: Any) -> str:

@@ -50,6 +50,7 @@ __all__ = [
     "load_record",
     "make_directory",
     "plain",
+    "read_json",
     "record_of",
     "record_of_strike",
     "remove_file",
@@ -441,7 +442,7 @@ def keep_series(done: dict[str, Any], directory: Path) -> Path:
     ------
     InputError : it cannot be written.
     """
-    place = _place(directory, done["done"], bool(_read(directory / SERIES).get("done")), done)
+    place = _place(directory, done["done"], bool(read_json(directory / SERIES).get("done")), done)
     text = f"{json.dumps(plain(done), indent=2)}\n".encode()
     place.mkdir(exist_ok=True)
     write_file(place / SERIES, lambda file: file.write(text))
@@ -478,13 +479,13 @@ def _good(status: Any) -> bool:
 def _status_in(directory: Path) -> Any:
     with contextlib.suppress(InputError):
         return load_record(directory).summary.get("status")
-    return _read(directory / SUMMARY).get("status")  # for a record of a newer version
+    return read_json(directory / SUMMARY).get("status")  # for a record of a newer version
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """Content of a JSON file; {} if it cannot be read."""
+def read_json(path: Path, most: int = LARGEST) -> dict[str, Any]:
+    """Table in a JSON file of at most so many bytes; {} if it cannot be read."""
     with contextlib.suppress(OSError, ValueError, RecursionError):
-        found = json.loads(read_plain(path, LARGEST))
+        found = json.loads(read_plain(path, most))
         return found if isinstance(found, dict) else {}
     return {}
 

@@ -19,14 +19,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.codegen.files import read_plain
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_choice, check_number
 from impactopt.files.export.motion import JUMP, Motion, motion_at, with_passive_at_rest
 from impactopt.files.export.smooth import Smoothness, smoothed
-from impactopt.files.output import plain
+from impactopt.files.output import plain, read_json
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
@@ -96,7 +95,7 @@ def _check_replaceable(directory: Path, to: str) -> None:
         raise InputError(f"cannot read {directory}: {error.strerror}; give another one") from error
     if not names:
         return
-    meta = _read_meta(directory / META)
+    meta = read_json(directory / META, LARGEST)
     exported = meta.get("files") if meta.get("made_by") == MADE_BY else None
     if not isinstance(exported, list):
         raise InputError(f"{directory} holds something else ({names[0]}); give another directory with --out")
@@ -107,14 +106,6 @@ def _check_replaceable(directory: Path, to: str) -> None:
     others = [name for name in names if name not in exported]
     if others:
         raise InputError(f"{directory} holds {others[0]} too, which no export made; give another directory")
-
-
-def _read_meta(path: Path) -> dict[str, Any]:
-    """Content of a `meta.json`; {} if it cannot be read."""
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        found = json.loads(read_plain(path, LARGEST))
-        return found if isinstance(found, dict) else {}
-    return {}
 
 
 Array = NDArray[np.float64]

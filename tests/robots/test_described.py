@@ -394,8 +394,8 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
 
 
 def _lines(kind: str) -> list[tuple[str, str]]:
-    """Of the table of a kind of file: what is in it, and what becomes of it."""
-    table = PAGE.read_text(encoding="utf-8").partition(f"| {kind} | what becomes of it |")[2]
+    """Features and their treatment, of the table of a kind of file."""
+    table = PAGE.read_text(encoding="utf-8").partition(f"| {kind} | treatment |")[2]
     rows = re.findall(r"^\| (.+?) \| (.+) \|$", table.split("\n\n")[0], flags=re.MULTILINE)
     return [row for row in rows if not row[0].startswith("---")]
 

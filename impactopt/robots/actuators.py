@@ -25,99 +25,51 @@ _FIELDS_OF_JOINT = ("viscous_friction", "coulomb_friction", "spring_stiffness", 
 MAX_BANDWIDTH, MAX_DELAY = 1e6, 1.0  # [Hz], [s]: larger ones are mistakes, such as another unit
 
 
+def _optional(what: str, unit: str, **limits: float) -> Any:
+    """A field that is None if it is not known."""
+    return field(default=None, metadata=about(what, unit=unit, **limits))
+
+
+_NOT_NEGATIVE, _POSITIVE = {"least": 0, "most": STRONGEST}, {"above": 0, "most": STRONGEST}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Actuator(Described):
     """A joint's motor and gear, and a spring in parallel to them. Values are at the joint, after the gear;
     None: not known.
     """
 
-    armature: float | None = field(
-        default=None,
-        metadata=about(
-            "reflected rotor inertia",
-            unit="kg m2",
-            least=0,
-            most=HEAVIEST,
-        ),
+    armature: float | None = _optional("reflected rotor inertia", "kg m2", least=0, most=HEAVIEST)
+    viscous_friction: float | None = _optional(
+        "viscous friction of motor and gear", "N m s/rad", **_NOT_NEGATIVE
     )
-    viscous_friction: float | None = field(
-        default=None,
-        metadata=about(
-            "viscous friction of motor and gear",
-            unit="N m s/rad",
-            least=0,
-            most=STRONGEST,
-        ),
+    coulomb_friction: float | None = _optional("Coulomb friction of motor and gear", "N m", **_NOT_NEGATIVE)
+    spring_stiffness: float | None = _optional(
+        "stiffness of a spring between the joint's links, in parallel to the motor",
+        "N m/rad",
+        **_NOT_NEGATIVE,
     )
-    coulomb_friction: float | None = field(
-        default=None,
-        metadata=about(
-            "Coulomb friction of motor and gear",
-            unit="N m",
-            least=0,
-            most=STRONGEST,
-        ),
+    spring_rest: float | None = _optional(
+        "angle at which this spring is relaxed", "rad", least=-FARTHEST, most=FARTHEST
     )
-    spring_stiffness: float | None = field(
-        default=None,
-        metadata=about(
-            "stiffness of a spring between the joint's links, beside the motor",
-            unit="N m/rad",
-            least=0,
-            most=STRONGEST,
-        ),
+    continuous_torque: float | None = _optional("the gear's continuous torque", "N m", **_POSITIVE)
+    peak_torque: float | None = _optional(
+        "the gear's repeated peak torque, as at each start and stop", "N m", **_POSITIVE
     )
-    spring_rest: float | None = field(
-        default=None,
-        metadata=about("angle at which this spring is relaxed", unit="rad", least=-FARTHEST, most=FARTHEST),
+    momentary_torque: float | None = _optional(
+        "the gear's momentary peak torque, as in an impact", "N m", **_POSITIVE
     )
-    continuous_torque: float | None = field(
-        default=None,
-        metadata=about("the gear's continuous torque", unit="N m", above=0, most=STRONGEST),
+    stall_torque: float | None = _optional("torque of the motor at rest", "N m", **_POSITIVE)
+    no_load_speed: float | None = _optional("speed of the motor without torque", "rad/s", **_POSITIVE)
+    power_limit: float | None = _optional("mechanical power of the motor", "W", **_POSITIVE)
+    bandwidth: float | None = _optional(
+        "bandwidth of the motor's torque, a lag of first order; left out: no lag",
+        "Hz",
+        above=0,
+        most=MAX_BANDWIDTH,
     )
-    peak_torque: float | None = field(
-        default=None,
-        metadata=about("the gear's torque at each start and stop", unit="N m", above=0, most=STRONGEST),
-    )
-    momentary_torque: float | None = field(
-        default=None,
-        metadata=about("the gear's torque now and then, in an impact", unit="N m", above=0, most=STRONGEST),
-    )
-    stall_torque: float | None = field(
-        default=None,
-        metadata=about(
-            "torque of the motor at rest",
-            unit="N m",
-            above=0,
-            most=STRONGEST,
-        ),
-    )
-    no_load_speed: float | None = field(
-        default=None,
-        metadata=about(
-            "speed of the motor without torque",
-            unit="rad/s",
-            above=0,
-            most=STRONGEST,
-        ),
-    )
-    power_limit: float | None = field(
-        default=None, metadata=about("mechanical power of the motor", unit="W", above=0, most=STRONGEST)
-    )
-    bandwidth: float | None = field(
-        default=None,
-        metadata=about(
-            "bandwidth of the motor's torque, a lag of first order; left out: no lag",
-            unit="Hz",
-            above=0,
-            most=MAX_BANDWIDTH,
-        ),
-    )
-    delay: float | None = field(
-        default=None,
-        metadata=about(
-            "delay from reading the joint to setting its torque", unit="s", least=0, most=MAX_DELAY
-        ),
+    delay: float | None = _optional(
+        "delay from reading the joint to setting its torque", "s", least=0, most=MAX_DELAY
     )
 
     def __post_init__(self) -> None:

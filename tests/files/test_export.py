@@ -567,7 +567,7 @@ def test_bad_input_is_refused_and_nothing_is_made(
 @pytest.mark.parametrize("to", FORMATS)
 def test_a_plan_that_is_not_finished_is_not_exported(to: str, still: Solution, tmp_path: Path) -> None:
     result = dataclasses.replace(still.result, status=Status.ITERATION_LIMIT)
-    with pytest.raises(InputError, match="not finished"):
+    with pytest.raises(InputError, match="not solved"):
         dataclasses.replace(still, result=result).export(to, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 

@@ -19,15 +19,13 @@ __all__ = ["AHEAD", "WAYS", "Arm", "aims", "ready"]
 
 Array = NDArray[np.float64]
 WAYS = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))  # horizontal strike directions
-# Positions relative to the shoulder, over the arm's length, in the order tried. Start of the arm's end:
-# (ahead, below), also for a strike from above. Hit point: ahead, and for a strike from above below.
-STARTS = ((0.4, 0.3), (0.45, 0.0), (0.35, 0.5), (0.5, -0.3))
-RAISED = ((0.45, 0.0), (0.4, -0.2), (0.5, 0.2))
-HITS = (0.75, 0.65, 0.85, 0.55)
-HITS_BELOW = (0.45, 0.35, 0.55)
-FARTHER = 0.2  # largest distance of a hit point below ahead of the start, over the arm's length
-# [m]: an arm with a lower shoulder is on the ground, and does not start below its shoulder
-LOW_SHOULDER = 0.6
+# Positions relative to the shoulder, over the arm's length, in the order tried:
+STARTS = ((0.4, 0.3), (0.45, 0.0), (0.35, 0.5), (0.5, -0.3))  # (ahead, below) of the arm's end at the start
+RAISED = ((0.45, 0.0), (0.4, -0.2), (0.5, 0.2))  # the same before a strike from above
+HITS = (0.75, 0.65, 0.85, 0.55)  # ahead, of the hit point
+HITS_BELOW = (0.45, 0.35, 0.55)  # below, of the hit point of a strike from above
+FARTHER = 0.2  # largest distance of that hit point ahead of the start, over the arm's length
+LOW_SHOULDER = 0.6  # [m]: an arm with a lower shoulder is on the ground, and does not start below it
 AHEAD = np.array(WAYS[0])
 LOWEST = 0.25  # [m] above the ground
 NEAR = 0.03  # [m] tolerance of the arm's end, as bent postures are preferred to exact ones

@@ -170,7 +170,7 @@ def test_what_cannot_hold_on_is_refused(problem: ImpactProblem) -> None:
         with pytest.raises(InputError, match=told):
             replace(problem, **changes)  # type: ignore[arg-type]
     short = load_robot("standin", locked=("left_wrist_yaw", "left_wrist_pitch"))
-    with pytest.raises(InputError, match="of the last 6 joints that lead to it, chest_yaw, chest_pitch"):
+    with pytest.raises(InputError, match="of the last 6 joints before it, chest_yaw, chest_pitch"):
         replace(
             problem, robot=short, start="half_sitting", stance=BothSoles(hands=("left_hand", "right_hand"))
         )

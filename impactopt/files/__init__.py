@@ -1,1 +1,1 @@
-"""Files that people read and write: problem files, results and their schema, replays."""
+"""Files: problem files, results and their schema, replays, verification, exports, drafts."""

@@ -1,8 +1,9 @@
 """Files of a result: `solution.npz` with all arrays, `summary.json` with the main figures, and their folder.
 
-`solution.npz` stands for itself: it holds the summary and the problem file too. Every file is written beside
-its place and then moved there, so that a reader never sees half of one. When new numbers take the place of
-old ones, what was made of those goes first: whenever a process ends, all files are of one result.
+`solution.npz` is complete: it has the summary and the problem file too. Every file is written under another
+name and then renamed, so that a reader never sees half of one. Before a new `solution.npz` replaces an old
+one, the files that were derived from the old one are removed: whenever a process ends, all files are of one
+result.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
 from impactopt.solvers.program import SolverResult, Status
 
-if TYPE_CHECKING:  # who only reads a record loads no planner
+if TYPE_CHECKING:  # reading a record does not import the planner
     from impactopt.planning.solution import Solution
     from impactopt.planning.strike import StrikeSolution
 
@@ -49,6 +50,7 @@ __all__ = [
     "load_record",
     "make_directory",
     "plain",
+    "read_json",
     "record_of",
     "record_of_strike",
     "remove_file",
@@ -60,15 +62,15 @@ __all__ = [
     "write_file",
 ]
 
-FORMAT = 1  # of solution.npz; raised when a reader of the old one would go wrong
+FORMAT = 1  # of solution.npz; increased by a change that an older reader would misread
 LARGEST, MOST_ARRAYS = 1 << 29, 1000  # bytes and arrays of solution.npz; ours have some MB, and a hundred
 NUMBERS, SUMMARY = "solution.npz", "summary.json"
-# Bits that histories are kept with, by prefix, of the largest value of each channel: 32 of what a servo is to
-# follow (at 2 rad 5e-10 rad: with 24 accelerations miss what `verify` allows); 15 of what a replay has
-# measured (3e-5 rad, 15 mN of 1 kN): less than any picture shows or anybody measures.
+# Bits of saved histories, by prefix, relative to each channel's largest value. References have 32 (5e-10 rad
+# of 2 rad): with 24, accelerations are beyond what `verify` allows. Replays have 15 (3e-5 rad, 15 mN of
+# 1 kN), which is finer than pictures and measurements.
 BITS = {"reference": 32, "missed": 32, "pose": 32, "simulated": 15, "replayed": 15}
-SMALLEST = 1e-30  # of a channel that is zero
-# what is made of the numbers beside them: by `impactopt show`, by `impactopt validate`, pictures
+SMALLEST = 1e-30  # instead of the largest value of a channel that is zero
+# files derived from a result: of `impactopt show`, of `impactopt validate`, and pictures
 DERIVED = (
     "report.html",
     "replay.json",
@@ -81,12 +83,12 @@ DERIVED = (
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Record:
-    """A solution as numbers and text only: what is kept, drawn and compared.
+    """A solution as numbers and text: the content of its files, from which reports are made.
 
     summary : the content of `summary.json`.
     problem : text of the problem file, "" if there was none.
     arrays : by name. `joints`, `torque_limit`, `velocity_limit`, `armature` (n,); `polygon` and `sole_<name>`
-        (k, 2) [m], corners on the ground, of a sole that steps as it stands at first; `reference_angle`,
+        (k, 2) [m], corners on the ground, for a sole that steps in its first foothold; `reference_angle`,
         `simulated_angle` (k, n), joint angles over time; and, field by field, `reference_*`
         (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort motion, `missed_*`,
         `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`),
@@ -94,7 +96,7 @@ class Record:
         velocities and torques), `solver_*` (`SolverResult`), `history_*` (its iterations);
         `program_statement`, names of the program's variables and constraints, as JSON. Histories of many
         channels are rounded (`rounded`).
-    problem_path : where the problem file was, for the files that it names; None if there was none.
+    problem_path : path of the problem file, to which paths in it are relative; None if there was none.
     """
 
     summary: dict[str, Any]
@@ -103,11 +105,10 @@ class Record:
     problem_path: Path | None = None
 
     def __repr__(self) -> str:
-        """One line: its numbers would fill pages."""
-        told = self.summary
-        name, impulse = told.get("problem", {}).get("name", ""), told.get("impulse_Ns")
-        much = "" if impulse is None else f", {impulse:.2f} N s"
-        return f"<Record of {name!r}: {told.get('status')}{much}>"
+        """One line, without the arrays."""
+        name, impulse = self.summary.get("problem", {}).get("name", ""), self.summary.get("impulse_Ns")
+        figure = "" if impulse is None else f", {impulse:.2f} N s"
+        return f"<Record of {name!r}: {self.summary.get('status')}{figure}>"
 
     @property
     def completed(self) -> bool:
@@ -126,7 +127,7 @@ class Record:
 
 
 def replay_name(summary: Mapping[str, Any]) -> str:
-    """Heading of MuJoCo's replay: nothing holds the soles of a robot that has some."""
+    """Heading of MuJoCo's replay, in which soles are not fixed."""
     return "free soles" if summary.get("sole_cop_margin_mm") else "MuJoCo"
 
 
@@ -138,16 +139,16 @@ def record_of(
     problem: str = "",
     problem_path: Path | None = None,
 ) -> Record:
-    """The record of a solution, of its re-simulations if there are any, and of the problem file's text.
+    """Record of a solution, of its re-simulations if there are any, and of the problem file's text.
 
-    There is always one: where the solver was stopped so early that legs and base do not fit together, it has
-    no `reference_*`, and a summary without the motion's numbers and with a `note` that says why.
+    A solver that is stopped early may leave legs and base that do not fit together. Then the record has no
+    `reference_*`, and its summary no numbers of the motion, but a `note` with the reason.
     """
     plan, robot, result = solution.plan, solution.problem.robot, solution.result
     arrays = _scene_arrays(solution.problem)
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
     parts |= {"collision": solution.collision, "solver": result}
-    summary, problem = _summary(solution, simulation, replay), _settled(problem, solution)
+    summary, problem = _summary(solution, simulation, replay), _with_chosen_gains(problem, solution)
     if "note" not in summary:
         parts |= {"reference": solution.trajectory, "pose": poses_of(solution.problem, solution.trajectory)}
         if plan.abort is not None:
@@ -168,17 +169,17 @@ def record_of(
 def record_of_strike(
     solution: StrikeSolution, *, problem: str = "", problem_path: Path | None = None
 ) -> Record:
-    """The record of a strike: as of a solution, with `strike_*` (`PlannedStrike`) and no motion."""
-    hit = solution.strike
-    parts = {"strike": hit, "collision": hit.collision, "solver": solution.result}
+    """Record of a strike: as of a solution, with `strike_*` (`PlannedStrike`) and no motion."""
+    strike = solution.strike
+    parts = {"strike": strike, "collision": strike.collision, "solver": solution.result}
     arrays = _scene_arrays(solution.problem) | _parts_arrays(parts, solution.result)
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
-    summary, problem = plain(solution.summary()), _settled(problem, solution)
+    summary, problem = plain(solution.summary()), _with_chosen_gains(problem, solution)
     return Record(summary=summary, problem=problem, arrays=arrays, problem_path=problem_path)
 
 
-def _settled(problem: str, solution: Solution | StrikeSolution) -> str:
-    """The text of a problem file with the gains that a solution has chosen in the place of their ranges."""
+def _with_chosen_gains(problem: str, solution: Solution | StrikeSolution) -> str:
+    """The text of a problem file, with the optimized gain factors of a solution instead of their ranges."""
     if not problem or not solution.gains:
         return problem
     data = read_toml(problem)
@@ -189,7 +190,7 @@ def _settled(problem: str, solution: Solution | StrikeSolution) -> str:
 
 
 def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:
-    """Summary of a solution's record; made without the record's arrays, if nothing else of it is kept."""
+    """Summary of a solution's record, without computing the record's arrays."""
     from impactopt.planning.strike import StrikeSolution
 
     return plain(
@@ -207,7 +208,7 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
         "armature": robot.armature,
         "polygon": support_polygon(robot, c),
     }
-    # of a sole that steps where it stands first
+    # reversed, so that the first foothold of a sole that steps is the one that remains
     legs = {leg.frame: leg for c in reversed(problem.stance_coordinates) for leg in c.legs}
     for leg in legs.values():
         if leg.sole is None:
@@ -217,16 +218,16 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
 
 
 def rounded(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Arrays whose histories of many channels, (k, ...), are rounded (`BITS`).
+    """Arrays with rounded histories (`BITS`): those of several channels, (k, ...).
 
-    That is a fifth of the file's size. Times and single curves stay as they are.
+    That makes the file five times smaller. Times and single curves are not rounded.
     """
     out = {name: np.asarray(value) for name, value in arrays.items()}
     for name, array in out.items():
         bits = BITS.get(name.partition("_")[0])
         if bits is not None and array.ndim > 1 and array.dtype == float and array.size:
             largest = np.abs(np.where(np.isfinite(array), array, 0.0)).max(axis=0)
-            # the power of two above what the channel is at most, in steps of which it is a whole number
+            # rounded to multiples of a power of two, 2^-bits of the next one above the largest value
             unit = np.exp2(np.ceil(np.log2(np.maximum(largest, SMALLEST))) - bits)
             out[name] = np.round(array / unit) * unit
     return out
@@ -239,12 +240,12 @@ def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, A
         out |= {f"{prefix}_{name}": value for name, value in _numbers(thing).items()}
     if result.history:
         history = [_numbers(iteration) for iteration in result.history]
-        out |= {f"history_{name}": [row[name] for row in history] for name in history[0]}
+        out |= {f"history_{name}": [iteration[name] for iteration in history] for name in history[0]}
     return out
 
 
 def replay_arrays(replay: Any) -> dict[str, NDArray[Any]]:
-    """Arrays of a record that hold a `Simulation` on free soles: motion and forces, as `replayed_*`."""
+    """Arrays `replayed_*` of a record, the motion and forces of a `Simulation` on free soles."""
     left_out = {"v", "demand", "torque", "gear"}
     kept = {name: value for name, value in _numbers(replay).items() if name not in left_out}
     return rounded(
@@ -269,7 +270,7 @@ def _numbers(thing: Any) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON has it; what is not finite becomes null."""
+    """`value` in the types of JSON; numbers that are not finite become null."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
@@ -280,11 +281,11 @@ def plain(value: Any) -> Any:
 
 
 def make_directory(directory: str | os.PathLike[str]) -> Path:
-    """The directory, made if it is not there; before hours of work are lost for want of it.
+    """The directory, made if it does not exist; called before a solve, whose result it is for.
 
     Raises
     ------
-    InputError : it cannot be made, or nothing can be written there.
+    InputError : it cannot be made, or is not writable.
     """
     path = Path(directory)
     try:
@@ -297,9 +298,9 @@ def make_directory(directory: str | os.PathLike[str]) -> Path:
 
 
 def save_record(record: Record, directory: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """Write `solution.npz` and `summary.json` into the directory, which is made if it is not there.
+    """Write `solution.npz` and `summary.json` into the directory, which is made if it does not exist.
 
-    What an earlier result has left there goes, of the files that this package makes (`DERIVED`).
+    Files derived from an earlier result (`DERIVED`) are removed.
 
     Raises
     ------
@@ -322,7 +323,7 @@ def save_record(record: Record, directory: str | os.PathLike[str]) -> tuple[Path
 
 
 def _packed(array: NDArray[Any]) -> NDArray[Any]:
-    """The same numbers in single precision, channel by channel, where they are histories that it holds."""
+    """A history in single precision, in Fortran order, if that represents it exactly; else the same array."""
     if array.ndim < 2 or array.dtype != float:
         return array
     with np.errstate(over="ignore"):
@@ -350,13 +351,13 @@ def remove_file(path: Path) -> None:
 def write_file(
     path: Path, write: Callable[[IO[bytes]], Any], *, before: Callable[[], object] | None = None
 ) -> None:
-    """Let `write` fill a new file that then takes the place of `path` in one step.
+    """Have `write` fill a new file, which then replaces `path` in one step.
 
-    before : what is to be done just before that, when nothing of the new file can fail any more.
+    before : called just before that, when the new file is complete.
 
     Raises
     ------
-    InputError : it cannot be written; what was at `path` before is still there.
+    InputError : it cannot be written; an earlier file at `path` is unchanged.
     """
     try:
         write_atomically(path, write, before=before)
@@ -365,7 +366,7 @@ def write_file(
 
 
 def load_record(directory: str | os.PathLike[str]) -> Record:
-    """The record that `save_record` left in a directory; its `solution.npz` can be named too.
+    """The record that `save_record` wrote into a directory, or of a path to `solution.npz`.
 
     Raises
     ------
@@ -382,8 +383,8 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
             arrays = {name: _unpacked(file[name]) for name in file.files}
         summary = json.loads(str(arrays.pop("summary_json")))
         problem = str(arrays.pop("problem_toml"))
-        problem.encode().decode()  # a damaged array may hold characters that there are not
-        near = str(arrays.pop("problem_path", ""))
+        problem.encode().decode()  # a damaged array may have invalid characters
+        relative = str(arrays.pop("problem_path", ""))
         del arrays["format"]
         check_summary(summary, whole="joints" in arrays)
         check_arrays(arrays)
@@ -393,7 +394,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         raise InputError(f"there is no {path}; {fix}") from error
     except PermissionError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
-    # what NumPy and zipfile raise for files that are cut, overwritten or of another kind
+    # errors of NumPy and zipfile for files that are truncated, overwritten or of another kind
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, NotImplementedError) as error:
         raise InputError(f"{path} is damaged ({error}); {fix}") from error
     except (
@@ -406,19 +407,19 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         RuntimeError,
     ) as error:
         raise InputError(f"{path} is damaged ({error}); {fix}") from error
-    place = Path(os.path.normpath(path.parent.resolve() / near)) if near else None
-    return Record(summary=summary, problem=problem, arrays=arrays, problem_path=place)
+    problem_path = Path(os.path.normpath(path.parent.resolve() / relative)) if relative else None
+    return Record(summary=summary, problem=problem, arrays=arrays, problem_path=problem_path)
 
 
-FAILED = "failed"  # in a result's directory: what would have taken a good result's place
+FAILED = "failed"  # folder in a result's directory, for a failed result that does not replace a good one
 SERIES = "blows.json"
 
 
 def keep_record(record: Record, directory: Path) -> tuple[Path, Path]:
-    """Saves a record (`save_record`); one that is not solved leaves a good one in the directory as it is.
+    """Save a record (`save_record`); a failed one does not replace a good one in the directory.
 
-    It is in the directory's own directory `failed` then, and its summary says so in `set_aside`. A good one
-    takes the place of all that there was, a failed one that it makes up for included.
+    It is then written to the subdirectory `failed`, which its summary has in `set_aside`. A good one replaces
+    the earlier result, and removes such a failed one.
 
     Raises
     ------
@@ -428,12 +429,12 @@ def keep_record(record: Record, directory: Path) -> tuple[Path, Path]:
     place = _place(directory, good, _good(_status_in(directory)), record.summary)
     written = save_record(record, place)
     if good:
-        _forget(directory / FAILED, NUMBERS, SUMMARY, *DERIVED)
+        _remove(directory / FAILED, NUMBERS, SUMMARY, *DERIVED)
     return written
 
 
 def keep_series(done: dict[str, Any], directory: Path) -> Path:
-    """The same of a series of blows, in `blows.json`: good is one whose nail is in.
+    """Save a series of blows in `blows.json`, as `keep_record`; it is good if the nail is driven in.
 
     done : `Series.describe`.
 
@@ -441,12 +442,12 @@ def keep_series(done: dict[str, Any], directory: Path) -> Path:
     ------
     InputError : it cannot be written.
     """
-    place = _place(directory, done["done"], bool(_read(directory / SERIES).get("done")), done)
+    place = _place(directory, done["done"], bool(read_json(directory / SERIES).get("done")), done)
     text = f"{json.dumps(plain(done), indent=2)}\n".encode()
     place.mkdir(exist_ok=True)
     write_file(place / SERIES, lambda file: file.write(text))
     if done["done"]:
-        _forget(directory / FAILED, SERIES)
+        _remove(directory / FAILED, SERIES)
     return place / SERIES
 
 
@@ -456,14 +457,13 @@ def set_aside(summary: Mapping[str, Any]) -> str:
     if found is None:
         return ""
     return (
-        f"{found['kept']} holds a good result, which is left as it is; this one came to nothing, and is in "
-        f"{found['directory']}"
+        f"{found['kept']} holds a good result, which is kept; this one failed, and is in {found['directory']}"
     )
 
 
-def _place(directory: Path, good: bool, held: bool, summary: dict[str, Any]) -> Path:
-    """Directory for a result; `held`: there is a good one. Its summary notes if that is another directory."""
-    if good or not held:
+def _place(directory: Path, good: bool, has_good: bool, summary: dict[str, Any]) -> Path:
+    """Directory for a result. If it is `failed`, as there is a good one, that is noted in its summary."""
+    if good or not has_good:
         return directory
     place = directory / FAILED
     summary["set_aside"] = {"directory": str(place), "kept": str(directory)}
@@ -471,7 +471,7 @@ def _place(directory: Path, good: bool, held: bool, summary: dict[str, Any]) -> 
 
 
 def _good(status: Any) -> bool:
-    """True if a record's status is that of a result to keep; a newer version's status is."""
+    """True if a record's status is that of a usable result; an unknown one, of a newer version, counts so."""
     known = [s.value for s in Status if not s.usable]
     return isinstance(status, str) and status not in known
 
@@ -479,19 +479,19 @@ def _good(status: Any) -> bool:
 def _status_in(directory: Path) -> Any:
     with contextlib.suppress(InputError):
         return load_record(directory).summary.get("status")
-    return _read(directory / SUMMARY).get("status")  # numbers of a newer version
+    return read_json(directory / SUMMARY).get("status")  # for a record of a newer version
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """A file of ours; nothing where it is none."""
+def read_json(path: Path, most: int = LARGEST) -> dict[str, Any]:
+    """Table in a JSON file of at most so many bytes; {} if it cannot be read."""
     with contextlib.suppress(OSError, ValueError, RecursionError):
-        found = json.loads(read_plain(path, LARGEST))
+        found = json.loads(read_plain(path, most))
         return found if isinstance(found, dict) else {}
     return {}
 
 
-def _forget(directory: Path, *names: str) -> None:
-    """Remove files of ours, and the directory if nothing else is in it."""
+def _remove(directory: Path, *names: str) -> None:
+    """Remove files of a directory, and the directory if nothing else is in it."""
     with contextlib.suppress(OSError):
         for name in names:
             (directory / name).unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """Schema of a saved result's arrays and summary: names, shapes, types of numbers.
 
-What is read back from a disk may be damaged, of another version, or made by someone else. What does not keep
-to this is refused as a whole, before anything is drawn or computed from it.
+A file may be damaged, of another version, or made by someone else. One that violates the schema is refused
+before anything is drawn or computed from it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from impactopt.errors import has_control
 
 __all__ = ["check_arrays", "check_summary"]
 
-# Letters are sizes: n, nq and nv of the robot in all arrays; others are the same among arrays of one prefix.
-# With a ? before them the array may be missing, as in records of older versions, or empty.
+# Shapes of arrays. Letters are sizes: n, nq and nv are the robot's, the same in all arrays; others are the
+# same in all arrays of one prefix. "?" at the beginning: the array may be missing, as in records of older
+# versions, or empty.
 _MOTION = {"time": "k", "q": "k nq"}
 _REFERENCE = {
     **_MOTION,
@@ -50,13 +51,13 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
 }
 _TEXTS = ("joints", "replayed_soles", "program_statement")
 _ROBOT = ("n", "nq", "nv")
-# of the motion; what there is none of may be NaN
+# arrays without NaN and infinity; in others NaN stands for a quantity that does not exist
 _FINITE = ("time", "q", "posture", "velocity", "angle", "torque", "links", "path")
-# What a value of the summary may be: one of these kinds. A table of kinds is of a table with these keys, a
-# key with a question mark may be left out, "*" is any other key; a list of one kind is of a list.
+# Kinds of a value of the summary, of which one has to match: a type; a dict of keys and kinds for a table, in
+# which a key with "?" is optional and "*" is any other key; a list with one kind for a list.
 _Kinds = tuple[Any, ...]
 _TEXT: _Kinds = (str,)
-_NUMBER: _Kinds = (int, float, type(None))  # what is not finite is null
+_NUMBER: _Kinds = (int, float, type(None))  # null for numbers that are not finite
 _YES: _Kinds = (bool, type(None))
 _NUMBERS: _Kinds = ({"*": _NUMBER},)
 _PHASES: _Kinds = ({"*": _NUMBER},)
@@ -139,7 +140,7 @@ _GAINS = {
     **dict.fromkeys(("stiffness_N_m_rad", "damping_N_m_s_rad"), _NUMBERS),
 }
 _SCENARIO = {**_BLOW, "name": _TEXT, **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBER)}
-# of a record with arrays, whole
+# required keys of a record with arrays
 _KEYS: Mapping[str, _Kinds] = {
     **dict.fromkeys(("status", "message", "solver"), _TEXT),
     "violations": ([({"row": _TEXT, "by": _TEXT, "amount?": _NUMBER},)],),
@@ -200,11 +201,11 @@ _OTHERS: Mapping[str, _Kinds] = {
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
     **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "style?", "collision_model?"), _TEXT),
 }
-_DEEPEST = 20
+_MAX_DEPTH = 20  # of tables and lists in a summary
 
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """ValueError that names the array which is missing, or is not what it should be."""
+    """ValueError with the name of an array that is missing, or has a wrong type, shape or value."""
     for name, array in arrays.items():
         text = name in _TEXTS and (array.dtype.kind == "U" or not array.size)
         if not text and (name == "joints" or array.dtype.kind not in "biuf"):
@@ -214,23 +215,28 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
     sizes: dict[str, int] = {}
     known = [f"{p}_{name}".lstrip("_") for p, shapes in _SCHEMA.items() for name in shapes]
     for prefix, shapes in _SCHEMA.items():
-        of = {name: f"{prefix}_{name}" if prefix else name for name in shapes}
-        if not any(name in arrays for name in (of.values() if prefix else known)):
+        full_names = {name: f"{prefix}_{name}" if prefix else name for name in shapes}
+        # a part, such as "missed", may be left out whole
+        if not any(name in arrays for name in (full_names.values() if prefix else known)):
             continue
         sizes = {letter: size for letter, size in sizes.items() if letter in _ROBOT}
         for name, shape in shapes.items():
-            if shape.startswith("?") and not np.size(arrays.get(of[name], ())):
+            full = full_names[name]
+            if shape.startswith("?") and not np.size(arrays.get(full, ())):
                 continue
-            _check_shape(of[name], arrays, shape.strip("? ").split(), sizes)
-            if name in _FINITE and not np.all(np.isfinite(arrays[of[name]])):
-                raise ValueError(f"{of[name]} has numbers that are not finite")
-        if "time" in shapes and not _rises(arrays[of["time"]]):
-            raise ValueError(f"{of['time']} does not rise")
+            _check_shape(full, arrays, shape.strip("? ").split(), sizes)
+            if name in _FINITE and not np.all(np.isfinite(arrays[full])):
+                raise ValueError(f"{full} has numbers that are not finite")
+        if "time" in shapes:
+            time = arrays[full_names["time"]]
+            if not len(time) or np.any(np.diff(time) < 0):
+                raise ValueError(f"{full_names['time']} does not rise")
 
 
 def _check_shape(
     name: str, arrays: Mapping[str, NDArray[Any]], shape: list[str], sizes: dict[str, int]
 ) -> None:
+    """ValueError for another shape; sizes of new letters are added to `sizes`."""
     if name not in arrays:
         raise ValueError(f"{name} is missing")
     found = arrays[name].shape
@@ -245,14 +251,10 @@ def _check_shape(
     raise ValueError(f"{name} has the shape {found}, not ({', '.join(shape)})")
 
 
-def _rises(time: NDArray[Any]) -> bool:
-    return len(time) > 0 and bool(np.all(np.diff(time) >= 0))
-
-
 def check_summary(summary: Any, *, whole: bool) -> None:
-    """ValueError for a summary that is none: a wrong kind of value, text that a terminal would obey.
+    """ValueError for a summary with a wrong kind of value, or with control characters in text.
 
-    whole : it is of a record with arrays, of which more is read.
+    whole : it is of a record with arrays, for which more keys are required.
     """
     if not isinstance(summary, dict):
         raise ValueError("its summary is no table")
@@ -264,16 +266,16 @@ def check_summary(summary: Any, *, whole: bool) -> None:
 
 
 def _check_kind(name: str, value: Any, kinds: _Kinds) -> None:
-    """`name` : where the value is, as a reader of the file would write it."""
+    """ValueError unless a value is of one of these kinds; name : its path in the summary."""
     for kind in kinds:
         if isinstance(kind, dict) and isinstance(value, dict):
             return _check_table(f"{name}.", value, kind)
         if isinstance(kind, list) and isinstance(value, list):
-            (of,) = kind
+            (inner,) = kind
             for i, entry in enumerate(value):
-                _check_kind(f"{name}[{i}]", entry, of if isinstance(of, tuple) else (of,))
+                _check_kind(f"{name}[{i}]", entry, inner if isinstance(inner, tuple) else (inner,))
             return None
-        # true and false are whole numbers to Python
+        # Python's bool is an int
         if (
             isinstance(kind, type)
             and isinstance(value, kind)
@@ -284,11 +286,11 @@ def _check_kind(name: str, value: Any, kinds: _Kinds) -> None:
 
 
 def _check_table(above: str, table: Mapping[str, Any], kinds: Mapping[str, _Kinds]) -> None:
-    """Keys that are not known are let be: a newer version's."""
-    for key, of in kinds.items():
+    """ValueError for a table with a missing key or a wrong value; unknown keys, of newer versions, may be."""
+    for key, inner in kinds.items():
         name = key.removesuffix("?")
         if name != "*" and name in table:
-            _check_kind(f"{above}{name}", table[name], of)
+            _check_kind(f"{above}{name}", table[name], inner)
         elif name == key != "*":
             raise ValueError(f"its summary has no {above}{name}")
     if "*" in kinds:
@@ -297,8 +299,9 @@ def _check_table(above: str, table: Mapping[str, Any], kinds: Mapping[str, _Kind
 
 
 def _texts(data: Any, depth: int = 0) -> Iterator[str]:
-    if depth > _DEEPEST:
-        raise ValueError(f"its summary is nested deeper than {_DEEPEST}")
+    """All texts and keys in a summary."""
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"its summary is nested deeper than {_MAX_DEPTH}")
     if isinstance(data, str):
         yield data
     elif isinstance(data, dict):

@@ -1,4 +1,4 @@
-"""Plans that a solve left on disk: problem, reference, the solution again, and replays by an engine."""
+"""Saved results read back: problem, reference and solution; their replays by an engine."""
 
 from __future__ import annotations
 
@@ -44,20 +44,22 @@ __all__ = [
     "solution_of_record",
 ]
 
-_SAME = 1e-6  # of constraints: those of a program that is not the record's are off by more
+# Tolerance of the recorded violation of constraints. A program that differs from the record's, as of another
+# version, has a larger violation at its variables.
+_SAME = 1e-6
 
 
 def resumed(record: Record, problem: ImpactProblem) -> Solution:
-    """The solution that a record is of, as far as a start has to know it: of its history it knows nothing.
+    """The solution of a record, for a warm start; without the history of its solve.
 
-    The program is made again from what the record says of it. Where it says nothing, or the program is
-    another one today, the problem is solved anew, from the record's variables if they fit.
+    The program is rebuilt from its description in the record. If there is none, or the program differs today,
+    the problem is solved again, with the record's variables as the initial guess if their number is the same.
 
     problem : the record's, as `impactopt.files.replay.load_planned` builds it.
     """
     made = program_of_record(record, problem)
     x = np.asarray(record.arrays["solver_x"])
-    if made is not None and _is_of(made, record):
+    if made is not None and _same_program(made, record):
         return solution_of_record(record, made)
     if made is None or made.program.n != len(x):
         return solve(problem)
@@ -65,38 +67,34 @@ def resumed(record: Record, problem: ImpactProblem) -> Solution:
 
 
 def program_of_record(record: Record, problem: ImpactProblem) -> Transcription | None:
-    """The program that a record says it is of, made again; None where it says nothing."""
+    """The program of a record, rebuilt from its description; None if the record has none."""
     if "program_statement" not in record.arrays:
         return None
-    told: dict[str, Any] = json.loads(str(record.arrays["program_statement"]))
-    elements: Elements = tuple(tuple(e) for e in told["elements"]) if told["guarded"] else ()
-    swing, follow, *stands = (tuple(places) for places in told["more"])
-    nodes = MoreNodes(swing, follow, tuple(stands))
-    t = program_on(problem, nodes, elements, tuple(told.get("shares", ())))
-    return t.with_apart(_apart(told["apart"])) if told["apart"] else t
-
-
-def _apart(told: list[dict[str, Any]]) -> dict[ClearanceKey, SeparatingDirection]:
-    """Constraints between bodies."""
-    return {
-        ClearanceKey(*(row[key] for key in ClearanceKey._fields)): SeparatingDirection(
-            tuple(row["way"]), row["reach"], row["travel"]
+    statement: dict[str, Any] = json.loads(str(record.arrays["program_statement"]))
+    elements: Elements = tuple(tuple(e) for e in statement["elements"]) if statement["guarded"] else ()
+    swing, follow, *stances = (tuple(added) for added in statement["more"])  # added mesh nodes
+    nodes = MoreNodes(swing, follow, tuple(stances))
+    t = program_on(problem, nodes, elements, tuple(statement.get("shares", ())))
+    clearances = {
+        ClearanceKey(*(entry[key] for key in ClearanceKey._fields)): SeparatingDirection(
+            tuple(entry["way"]), entry["reach"], entry["travel"]
         )
-        for row in told
+        for entry in statement["apart"]
     }
+    return t.with_apart(clearances) if clearances else t
 
 
-def _is_of(t: Transcription, record: Record) -> bool:
-    """True if a program has the record's variables and constraints, with the violation that it reports."""
-    x, rows = record.arrays["solver_x"], record.arrays["solver_multipliers"]
-    if (t.program.n, t.program.m) != (len(x), len(rows)):
+def _same_program(t: Transcription, record: Record) -> bool:
+    """True if a program has the sizes of the record's, and the recorded violation at its variables."""
+    x, multipliers = record.arrays["solver_x"], record.arrays["solver_multipliers"]
+    if (t.program.n, t.program.m) != (len(x), len(multipliers)):
         return False
-    found = max_violation(t.program, x, t.program.constraints(x))
-    return bool(found <= float(record.arrays["solver_max_violation"]) + _SAME)
+    violation = max_violation(t.program, x, t.program.constraints(x))
+    return bool(violation <= float(record.arrays["solver_max_violation"]) + _SAME)
 
 
 def solution_of_record(record: Record, t: Transcription) -> Solution:
-    """The solution that a program's variables in a record are."""
+    """The solution of a program at the variables in a record."""
     summary = record.summary
     given = {f.name: record.arrays.get(f"solver_{f.name}") for f in dataclasses.fields(SolverResult)}
     numbers: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in given.items() if v is not None}
@@ -113,8 +111,8 @@ def solution_of_record(record: Record, t: Transcription) -> Solution:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Planned:
-    """Data of a replay: a record, its problem, the servo's reference and, if the plan has one, the reference
-    that follows a missed blow; settings of a whole-body controller.
+    """Input of a replay: a record, its problem, the servo's reference, the reference for a missed target if
+    the plan has one, and settings of a whole-body controller.
     """
 
     record: Record
@@ -126,9 +124,9 @@ class Planned:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
-    """A replay: the world it found, its histories, and its numbers as in `impactopt validate --json`.
+    """A replay: its perturbation, its histories, and its numbers as in `impactopt validate --json`.
 
-    record : the plan's, with this replay in place of its own.
+    record : the plan's, with this replay instead of an earlier one.
     """
 
     planned: Planned
@@ -151,17 +149,17 @@ def load_planned(
 ) -> Planned:
     """The plan in a directory that `impactopt solve` wrote, or in its `solution.npz`.
 
-    problem_file : instead of the record's own text, such as when that is missing or its URDF has moved.
-    settings : other values of the problem, by key path.
+    problem_file : used instead of the record's own text, such as when that is missing or its URDF has moved.
+    settings : changed values of the problem, by key path.
 
     Raises
     ------
-    InputError : there is no record, it holds no motion, or it does not fit the robot that the problem names.
+    InputError : there is no record, it holds no motion, or its joints are not those of the problem's robot.
     """
     record = load_record(result)
     if not record.completed:
         strike = "strike_posture" in record.arrays
-        usual = "it is a strike, the blow alone" if strike else "the solve was stopped before there was one"
+        usual = "it is a strike, the impact alone" if strike else "the solve was stopped before there was one"
         note = record.summary.get("note", usual)
         raise InputError(f"{result} holds no motion to replay: {note}")
     file = _problem_file(record, Path(result), problem_file, settings)
@@ -169,7 +167,7 @@ def load_planned(
     a, robot = record.arrays, problem.robot
     if list(a["joints"]) != list(robot.joint_names) or a["reference_q"].shape[1] != robot.model.nq:
         raise InputError(
-            f"{result} was planned for another robot than {robot.name!r} is today: its joints differ; "
+            f"{result} was planned for other joints than those of the robot {robot.name!r} today; "
             "solve again, or give the file of its problem with --problem"
         )
     missed = _trajectory(record, "missed") if "missed_time" in a else None
@@ -183,6 +181,7 @@ def load_planned(
 
 
 def _trajectory(record: Record, prefix: str) -> Trajectory:
+    """The trajectory whose arrays in a record have this prefix."""
     named = {f.name: f"{prefix}_{f.name}" for f in dataclasses.fields(Trajectory)}
     given = {name: record.arrays[key] for name, key in named.items() if key in record.arrays}
     fields: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in given.items()}
@@ -195,11 +194,11 @@ def problem_of(
     problem_file: str | os.PathLike[str] | None,
     settings: Mapping[str, Any] | None,
 ) -> ImpactProblem:
-    """The problem of a record, built again; arguments as of `load_planned`.
+    """The problem of a record, rebuilt; arguments as of `load_planned`.
 
     Raises
     ------
-    InputError : the record has no problem file, or it cannot be built again.
+    InputError : the record has no problem file, or the problem cannot be rebuilt.
     """
     file = _problem_file(record, result, problem_file, settings)
     return _built(record, file, result, given=problem_file is not None)
@@ -219,19 +218,19 @@ def _problem_file(
     try:
         return parse_problem_file(record.problem, path, settings)
     except InputError as error:
-        raise _not_again(result, error) from error
+        raise _cannot_rebuild(result, error) from error
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """Problem with the lazy constraints and the touches that the record's plan needed, its chosen gains, and
-    its style's prices.
+    """The problem as the record's plan has it: with its lazy constraints, number of touches, optimized gains
+    and prices of the style.
 
-    given : the file was, and is not the record's own text.
+    given : the file is one given by the user, not the record's own text.
     """
     try:
         problem = file.build()
-        told = record.summary.get("gains", ())
-        problem = with_chosen(problem, [each["factor"] for each in told])
+        gains = record.summary.get("gains", ())
+        problem = with_chosen(problem, [each["factor"] for each in gains])
         if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
             problem = replace(problem, price_scale=scale)
         if problem.touches is None and (touches := record.summary.get("touches")) is not None:
@@ -240,12 +239,12 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
     except InputError as error:
         if given:
             raise
-        raise _not_again(result, error) from error
+        raise _cannot_rebuild(result, error) from error
 
 
-def _not_again(result: Path, error: InputError) -> InputError:
+def _cannot_rebuild(result: Path, error: InputError) -> InputError:
     return InputError(
-        f"the problem in {result} cannot be built again ({error}); if its files have moved, give the "
+        f"the problem in {result} cannot be rebuilt ({error}); if its files have moved, give the "
         "problem file with --problem FILE"
     )
 
@@ -259,16 +258,17 @@ def replay(
     contact: str = "point",
     **options: Any,
 ) -> Replay:
-    """Follow the plan's reference in an engine; "mujoco" lets the robot slip, lift its soles and fall.
+    """Track the plan's reference in an engine; with "mujoco" the robot may slip, lift its soles and fall.
 
-    perturbation : where the world differs from what was planned ("mujoco"; with "pinocchio" the target may
-        be missing, no more).  controller : "servo", or "wbc" ("mujoco" only).  contact : "point", or "link"
-        ("mujoco" only): the striking link's hull meets the target's body. The report then has impulse and
-        first touch of both.  options : of the engine, such as ``step`` [s].
+    perturbation : deviations of the world from the plan's ("mujoco"; for "pinocchio" a missing target only).
+    controller : "servo", or "wbc" ("mujoco" only).
+    contact : "point", or "link" ("mujoco" only): collision of the striking link's hull with the target's
+        body. The report then has impulse and first touch of both.
+    options : of the engine, such as ``step`` [s].
 
     Raises
     ------
-    InputError : an unknown engine or option, a missing package, a simulation that diverges, or whose steps
+    InputError : an unknown engine or option, a missing package, a simulation that diverges, or steps that
         leave more than 1 % of its impulse uncertain.
     """
     world = perturbation if perturbation is not None else Perturbation()
@@ -280,13 +280,13 @@ def replay(
     options["controller"] = controller_of(controller, planned.controller)
     problem = planned.problem
     if contact != "point" and engine != "mujoco":
-        raise InputError(f"engine {engine!r} knows striking points only; take engine 'mujoco'")
-    met: dict[str, Any] = {} if contact == "point" else {"contact": contact}
-    simulation = simulate(problem, planned.reference, engine=engine, **options, **met)
+        raise InputError(f"engine {engine!r} has striking points only; take engine 'mujoco'")
+    link_contact: dict[str, Any] = {} if contact == "point" else {"contact": contact}
+    simulation = simulate(problem, planned.reference, engine=engine, **options, **link_contact)
     check_steps(simulation, options.get("step"))
-    if met:
+    if link_contact:
         point = simulate(problem, planned.reference, engine=engine, **options)
-        met |= {**_touch(simulation), "point": _touch(point)}
+        link_contact |= {**_touch(simulation), "point": _touch(point)}
     report = plain(
         simulation.report(
             torque_limit=world.torque_limit * problem.robot.torque_limit,
@@ -294,17 +294,17 @@ def replay(
             planned_impulse=float(planned.record.summary["impulse_Ns"]),
         )
         | {"controller": controller}
-        | met
+        | link_contact
     )
-    kept = {n: v for n, v in planned.record.arrays.items() if not n.startswith("replayed_")}
-    kept |= {name: np.asarray(value) for name, value in replay_arrays(simulation).items()}
-    beyond = gear_caution(problem, [simulation.loads])
-    summary = {**planned.record.summary, "replayed": report, **beyond}
-    record = dataclasses.replace(planned.record, arrays=kept, summary=summary)
+    arrays = {n: v for n, v in planned.record.arrays.items() if not n.startswith("replayed_")}
+    arrays |= {name: np.asarray(value) for name, value in replay_arrays(simulation).items()}
+    caution = gear_caution(problem, [simulation.loads])
+    summary = {**planned.record.summary, "replayed": report, **caution}
+    record = dataclasses.replace(planned.record, arrays=arrays, summary=summary)
     return Replay(planned=planned, perturbation=world, simulation=simulation, report=report, record=record)
 
 
 def _touch(simulation: Simulation) -> dict[str, float]:
-    """Impulse [N s], and how much earlier than planned contact begins [ms]."""
+    """Impulse [N s], and time by which contact begins earlier than planned [ms]."""
     early = simulation.expected - simulation.contact_start
     return {"impulse_Ns": simulation.impulse, "first_touch_ms": 1e3 * early}

@@ -1,4 +1,4 @@
-"""A folder of solved problems, in which the nearest one to another problem is found, to start from."""
+"""Folder of solved problems, whose nearest one to a problem is its initial guess."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ from impactopt.solvers.program import Status
 
 __all__ = ["Neighbour", "SolvedFolder"]
 
-FAR = 2.0  # distance from which on two problems are no neighbours
-_STEP = 0.1  # of a number in a list, as [m] of a point: what counts as much as a factor of 2
-_NOT_THE_PLAN = {"name", "solver", "validate", "controller"}  # keys that do not change what is planned
+MAX_DISTANCE = 2.0  # of neighbours
+# Change of a number in a list, such as [m] of a point, of distance 1; of other numbers it is a factor of 2.
+_UNIT_CHANGE = 0.1
+_IRRELEVANT = {"name", "solver", "validate", "controller"}  # keys that do not change the plan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +48,7 @@ class Neighbour:
 class SolvedFolder:
     """Results of `impactopt solve` in the directories of a folder, each with its problem.
 
-    A sweep's ``cases`` is one, and so is ``results``. It is made when the first result is kept.
+    A sweep's ``cases`` is one, and so is ``results``. It is made by the first `keep`.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -55,9 +56,9 @@ class SolvedFolder:
         self._known: dict[Path, dict[str, Any]] = {}
 
     def keep(self, solution: Solution, file: ProblemFile, name: str = "") -> Path | None:
-        """Put a solution into the folder; None if it is none.
+        """Save a usable solution in the folder; its directory, or None if it is not usable.
 
-        file : its problem's.  name : of its directory; "": one that its problem's text has to itself.
+        file : its problem's.  name : of its directory; "": a hash of its problem's text.
         """
         if not solution.status.usable:
             return None
@@ -67,19 +68,20 @@ class SolvedFolder:
         return self.path / name
 
     def nearest(self, file: ProblemFile) -> Neighbour | None:
-        """The nearest solved problem; None where none differs in a few numbers only."""
+        """The nearest solved problem within `MAX_DISTANCE`; None if there is none."""
         own = _leaves(read_toml(file.text))
         found = []
         for numbers in sorted(self.path.glob(f"*/{NUMBERS}")):
             distance = _distance(own, self._leaves_of(numbers))
-            if distance <= FAR:
+            if distance <= MAX_DISTANCE:
                 found.append(Neighbour(path=numbers.parent, distance=distance))
         return min(found, key=lambda near: near.distance, default=None)
 
     def solve(
         self, problem: ImpactProblem, file: ProblemFile, **options: Any
     ) -> tuple[Solution, Neighbour | None]:
-        """`impactopt.solve` from the nearest solution; without, where there is none or it fails.
+        """`impactopt.solve` with the nearest solution as the initial guess; a cold start if there is none, or
+        the solve fails.
 
         options : of `impactopt.solve`, for both.
 
@@ -92,13 +94,13 @@ class SolvedFolder:
         near = self.nearest(file)
         if near is None:
             return solve(problem, **options), None
-        start = {"start", "starts"}
         first: Solution | None = None
-        with contextlib.suppress(InputError):  # of another robot, damaged, or of other variables
+        # the record may be damaged, of another robot, or have other variables
+        with contextlib.suppress(InputError):
             record = load_record(near.path)
-            before = resumed(record, problem_of(record, near.path, None, None))
-            rest = {key: value for key, value in options.items() if key not in start}
-            first = solve(problem, start=before, **rest)
+            neighbour = resumed(record, problem_of(record, near.path, None, None))
+            rest = {key: value for key, value in options.items() if key not in ("start", "starts")}
+            first = solve(problem, start=neighbour, **rest)
             if first.status.usable or first.status is Status.INTERRUPTED:
                 return first, near
         solution = solve(problem, **options)
@@ -107,7 +109,7 @@ class SolvedFolder:
         return solution, None
 
     def _leaves_of(self, numbers: Path) -> dict[str, Any]:
-        """Values in the problem of a result; none if it cannot be read."""
+        """Values of a result's problem by key path, cached; {} if it cannot be read."""
         if numbers not in self._known:
             self._known[numbers] = {}
             with contextlib.suppress(InputError):
@@ -116,30 +118,30 @@ class SolvedFolder:
 
 
 def _leaves(data: Any, above: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Values by key path, without what does not change the plan; a list's by their places."""
+    """Values that determine the plan, by key path; those of a list by their indices."""
     items: Any = enumerate(data) if isinstance(data, list) else data.items()
     out: dict[str, Any] = {}
     for key, value in items:
         at = (*above, f"[{key}]" if isinstance(data, list) else str(key))
-        if at[0] in _NOT_THE_PLAN or at == ("problem", "name"):
+        if at[0] in _IRRELEVANT or at == ("problem", "name"):
             continue
         out |= _leaves(value, at) if isinstance(value, (Mapping, list)) else {".".join(at): value}
     return out
 
 
 def _distance(own: dict[str, Any], other: dict[str, Any]) -> float:
-    """Distance of two problems; inf if more than numbers differ."""
+    """Distance of two problems, the norm of all changes; inf if other values than numbers differ."""
     if own.keys() != other.keys():
         return np.inf
     squares = 0.0
     for key, value in own.items():
-        its = other[key]
-        if value == its:
+        others = other[key]
+        if value == others:
             continue
-        if any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in (value, its)):
+        if any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in (value, others)):
             return np.inf
-        if key.endswith("]") or value * its <= 0:
-            squares += ((value - its) / _STEP) ** 2
+        if key.endswith("]") or value * others <= 0:
+            squares += ((value - others) / _UNIT_CHANGE) ** 2
         else:
-            squares += float(np.log2(value / its)) ** 2
+            squares += float(np.log2(value / others)) ** 2
     return float(np.sqrt(squares))

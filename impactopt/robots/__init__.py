@@ -1,4 +1,4 @@
-"""`Robot`: how one is read from its files, checked and built, and the presets.
+"""Robots: `Robot`, readers of URDF and MJCF, checks, and presets.
 
-Add a robot of the package in `presets.py`. `rigid_body/` has the symbolic dynamics of any of them.
+`presets.py` is where a robot of the package is added; `rigid_body/` has the symbolic dynamics.
 """

@@ -1,4 +1,4 @@
-"""`Actuator`: a joint's motor and gear, as far as it is known; which joints a class of them is of."""
+"""`Actuator`: the known parameters of a joint's motor, gear and spring; their assignment to joints."""
 
 from __future__ import annotations
 
@@ -17,145 +17,103 @@ from impactopt.robots.checks import HEAVIEST, STRONGEST
 
 __all__ = ["MOMENTARY_PEAK", "Actuator", "fitting", "known", "numbers_of", "with_classes"]
 
-# of a gear over the joint's torque limit, where nothing better is known: see docs/howto/gears.md
+# Momentary peak torque of a gear over the joint's torque limit, if its data sheet is not known: our choice
+# after Harmonic Drive's CSF-17-50, 34 N m repeated and 70 N m momentary peak (docs/howto/gears.md).
 MOMENTARY_PEAK = 2.0
-# what a robot's file may say of a joint, whose motor is not known: nothing is 0
-_OF_JOINT = ("viscous_friction", "coulomb_friction", "spring_stiffness", "spring_rest")
-FASTEST, LATEST = 1e6, 1.0  # [Hz], [s] of a motor: beyond, it is none, or in other units
+# Fields that a robot's file has without a motor's data; those that it leaves out are 0.
+_FIELDS_OF_JOINT = ("viscous_friction", "coulomb_friction", "spring_stiffness", "spring_rest")
+MAX_BANDWIDTH, MAX_DELAY = 1e6, 1.0  # [Hz], [s]: larger ones are mistakes, such as another unit
+
+
+def _optional(what: str, unit: str, **limits: float) -> Any:
+    """A field that is None if it is not known."""
+    return field(default=None, metadata=about(what, unit=unit, **limits))
+
+
+_NOT_NEGATIVE, _POSITIVE = {"least": 0, "most": STRONGEST}, {"above": 0, "most": STRONGEST}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Actuator(Described):
-    """A joint's motor and gear, and a spring beside them. All is as the joint feels it, after the gear; None
-    is not known.
+    """A joint's motor and gear, and a spring in parallel to them. Values are at the joint, after the gear;
+    None: not known.
     """
 
-    armature: float | None = field(
-        default=None,
-        metadata=about(
-            "reflected rotor inertia",
-            unit="kg m2",
-            least=0,
-            most=HEAVIEST,
-        ),
+    armature: float | None = _optional("reflected rotor inertia", "kg m2", least=0, most=HEAVIEST)
+    viscous_friction: float | None = _optional(
+        "viscous friction of motor and gear", "N m s/rad", **_NOT_NEGATIVE
     )
-    viscous_friction: float | None = field(
-        default=None,
-        metadata=about(
-            "viscous friction of motor and gear",
-            unit="N m s/rad",
-            least=0,
-            most=STRONGEST,
-        ),
+    coulomb_friction: float | None = _optional("Coulomb friction of motor and gear", "N m", **_NOT_NEGATIVE)
+    spring_stiffness: float | None = _optional(
+        "stiffness of a spring between the joint's links, in parallel to the motor",
+        "N m/rad",
+        **_NOT_NEGATIVE,
     )
-    coulomb_friction: float | None = field(
-        default=None,
-        metadata=about(
-            "Coulomb friction of motor and gear",
-            unit="N m",
-            least=0,
-            most=STRONGEST,
-        ),
+    spring_rest: float | None = _optional(
+        "angle at which this spring is relaxed", "rad", least=-FARTHEST, most=FARTHEST
     )
-    spring_stiffness: float | None = field(
-        default=None,
-        metadata=about(
-            "stiffness of a spring between the joint's links, beside the motor",
-            unit="N m/rad",
-            least=0,
-            most=STRONGEST,
-        ),
+    continuous_torque: float | None = _optional("the gear's continuous torque", "N m", **_POSITIVE)
+    peak_torque: float | None = _optional(
+        "the gear's repeated peak torque, as at each start and stop", "N m", **_POSITIVE
     )
-    spring_rest: float | None = field(
-        default=None,
-        metadata=about("angle at which this spring is relaxed", unit="rad", least=-FARTHEST, most=FARTHEST),
+    momentary_torque: float | None = _optional(
+        "the gear's momentary peak torque, as in an impact", "N m", **_POSITIVE
     )
-    continuous_torque: float | None = field(
-        default=None,
-        metadata=about("the gear's continuous torque", unit="N m", above=0, most=STRONGEST),
+    stall_torque: float | None = _optional("torque of the motor at rest", "N m", **_POSITIVE)
+    no_load_speed: float | None = _optional("speed of the motor without torque", "rad/s", **_POSITIVE)
+    power_limit: float | None = _optional("mechanical power of the motor", "W", **_POSITIVE)
+    bandwidth: float | None = _optional(
+        "bandwidth of the motor's torque, a lag of first order; left out: no lag",
+        "Hz",
+        above=0,
+        most=MAX_BANDWIDTH,
     )
-    peak_torque: float | None = field(
-        default=None,
-        metadata=about("the gear's torque at each start and stop", unit="N m", above=0, most=STRONGEST),
-    )
-    momentary_torque: float | None = field(
-        default=None,
-        metadata=about("the gear's torque now and then, in an impact", unit="N m", above=0, most=STRONGEST),
-    )
-    stall_torque: float | None = field(
-        default=None,
-        metadata=about(
-            "torque of the motor at rest",
-            unit="N m",
-            above=0,
-            most=STRONGEST,
-        ),
-    )
-    no_load_speed: float | None = field(
-        default=None,
-        metadata=about(
-            "speed of the motor without torque",
-            unit="rad/s",
-            above=0,
-            most=STRONGEST,
-        ),
-    )
-    power_limit: float | None = field(
-        default=None, metadata=about("mechanical power of the motor", unit="W", above=0, most=STRONGEST)
-    )
-    bandwidth: float | None = field(
-        default=None,
-        metadata=about(
-            "bandwidth of the motor's torque, a lag of first order; left out: no lag",
-            unit="Hz",
-            above=0,
-            most=FASTEST,
-        ),
-    )
-    delay: float | None = field(
-        default=None,
-        metadata=about("delay from reading the joint to setting its torque", unit="s", least=0, most=LATEST),
+    delay: float | None = _optional(
+        "delay from reading the joint to setting its torque", "s", least=0, most=MAX_DELAY
     )
 
     def __post_init__(self) -> None:
-        for told_of, told in abouts(type(self)):
-            value = getattr(self, told_of.name)
+        for field_, description in abouts(type(self)):
+            value = getattr(self, field_.name)
             if value is None:
                 continue
-            number = told.checked(f"Actuator: {told_of.name} [{told.unit}]", value)
-            object.__setattr__(self, told_of.name, number)
+            number = description.checked(f"Actuator: {field_.name} [{description.unit}]", value)
+            object.__setattr__(self, field_.name, number)
         if (self.stall_torque is None) != (self.no_load_speed is None):
             raise InputError(
                 "Actuator: stall_torque and no_load_speed are two ends of one line; give both, or neither"
             )
         gear = ("continuous_torque", "peak_torque", "momentary_torque")
         known = [(name, value) for name in gear if (value := getattr(self, name)) is not None]
-        for (low, less), (high, more) in pairwise(known):
-            if less > more:
+        for (frequent, torque), (rare, peak) in pairwise(known):
+            if torque > peak:
                 raise InputError(
-                    f"Actuator: {low} is {less:g} N m, and {high} {more:g} N m; a gear bears a larger torque "
-                    "the more rarely it comes"
+                    f"Actuator: {frequent} is {torque:g} N m, and {rare} {peak:g} N m; the rated torque of a "
+                    "gear is larger, the more rarely it occurs: check the two numbers"
                 )
 
 
 def with_classes(
     classes: Mapping[str, Actuator], joints: Sequence[str], known: Sequence[Actuator], model: Any
 ) -> tuple[Actuator, ...]:
-    """The actuator of each joint: of the last class whose name or pattern it fits, else the known one.
+    """The actuator of each joint: that of the last class that matches its name, else the known one.
 
-    classes : by names of joints, or patterns of them such as ``arm_*_4_joint``.
-    model : a pin.Model with these joints last, which gets the armature of the classes.
+    classes : by names of joints, or patterns such as ``arm_*_4_joint``.
+    model : a pin.Model with these joints last. Its armature is set to that of the classes, in place.
 
     Raises
     ------
-    InputError : what fits no joint.
+    InputError : a name or pattern that matches no joint.
     """
     out, base = list(known), model.nv - len(joints)
     for pattern, actuator in classes.items():
         if not isinstance(actuator, Actuator):
             raise InputError(f"actuators: of {pattern!r} is {actuator!r}; give an Actuator")
         for k in fitting(pattern, joints, "actuators"):
-            own = {name: getattr(out[k], name) for name in _OF_JOINT if getattr(actuator, name) is None}
+            # a class without friction or springs leaves those of the robot's file
+            own = {
+                name: getattr(out[k], name) for name in _FIELDS_OF_JOINT if getattr(actuator, name) is None
+            }
             out[k] = replace(actuator, armature=None, **own)
             if actuator.armature is not None:
                 model.armature[base + k] = actuator.armature
@@ -163,15 +121,15 @@ def with_classes(
 
 
 def known(actuators: Iterable[Actuator]) -> tuple[Actuator, ...]:
-    """The actuators of a robot: without friction and springs where nothing is said of them."""
+    """The actuators, with friction and springs that are not known set to zero."""
     return tuple(
-        replace(actuator, **{name: 0.0 for name in _OF_JOINT if getattr(actuator, name) is None})
+        replace(actuator, **{name: 0.0 for name in _FIELDS_OF_JOINT if getattr(actuator, name) is None})
         for actuator in actuators
     )
 
 
 def fitting(pattern: str, joints: Sequence[str], where: str) -> list[int]:
-    """Places of the joints that a name or pattern fits; InputError, which begins with ``where``, if none."""
+    """Indices of the joints that a name or pattern matches; InputError, beginning with ``where``, if none."""
     fits = [k for k, joint in enumerate(joints) if joint == pattern or fnmatchcase(joint, pattern)]
     if not fits:
         check_choice(f"{where}: no joint is called", pattern, joints)
@@ -179,6 +137,6 @@ def fitting(pattern: str, joints: Sequence[str], where: str) -> list[int]:
 
 
 def numbers_of(actuators: Iterable[Actuator], name: str) -> NDArray[np.float64]:
-    """(n,) of one field of them; nan where it is not known."""
+    """(n,) values of the field `name`; nan where it is not known."""
     values = [getattr(actuator, name) for actuator in actuators]
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Soles, strikers and tools: the parts of a robot that touch the world."""
+"""Soles, strikers and tools, which touch the world; `Source`, the origin of a robot."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impactopt.robots import checks
 from impactopt.robots.checks import HEAVIEST
 
 Array = NDArray[np.float64]
-WIDEST = 0.5  # [rad] that a hinge of a sole may turn
+MAX_HINGE_RANGE = 0.5  # [rad]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,14 +24,14 @@ class Sole:
 
     Attributes
     ----------
-    name : what problems and messages call it.
+    name : its name in problems and messages.
     frame : frame of the model at the sole: z up out of the ground, x forward.
     polygon : (k, 2) corners [m] in the x-y plane of the frame, counter-clockwise seen from above, convex.
-    parent, placement : for a model without that frame: it is added at `placement` (pin.SE3) in the frame
-        `parent`.
-    hinge : axis of the frame, "x", "y" or "z", about which the foot turns on the sole, as that of a leg of
-        five joints. Nothing drives it: the sole bears no moment about this axis. It makes a joint, called as
-        the sole with ``_hinge`` behind.  hinge_range [rad] : how far a plan may turn it either way.
+    parent, placement : for a model without that frame, which is then added at `placement` (pin.SE3) in the
+        frame `parent`.
+    hinge : axis of the frame, "x", "y" or "z", about which the foot turns on the sole: for legs of five
+        joints. It is a passive joint ``<name>_hinge``, so that the sole transmits no moment about this axis.
+    hinge_range [rad] : largest angle of the hinge in a plan, in both directions.
     """
 
     name: str
@@ -52,15 +52,16 @@ class Sole:
             check_array(f"sole {self.name!r}: placement [m]", self.placement.translation, (3,), most=FARTHEST)
         if self.hinge not in (None, "x", "y", "z"):
             raise InputError(f'sole {self.name!r}: hinge is {self.hinge!r}; give "x", "y" or "z", or None')
-        if not 0 < check_array(f"sole {self.name!r}: hinge_range [rad]", self.hinge_range, ()) <= WIDEST:
+        hinge_range = check_array(f"sole {self.name!r}: hinge_range [rad]", self.hinge_range, ())
+        if not 0 < hinge_range <= MAX_HINGE_RANGE:
             raise InputError(
                 f"sole {self.name!r}: hinge_range is {self.hinge_range:g} rad; give a number > 0, at most "
-                f"{WIDEST:g}"
+                f"{MAX_HINGE_RANGE:g}"
             )
 
     @property
     def hinge_joint(self) -> str:
-        """Name of the joint that a hinge makes."""
+        """Name of the hinge's joint."""
         return f"{self.name}_hinge"
 
     @classmethod
@@ -82,7 +83,7 @@ class Sole:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Striker:
-    """The point that hits: `point` (3,) [m] in the model's frame `frame`."""
+    """The striking point: `point` (3,) [m] in the model's frame `frame`."""
 
     name: str
     frame: str
@@ -94,22 +95,22 @@ class Striker:
 
     @property
     def model_frame(self) -> str:
-        """Name of the frame that the robot's model has at this point."""
+        """Name of the frame at this point in the robot's model."""
         return f"striker:{self.name}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SoftGrip:
-    """A hand that holds a tool by a spring and a damper about one axis, as one that grips a handle loosely.
+    """A compliant grip: a spring and a damper about one axis between hand and tool, as of a loose grip.
 
-    Where the tool is at rest in the start posture, the spring bears its weight. Nothing drives it: what a
-    blow does to the tool comes to the hand by the spring and the damper alone.
+    It is a passive joint. An impact on the tool reaches the hand through the spring and the damper alone.
+    The spring carries the tool's weight in the start posture.
 
     Attributes
     ----------
-    axis (3,) : that the tool turns about, a unit vector; point (3,) [m] : on it. Both in the tool's `frame`.
+    axis (3,), point (3,) [m] : axis of rotation, a unit vector, and a point on it, in the tool's `frame`.
     stiffness [N m/rad], damping [N m s/rad].
-    range [rad] : how far the tool may turn either way.
+    range [rad] : largest angle of the tool, in both directions.
 
     Raises
     ------
@@ -135,31 +136,31 @@ class SoftGrip:
 
     @property
     def placement(self) -> Any:
-        """pin.SE3 of the joint in the tool's frame: it turns about z."""
+        """pin.SE3 of the joint in the tool's frame; its axis is z."""
         turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(self.axis))
         return pin.SE3(turn.matrix(), np.array(self.point))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tool:
-    """A rigid body that a link holds, and the point of it that hits. All in the model's frame `frame`.
+    """A rigid body attached to a link, with a striking point. Vectors are in the model's frame `frame`.
 
     Attributes
     ----------
-    name : of the tool, and of the striker that it makes.
+    name : of the tool, and of its striker.
     frame : frame of the model at the link that holds it.
-    mass [kg], center (3,) [m] : its centre of mass; inertia (3, 3) [kg m2] : about that, in the axes of
-        `frame`; three numbers are its diagonal.
-    head (3,) [m] : the point that hits.
-    bar (3,) [m] : of a hammer, from the back of the bar across its end to the face that hits, where `head`
-        is; None: the tool is a rod to `head`.  bar_width [m] : of that bar.
-    grip : how a link holds it that does not hold it firmly. It makes a joint, called as the tool with
-        ``_grip`` behind, and a frame ``tool:<name>``, where `frame` is while the spring is at rest.
+    mass [kg], center (3,) [m] : mass and centre of mass.
+    inertia (3, 3) [kg m2] : about the centre of mass, along the axes of `frame`; or (3,), its diagonal.
+    head (3,) [m] : the striking point.
+    bar (3,) [m] : of a hammer, from the back of the bar to its striking face, where `head` is; None: the tool
+        is a rod to `head`.  bar_width [m] : side of the bar's square section.
+    grip : a compliant grip; None: the link holds the tool rigidly. It adds the joint ``<name>_grip`` and the
+        frame ``tool:<name>``, which coincides with `frame` at the spring's angle zero.
 
     Raises
     ------
-    InputError : a mass that is not positive, an inertia that is not symmetric or negative. Whether it is one
-        of matter is checked with the link, by `Robot.with_tool`.
+    InputError : a mass that is not positive, an inertia that is not symmetric or negative. `Robot.with_tool`
+        checks whether tool and link together have a physical inertia.
     """
 
     name: str
@@ -187,7 +188,7 @@ class Tool:
         least = float(np.linalg.eigvalsh(inertia)[0])
         if least < 0:
             raise InputError(
-                f"{what}: its inertia has the principal moment {least:.3g} kg m2; give that of a body, >= 0"
+                f"{what}: its inertia has the principal moment {least:.3g} kg m2; give moments >= 0"
             )
         object.__setattr__(self, "inertia", read_only(inertia))
         for part in ("center", "head"):
@@ -215,10 +216,10 @@ class Tool:
         head_length: float = 0.1,
         head_width: float = 0.03,
     ) -> Tool:
-        """A thin rod with a square bar across its end; it hits with one end of the bar.
+        """A thin rod with a square bar across its end, one end face of which strikes.
 
-        grip (3,) [m] : where the rod begins.  handle, face : the ways that the rod points and that the bar's
-        striking end looks, unit vectors at right angles.  length, head_length, head_width [m]; masses [kg].
+        grip (3,) [m] : beginning of the rod.  handle, face : directions of the rod and of the striking face's
+        normal, perpendicular unit vectors.  length, head_length, head_width [m]; masses [kg].
         """
         rod = check_array("hammer: handle", handle, (3,))
         bar = check_array("hammer: face", face, (3,))
@@ -227,6 +228,7 @@ class Tool:
         along, across = np.outer(rod, rod), np.outer(bar, bar)
         start = check_array("hammer: grip [m]", grip, (3,))
         end = start + length * rod
+        # mass, centre of mass, and inertia about it per mass: of a thin rod, and of a solid box
         parts = (
             (handle_mass, start + length / 2 * rod, length**2 / 12 * (np.eye(3) - along)),
             (
@@ -249,32 +251,32 @@ class Tool:
 
     @property
     def striker(self) -> Striker:
-        """The striker that the tool makes of the link which holds it."""
+        """Striker at the tool's striking point."""
         return Striker(name=self.name, frame=self.own_frame, point=self.head)
 
     @property
     def own_frame(self) -> str:
-        """Name of the frame that moves with it."""
+        """Name of the frame that moves with the tool."""
         return self.frame if self.grip is None else f"tool:{self.name}"
 
     @property
     def grip_joint(self) -> str:
-        """Name of the joint that a soft grip makes."""
+        """Name of a soft grip's joint."""
         return f"{self.name}_grip"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Source:
-    """Source of a robot, so that a problem file can name it.
+    """Origin of a robot, from which a problem file can rebuild it.
 
     Attributes
     ----------
     preset : name of one, or None.
     urdf, mjcf : path of a URDF or an MJCF, or None.
-    options : what else was given: to the preset, or to `Robot.from_urdf` or `Robot.from_mjcf`.
-    tools : what the robot was given to hold after that.
-    repairs : inertias that were changed, in words.
-    notes : what of the file was left out, or taken otherwise than it says, in words.
+    options : keyword arguments given to the preset, to `Robot.from_urdf` or to `Robot.from_mjcf`.
+    tools : tools added after that.
+    repairs : messages about inertias that were changed.
+    notes : messages about features of the file that were left out or interpreted differently.
     """
 
     preset: str | None = None

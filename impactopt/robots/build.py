@@ -1,4 +1,4 @@
-"""Builds a `pin.Model` and arrays from files and values by joint, for `Robot`'s constructors."""
+"""Functions that make a `pin.Model` and arrays by joint, for the constructors of `Robot`."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from impactopt.robots.attachments import Striker
 from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame, reduced, tell_apart
 
 Array = NDArray[np.float64]
-MANY = 100  # soles, strikers or tools
+MAX_ATTACHMENTS = 100  # soles, strikers or tools of a robot; more are a mistake
 
 
 def lock_joints(model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
-    """The model without the locked joints, held at the given angles [rad] (0 for bare names)."""
+    """The model without the locked joints, which stay at the given angles [rad] (0 for bare names)."""
     if isinstance(locked, str):
         raise InputError(
             f"locked: give a list of joint names or a mapping to angles, not the text {locked!r}"
@@ -46,14 +46,14 @@ def is_floating(model: pin.Model) -> bool:
 
 
 def joint_indices(model: pin.Model) -> list[int]:
-    """Indices of the joints in the order of v, without the free-flyer, and without followers, whose
-    coordinates are their leaders'.
+    """Indices of the joints in the order of v, without the free-flyer and followers (which share the
+    coordinates of their leaders).
     """
     return [joint.id for joint in moving_joints(model)]
 
 
 def joint_names(model: pin.Model) -> tuple[str, ...]:
-    """Names of these joints."""
+    """Names of the joints of `joint_indices`."""
     return tuple(str(model.names[j]) for j in joint_indices(model))
 
 
@@ -63,9 +63,10 @@ def joint_index(names: Sequence[str], name: str, what: str) -> int:
 
 
 def parent_body(model: pin.Model, joint: int) -> int:
-    """Joint that moves the body on which the body of a joint hangs; 0 for the ground.
+    """Joint that moves the parent body of a joint's body; 0 for the ground.
 
-    It is not always the joint before: several joints may move the same body.
+    It is not always the parent joint, since several joints may move one body: those but the last have no
+    mass.
     """
     above = int(model.parents[joint])
     while above and not model.inertias[above].mass:
@@ -76,7 +77,9 @@ def parent_body(model: pin.Model, joint: int) -> int:
 def per_joint(
     what: str, value: float | Mapping[str, float] | ArrayLike | None, joints: Sequence[str], default: Array
 ) -> Array:
-    """(n,) numbers: `default`, or one number for all, or a mapping by joint over it, or all given."""
+    """(n,) numbers: `default`, with those of a mapping by joint in their places, or one number for all, or
+    the array given.
+    """
     result = np.array(default, dtype=np.float64)
     if value is None:
         return result
@@ -96,7 +99,7 @@ def armature(
     value: float | Mapping[str, float] | ArrayLike | None,
     rotor: Mapping[str, tuple[float, float]],
 ) -> Array:
-    """(n,) reflected rotor inertias [kg m2]: the model's, under those of `rotor`, under `value`."""
+    """(n,) reflected rotor inertias [kg m2]: of `value`, else of `rotor`, else of the model."""
     reflected = {}
     for name, pair in rotor.items():
         inertia, gear = check_array(f"rotor of joint {name!r} (inertia [kg m2], gear ratio)", pair, (2,))
@@ -113,18 +116,18 @@ def armature(
 
 
 def effort_limit(model: pin.Model) -> Array:
-    """(nv,) largest torques [N m]; renamed in Pinocchio 4."""
+    """(nv,) largest torques [N m]; the attribute was renamed in Pinocchio 4."""
     return np.array(model.upperEffortLimit if hasattr(model, "upperEffortLimit") else model.effortLimit)
 
 
 def friction(model: pin.Model) -> tuple[Array, Array]:
-    """(nv,) viscous [N m s/rad] and dry friction [N m] of joints; the second renamed in Pinocchio 4."""
+    """(nv,) viscous [N m s/rad] and dry friction [N m] of joints; the latter was renamed in Pinocchio 4."""
     dry = model.upperDryFrictionLimit if hasattr(model, "upperDryFrictionLimit") else model.friction
     return np.array(model.damping), np.array(dry)
 
 
 def set_friction(model: pin.Model, viscous: Array, dry: Array) -> None:
-    """The other way round."""
+    """Set the friction (nv,) of a model in place."""
     model.damping = viscous
     if hasattr(model, "upperDryFrictionLimit"):
         model.upperDryFrictionLimit, model.lowerDryFrictionLimit = dry, -dry
@@ -133,7 +136,7 @@ def set_friction(model: pin.Model, viscous: Array, dry: Array) -> None:
 
 
 def frictions(model: pin.Model, joints: Sequence[str]) -> tuple[Actuator, ...]:
-    """Actuators of which only the friction is known, the model's, one a joint."""
+    """One actuator per joint, with the model's friction and nothing else."""
     out = []
     for name, viscous, dry in zip(
         joints, *(x[model.nv - len(joints) :] for x in friction(model)), strict=True
@@ -146,12 +149,12 @@ def frictions(model: pin.Model, joints: Sequence[str]) -> tuple[Actuator, ...]:
 
 
 def velocity_limit(model: pin.Model) -> Array:
-    """(nv,) largest velocities [rad/s]; renamed in Pinocchio 4."""
+    """(nv,) largest velocities [rad/s]; the attribute was renamed in Pinocchio 4."""
     return np.array(model.upperVelocityLimit if hasattr(model, "upperVelocityLimit") else model.velocityLimit)
 
 
 def set_velocity_limit(model: pin.Model, limit: Array) -> None:
-    """The other way round."""
+    """Set the largest velocities (nv,) [rad/s] of a model in place."""
     if hasattr(model, "upperVelocityLimit"):
         model.upperVelocityLimit, model.lowerVelocityLimit = limit, -limit
     else:
@@ -162,14 +165,15 @@ def position_limit(
     model: pin.Model, joints: Sequence[str], value: Mapping[str, tuple[float, float]] | ArrayLike | None
 ) -> tuple[Array, Array]:
     """(n,) lower and upper joint positions [rad]; infinite for continuous joints unless given."""
-    limits = np.empty((len(joints), 2))
-    for row, joint in zip(limits, moving_joints(model), strict=True):
-        # Pinocchio bounds cosine and sine of a continuous joint by +-1.01
-        row[:] = (
+    # for a continuous joint Pinocchio has bounds of its cosine and sine, +-1.01, which are none of the angle
+    limits = np.array(
+        [
             (-np.inf, np.inf)
             if joint.nq == 2
             else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
-        )
+            for joint in moving_joints(model)
+        ]
+    ).reshape(-1, 2)
     if isinstance(value, Mapping):
         for name, pair in value.items():
             limits[joint_index(joints, name, "position_limit")] = check_array(
@@ -193,7 +197,7 @@ def add_frame(model: pin.Model, name: str, parent: str, placement: Any, what: st
 
 
 def add_striker(model: pin.Model, striker: Striker) -> None:
-    """Add the striker's frame, or move it when there is one."""
+    """Add the striker's frame, or move the existing one."""
     placement = pin.SE3(np.eye(3), striker.point)
     if not model.existFrame(striker.model_frame):
         add_frame(model, striker.model_frame, striker.frame, placement, f"striker {striker.name!r}")
@@ -205,7 +209,7 @@ def add_striker(model: pin.Model, striker: Striker) -> None:
 
 
 def link_pairs(model: pin.Model, pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    """Pairs of names of links; InputError for what is no pair, or no link."""
+    """Pairs of link names, checked; InputError for anything else."""
     for pair in pairs:
         if len(pair) != 2 or any(not isinstance(name, str) for name in pair):
             raise InputError(f"disable_collisions: {pair!r} is no pair of links' names")
@@ -215,10 +219,10 @@ def link_pairs(model: pin.Model, pairs: Sequence[tuple[str, str]]) -> tuple[tupl
 
 
 def srdf_pairs(srdf: str | PathLike[str] | None) -> list[tuple[str, str]]:
-    """Pairs of links that an SRDF excludes from collisions.
+    """Pairs of links that an SRDF excludes from collisions, without those of the reason "Never".
 
-    Not those of the reason "Never", which an assistant has sampled: here they are looked at, which costs
-    little.
+    An assistant finds the latter by random samples, so a plan could collide there all the same, and checking
+    them costs little.
     """
     if srdf is None:
         return []
@@ -226,12 +230,12 @@ def srdf_pairs(srdf: str | PathLike[str] | None) -> list[tuple[str, str]]:
         root = ElementTree.parse(fspath(srdf)).getroot()
     except (OSError, ElementTree.ParseError):
         return []
-    said = (e for e in root.findall("disable_collisions") if e.get("reason") != "Never")
-    return [(e.get("link1", ""), e.get("link2", "")) for e in said]
+    excluded = (e for e in root.findall("disable_collisions") if e.get("reason") != "Never")
+    return [(e.get("link1", ""), e.get("link2", "")) for e in excluded]
 
 
 def joint_positions(model: pin.Model, q: Array) -> Array:
-    """(n,) joint angles of a configuration."""
+    """(n,) joint angles [rad] of a configuration (nq,), or (n, k) of several (nq, k)."""
     return np.array(
         [
             q[joint.idx_q] if joint.nq == 1 else np.arctan2(q[joint.idx_q + 1], q[joint.idx_q])
@@ -240,11 +244,11 @@ def joint_positions(model: pin.Model, q: Array) -> Array:
     )
 
 
-ROOT = "root of the MJCF"  # a reference configuration, which is no posture
+ROOT = "root of the MJCF"  # reference configuration with the root's orientation only; no posture
 
 
 def neutral(model: pin.Model) -> Array:
-    """(nq,) with all joints at zero; the root upright as its MJCF has it, at yaw 0."""
+    """(nq,) with all joints at zero, and the root at the roll and pitch of its MJCF, at yaw 0."""
     q = pin.neutral(model)
     for entry in model.referenceConfigurations:
         if entry.key() == ROOT:
@@ -267,7 +271,7 @@ def set_joints(model: pin.Model, q: Array, angles: Mapping[str, float], what: st
 
 
 def reference_configurations(model: pin.Model) -> dict[str, Array]:
-    """The model's own named configurations (an SRDF's), with quaternions brought to unit norm."""
+    """The model's own named configurations (an SRDF's), with normalized quaternions."""
     return {
         str(entry.key()): pin.normalize(model, np.array(entry.data(), dtype=np.float64))
         for entry in model.referenceConfigurations
@@ -276,7 +280,7 @@ def reference_configurations(model: pin.Model) -> dict[str, Array]:
 
 
 def lowest(model: pin.Model, q: Array, frames: Sequence[str], *, within: float = 0.01) -> list[str]:
-    """Frames that are not higher than the lowest one by more than `within` [m]."""
+    """Frames at most `within` [m] higher than the lowest one."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     heights = [float(data.oMf[check_frame(model, frame, "place")].translation[2]) for frame in frames]
@@ -284,7 +288,9 @@ def lowest(model: pin.Model, q: Array, frames: Sequence[str], *, within: float =
 
 
 def place(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
-    """The configuration with the mean of some frames at the origin, at yaw 0, by moving the free-flyer."""
+    """The configuration with the free-flyer moved so that the mean of some frames is at the origin, and their
+    mean direction at yaw 0.
+    """
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     poses = [data.oMf[check_frame(model, frame, "place")] for frame in frames]
@@ -298,13 +304,13 @@ def place(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
 
 
 def check_count(kind: str, things: Sequence[Any]) -> None:
-    """InputError if a robot has so many of them that it is none."""
-    if len(things) > MANY:
-        raise InputError(f"the robot has {len(things)} {kind}s; give at most {MANY}")
+    """InputError if a robot has more than `MAX_ATTACHMENTS` of a kind."""
+    if len(things) > MAX_ATTACHMENTS:
+        raise InputError(f"the robot has {len(things)} {kind}s; give at most {MAX_ATTACHMENTS}")
 
 
 def by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:
-    """The things by their names; InputError if two have the same."""
+    """Dictionary of things by their names; InputError if two have the same."""
     named = {thing.name: thing for thing in things}
     if len(named) != len(things):
         raise InputError(f"two {kind}s have the same name in {[thing.name for thing in things]}; rename one")
@@ -312,20 +318,20 @@ def by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:
 
 
 def pick(kind: str, name: str, options: Mapping[str, Any], robot: str) -> Any:
-    """The thing of that name, or an InputError that says what there is."""
+    """The thing of that name; InputError, with the known names, if there is none."""
     check_choice(f"robot {robot!r} has no {kind}", name, options)
     return options[name]
 
 
 def moving_joints(model: pin.Model) -> list[Any]:
-    """Pinocchio's joints of `joint_indices`."""
+    """Pinocchio's joint models of `joint_indices`."""
     return [joint for joint in list(model.joints)[2 if is_floating(model) else 1 :] if joint.nv]
 
 
 def existing(path: str | PathLike[str], kind: str) -> str:
     """The path of a file; InputError if there is none."""
     file = Path(fspath(path))
-    with contextlib.suppress(RuntimeError):  # of a user that there is not
+    with contextlib.suppress(RuntimeError):  # "~name" of a user that does not exist
         file = file.expanduser()
     if not is_plain_file(file):
         raise InputError(f"{kind} {shortened(str(file), 300)}: no such file")
@@ -333,7 +339,7 @@ def existing(path: str | PathLike[str], kind: str) -> str:
 
 
 def read_postures(model: pin.Model, given: Mapping[str, Mapping[str, float] | ArrayLike]) -> dict[str, Array]:
-    """The model's own postures, and these: configurations (nq,), or angles of some joints by name."""
+    """The model's own postures, and those given: configurations (nq,), or angles of some joints by name."""
     found = reference_configurations(model)
     postures = dict(found)
     for name, value in given.items():
@@ -346,10 +352,10 @@ def read_postures(model: pin.Model, given: Mapping[str, Mapping[str, float] | Ar
 
 
 def default_kd(torque_limit: Array) -> Array:
-    """Servo damping (n,) [N m s/rad] of joints that have none of their own."""
+    """Default servo damping (n,) [N m s/rad]."""
     return np.asarray(1.5 * np.minimum(100.0, torque_limit))
 
 
 def default_kp(kd: Array) -> Array:
-    """Servo stiffness (n,) [N m/rad] beside a damping (n,)."""
+    """Default servo stiffness (n,) [N m/rad] for a damping (n,)."""
     return np.asarray(30.0 * kd)

@@ -1,4 +1,4 @@
-"""Checks of a robot and its configurations; every failure names the thing and the fix."""
+"""Checks of a robot and its configurations; every message names the thing and the fix. Repair of inertias."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ __all__ = [
     "tell_apart",
 ]
 
-_MARK = "\x00"  # in no name of a file
+_MARK = "\x00"  # no name in a file contains it
 
 
 def tell_apart(model: pin.Model) -> None:
-    """Rename frames of joints that have a link's name: `elbow` is the link, `joint elbow` its joint."""
+    """Rename joint frames that have the name of a link: `elbow` is the link, `joint elbow` its joint."""
     count = Counter(str(frame.name) for frame in model.frames)
     for frame in model.frames:
         if count[str(frame.name)] > 1 and frame.type in (pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT):
@@ -43,11 +43,11 @@ def tell_apart(model: pin.Model) -> None:
 
 
 def reduced(model: pin.Model, locked: Sequence[int], q: NDArray[np.float64], *geometry: Any) -> Any:
-    """The model without locked joints, held at q (nq,), as of `pin.buildReducedModel`; and a
-    pin.GeometryModel where one is given.
+    """`pin.buildReducedModel`: the model without joints that are locked at q (nq,); with `geometry`, also the
+    reduced pin.GeometryModel.
 
-    Pinocchio 4.1 looks frames up by joints' names, and fails where a link has the same, or a fixed joint has
-    its link's.
+    Pinocchio 4.1 looks frames up by the joints' names, and fails if a link has the same name as a joint, or a
+    fixed joint the same as its link. So frames are renamed before, and named back after.
     """
     model = model.copy()
     joints, count = set(map(str, model.names)), Counter(str(frame.name) for frame in model.frames)
@@ -67,17 +67,19 @@ def reduced(model: pin.Model, locked: Sequence[int], q: NDArray[np.float64], *ge
 
 Array = NDArray[np.float64]
 
-# Fastest servo that makes sense [1/s]: a time constant of 33 us is below a tenth of any servo's sampling
-# time. Light wrists without armature reach 1e5.
+# Fastest plausible servo [1/s]: its time constant of 33 us is below a tenth of any servo's sampling time.
+# Light wrists without armature reach 1e5.
 MAX_SERVO_RATE = 3e4
-HEAVIEST = 1e6  # [kg], [kg m2] of a link, a tool, a rotor: a ship
-LEG = 6  # joints that hold a sole: as many as it has directions
+HEAVIEST = 1e6  # [kg], [kg m2] of a link, a tool or a rotor: the mass of a ship
+LEG = 6  # joints that a leg needs to fix its sole's six degrees of freedom
 _LIMITS = ("torque_limit", "velocity_limit", "position_limit")
-STRONGEST = 1e15  # [N m], [rad/s] of a joint: a test may ask for no limit
+STRONGEST = 1e15  # [N m], [rad/s] of a joint: large enough for "no limit"
 
 
 def check_joint_types(model: pin.Model) -> None:
-    """InputError unless all joints but a free-flyer at the root have one degree of freedom, or follow one."""
+    """InputError unless all joints, except a free-flyer at the root, have one degree of freedom or follow a
+    joint that has position limits.
+    """
     for i in range(1, model.njoints):
         joint = model.joints[i]
         if joint.nv > 1 and not (i == 1 and joint.shortname() == "JointModelFreeFlyer"):
@@ -87,8 +89,7 @@ def check_joint_types(model: pin.Model) -> None:
             )
         if not joint.nv and any(other.idx_v == joint.idx_v and other.nq == 2 for other in model.joints):
             raise InputError(
-                f"joint {model.names[i]!r} follows one that turns without end; give both of them position "
-                "limits"
+                f"joint {model.names[i]!r} follows a continuous joint; give both of them position limits"
             )
 
 
@@ -96,14 +97,14 @@ def check_joints(joints: Sequence[str], name: str) -> None:
     """InputError if there is no joint to drive."""
     if not joints:
         raise InputError(
-            f"robot {name!r} has no joints that move: there is nothing to plan; see its <joint>s"
+            f"robot {name!r} has no movable joints: there is nothing to plan; check its <joint>s"
         )
     for joint in joints:
         if not joint.isprintable():
             raise InputError(f"the name of joint {joint!r} has control characters; take them out")
 
 
-# how a limit is fixed in a file of that kind
+# fix of a missing limit, by kind of file
 _FIXES = {
     "URDF": dict.fromkeys(_LIMITS, "set it in the URDF's <limit>, or "),
     "MJCF": {
@@ -120,7 +121,7 @@ def check_limits(
 ) -> None:
     """InputError with all limits that are missing (zero or infinite in a URDF), negative or crossed.
 
-    kind : of the file that they are from, "URDF" or "MJCF", "" for none.
+    kind : kind of the robot's file, "URDF" or "MJCF"; "" without a file.
     """
     fixes = _FIXES[kind]
     found = Mistakes()
@@ -128,8 +129,7 @@ def check_limits(
         *((j, x, "N m", "torque_limit") for j, x in zip(joints, torque, strict=True)),
         *((j, x, "rad/s", "velocity_limit") for j, x in zip(joints, velocity, strict=True)),
     ):
-        # Pinocchio writes a missing limit as infinity or the largest double
-        if not 0 < value <= STRONGEST:
+        if not 0 < value <= STRONGEST:  # Pinocchio has infinity or the largest double for a missing limit
             found.found.append(
                 f"joint {name!r} has no usable {option.replace('_', ' ')} ({value:g} {unit}); "
                 f"{fixes[option]}give {option}={{{name!r}: ...}}"
@@ -144,7 +144,7 @@ def check_limits(
 
 
 def check_actuators(joints: Sequence[str], actuators: Sequence[Any]) -> None:
-    """InputError unless there is one a joint, none of which has an armature of its own."""
+    """InputError unless there is one actuator per joint, and all armatures are in the model."""
     if len(actuators) != len(joints):
         raise InputError(f"there are {len(actuators)} actuators for {len(joints)} joints; give one a joint")
     for name, actuator in zip(joints, actuators, strict=True):
@@ -156,23 +156,24 @@ def check_actuators(joints: Sequence[str], actuators: Sequence[Any]) -> None:
 
 
 def check_springs(model: pin.Model, springs: Iterable[str]) -> None:
-    """InputError if a joint, by name, has a spring and no end of its turns."""
+    """InputError if one of the joints with springs, by name, is continuous."""
     for name in springs:
         if model.joints[model.getJointId(name)].nq > 1:
             raise InputError(
-                f"joint {name!r} has a spring and turns without end, so that its angle is not known; give it "
-                "position limits in its file, or take the spring out"
+                f"joint {name!r} has a spring and is continuous, so that its number of turns is not known; "
+                "give it position limits in its file, or take the spring out"
             )
 
 
 def check_gains(
     model: pin.Model, joints: Sequence[str], kp: Array, kd: Array, configurations: Iterable[Array]
 ) -> None:
-    """InputError if a gain is negative, or makes a joint's servo faster than MAX_SERVO_RATE.
+    """InputError if a gain is negative, or makes a joint's servo faster than MAX_SERVO_RATE at one of the
+    configurations.
 
-    The inertia that joint i's servo feels is least when no other joint resists: 1 / (H^-1)_ii, with armature.
-    There a damper alone decays at Kd (H^-1)_ii [1/s], and a spring alone swings at sqrt(Kp (H^-1)_ii)
-    [rad/s].
+    The effective inertia of joint i is least when all other joints are free: 1 / (H^-1)_ii, with armature.
+    Then damping alone has the rate Kd (H^-1)_ii [1/s], and stiffness alone the frequency
+    sqrt(Kp (H^-1)_ii) [rad/s].
     """
     for option, gains in (("kp", kp), ("kd", kd)):
         for name, gain in zip(joints, gains, strict=True):
@@ -186,8 +187,8 @@ def check_gains(
             mobility = np.full(len(joints), np.nan)
         if not np.all(np.isfinite(mobility)):
             raise InputError(
-                "the robot's inertia matrix is singular: its links' inertias are too far apart for numbers "
-                "of 16 digits; correct the smallest and the largest <inertial>, or give armature"
+                "the robot's inertia matrix is singular: its links' inertias differ by too many orders of "
+                "magnitude; correct the smallest and the largest <inertial>, or give armature"
             )
         rates = np.maximum(kd * mobility, np.sqrt(kp * np.maximum(mobility, 0)))
         worst = int(np.argmax(rates))
@@ -196,8 +197,8 @@ def check_gains(
             armature = model.armature[model.nv - len(joints) + worst]
             raise InputError(
                 f"servo of joint {joints[worst]!r}: Kp = {kp[worst]:g} N m/rad and Kd = {kd[worst]:g} "
-                f"N m s/rad on only {inertia:.2g} kg m2 make a rate of {rates[worst]:.2g} 1/s, and "
-                f"{MAX_SERVO_RATE:g} is the most; give the joint its armature (rotor inertia x gear^2, now "
+                f"N m s/rad on only {inertia:.2g} kg m2 have a rate of {rates[worst]:.2g} 1/s, and at most "
+                f"{MAX_SERVO_RATE:g} is allowed; give the joint its armature (rotor inertia x gear^2, now "
                 f"{armature:.2g} kg m2), or lower Kd below {MAX_SERVO_RATE * inertia:.2g} and Kp below "
                 f"{MAX_SERVO_RATE**2 * inertia:.2g}"
             )
@@ -212,7 +213,7 @@ def check_polygon(name: str, polygon: Array) -> None:
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
     if np.all(turns < 0):
         raise InputError(f"sole {name!r}: its corners run clockwise; reverse their order")
-    # the turning angles of a simple polygon add up to one turn, those of a star to more
+    # the exterior angles of a simple polygon add up to one turn, those of a self-intersecting one to more
     angles = np.arctan2(turns, np.sum(edges * following, axis=1))
     if not np.all(turns > 0) or angles.sum() > 3 * np.pi:
         raise InputError(
@@ -235,16 +236,18 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
 
 
 def columns_above(model: pin.Model, joint: int) -> list[int]:
-    """Columns in v, each once, of the joints that move the body of a joint, from the root on; without a
-    free-flyer's. A follower's is its leader's.
+    """Indices in v of the joints from the root to a joint, each once, without the free-flyer's six. For a
+    follower it is its leader's.
     """
     above = (model.joints[j] for j in model.supports[joint] if j)
     return list(dict.fromkeys(int(each.idx_v) for each in above if each.nv <= 1))
 
 
 def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
-    """InputError with all fixed soles, (name, frame) each, that are on no leg of their own: its last six
-    joints, which move no other fixed sole.
+    """InputError with all fixed soles, (name, frame) each, without a leg of their own.
+
+    The last six joints before a sole are its leg. They fix the sole's six degrees of freedom, so none of them
+    may move another fixed sole.
     """
     found, chains = Mistakes(), []
     names = {
@@ -255,56 +258,58 @@ def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
         chains.append([names[k] for k in columns_above(model, parent)])
     for k, ((name, frame), joints) in enumerate(zip(soles, chains, strict=True)):
         others = {joint for other in chains[:k] + chains[k + 1 :] for joint in other}
-        own = joints[-LEG:]
-        told = f": {', '.join(joints)}" if joints else ""
-        if len(joints) == LEG - 1 and not others & set(own):
+        leg = joints[-LEG:]
+        listed = f": {', '.join(joints)}" if joints else ""
+        if len(joints) == LEG - 1 and not others & set(leg):
             found.found.append(
-                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}, "
-                f"and a sole is held in {LEG} directions: say about which of its axes the foot may turn on "
-                'the ground, as by hinge = "x", its long axis, where the leg lacks an ankle roll'
+                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{listed}, "
+                f"and a fixed sole has {LEG} constraints: give the axis about which the foot may turn on the "
+                'ground, such as hinge = "x", its long axis, if the leg lacks an ankle roll'
             )
         elif len(joints) < LEG:
             found.found.append(
-                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}; a "
-                f"held sole needs {LEG} or more, or {LEG - 1} and a hinge"
+                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{listed}; "
+                f"a fixed sole needs {LEG} or more, or {LEG - 1} and a hinge"
             )
-        elif others & set(own):
-            shared = ", ".join(joint for joint in own if joint in others)
+        elif others & set(leg):
+            shared = ", ".join(joint for joint in leg if joint in others)
             found.found.append(
-                f"the held soles' legs share joints: of the last {LEG} that lead to sole {name!r}, {shared} "
-                "move another held sole too; each leg needs as many of its own"
+                f"the fixed soles' legs share joints: of the last {LEG} before sole {name!r}, {shared} also "
+                f"move another fixed sole; each leg needs {LEG} of its own"
             )
     found.raise_if_any("the stance")
 
 
 def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]]) -> None:
-    """InputError with all hands, (name, frame) each, that hold on with no arm of their own: its last six
-    joints, which move neither a fixed sole, by its frame, nor another hand.
+    """InputError with all gripping hands, (name, frame) each, without an arm of their own.
+
+    The last six joints before a hand are its arm. None of them may move a fixed sole, by its frame, or
+    another gripping hand.
     """
     found = Mistakes()
     chains = {frame: robot.limb(frame) for frame in (*soles, *(frame for _, frame in hands))}
     for name, frame in hands:
         arm = chains[frame][-LEG:]
-        told = ", ".join(robot.joint_names[j] for j in arm)
+        listed = ", ".join(robot.joint_names[j] for j in arm)
         others = {j for other, chain in chains.items() if other != frame for j in chain}
         shared = ", ".join(robot.joint_names[j] for j in arm if j in others)
         if len(arm) < LEG:
             found.found.append(
-                f"hand {name!r} cannot hold on in all six directions: between the base and it there are "
-                f"{len(arm)} joints{': ' if told else ''}{told}; give a hand with {LEG} or more"
+                f"hand {name!r} cannot be fixed in all six directions: between the base and it there are "
+                f"{len(arm)} joints{': ' if listed else ''}{listed}; give a hand with {LEG} or more"
             )
         elif shared:
             found.found.append(
-                f"hand {name!r} cannot hold on: of the last {LEG} joints that lead to it, {shared} move "
-                "something else that is held; give a hand on an arm of its own"
+                f"hand {name!r} cannot be fixed: of the last {LEG} joints before it, {shared} also move a "
+                "fixed sole or another fixed hand; give a hand on an arm of its own"
             )
         elif np.any(robot.sprung[list(arm)]):
-            found.found.append(f"hand {name!r} cannot hold on by a soft grip: give the hand, not its tool")
+            found.found.append(f"hand {name!r} cannot be fixed by a soft grip: give the hand, not its tool")
     found.raise_if_any("the stance")
 
 
 def check_configuration(model: pin.Model, q: ArrayLike, name: str) -> Array:
-    """`q` as a float64 copy, known to be a configuration of the model."""
+    """`q` as a float64 copy (nq,); InputError unless it is a configuration of the model."""
     q = check_array(name, q, (model.nq,))
     for i in range(1, model.njoints):
         joint = model.joints[i]
@@ -321,8 +326,8 @@ def check_configuration(model: pin.Model, q: ArrayLike, name: str) -> Array:
 
 
 def check_positions(joints: Sequence[str], angles: Array, lower: Array, upper: Array, name: str) -> None:
-    """InputError naming the joints outside their position limits."""
-    slack = 1e-9
+    """InputError with the joints outside their position limits."""
+    slack = 1e-9  # [rad] of rounding
     outside = [
         f"{joint!r} at {x:.4g} (limits {low:.4g} to {high:.4g})"
         for joint, x, low, high in zip(joints, angles, lower, upper, strict=True)
@@ -352,35 +357,37 @@ def check_stance(
             side = "above" if z > 0 else "below"
             raise InputError(
                 f"sole {name!r} is {1e3 * abs(z):.3g} mm {side} the ground (at most {1e3 * height:g} mm): "
-                "move its leg's joints; if all soles are off by the same, put the robot down with Robot.place"
+                "move its leg's joints; if all soles are off by the same height, use Robot.place"
             )
 
 
 GIVEN, REPAIRED = "given", "repaired"
 INERTIAS = (GIVEN, REPAIRED)
-TRIANGLE = 1e-3  # relative, of the triangle inequality: room for rounded decimals
-THIN = 0.01  # [m] of the slab that a repaired body has at least the second moments of
-DENSITY = 2000.0  # [kg/m3] of the ball that takes the place of a point: motors, gears and housing
-_MEND = f'correct its <inertial>, with moments about the centre of mass, or take inertias="{REPAIRED}"'
+# Principal moments of a body obey the triangle inequality: each is at most the sum of the other two. Relative
+# tolerance, for the rounded decimals of files.
+TRIANGLE_TOLERANCE = 1e-3
+MIN_THICKNESS = 0.01  # [m] of a repaired body, along each principal axis
+BALL_DENSITY = 2000.0  # [kg/m3] of the ball that replaces a point mass: motors, gears and housing
+_FIX = f'correct its <inertial>, with moments about the centre of mass, or take inertias="{REPAIRED}"'
 
 
 def _is_between_joints(model: pin.Model, i: int) -> bool:
-    """True if joint i moves no body of its own, but the joint after it: both move the same body."""
+    """True if joint i moves a body only through its one child joint, as one of several joints of a body."""
     weightless = not model.inertias[i].mass and not np.any(np.array(model.inertias[i].inertia))
     return weightless and model.joints[i].nv <= 1 and list(model.parents)[1:].count(i) == 1
 
 
 def check_inertias(model: pin.Model) -> None:
-    """InputError with all moving bodies whose mass or inertia cannot be those of matter."""
+    """InputError with all moving bodies whose mass or inertia is not physical."""
     found = Mistakes()
     for i in range(1, model.njoints):
         if not _is_between_joints(model, i):
-            found.found += _wrong(model, i)
+            found.found += _inertia_mistake(model, i)
     found.raise_if_any(f"the robot {model.name!r}")
 
 
-def _wrong(model: pin.Model, i: int) -> Iterator[str]:
-    """First physically impossible property of the body that joint i moves."""
+def _inertia_mistake(model: pin.Model, i: int) -> Iterator[str]:
+    """Message about the first physically impossible property of the body of joint i, if there is one."""
     body = model.inertias[i]
     root = model.joints[i].nq == 7  # a free-flyer, which has no joint in the file
     link = _root(model) if root else f"the link moved by joint {model.names[i]!r}"
@@ -398,58 +405,62 @@ def _wrong(model: pin.Model, i: int) -> Iterator[str]:
         )
     elif not max(np.abs(placed)) <= FARTHEST:
         yield (
-            f"joint {model.names[i]!r} is {max(np.abs(placed)):g} m from the one before, and "
-            f"{FARTHEST:g} is the most; correct its <origin>"
+            f"joint {model.names[i]!r} is {max(np.abs(placed)):g} m from its parent joint, and at most "
+            f"{FARTHEST:g} m is allowed; correct its <origin>"
         )
     else:
         small, middle, large = np.linalg.eigvalsh(inertia)
         moments = f"{small:.3g}, {middle:.3g}, {large:.3g} kg m2"
         if small <= 0:
-            yield f"{where} has principal moments of inertia {moments}: not positive definite; {_MEND}"
-        elif small + middle < large * (1 - TRIANGLE):
+            yield f"{where} has principal moments of inertia {moments}: not positive definite; {_FIX}"
+        elif small + middle < large * (1 - TRIANGLE_TOLERANCE):
             yield (
                 f"{where} has principal moments of inertia {moments}: one exceeds the sum of the others, "
-                f"which no body has; {_MEND}"
+                f"which no body has; {_FIX}"
             )
 
 
 def _root(model: pin.Model) -> str:
+    """The root link in words."""
     links = (f for f in model.frames if f.parentJoint == 1 and f.type == pin.FrameType.BODY)
     link = next(links, None)
     return f"the root link {link.name!r}" if link is not None else "the root link"
 
 
 def repair_inertias(model: pin.Model) -> list[str]:
-    """Change inertias that no body of this mass can have, in place, and say in words which.
+    """Change inertias that no body of this mass can have, in place; messages about the changes.
 
-    Mass and centre of mass stay. Moments come from second moments of mass along the principal axes, which are
-    raised to those of a slab 1 cm thick where they are less; where all three are, the body becomes a ball of
-    2000 kg/m3. A body that passes both is left alone.
+    Mass and centre of mass stay. The second moments of mass along the principal axes are raised to those of a
+    slab 1 cm thick. If all three are smaller than that, the body becomes a ball of 2000 kg/m3. Physical
+    inertias are not changed.
     """
-    said = []
+    messages = []
     for i in range(1, model.njoints):
         body = model.inertias[i]
         if not (0 < body.mass <= HEAVIEST and np.isfinite(np.array(body.inertia)).all()):
-            continue  # there is nothing to go by: it is refused
+            continue  # without a mass nothing can be repaired: `check_inertias` refuses it
         moments, axes = np.linalg.eigh(np.array(body.inertia))
-        second = moments.sum() / 2 - moments  # of mass, along the axes
-        least = body.mass * THIN**2 / 12
+        # Integrals of x^2 dm along the principal axes. Those of a body are positive, which is the triangle
+        # inequality of its moments of inertia.
+        second = moments.sum() / 2 - moments
+        least = body.mass * MIN_THICKNESS**2 / 12
         point = bool((second < least).all())
-        if not point and moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - TRIANGLE):
+        if not point and moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - TRIANGLE_TOLERANCE):
             continue
         if point:
-            second = np.full(3, body.mass / 5 * (3 * body.mass / (4 * np.pi * DENSITY)) ** (2 / 3))
+            radius_squared = (3 * body.mass / (4 * np.pi * BALL_DENSITY)) ** (2 / 3)
+            second = np.full(3, body.mass / 5 * radius_squared)
         second = np.maximum(second, least)
         new = second.sum() - second
         model.inertias[i] = pin.Inertia(
             body.mass, np.array(body.lever), axes @ np.diag(new) @ axes.T if not point else np.diag(new)
         )
-        how = f"a ball of {DENSITY:g} kg/m3" if point else "the nearest that a body can have"
-        said.append(
+        how = f"a ball of {BALL_DENSITY:g} kg/m3" if point else "the nearest that a body can have"
+        messages.append(
             f"the link moved by joint {model.names[i]!r}, {body.mass:.3g} kg: {_three(moments)} became "
             f"{_three(np.sort(new))} kg m2, {how}"
         )
-    return said
+    return messages
 
 
 def _three(numbers: Any) -> str:

@@ -1,7 +1,8 @@
-"""Couplings: joints that follow others, as `<mimic>` and MuJoCo's joint equalities have it.
+"""Couplings: joints that follow others, as by `<mimic>` of a URDF or a joint equality of an MJCF.
 
-A follower's angle is a multiple of its leader's and an offset. It is a `JointModelMimic` of the `pin.Model`,
-which has no coordinate of its own: with v_all = S v, inertias are S'HS, forces S'tau and Jacobians J S.
+A follower's angle is a multiple of its leader's, plus an offset. In the `pin.Model` it is a
+`JointModelMimic`, without a coordinate of its own: with v_all = S v, where v_all are the velocities of all
+joints, inertias are S'HS, forces S'tau and Jacobians J S.
 """
 
 from __future__ import annotations
@@ -48,10 +49,10 @@ class Coupling(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """A joint at zero of its coordinate.
+    """Placement and axis of a joint, at zero of its coordinate.
 
-    placement : pin.SE3 in the parent's frame.  subspace (6,) : unit twist [linear; angular] about or along
-    its axis.  ratio : of its angle to its coordinate.
+    placement : pin.SE3 in the parent's frame.  subspace (6,) : unit twist [linear; angular] of the joint.
+    ratio : derivative of the joint's angle by its coordinate; 1 unless it is a follower.
     """
 
     placement: Any
@@ -83,7 +84,7 @@ def couplings_of(model: pin.Model) -> dict[str, Coupling]:
 
 
 def follower_axes(model: pin.Model) -> dict[int, Array]:
-    """Subspaces (6,) of a model's followers by index, which `restore_followers` needs."""
+    """Subspaces (6,) of a model's followers by index, for `restore_followers`."""
     return {
         model.getJointId(name): axis_of(model, model.getJointId(name)).subspace
         for name in couplings_of(model)
@@ -91,8 +92,9 @@ def follower_axes(model: pin.Model) -> dict[int, Array]:
 
 
 def restore_followers(model: pin.Model, axes: Mapping[int, Array]) -> None:
-    """Make followers anew, in place, in a model that was pickled: Pinocchio 4.1 loses how they move, and
-    crashes where they do.
+    """Replace the followers of an unpickled model, in place.
+
+    Pinocchio 4.1 does not pickle the joint inside a `JointModelMimic`, and crashes when it is used.
     """
     leaders = {model.joints[j].idx_v: model.joints[j] for j in joint_indices(model)}
     for j, axis in axes.items():
@@ -108,7 +110,7 @@ def restore_followers(model: pin.Model, axes: Mapping[int, Array]) -> None:
 
 
 def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
-    """Couplings to leaders that follow none: a follower's follower is one of the first leader.
+    """Couplings whose leaders are no followers: chains of couplings are composed.
 
     Raises
     ------
@@ -116,21 +118,21 @@ def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
     """
     out = {}
     for name, (leader, ratio, offset) in couplings.items():
-        seen = [name]
+        chain = [name]
         while leader in couplings:
-            if leader in seen:
+            if leader in chain:
                 raise InputError(
-                    f"joints {', '.join(map(repr, seen))} follow each other; one of them has to lead"
+                    f"joints {', '.join(map(repr, chain))} follow each other; one of them has to lead"
                 )
-            seen.append(leader)
-            above = couplings[leader]
-            leader, ratio, offset = above.leader, ratio * above.ratio, ratio * above.offset + offset
+            chain.append(leader)
+            outer = couplings[leader]
+            leader, ratio, offset = outer.leader, ratio * outer.ratio, ratio * outer.offset + offset
         out[name] = Coupling(leader, ratio, offset)
     return out
 
 
 def unfit(model: pin.Model, name: str, coupling: Coupling) -> str:
-    """Reason why a joint of a model cannot follow another one, and the fix; "" if it can."""
+    """Reason why a joint of a model cannot follow another one, with the fix; "" if it can."""
     follower, leader = (model.joints[model.getJointId(joint)] for joint in (name, coupling.leader))
     if not hasattr(pin, "transformJointIntoMimic"):
         return f"Pinocchio {pin.__version__} has no such joints: pip install -U pin"
@@ -138,8 +140,8 @@ def unfit(model: pin.Model, name: str, coupling: Coupling) -> str:
         return f"its multiplier is {coupling.ratio:g}, its offset {coupling.offset:g}: correct them"
     for joint, each in ((name, follower), (coupling.leader, leader)):
         if each.nq != 1:
-            return f"{joint!r} turns without end: give both of them position limits"
-    if leader.id > follower.id:
+            return f"{joint!r} is continuous: give both of them position limits"
+    if leader.id > follower.id:  # Pinocchio needs leaders before their followers
         ratio, offset = 1 / coupling.ratio, -coupling.offset / coupling.ratio
         return (
             f"{coupling.leader!r} comes after it in the tree: let {coupling.leader!r} follow {name!r}, with "
@@ -149,14 +151,15 @@ def unfit(model: pin.Model, name: str, coupling: Coupling) -> str:
 
 
 def coupled(model: pin.Model, couplings: Mapping[str, Coupling]) -> pin.Model:
-    """The model whose followers have no coordinates of their own.
+    """The model with these joints as followers, without coordinates of their own.
 
-    Leaders get the followers' position and velocity limits too, and their armature and friction: at a speed
-    `ratio` times its own, they resist with ratio^2 times their inertia and damping.
+    A leader's position and velocity limits are intersected with those of its followers, and it gets their
+    armature and friction in addition. As a follower moves `ratio` times as fast, its armature and viscous
+    friction count ratio^2 times.
 
     Raises
     ------
-    InputError : all couplings that a model cannot have; limits that leave a leader no room.
+    InputError : all couplings that a model cannot have; limits with an empty intersection.
     """
     found = Mistakes()
     couplings = resolved(couplings)
@@ -168,32 +171,37 @@ def coupled(model: pin.Model, couplings: Mapping[str, Coupling]) -> pin.Model:
     found.raise_if_any("the robot's couplings")
     model = model.copy()
     for name, coupling in couplings.items():
-        _hand_over(model, name, coupling)
+        _reflect_on_leader(model, name, coupling)
+    # named configurations lose the entries of the followers
     postures = {str(entry.key()): np.array(entry.data()) for entry in model.referenceConfigurations}
-    places = [model.joints[model.getJointId(name)].idx_q for name in couplings]
+    in_q = [model.joints[model.getJointId(name)].idx_q for name in couplings]
     for name, (leader, ratio, offset) in couplings.items():
         joints = (model.getJointId(joint) for joint in (leader, name))
         model = pin.transformJointIntoMimic(model, *joints, ratio, offset)
     for posture, q in postures.items():
-        model.referenceConfigurations[posture] = np.delete(q, places)
+        model.referenceConfigurations[posture] = np.delete(q, in_q)
     return model
 
 
 def with_followers(
     springs: Mapping[str, tuple[float, float]], couplings: Mapping[str, Coupling]
 ) -> dict[str, tuple[float, float]]:
-    """Stiffness and angle at rest by joint, with those of followers as their leaders feel them."""
+    """Stiffness and rest angle by joint, with the springs of followers reflected on their leaders.
+
+    Two springs in parallel are one: stiffnesses add, and its rest angle is their weighted mean.
+    """
     out = dict(springs)
     for name, (leader, ratio, offset) in couplings.items():
         if name in springs and springs[name][0]:
             stiffness, rest = ratio**2 * springs[name][0], (springs[name][1] - offset) / ratio
-            own, at = out.get(leader, (0.0, 0.0))
-            out[leader] = own + stiffness, (own * at + stiffness * rest) / (own + stiffness)
+            own_stiffness, own_rest = out.get(leader, (0.0, 0.0))
+            both = own_stiffness + stiffness
+            out[leader] = both, (own_stiffness * own_rest + stiffness * rest) / both
     return out
 
 
-def _hand_over(model: pin.Model, name: str, coupling: Coupling) -> None:
-    """Give a leader, in place, what its follower has by joint."""
+def _reflect_on_leader(model: pin.Model, name: str, coupling: Coupling) -> None:
+    """Add the armature and friction of a follower to its leader's, and intersect their limits, in place."""
     leader, ratio, offset = coupling
     own, other = (model.joints[model.getJointId(joint)] for joint in (leader, name))
     armature = np.array(model.armature)
@@ -205,16 +213,16 @@ def _hand_over(model: pin.Model, name: str, coupling: Coupling) -> None:
     set_friction(model, viscous, dry)
     speed, low = velocity_limit(model), np.array(model.lowerPositionLimit)
     high = np.array(model.upperPositionLimit)
-    with np.errstate(over="ignore"):  # Pinocchio's largest double stands for a limit that is missing
+    with np.errstate(over="ignore"):  # Pinocchio has the largest double for a missing limit
         fastest = speed[other.idx_v] / abs(ratio)
         ends = sorted((bound[other.idx_q] - offset) / ratio for bound in (low, high))
-    if fastest > 0:  # many files give a follower none
+    if fastest > 0:  # many files have no velocity limit, or 0, for a follower
         speed[own.idx_v] = min(speed[own.idx_v], fastest)
     set_velocity_limit(model, speed)
     low[own.idx_q], high[own.idx_q] = max(low[own.idx_q], ends[0]), min(high[own.idx_q], ends[1])
     if not low[own.idx_q] < high[own.idx_q]:
         raise InputError(
-            f"joint {name!r} follows {leader!r}, whose position limits lie outside the follower's, which are "
-            f"{ends[0]:.4g} to {ends[1]:.4g} rad of {leader!r}; correct their <limit>s or the offset"
+            f"joint {name!r} follows {leader!r}, and their position limits do not overlap: the follower's "
+            f"are {ends[0]:.4g} to {ends[1]:.4g} rad of {leader!r}; correct their <limit>s or the offset"
         )
     model.lowerPositionLimit, model.upperPositionLimit = low, high

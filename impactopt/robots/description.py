@@ -1,4 +1,4 @@
-"""`Description`: what a URDF or an MJCF says of a robot, and what of it no plan can have."""
+"""`Description`: contents of a URDF or an MJCF, with the features that plans do not support."""
 
 from __future__ import annotations
 
@@ -29,13 +29,15 @@ __all__ = ["Description", "Tie", "between"]
 
 @dataclass(frozen=True, kw_only=True)
 class Tie:
-    """Forces or constraints between joints, or on one, that a plan does not have.
+    """A constraint or force on joints that the equations of motion do not have.
 
-    joints : by name.  free : how many of them may move all the same; the others have to be locked.
-    text : of a message; begins with the thing and its name.  fix : another one than to lock.
-    follower : the joint that has no motor, "" if none is meant; follows : a polynomial of the other joint's
-        angle [rad], the lowest coefficient first, which is the follower's.
-    note : what is told where it follows.
+    It is supported only if it is a linear law of two joints (`coupling`). Otherwise joints must be locked.
+
+    joints : by name.  free : how many of them may stay unlocked.
+    text : beginning of a message: the thing and its name.  fix : another fix than to lock joints.
+    follower : the joint that follows, "" if there is no such law.  follows : its angle, a polynomial of the
+        other joint's angle [rad], lowest coefficient first.
+    note : a message for a follower that is supported, "" for none.
     """
 
     text: str
@@ -48,36 +50,38 @@ class Tie:
 
     @property
     def coupling(self) -> Coupling | None:
-        """Law of the follower, if it is one that plans have."""
+        """Law of the follower; None if it is not linear, or there is no follower."""
         if not self.follower or len(self.joints) != 2 or any(self.follows[2:]):
             return None
-        (leader,) = {*self.joints} - {self.follower} or {self.follower}
+        (leader,) = {*self.joints} - {self.follower} or {self.follower}  # a file may have it follow itself
         offset, ratio = (*self.follows, 0.0)[:2]
         return Coupling(leader, ratio, offset)
 
     def broken(self, joints: tuple[str, ...]) -> str:
-        """The mistake of a robot whose joints these are; "" if there is none."""
-        left = [joint for joint in self.joints if joint in joints]
-        if len(left) <= self.free:
+        """Message for a robot with these joints, if it does not support the tie; else ""."""
+        unlocked = [joint for joint in self.joints if joint in joints]
+        if len(unlocked) <= self.free:
             return ""
-        which = "it" if len(left) == 1 else "one of them" if self.free else f"all of {', '.join(left)}"
+        which = (
+            "it" if len(unlocked) == 1 else "one of them" if self.free else f"all of {', '.join(unlocked)}"
+        )
         return f"{self.text}; {self.fix and f'{self.fix}, or '}lock {which} (`locked`)"
 
 
 @dataclass(kw_only=True)
 class Description:
-    """A robot in a file.
+    """A robot as described by a file.
 
     kind : "URDF" or "MJCF".
-    model : with its armature, friction, limits and gravity, and named configurations; a frame of type BODY
-        for each link or body, and an OP_FRAME for each site, by their names.
-    kp, kd, torque : by joint, what its actuators say.
-    springs : stiffness [N m/rad] and angle at rest [rad] by joint.
+    model : with armature, friction, limits, gravity and named configurations; a frame of type BODY for each
+        link or body, and an OP_FRAME for each site, by their names.
+    kp, kd, torque : servo gains and torque limits of the file's actuators, by joint.
+    springs : stiffness [N m/rad] and rest angle [rad] by joint.
     tendons : ranges of sums of joint angles.
-    sites : names of those on links that move.  driven : joints that actuators move.  idle : joints that no
-        actuator moves, where some have one.
-    ties : what no plan has, unless joints are locked.
-    notes : what was left out or taken otherwise than the file says, in words.
+    sites : names of those on moving links.  driven : joints with an actuator.  idle : joints without one, in
+        a file that has actuators.
+    ties : constraints and forces for which joints have to be locked or coupled.
+    notes : messages about features that were left out or interpreted differently.
     """
 
     kind: str
@@ -94,7 +98,11 @@ class Description:
     notes: list[str] = field(default_factory=list)
 
     def lead_from_root(self) -> None:
-        """Let joints that come before their leader in the tree lead, by the inverse law, with its motor."""
+        """Invert couplings whose leader comes after the follower in the tree, in place.
+
+        Pinocchio needs leaders first. The motor's numbers (gains, torque and velocity limits) move from the
+        old leader to the new one, reflected by the ratio.
+        """
         model, followers = self.model, {tie.follower for tie in self.ties}
         for k, tie in enumerate(self.ties):
             law = tie.coupling
@@ -112,27 +120,28 @@ class Description:
             inverse = (-law.offset / law.ratio, 1 / law.ratio)
             self.ties[k] = replace(tie, follower=law.leader, follows=inverse, note=note)
             followers ^= {tie.follower, law.leader}
-            gain, speed = abs(law.ratio), velocity_limit(model)
+            ratio, speed = abs(law.ratio), velocity_limit(model)
             effort = float(effort_limit(model)[other.idx_v])
-            if 0 < effort < np.finfo(float).max:  # Pinocchio's largest double stands for none
+            if 0 < effort < np.finfo(float).max:  # Pinocchio has the largest double for a missing limit
                 self.torque.setdefault(law.leader, effort)
+            # a torque is reflected by the ratio, a stiffness or damping by its square
             for numbers, power in ((self.torque, 1), (self.kp, 2), (self.kd, 2)):
                 numbers.pop(tie.follower, None)
                 if law.leader in numbers:
-                    numbers[tie.follower] = numbers.pop(law.leader) / gain**power
-            if not speed[own.idx_v] > 0:  # many files give a follower none
-                speed[own.idx_v] = gain * speed[other.idx_v]
+                    numbers[tie.follower] = numbers.pop(law.leader) / ratio**power
+            if not speed[own.idx_v] > 0:  # many files have no velocity limit, or 0, for a follower
+                speed[own.idx_v] = ratio * speed[other.idx_v]
                 set_velocity_limit(model, speed)
             self.idle = [joint for joint in self.idle if joint != tie.follower]
             for names in (self.driven, self.idle):
                 names[:] = [tie.follower if joint == law.leader else joint for joint in names]
 
     def moving(self, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
-        """The model without locked joints, whose followers follow.
+        """The model without locked joints, with the supported couplings.
 
         Raises
         ------
-        InputError : a joint that cannot follow another one, or two of them.
+        InputError : a joint that cannot follow another one, or follows two.
         """
         model = lock_joints(self.model, locked)
         joints, couplings = joint_names(model), dict[str, Coupling]()
@@ -147,11 +156,11 @@ class Description:
         return coupled(model, couplings) if couplings else model
 
     def options(self, model: pin.Model, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Options of `Robot.from_model` for a model with some of these joints, under those that are given.
+        """Options of `Robot.from_model` for a model with some of these joints; those given take precedence.
 
         Raises
         ------
-        InputError : joints are left whose ties a plan does not have.
+        InputError : unsupported ties between joints that are not locked.
         """
         joints, found = joint_names(model), Mistakes()
         found.found += [f"{self.kind}: {mistake}" for tie in self.ties if (mistake := tie.broken(joints))]
@@ -173,19 +182,20 @@ class Description:
         return {**out, "strikers": [*sites, *given.get("strikers", ())]}
 
     def tendons_of(self, model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> list[Tendon]:
-        """Tendons of a model with locked joints, whose followers follow."""
+        """Tendons of a model with locked joints and couplings."""
         angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
-        left = [tendon.without(angles, couplings_of(model)) for tendon in self.tendons]
-        # one that is too long or too short with all of its joints locked is refused by the robot
-        return [tendon for tendon in left if tendon.coefficients or not tendon.lower <= 0 <= tendon.upper]
+        tendons = [tendon.without(angles, couplings_of(model)) for tendon in self.tendons]
+        # Those with all joints locked inside their range are dropped; one outside it is kept, so that
+        # `check_tendons` refuses it.
+        return [tendon for tendon in tendons if tendon.coefficients or not tendon.lower <= 0 <= tendon.upper]
 
     def made(
         self, path: str | PathLike[str], given: Mapping[str, Any], options: Mapping[str, Any]
     ) -> tuple[pin.Model, dict[str, Any], Source]:
         """The model without locked joints, all options of `Robot.from_model` for it, and its source.
 
-        given : name, locked and inertias, as of `Robot.from_urdf`, and what is recorded beside them.
-        options : of `Robot.from_model`, that were given.
+        given : name, locked and inertias, as of `Robot.from_urdf`, and other arguments to record.
+        options : arguments for `Robot.from_model`.
         """
         check_choice("inertias", given["inertias"], INERTIAS)
         model, kind = self.moving(given["locked"]), self.kind.lower()
@@ -197,6 +207,7 @@ class Description:
         return model, every, Source(repairs=repairs, notes=notes, **own)
 
     def _approximated(self, model: pin.Model) -> Iterator[str]:
+        """Notes on actuators and ties that a model without the locked joints treats differently."""
         joints, followers = joint_names(model), couplings_of(model)
         if idle := [repr(joint) for joint in self.idle if joint in joints]:
             yield f"no actuator moves {', '.join(idle)}: plans have a motor there all the same"
@@ -206,13 +217,14 @@ class Description:
             if tie.follower in followers:
                 yield from [tie.note] if tie.note else []
                 continue
-            left = [joint for joint in tie.joints if joint in joints]
-            if left and len(left) < len(tie.joints):
+            unlocked = [joint for joint in tie.joints if joint in joints]
+            if unlocked and len(unlocked) < len(tie.joints):
                 locked = ", ".join(repr(joint) for joint in tie.joints if joint not in joints)
-                yield f"{tie.text}; {locked} is locked, and does not move with {', '.join(map(repr, left))}"
+                moving = ", ".join(map(repr, unlocked))
+                yield f"{tie.text}; {locked} is locked, and does not move with {moving}"
 
 
 def between(model: pin.Model, one: int, other: int) -> tuple[str, ...]:
-    """Names of the joints on the way in the tree from one joint of a model to another."""
-    a, b = (list(model.supports[joint]) for joint in (one, other))
-    return tuple(str(model.names[j]) for j in sorted(set(a) ^ set(b)) if model.joints[j].nv == 1)
+    """Names of the joints on the path in the tree from one joint of a model to another."""
+    a, b = (set(model.supports[joint]) for joint in (one, other))
+    return tuple(str(model.names[j]) for j in sorted(a ^ b) if model.joints[j].nv == 1)

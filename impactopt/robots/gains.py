@@ -1,10 +1,9 @@
-"""Gains of servos and springs of soft grips times a factor, given or for a plan to choose; rotor inertias."""
+"""Factors on servo gains and on springs of soft grips, given or optimized; plausible rotor inertias."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from impactopt.contact.fields import about
 from impactopt.errors import InputError, check_array, check_number
 from impactopt.robots.actuators import fitting
 from impactopt.robots.robot import Robot
-from impactopt.robots.tools import grip_limits
+from impactopt.robots.tools import grip_limits, replaced_grips
 
 __all__ = ["HEAVIEST_ROTOR", "LIGHTEST_ROTOR", "USUAL_ROTOR", "GainFactor", "scaled_gains", "with_room"]
 
@@ -20,24 +19,22 @@ __all__ = ["HEAVIEST_ROTOR", "LIGHTEST_ROTOR", "USUAL_ROTOR", "GainFactor", "sca
 # 14 to 22) to 3e-3 (arms: 160). Motors without gears have some 1e-5 to 1e-4: 10 N m on 1e-3 kg m2. Large
 # industrial arms have 2e-2: at 0.1 a drive takes a second to 10 rad/s by itself.
 LIGHTEST_ROTOR, USUAL_ROTOR, HEAVIEST_ROTOR = 1e-6, 1e-3, 0.1
-
-
-WEAKEST, STRONGEST = 1e-3, 1e3  # factors: beyond, gains are others and not these
+MIN_FACTOR, MAX_FACTOR = 1e-3, 1e3  # on the stiffness
 
 
 @dataclass(frozen=True, kw_only=True)
 class GainFactor:
-    """A factor on the stiffness of some joints, which a plan chooses; their damping gets its root.
+    """An optimized factor on the stiffness of some joints, whose root multiplies their damping.
 
-    So the damping ratio stays. At a servo's joint these are its gains, from start to rest; at that of a soft
-    grip they are the spring's and the damper's.
+    So the damping ratio is constant. For a driven joint these are the servo's gains, from start to rest; for
+    the joint of a soft grip they are those of the spring and the damper.
 
-    joints : names, or patterns such as ``arm_right_*``; a soft grip's joint is the tool's name with ``_grip``
-        behind.  factor : (least, largest).
+    joints : names, or patterns such as ``arm_right_*``; the joint of a soft grip is ``<tool>_grip``.
+    factor : (least, largest).
 
     Raises
     ------
-    InputError : no joints; factors that are none, or leave no choice.
+    InputError : no joints; bounds that are no factors, or not least < largest.
     """
 
     joints: tuple[str, ...] = field(metadata=about("names of joints, or patterns"))
@@ -49,35 +46,36 @@ class GainFactor:
             raise InputError(f"GainFactor: joints are names or patterns, at least one, not {self.joints!r}")
         object.__setattr__(self, "joints", tuple(self.joints))
         least, largest = check_array("GainFactor: factor", self.factor, (2,)).tolist()
-        if not WEAKEST <= least < largest <= STRONGEST:
+        if not MIN_FACTOR <= least < largest <= MAX_FACTOR:
             raise InputError(
-                f"GainFactor: factor is (least, largest) with {WEAKEST:g} <= least < largest <= "
-                f"{STRONGEST:g}, not ({least:g}, {largest:g}); for one number take scaled_gains"
+                f"GainFactor: factor is (least, largest) with {MIN_FACTOR:g} <= least < largest <= "
+                f"{MAX_FACTOR:g}, not ({least:g}, {largest:g}); for one number take scaled_gains"
             )
         object.__setattr__(self, "factor", (least, largest))
 
     def indices(self, robot: Robot) -> tuple[int, ...]:
-        """Indices of its joints, in arrays of length n; InputError for a name that fits none."""
+        """Indices of its joints, in arrays of length n; InputError for a name that matches none."""
         found = {k for name in self.joints for k in fitting(name, robot.joint_names, "gains")}
         return tuple(sorted(found))
 
 
 def scaled_gains(robot: Robot, factors: Mapping[str, float]) -> Robot:
-    """A copy of the robot whose stiffness is some times its own, and whose damping the root of that times.
+    """A copy of the robot with stiffness multiplied by factors, and damping by their roots.
 
-    factors : by names of joints, or patterns of them such as ``arm_right_*``; of several that fit a joint the
-        last one holds. At the joint of a soft grip it is the grip that changes.
+    factors : by names of joints, or patterns such as ``arm_right_*``; for a joint that several match, the
+        last one holds. For the joint of a soft grip they change the grip.
 
     Raises
     ------
-    InputError : what fits no joint; a factor that is none; gains too fast for the inertia they act on.
+    InputError : a name that matches no joint; a factor out of range; gains too fast for the inertia that they
+        act on.
     """
     each = np.ones(robot.n)
     for pattern, given in factors.items():
         factor = check_number(f"gains of {pattern!r}", given)
-        if not WEAKEST <= factor <= STRONGEST:
+        if not MIN_FACTOR <= factor <= MAX_FACTOR:
             raise InputError(
-                f"gains of {pattern!r}: the factor {factor:g}; give {WEAKEST:g} to {STRONGEST:g}"
+                f"gains of {pattern!r}: the factor {factor:g}; give {MIN_FACTOR:g} to {MAX_FACTOR:g}"
             )
         each[list(fitting(pattern, robot.joint_names, "gains"))] = factor
     kp, kd, limit = robot.kp * each, robot.kd * np.sqrt(each), np.array(robot.torque_limit)
@@ -86,22 +84,12 @@ def scaled_gains(robot: Robot, factors: Mapping[str, float]) -> Robot:
         if tool.grip is not None and each[at := robot.joint_index(tool.grip_joint)] != 1.0:
             grip = replace(tool.grip, stiffness=float(kp[at]), damping=float(kd[at]))
             grips[tool.name], limit[at] = grip, grip_limits(grip)[0]
-    return replace(robot, kp=kp, kd=kd, torque_limit=limit, **_held(robot, grips))
+    return replace(robot, kp=kp, kd=kd, torque_limit=limit, **replaced_grips(robot, grips))
 
 
 def with_room(robot: Robot, factors: Mapping[str, float]) -> Robot:
-    """The same robot, with torque limits at the joints of soft grips as if they were stiffer by such factors,
-    by names of joints: a spring's limit is what it has at the end of its range.
+    """The same robot, with larger torque limits at the joints of soft grips: those that grips stiffer by
+    these factors, by joint, reach at the ends of their ranges.
     """
     limit = np.maximum(robot.torque_limit, scaled_gains(robot, factors).torque_limit)
     return replace(robot, torque_limit=limit)
-
-
-def _held(robot: Robot, grips: Mapping[str, Any]) -> dict[str, Any]:
-    """Tools, and those of the source, of which some are held by other grips, by the tools' names."""
-
-    def held(tools: tuple[Any, ...]) -> tuple[Any, ...]:
-        return tuple(replace(t, grip=grips[t.name]) if t.name in grips else t for t in tools)
-
-    source = robot.source and replace(robot.source, tools=held(robot.source.tools))
-    return {"tools": held(robot.tools), "source": source}

@@ -1,4 +1,4 @@
-"""Tables of links and drives, and robots made of them: two arms on a fixed base, the stand-in for HRP-2.
+"""Tables of links and drives, and models made of them: arms, and the stand-in for HRP-2.
 
 The planar arm is made up. Of the seven-joint arm these are public, KUKA's for the LBR iiwa 7 R800: the
 distances between its axes (0.34, 0.4, 0.4 and 0.126 m, straight up at zero angles), limits of position (170
@@ -72,8 +72,8 @@ class Box:
 
 
 class Drive(NamedTuple):
-    """The public part of a joint: torque limit [N m], velocity limit [rad/s], gear ratio, rotor inertia
-    before the gear [kg m2].
+    """Drive of a joint: torque limit [N m], velocity limit [rad/s], gear ratio, and rotor inertia [kg m2]
+    before the gear.
     """
 
     torque: float
@@ -83,7 +83,7 @@ class Drive(NamedTuple):
 
     @property
     def armature(self) -> float:
-        """Inertia of the rotor as the joint feels it [kg m2]."""
+        """Rotor inertia reflected to the joint [kg m2]."""
         return self.rotor * self.ratio**2
 
 
@@ -91,8 +91,8 @@ class Drive(NamedTuple):
 class Link:
     """A link and the revolute joint, of the same name, that moves it.
 
-    At zero angles all frames are parallel to the world's: x forward, y left, z up. `at` [m] is where the
-    joint is in the frame of `parent`, `axis` is "x", "y" or "z", `limits` [rad] are the lowest and highest
+    At zero angles all frames are parallel to the world's: x forward, y left, z up. `at` [m] is the joint's
+    position in the frame of `parent`, `axis` is "x", "y" or "z", `limits` [rad] are the least and largest
     angle.
     """
 
@@ -134,9 +134,9 @@ _AXES = {"x": pin.JointModelRX, "y": pin.JointModelRY, "z": pin.JointModelRZ}
 
 
 def add_links(model: Any, links: Iterable[Link], roots: Mapping[str, int]) -> None:
-    """Add links with their limits and armature to a pin.Model, and a frame a joint.
+    """Add links with their limits and armature to a pin.Model, and a frame per joint.
 
-    roots : what the first of them may hang on: indices of joints by the name of a frame.
+    roots : indices of existing joints that links may hang on, by the name of a frame.
     """
     joints = dict(roots)
     for item in links:
@@ -167,7 +167,7 @@ _DEG = np.pi / 180
 
 
 def _turn(k: int, axis: str, rise: float, torque: float, speed: float, mass: float, long: float) -> Link:
-    """Joint k of the seven: `rise` [m] above the one before, its link `long` [m]; speed [degrees/s]."""
+    """Link of joint k of seven, `rise` [m] above the joint before, `long` [m]; speed [degrees/s]."""
     limit = (175.0 if k == 7 else 170.0 if axis == "z" else 120.0) * _DEG
     rotor = {176.0: 2.0e-5, 110.0: 1.2e-5, 40.0: 4e-6}[torque]
     return link(f"joint_{k}", f"joint_{k - 1}" if k > 1 else "base", axis, (0.0, 0.0, rise), (-limit, limit),
@@ -187,7 +187,7 @@ ARM7 = (
 
 
 def arm_model(name: str, links: tuple[Link, ...], base: Box | None = None) -> Any:
-    """The pin.Model of a chain on the frame `base`: fixed to the ground, or of a body that floats freely."""
+    """pin.Model of a chain on the frame `base`, which is fixed to the ground, or that of a floating body."""
     model, still, root, above = pin.Model(), pin.SE3.Identity(), 0, 0
     model.name = name
     if base is not None:
@@ -205,7 +205,7 @@ def _soft_kd(links: Iterable[Link]) -> dict[str, float]:
 
 
 def planar_arm(**overrides: Any) -> Robot:
-    """An arm of three joints in the plane x-z, on a fixed base, with a hammer; all of it is made up.
+    """An invented arm of three joints in the plane x-z, on a fixed base, with a hammer.
 
     * Joints `shoulder`, `elbow`, `wrist`, about y, straight up at zero angles: 0.4, 0.36, 0.08 m, 9 kg.
     * Torque 180, 100, 40 N m; velocity 4, 5, 8 rad/s; armature 0.4, 0.2, 0.04 kg m2.
@@ -250,7 +250,7 @@ def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
 
 
 def space_arm(**overrides: Any) -> Robot:
-    """The arm of `arm7` on a satellite of 60 kg, a cube of 0.5 m that floats freely without gravity; made up.
+    """The arm of `arm7` on an invented satellite of 60 kg, a cube of 0.5 m that floats without gravity.
 
     * Joints, drives, servo, striker `fist` and posture `ready` are those of `arm7`.
 
@@ -318,6 +318,7 @@ _LEFT_ARM = (
 
 
 def _side(side: str, links: tuple[Link, ...]) -> Iterator[Link]:
+    """Links of one side, from those of the left one: renamed, and mirrored for the right side."""
     own = {part.joint for part in links}
     for part in links:
         moved = part if side == "left" else part.mirrored()
@@ -342,7 +343,7 @@ TOE = np.array([0.130, 0.0095, -0.080])
 
 
 def standin_model(*, floating: bool = True) -> Any:
-    """The pin.Model with limits and armature; a frame a joint, and the frame `pelvis` at the root.
+    """pin.Model of the stand-in with limits and armature; a frame per joint, and the frame `pelvis`.
 
     floating : with a free-flyer at the pelvis; else the pelvis is fixed to the world.
     """

@@ -1,4 +1,4 @@
-"""Loads of a motion: of gears and motors, and of each sole by itself."""
+"""Loads in a motion: of gears and motors, and of each sole (normal force, centre-of-pressure margin)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 
 def gear_torque(robot: Robot, torque: ArrayLike, acceleration: ArrayLike) -> Array:
-    """(..., n) [N m] through the gears: what the servo's torque leaves when it has moved the rotor.
+    """Torque (..., n) [N m] through the gears: the servo's minus that which accelerates the rotor.
 
     torque (..., n) [N m] of the servo; acceleration (..., n) [rad/s^2] of the joints.
     """
@@ -39,21 +39,21 @@ def gear_torque(robot: Robot, torque: ArrayLike, acceleration: ArrayLike) -> Arr
 
 
 def motor_use(robot: Robot, torque: ArrayLike, velocity: ArrayLike) -> Array:
-    """(..., n) |torque| / stall torque + |speed| / no-load speed; 1 is on the line, nan: not known.
+    """(..., n) |torque| / stall torque + |speed| / no-load speed; 1: at the motor's limit, nan: not known.
 
-    Friction counts as if it always opposed the motor, so this is on the safe side where the motor brakes.
+    Friction is taken to oppose the motor always, which is conservative when the motor brakes.
     """
     stall, idle = (numbers_of(robot.actuators, name) for name in ("stall_torque", "no_load_speed"))
-    return np.asarray(_efforts(robot, torque, velocity) / stall + np.abs(velocity) / idle)
+    return np.asarray(_motor_torque(robot, torque, velocity) / stall + np.abs(velocity) / idle)
 
 
 def motor_power(robot: Robot, torque: ArrayLike, velocity: ArrayLike) -> Array:
-    """(..., n) [W] largest mechanical power of the motors, driving or braking, friction as in `motor_use`."""
-    return np.asarray(_efforts(robot, torque, velocity) * np.abs(velocity))
+    """(..., n) [W] magnitude of the motors' mechanical power, with friction as in `motor_use`."""
+    return np.asarray(_motor_torque(robot, torque, velocity) * np.abs(velocity))
 
 
-def _efforts(robot: Robot, torque: ArrayLike, velocity: ArrayLike) -> Array:
-    """(..., n) [N m] of the motors: the servo's torque and what friction takes."""
+def _motor_torque(robot: Robot, torque: ArrayLike, velocity: ArrayLike) -> Array:
+    """(..., n) [N m] magnitude of the motors' torque: the servo's and friction's."""
     viscous, coulomb = (
         numbers_of(robot.actuators, name) for name in ("viscous_friction", "coulomb_friction")
     )
@@ -66,7 +66,7 @@ class DriveLoads:
 
     joints : their names.  gear_limit (n,) : `Robot.gear_limit`.
     gear (n,) : torque through the gear over the torque limit.  motor (n,) : as of `motor_use`.  power (n,)
-    [W].  velocity_jump (n,) [rad/s] : how much faster or slower a joint is after the contact than before it.
+    [W].  velocity_jump (n,) [rad/s] : change of the velocity by the contact, in magnitude.
     """
 
     joints: tuple[str, ...]
@@ -80,21 +80,21 @@ class DriveLoads:
     def of(
         cls, robot: Robot, *, gear: ArrayLike, torque: ArrayLike, velocity: ArrayLike, jump: ArrayLike
     ) -> DriveLoads:
-        """Loads from histories: gear [N m] of torque through the gears, torque [N m] of the servos,
-        velocity [rad/s], each (k, n); jump (n,) [rad/s].
+        """Peak loads of histories: torque through the gears [N m], torque of the servos [N m] and velocity
+        [rad/s], each (k, n); jump of the velocity (n,) [rad/s].
         """
         driven = np.where(robot.passive, np.nan, 1.0)
         return cls(
             joints=robot.joint_names,
             gear_limit=robot.gear_limit,
-            gear=driven * _most(np.asarray(gear) / robot.torque_limit, robot.n),
-            motor=_most(motor_use(robot, torque, velocity), robot.n),
-            power=driven * _most(motor_power(robot, torque, velocity), robot.n),
+            gear=driven * _peak(np.asarray(gear) / robot.torque_limit, robot.n),
+            motor=_peak(motor_use(robot, torque, velocity), robot.n),
+            power=driven * _peak(motor_power(robot, torque, velocity), robot.n),
             velocity_jump=driven * np.abs(np.asarray(jump, dtype=np.float64)),
         )
 
     def summary(self) -> dict[str, Any]:
-        """The worst joints, keys as in ``summary.json``; None where nothing is known."""
+        """Largest loads and their joints, keys as in ``summary.json``; None without data."""
         out: dict[str, Any] = {}
         for values, key, name in (
             (self.gear, "gear_ratio", "gear_joint"),
@@ -109,27 +109,29 @@ class DriveLoads:
         return out
 
     def beyond_peak(self) -> str:
-        """Message about gears that carry more than their momentary peak; "" if none does."""
+        """Message about gears beyond their momentary peak; "" if there is none."""
         limit, names = self.gear_limit, self.joints
-        worst = sorted(np.flatnonzero(self.gear > limit * (1 + 1e-3)), key=lambda k: -self.gear[k] / limit[k])
-        if not worst:
+        beyond = np.flatnonzero(self.gear > limit * (1 + 1e-3))
+        worst_first = sorted(beyond, key=lambda k: -self.gear[k] / limit[k])
+        if not worst_first:
             return ""
-        k = int(worst[0])
-        others = f", and {len(worst) - 1} more" if len(worst) > 1 else ""
+        k = int(worst_first[0])
+        others = f", and {len(beyond) - 1} more" if len(beyond) > 1 else ""
         return (
             f"gear of {names[k]}: {self.gear[k]:.3g} times its torque limit, and {limit[k]:.3g} is its "
             f"momentary peak{others}; bound it with [terms.gear_load]"
         )
 
 
-def _most(values: Array, n: int) -> Array:
-    """(n,) largest magnitudes of (k, n); nan where there is none."""
+def _peak(values: Array, n: int) -> Array:
+    """(n,) largest magnitudes of a history (k, n); nan if it is empty."""
     return np.abs(values).max(axis=0) if len(values) else np.full(n, np.nan)
 
 
-BEARS = 0.02  # of the weight: a sole with less on it bears no load
+BEARS = 0.02  # a sole with a smaller fraction of the weight counts as unloaded
 ROUNDING = 0.01  # [mm, N]
-SHARE, FREE = 0.5, 1e-3  # of a margin, and [m] of any: what may be given up between nodes
+# Constraints hold at nodes. Between them a margin may fall to this share of its bound, or by so much [m].
+SHARE, FREE = 0.5, 1e-3
 
 
 def weight_of(robot: Robot) -> float:
@@ -144,17 +146,18 @@ def cop_margin(robot: Robot, corners: Sequence[Array], wrench: Array) -> Array:
     corners : (c, 2) [m] of each sole in its own frame, counter-clockwise.
     wrench (k, soles, 6) : of the ground on each, in its own frame [N, N m].
 
-    Positive inside; 0 on an edge, about which the sole tips; negative outside, where only a sole that is held
-    can have it. With next to no force the centre of pressure is a quotient of small numbers. So a sole that
-    bears less than 2 % of the robot's weight counts as if what it lacks of that pressed at its middle: an
-    unloaded sole has its middle's margin, and a moment with no force to bear it still counts. A sole that is
-    pulled shows in its normal force alone.
+    Positive inside; 0 on an edge, about which the sole tips; negative outside, which only a replay with fixed
+    soles can have. Without a normal force the centre of pressure is not defined. So for a force below 2 % of
+    the weight, the rest to 2 % is taken to act at the polygon's centre: an unloaded sole has the margin of
+    its centre, and a moment without force still shows. A pulling force shows in the normal force alone.
     """
     out = np.empty(wrench.shape[:2])
     for k, polygon in enumerate(corners):
+        # centre of pressure times force: (-m_y, m_x)
         force, moment = wrench[:, k, 2], np.stack([-wrench[:, k, 4], wrench[:, k, 3]], axis=1)
         lacking = np.maximum(BEARS * weight_of(robot) - force, 0.0)
         cop = (moment + lacking[:, None] * polygon.mean(axis=0)) / (force + lacking)[:, None]
+        # distances (k, c) from the edges, along their inward normals
         edge = np.roll(polygon, -1, axis=0) - polygon
         inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
         out[:, k] = (cop @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1)
@@ -162,16 +165,19 @@ def cop_margin(robot: Robot, corners: Sequence[Array], wrench: Array) -> Array:
 
 
 def least_kept(asked: float) -> float:
-    """Margin [m] that a plan has to keep between its nodes of one that it is asked for at them: half of it,
-    or all but a millimetre.
+    """Least margin [m] between nodes if `asked` [m] is required at the nodes: half of it, or 1 mm less than
+    it, whichever is smaller.
     """
     return asked - max(SHARE * asked, FREE)
 
 
 def fading(standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask (phases, soles) of soles that stand, but not in the phase before or after; of what stands."""
-    away = ~np.pad(standing, ((1, 1), (0, 0)), mode="edge")
-    return np.asarray(standing & (away[:-2] | away[2:]))
+    """Mask (phases, soles) of soles that stand in a phase, but not in the one before or after.
+
+    standing (phases, soles) : mask of standing soles.
+    """
+    lifted = ~np.pad(standing, ((1, 1), (0, 0)), mode="edge")
+    return np.asarray(standing & (lifted[:-2] | lifted[2:]))
 
 
 def least_margins(
@@ -184,13 +190,14 @@ def least_margins(
 ) -> dict[str, dict[str, dict[str, float]]]:
     """Least margin [mm] and least normal force [N] of each sole in each phase, as in ``summary.json``.
 
-    cop (k, soles) [m] : of :func:`cop_margin`.  force (k, soles) [N].  phases : by name, which instants (k,)
-    are in it; one without any is left out.  standing (stances, soles), stance (k,) : which soles stand, and
-    when; None: all of them, always. Forces are of soles that are not about to lift, or just down.
+    cop (k, soles) [m] : of :func:`cop_margin`.  force (k, soles) [N].  phases : mask of instants (k,) by the
+    phase's name; a phase without instants is left out.  standing (stances, soles), stance (k,) : mask of
+    standing soles, and index of the stance at each instant; None: all soles stand always. Forces of soles
+    that lift off next, or have just touched down, are left out, as they go through zero.
     """
-    on = bears = np.ones(force.shape, dtype=bool)
+    stands = loaded = np.ones(force.shape, dtype=bool)
     if standing is not None and stance is not None:
-        on, bears = standing[stance], (standing & ~fading(standing))[stance]
+        stands, loaded = standing[stance], (standing & ~fading(standing))[stance]
 
     def least(values: Array, chosen: NDArray[np.bool_]) -> dict[str, dict[str, float]]:
         return {
@@ -198,13 +205,13 @@ def least_margins(
             for name, column, own in zip(names, values.T, chosen.T, strict=True)
         }
 
-    return {"sole_cop_margin_mm": least(1e3 * cop, on), "sole_force_N": least(force, bears)}
+    return {"sole_cop_margin_mm": least(1e3 * cop, stands), "sole_force_N": least(force, loaded)}
 
 
 def shortfalls(numbers: Mapping[str, Any]) -> list[str]:
-    """The margins of which less than half is kept, in words, worst first.
+    """Messages about margins below what is required between nodes, worst first.
 
-    numbers : of `least_margins`, beside what is asked, as in ``summary.json``.
+    numbers : least margins (`least_margins`) and required ones, keys as in ``summary.json``.
     """
     asked, found = numbers.get("sole_cop_margin_asked_mm") or {}, []
     for name, phases in (numbers.get("sole_cop_margin_mm") or {}).items():
@@ -218,4 +225,4 @@ def shortfalls(numbers: Mapping[str, Any]) -> list[str]:
             if kept < SHARE * force - ROUNDING:
                 what = f"normal force on the sole {name!r}, {phase}"
                 found.append((kept - SHARE * force, f"{what}: {kept:.0f} N kept of {force:g} N"))
-    return [words for _, words in sorted(found)]
+    return [message for _, message in sorted(found)]

@@ -1,9 +1,9 @@
 """Reads a `pin.Model` and other data of a robot from an MJCF, by MuJoCo's own compiler.
 
-The compiler knows all of the language: defaults, includes, angles, inertias of geoms and meshes. What it has
-compiled is taken over number by number, so both engines have the same robot. Pinocchio's own reader (4.1)
-gives the same for plain files, but leaves out the mass of geoms that do not collide, refuses keyframes of
-scenes, and says nothing of actuators.
+The compiler supports the whole language: defaults, includes, angles, inertias of geoms and meshes. Its
+numbers are copied, so that both engines have the same robot. Pinocchio's own reader (4.1) gives the same for
+plain files, but leaves out the mass of geoms that do not collide, refuses keyframes of scenes, and does not
+read actuators.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ _OUT = "take it out"
 
 
 class Compiled:
-    """A compiled MJCF, and which of its bodies and joints the robot has.
+    """A compiled MJCF, and the bodies and joints of it that the robot has.
 
     mj : mujoco.MjModel.  what : the file, in messages.  model : the pin.Model made of it.
-    body : of MuJoCo's index, the joint that moves a body, its placement there and its frame.
-    joint : of MuJoCo's index, that of the model.
+    body : by MuJoCo's index of a body of the robot: its joint's index in `model`, its placement (pin.SE3) in
+        that joint, the index of its frame.
+    joint : by MuJoCo's index of a joint of the robot: its index in `model`.
     """
 
     def __init__(self, mj: Any, what: str) -> None:
@@ -65,8 +66,8 @@ class Compiled:
 
 
 def ties_of(c: Compiled) -> Iterator[Tie]:
-    """Ties between joints and bodies that the robot has."""
-    yield from _of_joints(c)
+    """Ties of the robot's joints: nonlinear forces, equalities, tendons, and partial gravity compensation."""
+    yield from _nonlinear_joints(c)
     if not c.off("equality", "constraint"):
         yield from _equalities(c)
     yield from _tendons(c)
@@ -74,7 +75,7 @@ def ties_of(c: Compiled) -> Iterator[Tie]:
 
 
 def gravity_of(c: Compiled) -> Array:
-    """(3,) [m/s2], less what the same `gravcomp` of all bodies takes of it."""
+    """Gravity (3,) [m/s2], reduced by `gravcomp` if all bodies have the same."""
     if c.off("gravity"):
         return np.zeros(3)
     shares = _gravcomp(c)
@@ -83,13 +84,13 @@ def gravity_of(c: Compiled) -> Array:
 
 
 def notes_of(c: Compiled) -> Iterator[str]:
-    """Notes on features that were left out, or are treated otherwise than by MuJoCo."""
+    """Notes on features that are left out, or are treated differently than by MuJoCo."""
     mj = c.mj
     shares = _gravcomp(c)
     if len(shares) == 1 and (share := shares.pop()) and not c.off("gravity"):
-        yield f"all bodies have gravcomp {share:g}: motors bear {1 - share:g} times the weight, as in MuJoCo"
+        yield f"all bodies have gravcomp {share:g}: motors carry {1 - share:g} times the weight, as in MuJoCo"
     if mj.opt.density > 0 or mj.opt.viscosity > 0:
-        yield "the drag of a medium is left out: <option density, viscosity>"
+        yield "fluid drag is left out: <option density, viscosity>"
     for j in range(mj.njnt):
         dofs = slice(int(mj.jnt_dofadr[j]), int(mj.jnt_dofadr[j]) + 6)
         if c.floating and mj.jnt_bodyid[j] in c.body and mj.jnt_type[j] == c.mujoco.mjtJoint.mjJNT_FREE:
@@ -109,43 +110,46 @@ def notes_of(c: Compiled) -> Iterator[str]:
 
 
 def _gravcomp(c: Compiled) -> set[float]:
-    """The shares of its weight that a body does not have, without those that motors make up for."""
+    """Compensated fractions of gravity (`gravcomp`) of the moving bodies; {0} if motors apply them."""
     mj = c.mj
-    made_up = c.numbers("jnt_actgravcomp")[sorted(c.joint)]
-    if made_up.size and made_up.all() and not c.floating:
-        return {0.0}  # the motors' torque has it, inside its limits: this is ordinary gravity
+    by_motors = c.numbers("jnt_actgravcomp")[sorted(c.joint)]
+    if by_motors.size and by_motors.all() and not c.floating:
+        return {0.0}  # it is part of the motors' torque, inside its limits: this is ordinary gravity
     return {float(mj.body_gravcomp[b]) for b in c.moving()}
 
 
 def _partly_weightless(c: Compiled) -> Iterator[Tie]:
+    """Different `gravcomp` of bodies, for which the equations of motion have no gravity vector."""
     if len(_gravcomp(c)) < 2 or c.off("gravity"):
         return
     bodies = [b for b in c.moving() if c.mj.body_gravcomp[b]]
     above = sorted({j for b in bodies for j in map(int, c.model.supports[c.body[b][0]]) if j})
     names = ", ".join(repr(c.name("body", b)) for b in bodies)
     yield Tie(
-        text=f"bodies {names} have a gravcomp that the others do not have",
+        text=f"bodies {names} have another gravcomp than the rest",
         joints=tuple(str(c.model.names[j]) for j in above),
         free=0,
         fix="give all of them the same",
     )
 
 
-def _of_joints(c: Compiled) -> Iterator[Tie]:
+def _nonlinear_joints(c: Compiled) -> Iterator[Tie]:
+    """Nonlinear springs and dampers of joints."""
     mj = c.mj
     for j in c.joint:
         name = c.name("joint", j)
         stiffens = any(c.numbers(f"jnt_{key}")[j : j + 1].any() for key in ("stiffnesspoly", "springyield"))
         if stiffens and not c.off("spring", "passive"):
-            text = f"joint {name!r} has a spring whose torque is not linear in its angle, which no plan has"
+            text = f"joint {name!r} has a spring whose torque is not linear in its angle, which plans lack"
             yield Tie(text=text, joints=(name,), free=0, fix=_OUT)
-        bent = c.numbers("dof_dampingpoly")[int(mj.jnt_dofadr[j]) :][:1]
-        if bent.any() and not c.off("damper", "passive"):
-            text = f"joint {name!r} has damping that is not linear in its speed, which no plan has"
+        nonlinear = c.numbers("dof_dampingpoly")[int(mj.jnt_dofadr[j]) :][:1]
+        if nonlinear.any() and not c.off("damper", "passive"):
+            text = f"joint {name!r} has damping that is not linear in its speed, which plans lack"
             yield Tie(text=text, joints=(name,), free=0, fix=_OUT)
 
 
 def _equalities(c: Compiled) -> Iterator[Tie]:
+    """Active equality constraints: closed loops, joints fixed at an angle, joints that follow others."""
     mj, kinds = c.mj, c.mujoco.mjtEq
     for e in range(mj.neq):
         kind, one, other = int(mj.eq_type[e]), int(mj.eq_obj1id[e]), int(mj.eq_obj2id[e])
@@ -156,91 +160,93 @@ def _equalities(c: Compiled) -> Iterator[Tie]:
             yield from _loop(c, name, *(_body(c, e, i) for i in (one, other)))
         elif kind == int(kinds.mjEQ_JOINT) and one in c.joint:
             first = c.name("joint", one)
+            # y - y0 is a polynomial of x - x0, where y is the first joint, x the other one (0 without one),
+            # and x0, y0 are their reference angles
+            law = Polynomial(mj.eq_data[e][:5]) + float(mj.qpos0[mj.jnt_qposadr[one]])
             if other < 0:
-                text = f"joint {first!r} is held by the equality {name!r}"
-                held = _held_at(c, e, one)
-                yield Tie(text=text, joints=(first,), free=0, follower=first, follows=tuple(held.coef))
+                text = f"joint {first!r} is fixed by the equality {name!r}"
+                yield Tie(text=text, joints=(first,), free=0, follower=first, follows=tuple(law.coef))
             elif other in c.joint:
                 second = c.name("joint", other)
                 text = f"joint {first!r} follows {second!r} by the equality {name!r}"
-                zero = float(mj.qpos0[mj.jnt_qposadr[other]])
-                held = _held_at(c, e, one)(Polynomial([-zero, 1.0]))
-                yield Tie(text=text, joints=(first, second), follower=first, follows=tuple(held.coef))
-
-
-def _held_at(c: Compiled, equality: int, joint: int) -> Any:
-    """Angle of a joint, a polynomial of how far the other one is from where it is compiled."""
-    return Polynomial(c.mj.eq_data[equality][:5]) + float(c.mj.qpos0[c.mj.jnt_qposadr[joint]])
+                law = law(Polynomial([-float(mj.qpos0[mj.jnt_qposadr[other]]), 1.0]))
+                yield Tie(text=text, joints=(first, second), follower=first, follows=tuple(law.coef))
 
 
 def _body(c: Compiled, equality: int, i: int) -> int:
-    """Body of an object that a loop constrains."""
-    kinds = c.numbers("eq_objtype")  # MuJoCo 3.2 has bodies only
+    """Index of the body, or of the body of the site, that a loop constrains."""
+    kinds = c.numbers("eq_objtype")  # MuJoCo 3.2 has no sites there
     is_site = bool(kinds.size) and kinds[equality] == int(c.mujoco.mjtObj.mjOBJ_SITE)
     return int(c.mj.site_bodyid[i]) if is_site else max(i, 0)
 
 
 def _loop(c: Compiled, name: str, one: int, other: int) -> Iterator[Tie]:
+    """Closed loop through two bodies (0: the world); InputError if one of them is not the robot's."""
     inside = [b for b in (one, other) if b and b in c.body]
     if not inside:
         return
+    # a robot on a fixed base has the world's body
     outside = [b for b in (one, other) if b not in c.body or (c.floating and not b)]
     if outside:
         raise InputError(
-            f"{c.what} holds {c.name('body', inside[0])!r} to {c.name('body', outside[0])!r} by the equality "
-            f"{name!r}, which no plan has; {_OUT}"
+            f"{c.what} connects {c.name('body', inside[0])!r} to {c.name('body', outside[0])!r} by the "
+            f"equality {name!r}, which plans lack; {_OUT}"
         )
     ends = (c.body[b][0] for b in (one, other))
     text = f"it closes a loop by the equality {name!r}, and robots here are trees"
-    yield Tie(text=text, joints=between(c.model, *ends), free=0, fix=f"{_OUT}, with the rods that it holds")
+    yield Tie(
+        text=text, joints=between(c.model, *ends), free=0, fix=f"{_OUT}, with the rods that it connects"
+    )
 
 
 def tendons_of(c: Compiled) -> Iterator[Tendon]:
-    """Fixed tendons that have a range, and do nothing else."""
+    """Fixed tendons with a range and no other effect."""
     mj = c.mj
     for t in range(mj.ntendon):
-        if sum_of := _sum_of(c, t):
+        if coefficients := _coefficients(c, t):
             low, high = map(float, mj.tendon_range[t])
-            yield Tendon(name=c.name("tendon", t), coefficients=sum_of, lower=low, upper=high)
+            yield Tendon(name=c.name("tendon", t), coefficients=coefficients, lower=low, upper=high)
 
 
 def _tendons(c: Compiled) -> Iterator[Tie]:
+    """Tendons with other effects than a range on a sum of angles."""
     for t in range(c.mj.ntendon):
-        does, joints = _actions(c, t), _joints_of_tendon(c, t)
-        if does and joints and not _sum_of(c, t):
+        effects, joints = _effects(c, t), _joints_of_tendon(c, t)
+        if effects and joints and not _coefficients(c, t):
             yield Tie(
-                text=f"tendon {c.name('tendon', t)!r} acts on {', '.join(joints)} ({', '.join(does)}), which "
-                "no plan has",
+                text=f"tendon {c.name('tendon', t)!r} acts on {', '.join(joints)} ({', '.join(effects)}), "
+                "which plans lack",
                 joints=joints,
                 free=0,
                 fix=_OUT,
             )
 
 
-def _actions(c: Compiled, t: int) -> list[str]:
-    """Effects of a tendon on its joints, in words."""
+def _effects(c: Compiled, t: int) -> list[str]:
+    """Effects of a tendon on its joints, in words; "limited" is that it has a range."""
     mj = c.mj
     driven = [
         int(mj.actuator_trnid[a, 0])
         for a in range(len(mj.actuator_trntype))
         if mj.actuator_trntype[a] == c.mujoco.mjtTrn.mjTRN_TENDON
     ]
-    equal = [e for e in range(mj.neq) if mj.eq_type[e] == c.mujoco.mjtEq.mjEQ_TENDON]
-    held = [int(i) for e in equal for i in (mj.eq_obj1id[e], mj.eq_obj2id[e])]
-    does = [
+    equalities = [e for e in range(mj.neq) if mj.eq_type[e] == c.mujoco.mjtEq.mjEQ_TENDON]
+    constrained = [int(i) for e in equalities for i in (mj.eq_obj1id[e], mj.eq_obj2id[e])]
+    own = [
         key
         for key in ("stiffness", "damping", "frictionloss", "armature", "limited")
         if c.numbers(f"tendon_{key}")[t : t + 1].any()
     ]
-    return [*does, *(["an actuator"] if t in driven else []), *(["an equality"] if t in held else [])]
+    return [*own, *(["an actuator"] if t in driven else []), *(["an equality"] if t in constrained else [])]
 
 
-def _sum_of(c: Compiled, t: int) -> dict[str, float]:
-    """Coefficients by joint of a fixed tendon that has a range, and does nothing else; empty for another one,
-    and for joints that turn without end or are not the robot's.
+def _coefficients(c: Compiled, t: int) -> dict[str, float]:
+    """Coefficients, by joint, of a fixed tendon with a range and no other effect.
+
+    Empty for other tendons, and if one of the joints is continuous or not the robot's.
     """
     mj, out = c.mj, dict[str, float]()
-    if _actions(c, t) != ["limited"]:
+    if _effects(c, t) != ["limited"]:
         return out
     first = int(mj.tendon_adr[t])
     for w in range(first, first + int(mj.tendon_num[t])):
@@ -265,11 +271,13 @@ def _joints_of_tendon(c: Compiled, t: int) -> tuple[str, ...]:
             bodies.append(int(mj.site_bodyid[i]))
         elif kind in (int(kinds.mjWRAP_SPHERE), int(kinds.mjWRAP_CYLINDER)):
             bodies.append(int(mj.geom_bodyid[i]))
+    # A spatial tendon is changed by all joints between the bodies that it passes. One to a body that is not
+    # the robot's would fix a floating robot.
     inside = [c.body[b][0] for b in bodies if b in c.body]
     if c.floating and any(inside) and len(inside) < len(bodies) + bodies.count(0):
         raise InputError(
-            f"{c.what} ties the robot to what is not of it by the tendon {c.name('tendon', t)!r}, which no "
-            f"plan has; {_OUT}"
+            f"{c.what} ties the robot to a body that is not the robot's by the tendon "
+            f"{c.name('tendon', t)!r}, which plans lack; {_OUT}"
         )
     for one in inside[1:]:
         joints.update(between(c.model, inside[0], one))
@@ -277,7 +285,7 @@ def _joints_of_tendon(c: Compiled, t: int) -> tuple[str, ...]:
 
 
 _HINGES = (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ)
-_TURNS = (pin.JointModelRUBX, pin.JointModelRUBY, pin.JointModelRUBZ)  # without limits
+_CONTINUOUS = (pin.JointModelRUBX, pin.JointModelRUBY, pin.JointModelRUBZ)
 _SLIDES = (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ)
 
 
@@ -295,22 +303,24 @@ def compile_mjcf(path: str | PathLike[str]) -> Any:
 
 
 def read_mjcf(path: str | PathLike[str], *, floating: bool | None = None) -> Description:
-    """The robot of an MJCF: the body with a free joint, and joints below it; else all that have joints.
+    """The robot of an MJCF: the subtree of the body with a free joint; else all bodies with joints.
 
-    floating : whether its root has a free joint; None: as the file says.
+    floating : with a free-flyer at the root, or without; None: as in the file.
 
     Raises
     ------
-    InputError : no robot, or several; ball joints; equality constraints that hold it to other bodies.
+    InputError : no robot, or several; ball joints; equality constraints with other bodies.
     """
     mj = compile_mjcf(path)
     return _Reader(mj, f"MJCF {path}", floating).read()
 
 
 class _Reader(Compiled):
+    """Reader of a compiled MJCF; `read` fills `out`."""
+
     def __init__(self, mj: Any, what: str, floating: bool | None) -> None:
         super().__init__(mj, what)
-        roots = [b for b in range(1, mj.nbody) if mj.body_parentid[b] == 0 and self._driven(b)]
+        roots = [b for b in range(1, mj.nbody) if mj.body_parentid[b] == 0 and self._has_joints(b)]
         free = [b for b in roots if self._free(b)]
         if not roots:
             raise InputError(f"{what} has no hinges or slides: there is nothing to plan")
@@ -321,7 +331,8 @@ class _Reader(Compiled):
         if len(self.roots) > 1 and floating:
             raise InputError(f"{what} has several bodies with joints on the ground: it cannot float")
         self.floating = bool(free) if floating is None else floating
-        # of joints, which have one number for an angle without limits
+        # Followers by joint equalities have one coordinate even without limits, which a continuous joint of
+        # Pinocchio, with (cos, sin), has not.
         joints = (mj.eq_type == self.mujoco.mjtEq.mjEQ_JOINT) & (mj.eq_obj2id >= 0)
         self.followers = set(map(int, mj.eq_obj1id[joints]))
         self.model.name = mj.names[: mj.names.index(b"\0")].decode() or "robot"
@@ -349,18 +360,21 @@ class _Reader(Compiled):
         self.out.lead_from_root()
         return self.out
 
-    def _driven(self, root: int) -> bool:
+    def _has_joints(self, root: int) -> bool:
+        """True if the subtree of a root body has joints besides a free one."""
         kinds = self.mj.jnt_type[self.mj.body_rootid[self.mj.jnt_bodyid] == root]
         return bool((kinds != self.mujoco.mjtJoint.mjJNT_FREE).any())
 
     def _free(self, b: int) -> bool:
+        """True if the body has a free joint."""
         first, count = int(self.mj.body_jntadr[b]), int(self.mj.body_jntnum[b])
         return count > 0 and self.mj.jnt_type[first] == self.mujoco.mjtJoint.mjJNT_FREE
 
     def _add_body(self, b: int) -> None:
+        """Add a body with its joints, in the order of the file, to the one that its parent hangs on."""
         mj, model = self.mj, self.model
         joint, place, above = self.body[int(mj.body_parentid[b])]
-        place = place * _placement(mj.body_pos[b], mj.body_quat[b])
+        place = place * _placement(mj.body_pos[b], mj.body_quat[b])  # in `joint`
         first, count = int(mj.body_jntadr[b]), int(mj.body_jntnum[b])
         free = self._free(b)
         if self.floating and b == self.roots[0]:
@@ -381,13 +395,17 @@ class _Reader(Compiled):
         self.body[b] = (joint, place, int(model.addFrame(frame, False)))
 
     def _apart(self, kind: str, i: int) -> str:
-        """A name that no frame of the model has yet, other than a joint."""
+        """Name of an object, prefixed by its kind if a link or a site of the model has that name already."""
         name = self.name(kind, i)
         taken = [str(f.name) for f in self.model.frames if f.type != pin.FrameType.JOINT]
         return name if name not in taken else f"{kind} {name}"
 
     def _add_joint(self, j: int, parent: int, place: Any, above: int) -> tuple[int, int, Any]:
-        """The joint and its frame, and how it is turned to have its axis, in a parent's joint at a place."""
+        """Index of the added joint, index of its frame, and rotation (pin.SE3) to the frame in which it turns
+        about or along its axis.
+
+        parent, place : joint that it hangs on, and its placement there.  above : the parent's frame.
+        """
         mj, model, name = self.mj, self.model, self.name("joint", j)
         hinge = mj.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_HINGE
         if not hinge and mj.jnt_type[j] != self.mujoco.mjtJoint.mjJNT_SLIDE:
@@ -395,11 +413,11 @@ class _Reader(Compiled):
                 f"{self.what}: joint {name!r} is a ball or a free joint inside the robot; make hinges of it"
             )
         axis, zero = np.array(mj.jnt_axis[j]), float(mj.qpos0[mj.jnt_qposadr[j]])
-        # MuJoCo's bodies are where the file has them at the joint's reference, Pinocchio's at zero
+        # placements of an MJCF are those at the joint's reference angle, Pinocchio's those at zero
         place = place * (
             pin.SE3(pin.exp3(-zero * axis), np.zeros(3)) if hinge else pin.SE3(np.eye(3), -zero * axis)
         )
-        limited, lasting = bool(mj.jnt_limited[j]), int(mj.jnt_dofadr[j])
+        limited, dof = bool(mj.jnt_limited[j]), int(mj.jnt_dofadr[j])
         kind, turn = _kind(axis, hinge, limited or j in self.followers)
         added = int(model.addJoint(parent, kind, place * turn, name))
         at = model.joints[added]
@@ -411,9 +429,9 @@ class _Reader(Compiled):
         self.joint[j] = added
         self._add_to_joint(
             j,
-            armature=mj.dof_armature[lasting],
-            viscous=0.0 if self.off("damper", "passive") else _first(mj.dof_damping[lasting]),
-            dry=0.0 if self.off("frictionloss", "constraint") else mj.dof_frictionloss[lasting],
+            armature=mj.dof_armature[dof],
+            viscous=0.0 if self.off("damper", "passive") else _first(mj.dof_damping[dof]),
+            dry=0.0 if self.off("frictionloss", "constraint") else mj.dof_frictionloss[dof],
         )
         stiffness = _first(mj.jnt_stiffness[j])
         if stiffness and not self.off("spring", "passive"):
@@ -421,11 +439,11 @@ class _Reader(Compiled):
         return added, int(model.addJointFrame(added, above)), turn
 
     def _add_to_joint(self, j: int, *, armature: float = 0.0, viscous: float = 0.0, dry: float = 0.0) -> None:
-        """More armature and friction; a negative one takes off."""
+        """Add armature and friction, which may be negative, to those of a joint."""
         model, at = self.model, self.model.joints[self.joint[j]].idx_v
         own = np.array(model.armature), *friction(model)
-        for numbers, more in zip(own, (armature, viscous, dry), strict=True):
-            numbers[at] += more
+        for numbers, added in zip(own, (armature, viscous, dry), strict=True):
+            numbers[at] += added
         model.armature = own[0]
         set_friction(model, *own[1:])
 
@@ -438,19 +456,22 @@ class _Reader(Compiled):
             self.out.sites.append(name)
 
     def _actuators(self) -> None:
+        """Read gains, torque limits, armature and damping of the actuators, several of which add up."""
         mj, kinds = self.mj, self.mujoco.mjtTrn
-        inside = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
-        most: dict[str, float] = {}
+        of_joints = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
+        most: dict[str, float] = {}  # torque [N m] of all enabled actuators, by joint
         for a in range(len(mj.actuator_trntype)):
             j = int(mj.actuator_trnid[a, 0])
-            if int(mj.actuator_trntype[a]) not in inside:
-                if mj.actuator_trntype[a] != kinds.mjTRN_TENDON:  # a tendon's is reported with it
+            if int(mj.actuator_trntype[a]) not in of_joints:
+                if mj.actuator_trntype[a] != kinds.mjTRN_TENDON:  # reported with the tendon
                     self.out.notes.append(f"actuator {self.name('actuator', a)!r}, of no joint, is left out")
                 continue
             if j not in self.joint:
                 continue
             out = int(mj.actuator_outadr[a]) if hasattr(mj, "actuator_outadr") else a
             name, gear = self.name("joint", j), abs(float(mj.actuator_gear[out, 0]))
+            # An affine actuator's force is gain x control + b0 + b1 length + b2 speed. At the joint, forces
+            # are multiplied by the gear ratio, gains and armature by its square.
             affine = mj.actuator_biastype[a] == self.mujoco.mjtBias.mjBIAS_AFFINE
             kp, kd = (-float(mj.actuator_biasprm[a, k]) * gear**2 if affine else 0.0 for k in (1, 2))
             rotor, viscous = (
@@ -460,7 +481,7 @@ class _Reader(Compiled):
             self._add_to_joint(j, armature=rotor, viscous=0.0 if self.off("damper", "passive") else viscous)
             if self._disabled(a):
                 continue
-            most[name] = most.get(name, 0.0) + _largest(mj, a, affine) * gear
+            most[name] = most.get(name, 0.0) + _force_limit(mj, a, affine) * gear
             if kp > 0 or kd > 0:
                 self.out.kp[name] = self.out.kp.get(name, 0.0) + kp
                 self.out.kd[name] = self.out.kd.get(name, 0.0) + kd
@@ -481,7 +502,7 @@ class _Reader(Compiled):
                 self.out.torque[name] = most[name]
             viscous = float(friction(self.model)[0][self.model.joints[self.joint[j]].idx_v])
             if self.out.kp.get(name, 0.0) > 0 and self.out.kd[name] == 0 and viscous:
-                # a servo without damping of its own leans on the joint's, which is then no friction
+                # a servo without Kd is damped by the joint's damping, which becomes Kd instead of friction
                 self.out.kd[name] = viscous
                 self._add_to_joint(j, viscous=-viscous)
 
@@ -491,7 +512,9 @@ class _Reader(Compiled):
         return 0 <= group < 31 and bool(int(self.mj.opt.disableactuator) >> group & 1)
 
     def _simple(self, a: int) -> bool:
-        """True if an actuator's force is at once a control, or a servo of position and velocity."""
+        """True if an actuator's force is an instantaneous function of control, position and velocity, as of a
+        motor or a servo.
+        """
         mj, m = self.mj, self.mujoco
         return bool(
             mj.actuator_gaintype[a] == m.mjtGain.mjGAIN_FIXED
@@ -502,6 +525,7 @@ class _Reader(Compiled):
         )
 
     def _keyframes(self) -> None:
+        """Read the keyframes inside the position limits as reference configurations."""
         mj = self.mj
         for k in range(mj.nkey):
             q, inside = pin.neutral(self.model), True
@@ -513,12 +537,15 @@ class _Reader(Compiled):
                 start = int(mj.jnt_qposadr[int(mj.body_jntadr[self.roots[0]])])
                 where = mj.key_qpos[k][start : start + 7]
                 q[:7] = pin.SE3ToXYZQUAT(_placement(where[:3], where[3:]))
-            if inside:  # what is outside its limits is no posture
+            if inside:
                 self.model.referenceConfigurations[self.name("key", k)] = q
 
 
-def _largest(mj: Any, a: int, affine: bool) -> float:
-    """The largest force [N m] of an actuator; infinite where nothing bounds it."""
+def _force_limit(mj: Any, a: int, affine: bool) -> float:
+    """The largest force [N m] of an actuator, before the gear; infinite without a limit.
+
+    A control limit bounds the force of a motor only: for a servo (affine) it bounds the reference.
+    """
     out = np.inf
     if mj.actuator_forcelimited[a]:
         out = float(np.abs(mj.actuator_forcerange[a]).min())
@@ -529,15 +556,15 @@ def _largest(mj: Any, a: int, affine: bool) -> float:
 
 
 def _kind(axis: Array, hinge: bool, limited: bool) -> tuple[Any, Any]:
-    """Pinocchio's joint about or along an axis, and the placement in which it is that."""
+    """Pinocchio's joint model about or along an axis, and its placement (pin.SE3) in the joint's frame."""
     along = [k for k in range(3) if axis[k] == 1 and not np.delete(axis, k).any()]
     if along:
-        return ((_HINGES if limited else _TURNS) if hinge else _SLIDES)[along[0]](), _none()
+        return ((_HINGES if limited else _CONTINUOUS) if hinge else _SLIDES)[along[0]](), _none()
     if not hinge:
         return pin.JointModelPrismaticUnaligned(axis), _none()
     if limited:
         return pin.JointModelRevoluteUnaligned(axis), _none()
-    # Python cannot give the axis of an unbounded one
+    # Pinocchio's Python has no continuous joint with an axis as an argument: turn one about z
     to_axis = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
     return pin.JointModelRUBZ(), pin.SE3(to_axis.matrix(), np.zeros(3))
 
@@ -553,13 +580,13 @@ def _rotation(quaternion: Any) -> Array:
 
 
 def _turned(quaternion: Any, moments: Array) -> Array:
-    """Principal moments (3,) in the axes of a body."""
+    """Inertia (3, 3) along a body's axes, of principal moments (3,) and the orientation of their axes."""
     turn = _rotation(quaternion)
     return turn @ np.diag(moments) @ turn.T
 
 
 def _first(value: Any) -> float:
-    """MuJoCo 4 has polynomials of damping, whose first coefficient is the linear one."""
+    """Linear coefficient of a stiffness or damping: MuJoCo 4 has polynomials, of which it is the first."""
     return float(np.ravel(value)[0])
 
 

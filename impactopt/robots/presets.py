@@ -1,7 +1,7 @@
-"""Robots ready to use: humanoids, and arms on a fixed base or a satellite.
+"""Preset robots: humanoids, and arms on a fixed base or a satellite.
 
-The stand-in for HRP-2 and the arms need no files; TALOS and G1 are on the URDFs of the package
-example-robot-data, which the extra `robots` brings.
+The stand-in for HRP-2 and the arms need no files. TALOS and G1 are made of the URDFs of the package
+example-robot-data (extra `robots`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.errors import check_choice, missing_package
-from impactopt.robots import link_tables as _arms
+from impactopt.robots import link_tables
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Source
 from impactopt.robots.build import joint_names, lock_joints
@@ -40,7 +40,7 @@ __all__ = [
 
 
 def _preset(make: Callable[P, Robot]) -> Callable[P, Robot]:
-    """The function of a preset, whose robots know what they were made from."""
+    """Decorator of a preset's function, which records name and arguments as the robot's `source`."""
 
     @wraps(make)
     def made(*args: P.args, **overrides: P.kwargs) -> Robot:
@@ -49,23 +49,23 @@ def _preset(make: Callable[P, Robot]) -> Callable[P, Robot]:
     return made
 
 
-arm7, planar_arm, space_arm = map(_preset, (_arms.arm7, _arms.planar_arm, _arms.space_arm))
+arm7, planar_arm, space_arm = map(_preset, (link_tables.arm7, link_tables.planar_arm, link_tables.space_arm))
 
 
 @_preset
 def talos(**overrides: Any) -> Robot:
     """PAL Robotics' TALOS: 90 kg, grippers locked, 30 joints and a free-flyer.
 
-    * Armature: the SRDF has a rotor inertia of 1e-5 kg m2 and a gear ratio of 100 on every joint:
-      0.1 kg m2 down to the wrists, which is an assumption. What is public of its motors and gears ends there.
+    * Armature: the SRDF has a rotor inertia of 1e-5 kg m2 and a gear ratio of 100 for every joint, wrists
+      included: 0.1 kg m2, which is an assumption. Nothing else about its motors and gears is public.
     * Limits: the URDF's.
     * Servo: Kd = min(150, 1.5 s/rad x torque limit) N m s/rad and Kp = 30 1/s x Kd.
-    * Soles: 0.20 x 0.12 m about `left_sole_link` and `right_sole_link`, 5 mm inside the 0.21 x 0.13 m box
-      that the URDF's simplified variant collides with, as the foot's edges are round (flat part of the mesh:
+    * Soles: 0.20 x 0.12 m about `left_sole_link` and `right_sole_link`, 5 mm inside the 0.21 x 0.13 m
+      collision box of the URDF's simplified variant, as the foot's edges are round (flat part of the mesh:
       0.195 x 0.117 m).
-    * Strikers `right_hand`, `left_hand`: 0.1515 m from the gripper's base along its approach axis (-z), in
-      the middle between the tips of the three fingers, which touch first (`FirstTouch`).
-    * Posture `half_sitting`: the SRDF's, but with the ankles' roll at 0, as its 1.7 mrad tilt the soles.
+    * Strikers `right_hand`, `left_hand`: 0.1515 m from the gripper's base along its approach axis (-z), the
+      mean of the tips of the three fingers, which touch first (`FirstTouch`).
+    * Posture `half_sitting`: the SRDF's, with the ankles' roll set to 0, as its 1.7 mrad tilt the soles.
 
     `overrides` go to `Robot.from_urdf`.
     """
@@ -92,15 +92,18 @@ def talos(**overrides: Any) -> Robot:
 _5020, _7520_14, _7520_22, _4010 = 3.609725e-3, 1.017752e-2, 2.5101925e-2, 4.25e-3
 
 
-def _g1_motor(knee: float, idle: float, torque: float, coulomb: float, viscous: float) -> Actuator:
-    """The line of a motor from its torque [N m] up to a speed [rad/s] and the speed without load [rad/s], and
-    its friction: measured by Unitree, as in its `unitree_rl_lab` (X1, X2, Y1, Fs, Fd of its actuators).
+def _g1_motor(
+    knee_speed: float, no_load_speed: float, torque: float, coulomb: float, viscous: float
+) -> Actuator:
+    """A motor with `torque` [N m] up to `knee_speed`, from there a linear decrease to zero at `no_load_speed`
+    [rad/s], and its friction.
 
-    What its gears carry is not public.
+    Measured by Unitree: X1, X2, Y1, Fs, Fd of the actuators in its `unitree_rl_lab`. Ratings of its gears are
+    not public.
     """
     return Actuator(
-        stall_torque=torque * idle / (idle - knee),
-        no_load_speed=idle,
+        stall_torque=torque * no_load_speed / (no_load_speed - knee_speed),  # the line's, at speed zero
+        no_load_speed=no_load_speed,
         coulomb_friction=coulomb,
         viscous_friction=viscous,
     )
@@ -110,7 +113,7 @@ _OF_5020 = _g1_motor(30.86, 40.13, 24.8, 0.6, 0.06)
 _OF_7520_14 = _g1_motor(22.63, 35.52, 71.0, 1.6, 0.16)
 _OF_7520_22 = _g1_motor(14.5, 22.7, 111.0, 2.4, 0.24)
 _OF_4010 = _g1_motor(15.3, 24.76, 4.8, 0.6, 0.06)
-# two in parallel, at the same speed: an assumption, as rods are between them and the joint
+# two in parallel, at the same speed: an assumption, as rods connect them to the joint
 _OF_TWO_5020 = _g1_motor(30.86, 40.13, 2 * 24.8, 2 * 0.6, 2 * 0.06)
 _G1_MOTORS = {
     _5020: _OF_5020,
@@ -142,14 +145,14 @@ _G1_WAIST = {"waist_yaw": (_7520_14, 17.6), "waist_roll": (2 * _5020, 7.0), "wai
 def g1(**overrides: Any) -> Robot:
     """Unitree's G1 with 29 joints and rubber hands: 33 kg.
 
-    * Armature: of the motors, 0.0036 to 0.025 kg m2; their lines of torque over speed, and friction (source
-      beside the numbers).
+    * Armature: of the motors, 0.0036 to 0.025 kg m2. Also known are their torque-speed lines and friction
+      (sources beside the numbers).
     * Limits: the URDF's.
     * Servo: Kd = 0.2 s/rad x torque limit, Kp = 30 1/s x Kd, a choice of ours: stiffer than what walking
       policies use, and just stiff enough in the ankles (2 x 210 N m/rad) to stand without balance feedback (m
       g h = 230 N m/rad).
-    * Soles: frames `left_sole`, `right_sole` 35 mm below the ankle-roll links, corners at the four spheres
-      that the URDF's feet collide with (narrower at the heel; the mesh is larger, 0.208 x 0.076 m).
+    * Soles: frames `left_sole`, `right_sole` 35 mm below the ankle-roll links, corners at the four collision
+      spheres of the URDF's feet (narrower at the heel; the mesh is larger, 0.208 x 0.076 m).
     * Strikers `right_hand`, `left_hand`: front of the rubber hand's knuckles (its mesh ends at x = 0.132 m).
     * Posture `half_sitting`: knees bent by 0.67 rad, soles flat, elbows bent.
 
@@ -226,8 +229,8 @@ def standin(
 
     HRP-2's own description is not public. Torque and velocity limits, gear ratios, rotor inertias and soles
     are HRP-2's from a public source (named in `robots/link_tables.py`), and so are 58 kg and 1.54 m. Lengths,
-    the masses of the links, inertias (of solid boxes) and position limits are *ours*: what is planned on the
-    stand-in is of HRP-2's class, not HRP-2's.
+    the masses of the links, inertias (of solid boxes) and position limits are *ours*: results are those of a
+    robot of HRP-2's class, not HRP-2's.
 
     * Joints of a side: hip yaw, roll, pitch, knee, ankle pitch, roll; shoulder pitch, roll, yaw, elbow, wrist
       yaw, pitch. Chest and head: yaw, pitch each. The grippers' are left out, as in the paper.
@@ -305,7 +308,9 @@ def robot_names() -> tuple[str, ...]:
 
 
 def example_robots(what: str = "this robot (not 'standin')") -> Path:
-    """Folder of the robots of example-robot-data; what : is to be read there, in words.
+    """Folder of the robots of example-robot-data.
+
+    what : the thing that needs it, in the message.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""`Robot`: a Pinocchio model with what a URDF lacks: armature, servo, limits, soles, strikers, postures."""
+"""`Robot`: a Pinocchio model with armature, servo gains, limits, soles, strikers, tools and postures."""
 
 from __future__ import annotations
 
@@ -28,16 +28,15 @@ from impactopt.robots.tools import check_sole, with_hinges
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
 
 Array = NDArray[np.float64]
-STRONGEST = 1e3  # [m/s2] of gravity
+MAX_GRAVITY = 1e3  # [m/s2]
 PerJoint = float | Mapping[str, float] | ArrayLike | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Robot:
-    """A robot ready to strike; checked when built. Arrays are read-only; `dataclasses.replace` makes a
-    changed copy.
+    """A robot, checked when built. Arrays are read-only; `dataclasses.replace` makes a changed copy.
 
-    Arrays of length n run over the joints without the free-flyer and without followers (`couplings`), in the
+    Arrays of length n are of the joints without the free-flyer and without followers (`couplings`), in the
     order of Pinocchio's v. Units are those of revolute joints; for a prismatic joint read m, m/s, N, kg.
 
     Attributes
@@ -48,15 +47,16 @@ class Robot:
     torque_limit, velocity_limit : (n,) [N m], [rad/s], largest magnitudes.
     lower, upper : (n,) position limits [rad]; infinite for a continuous joint.
     tendons : ranges of sums of joint angles.
-    actuators : one a joint, of which nothing may be known; armature is None there, it is in `armature`.
+    actuators : one per joint, with the known fields; their `armature` is None, as `armature` has it.
     soles : flat feet, in a fixed order.
     strikers : by name.
-    postures : named configurations, (nq,) in Pinocchio's convention. A floating robot's are placed so that
-        the mean of the soles it stands on is at the origin of the ground, at yaw 0 (`place`).
-    disable_collisions : pairs of links that may pass through each other: an SRDF's, and one's own.
-    tools : what it holds.
-    source : what it was made from, None where that was a model in Python.
-    urdf, mjcf : file whose shapes are its bodies and a picture shows, None for simple ones.
+    postures : named configurations, (nq,) in Pinocchio's convention. Those of a floating robot are placed so
+        that the mean of the soles on the ground is at the origin, at yaw 0 (`place`).
+    disable_collisions : pairs of links that may pass through each other: an SRDF's and additional ones.
+    tools : tools attached to links.
+    source : preset or file that it is from, None for a model made in Python.
+    urdf, mjcf : file with the shapes of the links, for collisions and pictures; None: boxes of their
+        inertias.
 
     Raises
     ------
@@ -114,8 +114,8 @@ class Robot:
             self.check_limits(posture, name=f"posture {name!r}")
             postures[name] = read_only(posture)
         object.__setattr__(self, "postures", postures)
-        at = [pin.neutral(self.model), *postures.values()]
-        checks.check_gains(self.model, self.joint_names, self.kp, self.kd, at)
+        configurations = [pin.neutral(self.model), *postures.values()]
+        checks.check_gains(self.model, self.joint_names, self.kp, self.kd, configurations)
 
     @classmethod
     def from_urdf(
@@ -133,22 +133,22 @@ class Robot:
 
         Parameters
         ----------
-        path, srdf : the files. Meshes are read by who draws the robot only.
-        name : the URDF's own name when left out.
+        path, srdf : the files. Meshes are read later, when the bodies or a picture need them.
+        name : default the URDF's own name.
         floating : with a free-flyer at the root; else the root link is fixed to the world.
         locked : joints to remove from the model: names (at angle 0), or angles [rad] by name.
-        inertias : "given", or "repaired" where no body can have them: `source.repairs` lists these.
+        inertias : "given", or "repaired" to change non-physical ones, which `source.repairs` lists.
         options : as of `from_model`.
 
         Raises
         ------
-        InputError : no such file; Gazebo's loops, and joints that cannot follow another by <mimic>, unless
-            they are locked.
+        InputError : no such file; unless their joints are locked, Gazebo's loops, and a <mimic> that is not
+            supported.
         """
         read = _urdf.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, "inertias": inertias}
-        model, every, source = read.made(path, given, options)
-        robot = cls.from_model(model, **every)
+        model, all_options, source = read.made(path, given, options)
+        robot = cls.from_model(model, **all_options)
         pairs = (*build.srdf_pairs(srdf), *robot.disable_collisions)
         return dataclasses.replace(robot, disable_collisions=pairs, source=source)
 
@@ -168,20 +168,20 @@ class Robot:
         Parameters
         ----------
         path : the file, which MuJoCo compiles.
-        floating : with a free-flyer at the root, or fixed to the world; None: as the file has it.
+        floating : with a free-flyer at the root, or fixed to the world; None: as in the file.
         name, locked, inertias : as of `from_urdf`.
-        options : as of `from_model`. MJCF has no velocity limits. Each site on a link that moves is a
-            striker; postures are the keyframes inside the limits.
+        options : as of `from_model`. MJCF has no velocity limits. Each site on a moving link becomes a
+            striker, each keyframe inside the limits a posture.
 
         Raises
         ------
-        InputError : no MuJoCo; no robot; ball joints; tendons and loops that move; joints that follow others
-            otherwise than linearly.
+        InputError : no MuJoCo; no robot; ball joints; unless their joints are locked, tendons, loops, and
+            joints that follow others nonlinearly.
         """
         read = _mjcf.read_mjcf(path, floating=floating)
         given = {"name": name, "floating": floating, "locked": locked, "inertias": inertias}
-        model, every, source = read.made(path, given, options)
-        return dataclasses.replace(cls.from_model(model, **every), source=source)
+        model, all_options, source = read.made(path, given, options)
+        return dataclasses.replace(cls.from_model(model, **all_options), source=source)
 
     @classmethod
     def from_model(
@@ -209,23 +209,23 @@ class Robot:
         """A robot from a pin.Model (which is copied): a free-flyer, if any, first, and then one-DOF joints.
 
         Values by joint are one number for all joints, a mapping from joint names, or (n,) numbers; joints
-        that a mapping leaves out keep the default.
+        that are not in a mapping keep the default.
 
         Parameters
         ----------
         armature : reflected rotor inertia [kg m2]; default the model's own (an SRDF's rotors).
-        rotor : (rotor inertia [kg m2], gear ratio) by joint: armature = inertia x ratio^2. `armature` wins
-            over it.
+        rotor : (rotor inertia [kg m2], gear ratio) by joint: armature = inertia x ratio^2. `armature` takes
+            precedence.
         kd : servo damping [N m s/rad]; default 1.5 s/rad times the torque limit, but at most 150.
         kp : servo stiffness [N m/rad]; default 30 1/s times kd.
         torque_limit, velocity_limit : default the model's.
         position_limit : (lower, upper) [rad] by joint, or (n, 2); default the model's.
-        soles, strikers : as they are.
-        postures : by name: (nq,) configurations, or joint angles [rad] by name on top of the model's posture
-            of that name (an SRDF's), or else of zero. The model's other postures are kept.
+        soles, strikers : contact surfaces and striking points.
+        postures : by name: (nq,) configurations, or joint angles [rad] by name, which change the model's
+            posture of that name (an SRDF's), or else zero. The model's other postures are kept.
         disable_collisions : pairs of links that may pass through each other.
-        urdf, mjcf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
-        actuators : motors and gears, as of `with_actuators`; friction is the model's where they have none.
+        urdf, mjcf : file with the links' visual shapes, for pictures, and collision shapes, for clearance.
+        actuators : motors and gears, as of `with_actuators`; default friction is the model's.
         gravity (3,) : [m/s2], world axes; default the model's.
         tendons : ranges of sums of joint angles.
         """
@@ -235,7 +235,7 @@ class Robot:
         tell_apart(model)
         checks.check_joint_types(model)
         if gravity is not None:
-            model.gravity.linear = check_array("gravity [m/s2]", gravity, (3,), most=STRONGEST)
+            model.gravity.linear = check_array("gravity [m/s2]", gravity, (3,), most=MAX_GRAVITY)
         joints = build.joint_names(model)
         base = model.nv - len(joints)
         model.armature[base:] = build.armature(model, joints, armature, rotor or {})
@@ -276,7 +276,7 @@ class Robot:
         restore_followers(self.model, axes)
 
     def __repr__(self) -> str:
-        """One line: its model and arrays would fill pages."""
+        """One line, without model and arrays."""
         return f"<Robot {self.name!r}: {self.n} joints, strikes with {', '.join(self.strikers) or 'nothing'}>"
 
     @cached_property
@@ -299,7 +299,7 @@ class Robot:
 
     @cached_property
     def forward_kinematics(self) -> ForwardKinematics:
-        """Placements of its joints at many configurations at once."""
+        """Placements of its joints at many configurations."""
         return ForwardKinematics(self.model)
 
     @cached_property
@@ -313,7 +313,7 @@ class Robot:
 
     @cached_property
     def couplings(self) -> dict[str, Coupling]:
-        """Laws of the joints that follow others and have no motor, by name; `joint_names` has them not."""
+        """Couplings by the follower's name. Followers have no motor, and are not in `joint_names`."""
         return couplings_of(self.model)
 
     @cached_property
@@ -323,19 +323,19 @@ class Robot:
 
     @property
     def armature(self) -> Array:
-        """(n,) reflected rotor inertia [kg m2]; it lives in `model.armature`."""
+        """(n,) reflected rotor inertia [kg m2], a copy from `model.armature`."""
         return read_only(np.array(self.model.armature[self.nv - self.n :], dtype=np.float64))
 
     @property
     def gear_limit(self) -> Array:
-        """(n,) Gears' peak in a blow over the torque limit, 2 where not known; inf: there is no gear."""
+        """(n,) momentary peak torque of gears over the torque limit, 2 if not known; inf without a gear."""
         known = numbers_of(self.actuators, "momentary_torque") / self.torque_limit
         limit = np.where(np.isnan(known), MOMENTARY_PEAK, known)
         return read_only(np.where(self.passive, np.inf, limit))
 
     @cached_property
     def springs(self) -> dict[str, tuple[float, float]]:
-        """Stiffness [N m/rad] and angle at rest [rad] of springs beside the motors, by joint."""
+        """Stiffness [N m/rad] and rest angle [rad] of springs in parallel to the motors, by joint."""
         return {
             joint: (float(actuator.spring_stiffness), float(actuator.spring_rest or 0.0))
             for joint, actuator in zip(self.joint_names, self.actuators, strict=True)
@@ -343,7 +343,7 @@ class Robot:
         }
 
     def spring_torque(self, q: Array) -> Array:
-        """(n,) [N m] with which motors bend the springs at q (nq,): stiffness times the angle from rest."""
+        """(n,) [N m] of the motors against the springs at q (nq,): stiffness times the angle from rest."""
         out = np.zeros(self.n)
         for joint, (stiffness, rest) in self.springs.items():
             at = self.model.joints[self.model.getJointId(joint)]
@@ -352,17 +352,17 @@ class Robot:
 
     def inverse_dynamics(self, data: Any, q: Array, v: Array, a: Array) -> Array:
         """Forces (nv,) [N, N m] of a motion q (nq), v, a (nv): `pin.rnea` and the springs' torques."""
-        return self._sprung(q, pin.rnea(self.model, data, q, v, a))
+        return self._plus_springs(q, pin.rnea(self.model, data, q, v, a))
 
     def nonlinear_effects(self, data: Any, q: Array, v: Array) -> Array:
         """Forces (nv,) [N, N m] without acceleration: `pin.nonLinearEffects` and the springs' torques."""
-        return self._sprung(q, pin.nonLinearEffects(self.model, data, q, v))
+        return self._plus_springs(q, pin.nonLinearEffects(self.model, data, q, v))
 
     def generalized_gravity(self, data: Any, q: Array) -> Array:
         """Forces (nv,) [N, N m] at rest: `pin.computeGeneralizedGravity` and the springs' torques."""
-        return self._sprung(q, pin.computeGeneralizedGravity(self.model, data, q))
+        return self._plus_springs(q, pin.computeGeneralizedGravity(self.model, data, q))
 
-    def _sprung(self, q: Array, forces: Any) -> Array:
+    def _plus_springs(self, q: Array, forces: Any) -> Array:
         out = np.array(forces)
         if self.springs:
             out[self.nv - self.n :] += self.spring_torque(q)
@@ -388,43 +388,43 @@ class Robot:
         return build.pick("posture", name, self.postures, self.name).copy()
 
     def with_striker(self, striker: Striker) -> Robot:
-        """A copy of the robot that has `striker` too (or instead of its own one of that name)."""
+        """A copy of the robot with `striker`, which replaces one of the same name."""
         model = self.model.copy()
         build.add_striker(model, striker)
         return dataclasses.replace(self, model=model, strikers={**self.strikers, striker.name: striker})
 
     def with_tool(self, tool: Tool) -> Robot:
         """A copy of the robot that holds `tool`: its mass on the link, and a striker of its name."""
-        return dataclasses.replace(self, **tools.holding(self, tool))
+        return dataclasses.replace(self, **tools.fields_with_tool(self, tool))
 
     def with_grip(self, name: str, grip: SoftGrip) -> Robot:
-        """A copy of the robot that holds its tool of that name so softly, and no longer firmly."""
-        return dataclasses.replace(self, **tools.holding_softly(self, name, grip))
+        """A copy of the robot with a soft grip for its rigidly held tool of that name."""
+        return dataclasses.replace(self, **tools.fields_with_grip(self, name, grip))
 
     @property
     def passive(self) -> NDArray[np.bool_]:
-        """(n,) Whether no motor moves a joint: it is `sprung`, or one of the `hinges`."""
+        """(n,) mask of joints without a motor: `sprung` ones and `hinges`."""
         return self.sprung | self.hinges
 
     @property
     def sprung(self) -> NDArray[np.bool_]:
-        """(n,) Whether nothing but a spring and a damper moves a joint, as that of a soft grip."""
+        """(n,) mask of joints of soft grips, which have a spring and a damper and no motor."""
         return np.isin(self.joint_names, [tool.grip_joint for tool in self.tools if tool.grip is not None])
 
     @property
     def hinges(self) -> NDArray[np.bool_]:
-        """(n,) Whether nothing moves a joint, as a sole's hinge."""
+        """(n,) mask of hinges of soles, which have neither motor nor spring."""
         return np.isin(self.joint_names, [sole.hinge_joint for sole in self.soles if sole.hinge is not None])
 
     def with_actuators(self, actuators: Mapping[str, Actuator]) -> Robot:
-        """A copy of the robot with these motors and gears, of joints by name or pattern.
+        """A copy of the robot with these motors and gears, by names or patterns of joints.
 
-        Of the joints that fit several patterns, such as ``arm_*_4_joint``, the last one holds. Those that fit
-        none keep what they have. Their armature takes the place of the model's.
+        For a joint that several patterns (such as ``arm_*_4_joint``) match, the last one holds. Other joints
+        keep their actuators. An armature given replaces the model's.
 
         Raises
         ------
-        InputError : what fits no joint; gains too fast for the armature.
+        InputError : a name that matches no joint; gains too fast for the armature.
         """
         model = self.model.copy()
         drives = with_classes(actuators, self.joint_names, self.actuators, model)
@@ -441,8 +441,8 @@ class Robot:
     def place(self, q: ArrayLike, soles: Sequence[Sole] | None = None) -> Array:
         """The configuration with the base moved: mean of the soles at the origin of the ground, at yaw 0.
 
-        Roll and pitch of the base stay as they are. `soles` are those that it stands on; when left out, those
-        of the robot's own that are not higher than its lowest one by more than a centimetre.
+        Roll and pitch of the base are kept. `soles` are those on the ground; default: those of the robot at
+        most 1 cm higher than its lowest one.
         """
         q = self.check_configuration(q)
         frames = [sole.frame for sole in (self.soles if soles is None else soles)]
@@ -460,8 +460,8 @@ class Robot:
 
     def check_limits(self, q: ArrayLike, *, name: str = "q") -> None:
         """InputError unless all joints and tendons of the configuration are inside their position limits."""
-        own = self.ranges
-        checks.check_positions(own.names, own.positions(self.joint_positions(q)), own.lower, own.upper, name)
+        ranges, angles = self.ranges, self.joint_positions(q)
+        checks.check_positions(ranges.names, ranges.positions(angles), ranges.lower, ranges.upper, name)
 
     def check_stance(
         self,
@@ -473,7 +473,7 @@ class Robot:
     ) -> None:
         """InputError unless the soles lie flat on the ground, z = 0, within `height` [m] and `tilt` [rad].
 
-        `soles` are the robot's own, or some of them, or their names.
+        soles : default all of the robot's; or soles, or names of its soles.
         """
         q = self.check_configuration(q)
         chosen = self.soles if soles is None else [self.sole(s) if isinstance(s, str) else s for s in soles]

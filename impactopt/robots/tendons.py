@@ -1,4 +1,4 @@
-"""Tendons: sums of joint angles that have a range, as MuJoCo's limited fixed tendons are."""
+"""Tendons: bounds on weighted sums of joint angles, as MuJoCo's limited fixed tendons are."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Tendon:
-    """Range of a sum: lower <= sum of each coefficient times its joint's angle <= upper.
+    """Bounds on a weighted sum of joint angles: lower <= sum of coefficient x angle <= upper.
 
     name : of the tendon.  coefficients : by joint, without unit.  lower, upper [rad] : of the sum.
     """
@@ -34,17 +34,19 @@ class Tendon:
         return f"{self.name}: {self.lower:g} <= {sum_of} <= {self.upper:g}"
 
     def without(self, locked: Mapping[str, float], couplings: Mapping[str, Coupling]) -> Tendon:
-        """The tendon of the joints that are left: locked ones at an angle [rad], followers by leaders."""
-        held, left = 0.0, dict[str, float]()
+        """The same bounds on the remaining joints: locked ones, at an angle [rad], are moved to the bounds,
+        followers are replaced by their leaders.
+        """
+        constant, left = 0.0, dict[str, float]()
         for joint, factor in self.coefficients.items():
             if joint in locked:
-                held += factor * locked[joint]
+                constant += factor * locked[joint]
                 continue
             leader, ratio, offset = couplings.get(joint, (joint, 1.0, 0.0))
-            held += factor * offset
+            constant += factor * offset
             left[leader] = left.get(leader, 0.0) + factor * ratio
         left = {joint: factor for joint, factor in left.items() if factor}
-        return replace(self, coefficients=left, lower=self.lower - held, upper=self.upper - held)
+        return replace(self, coefficients=left, lower=self.lower - constant, upper=self.upper - constant)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,7 +78,7 @@ class Ranges:
         return np.concatenate([angles, angles @ self.matrix.T], axis=-1)
 
     def excess(self, angles: Array) -> tuple[str, float]:
-        """Name and amount [rad] of what is farthest out of its range in joint angles (k, n)."""
+        """Name and excess [rad] of the joint or tendon farthest out of its range, at joint angles (k, n)."""
         at = self.positions(angles)
         most = np.maximum(at - self.upper, self.lower - at).max(axis=0)
         worst = int(np.argmax(most))
@@ -84,7 +86,7 @@ class Ranges:
 
 
 def check_tendons(tendons: Sequence[Tendon], joints: Sequence[str]) -> None:
-    """InputError for a tendon of joints that there are not, or of none, or without a range."""
+    """InputError for a tendon with unknown joints, an empty range, or no joints."""
     for tendon in tendons:
         what = f"tendon {tendon.name!r}"
         for joint in tendon.coefficients:
@@ -92,4 +94,4 @@ def check_tendons(tendons: Sequence[Tendon], joints: Sequence[str]) -> None:
         if not tendon.lower < tendon.upper:
             raise InputError(f"{what}: its range is {tendon.lower:g} to {tendon.upper:g}; give lower < upper")
         if not tendon.coefficients:
-            raise InputError(f"{what} is out of its range by the angles that its joints are locked at")
+            raise InputError(f"{what} is out of its range at the angles of its locked joints; change those")

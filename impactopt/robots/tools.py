@@ -1,8 +1,8 @@
-"""Joints that a robot's file does not have: hinges of soles that may turn, tools held firmly or softly."""
+"""Changes of a robot's model: joints of hinged soles, and tools in rigid or compliant (soft) grips."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,31 +19,33 @@ from impactopt.robots.checks import check_frame
 __all__ = [
     "check_held",
     "check_sole",
+    "extended",
+    "fields_with_grip",
+    "fields_with_tool",
     "grip_limits",
     "hinged",
-    "holding",
-    "holding_softly",
-    "hung",
     "inside",
-    "let_go",
-    "mapped",
+    "replaced_grips",
     "with_hinges",
+    "with_joint",
     "with_tool",
     "without",
+    "without_tool",
 ]
 
 Array = NDArray[np.float64]
 
 
-def hung(
+def with_joint(
     model: pin.Model, frame: str, placement: Any, joint: tuple[str, float, float, float], mark: str, body: Any
 ) -> pin.Model:
-    """The model with one more joint, that turns about z of `placement` (pin.SE3) in a frame.
+    """The model with one more revolute joint, about z of `placement` (pin.SE3) in a frame.
 
-    Joints are in depth-first order, as Pinocchio has to have them.
+    `pin.appendModel` puts it in its place in depth-first order, which Pinocchio requires.
 
-    joint : its name, largest torque [N m] and speed [rad/s], and reach [rad] to both sides.  mark : name of a
-    frame that moves with it, and is where `frame` is at zero.  body : pin.Inertia that moves so, in `mark`.
+    joint : its name, largest torque [N m], speed [rad/s] and angle [rad] in both directions.  mark : name of
+    a frame that moves with it, and coincides with `frame` at zero.  body : pin.Inertia of the moving body, in
+    `mark`.
     """
     name, torque, speed, reach = joint
     one, back = pin.Model(), placement.inverse()
@@ -54,14 +56,15 @@ def hung(
     one.gravity = model.gravity
     whole = pin.appendModel(model, one, check_frame(model, frame, name), placement)
     whole.name = model.name
-    for old_name, old in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):  # it leaves them
+    # appendModel leaves armatures out
+    for old_name, old in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         at = whole.joints[whole.getJointId(old_name)].idx_v
         whole.armature[at : at + old.nv] = model.armature[old.idx_v : old.idx_v + old.nv]
     return whole
 
 
-def mapped(old: pin.Model, new: pin.Model, q: Array) -> Array:
-    """A configuration of a model with fewer joints: the others are at zero."""
+def extended(old: pin.Model, new: pin.Model, q: Array) -> Array:
+    """A configuration of `old` as one of the model `new`, which has more joints; those are at zero."""
     out = pin.neutral(new)
     for name, joint in zip(list(old.names)[1:], list(old.joints)[1:], strict=True):
         at = new.joints[new.getJointId(name)].idx_q
@@ -69,17 +72,16 @@ def mapped(old: pin.Model, new: pin.Model, q: Array) -> Array:
     return out
 
 
-SHARE = 0.5  # of the foot's mass that goes with the sole
-SPEED = 20.0  # [rad/s]: no bound of a strike
-SINGULAR = 1e-3  # a leg's Jacobian's least singular value [m], at least
-LEVER = 0.1  # [m] by which the weight makes the torque that numbers of a hinge are reported in
+SOLE_SHARE = 0.5  # of the foot's mass, that is below the hinge
+HINGE_SPEED = 20.0  # [rad/s]: a limit that no strike reaches
+SINGULAR = 1e-3  # [m] least singular value of a leg's Jacobian, at least
+LEVER = 0.1  # [m]: weight x lever is the torque limit of a hinge, which only scales reported numbers
 
 
 def hinged(model: pin.Model, soles: Sequence[Sole]) -> pin.Model:
     """The model with a joint for each sole that has a hinge, which then moves the sole's frame.
 
-    Soles and hinge turn about the frame's origin. The sole takes half of its link's mass with it, spread as
-    the link's is.
+    The hinge is at the frame's origin. Half of the foot's mass and inertia moves with the sole.
     """
     torque = hinge_torque(model)
     for sole in soles:
@@ -95,107 +97,118 @@ def hinged(model: pin.Model, soles: Sequence[Sole]) -> pin.Model:
             raise InputError(
                 f"sole {sole.name!r}: no joint moves its frame {sole.frame!r}, so leave out the hinge"
             )
-        place, whole = pin.SE3(place), pin.Inertia(model.inertias[foot])  # they outlive their model
+        # copies: references into the old model would dangle once it is replaced
+        place, whole = pin.SE3(place), pin.Inertia(model.inertias[foot])
         model = model.copy()
-        model.inertias[foot] = _part(whole, 1 - SHARE)
-        turn, mark = pin.SE3(_to_axis("xyz".index(sole.hinge)), np.zeros(3)), f"sole:{sole.name}"
-        joint, body = (sole.hinge_joint, torque, SPEED, sole.hinge_range), place.actInv(_part(whole, SHARE))
-        model = hung(model, sole.frame, turn, joint, mark, body)
-        moved, its = model.frames[model.getFrameId(sole.frame)], model.getFrameId(mark)
-        moved.parentJoint, moved.placement = model.frames[its].parentJoint, model.frames[its].placement
-        moved.parentFrame = its
+        model.inertias[foot] = _part(whole, 1 - SOLE_SHARE)
+        # a rotation whose z is the hinge's axis
+        turn = np.roll(np.eye(3), "xyz".index(sole.hinge) + 1, axis=0)
+        axis, mark = pin.SE3(turn, np.zeros(3)), f"sole:{sole.name}"
+        joint = (sole.hinge_joint, torque, HINGE_SPEED, sole.hinge_range)
+        model = with_joint(model, sole.frame, axis, joint, mark, place.actInv(_part(whole, SOLE_SHARE)))
+        # the sole's frame moves with the hinge's joint
+        moved, new = model.frames[model.getFrameId(sole.frame)], model.getFrameId(mark)
+        moved.parentJoint, moved.placement = model.frames[new].parentJoint, model.frames[new].placement
+        moved.parentFrame = new
     return model
 
 
 def with_hinges(
     model: pin.Model, soles: Sequence[Sole], numbers: dict[str, Any], postures: dict[str, Array]
 ) -> tuple[pin.Model, dict[str, Any], dict[str, Array]]:
-    """Model with hinges (`hinged`), and numbers by joint, drives and postures of all joints."""
+    """The model with hinges (`hinged`), and fields of a `Robot` by joint and postures, extended to them."""
     whole, torque = hinged(model, soles), hinge_torque(model)
     known: dict[str, dict[str, Any]] = {}
     for sole in soles:
-        own: dict[str, Any] = {"kp": 0.0, "kd": 0.0, "torque_limit": torque, "velocity_limit": SPEED}
+        own: dict[str, Any] = {"kp": 0.0, "kd": 0.0, "torque_limit": torque, "velocity_limit": HINGE_SPEED}
         own |= {"lower": -sole.hinge_range, "upper": sole.hinge_range, "actuators": Actuator()}
         known[sole.hinge_joint] = own
     for k, joint in enumerate(build.joint_names(model)):
         known[joint] = {key: values[k] for key, values in numbers.items()}
     numbers = {key: [known[joint][key] for joint in build.joint_names(whole)] for key in numbers}
-    return whole, numbers, {name: mapped(model, whole, q) for name, q in postures.items()}
+    return whole, numbers, {name: extended(model, whole, q) for name, q in postures.items()}
 
 
 def check_sole(model: pin.Model, sole: Sole) -> None:
-    """InputError for a sole whose frame or hinge the model has not."""
+    """InputError for a sole whose frame or hinge is not in the model."""
     check_frame(model, sole.frame, f"sole {sole.name!r}")
     if sole.hinge is not None and sole.hinge_joint not in build.joint_names(model):
         raise InputError(
             f"sole {sole.name!r} has a hinge, and the model no joint for it: give the sole to "
-            "Robot.from_urdf, from_mjcf or from_model, which make one"
+            "Robot.from_urdf, from_mjcf or from_model, which add one"
         )
 
 
 def check_held(model: pin.Model, sole: Sole, q: Array, columns: Any) -> None:
-    """InputError where the joints of these columns of v, the sole's hinge among them, cannot hold it at q."""
+    """InputError if a hinged sole's Jacobian is singular at q: leg and hinge cannot fix all its directions.
+
+    columns : indices in v of the leg's joints and the hinge.
+    """
     frame = model.getFrameId(sole.frame)
     jac = pin.computeFrameJacobian(model, model.createData(), q, frame, pin.LOCAL)[:, columns]
     if sole.hinge is not None and np.linalg.svd(jac, compute_uv=False)[-1] < SINGULAR:
         raise InputError(
-            f"sole {sole.name!r} cannot be held: its hinge about {sole.hinge} turns as joints of its leg do; "
-            "give the axis that they lack, or a posture with bent knees"
+            f"sole {sole.name!r} cannot be fixed: joints of its leg turn it about the axis {sole.hinge} of "
+            "its hinge already; give the axis that they lack, or a posture with bent knees"
         )
 
 
 def inside(robot: Any, margin: float) -> tuple[Array, Array]:
-    """(n + tendons,) lower and upper limits [rad] of a `Robot`'s `ranges`, less a margin; of hinges and
-    tendons, whose range may be small, less a quarter of it at most.
+    """Lower and upper limits (n + tendons,) [rad] of a `Robot`'s `ranges`, tightened by a margin [rad].
+
+    Hinges and tendons may have small ranges, so there the margin is at most an eighth of the range.
     """
     own = robot.ranges
     small = np.append(robot.hinges, np.ones(len(robot.tendons), dtype=bool))
-    less = np.where(small, np.minimum(margin, (own.upper - own.lower) / 8), margin)
-    return own.lower + less, own.upper - less
+    margins = np.where(small, np.minimum(margin, (own.upper - own.lower) / 8), margin)
+    return own.lower + margins, own.upper - margins
 
 
 def hinge_torque(model: pin.Model) -> float:
-    """Torque [N m] in which those of hinges are reported: the weight at a lever."""
+    """Torque [N m] by which torques of hinges are scaled: the weight times a lever."""
     return LEVER * 9.81 * float(sum(body.mass for body in model.inertias))
 
 
 def _part(body: Any, share: float) -> Any:
+    """pin.Inertia of a share of a body, with the same centre of mass."""
     return pin.Inertia(share * body.mass, body.lever, share * np.array(body.inertia))
 
 
-def _to_axis(k: int) -> Array:
-    """The rotation (3, 3) whose z is the k-th axis."""
-    return np.roll(np.eye(3), k - 2, axis=0) if k < 2 else np.eye(3)
+GRIP_SPEED = 60.0  # [rad/s] of a tool in a soft grip: a limit that no impact reaches
 
 
-GRIP_SPEED = 60.0  # [rad/s] of a tool in a soft grip; no bound of a blow
-
-
-def holding(robot: Any, tool: Tool) -> dict[str, Any]:
-    """Fields of a `Robot` that change when it takes a tool."""
+def fields_with_tool(robot: Any, tool: Tool) -> dict[str, Any]:
+    """Fields of a `Robot` that an additional tool changes."""
     if tool.name in robot.strikers:
         raise InputError(f"robot {robot.name!r} has a striker {tool.name!r} already; rename the tool")
     source = robot.source and replace(robot.source, tools=(*robot.source.tools, tool))
-    return {"source": source, "tools": (*robot.tools, tool), **_changes(robot, robot.model, tool)}
+    return {"source": source, "tools": (*robot.tools, tool), **_attached(robot, robot.model, tool)}
 
 
-def holding_softly(robot: Any, name: str, grip: SoftGrip) -> dict[str, Any]:
-    """Fields of a `Robot` that change when its firmly held tool of that name gets a soft grip."""
+def fields_with_grip(robot: Any, name: str, grip: SoftGrip) -> dict[str, Any]:
+    """Fields of a `Robot` that change if its rigidly held tool of that name gets a soft grip."""
     tool = build.pick("tool", name, {tool.name: tool for tool in robot.tools}, robot.name)
     if tool.grip is not None:
         raise InputError(f"robot {robot.name!r} holds {name!r} softly already; give it one grip")
-    soft = replace(tool, grip=grip)
-
-    def held(tools: tuple[Tool, ...]) -> tuple[Tool, ...]:
-        return tuple(soft if t is tool else t for t in tools)
-
-    source = robot.source and replace(robot.source, tools=held(robot.source.tools))
-    return {"source": source, "tools": held(robot.tools), **_changes(robot, let_go(robot.model, tool), soft)}
+    attached = _attached(robot, without_tool(robot.model, tool), replace(tool, grip=grip))
+    return {**replaced_grips(robot, {name: grip}), **attached}
 
 
-def _changes(robot: Any, free: pin.Model, tool: Tool) -> dict[str, Any]:
-    """Its model, made of that without the tool, and strikers; with a soft grip's joint also numbers and
-    postures of all joints.
+def replaced_grips(robot: Any, grips: Mapping[str, SoftGrip]) -> dict[str, Any]:
+    """Fields `tools` and `source` of a `Robot` with other grips, by the tools' names."""
+
+    def replaced(tools: tuple[Tool, ...]) -> tuple[Tool, ...]:
+        return tuple(replace(t, grip=grips[t.name]) if t.name in grips else t for t in tools)
+
+    source = robot.source and replace(robot.source, tools=replaced(robot.source.tools))
+    return {"tools": replaced(robot.tools), "source": source}
+
+
+def _attached(robot: Any, free: pin.Model, tool: Tool) -> dict[str, Any]:
+    """Fields `model` and `strikers` of a `Robot` with a tool, and for a soft grip, which adds a joint, all
+    fields by joint and the postures.
+
+    free : the model without the tool.
     """
     model = with_tool(free, tool)
     out: dict[str, Any] = {"model": model, "strikers": {**robot.strikers, tool.name: tool.striker}}
@@ -212,13 +225,13 @@ def _changes(robot: Any, free: pin.Model, tool: Tool) -> dict[str, Any]:
     }
     out |= {name: np.insert(getattr(robot, name), at, x) for name, x in own.items()}
     out["actuators"] = (*robot.actuators[:at], Actuator(), *robot.actuators[at:])
-    out["postures"] = {name: mapped(robot.model, model, q) for name, q in robot.postures.items()}
+    out["postures"] = {name: extended(robot.model, model, q) for name, q in robot.postures.items()}
     return out
 
 
 def with_tool(model: pin.Model, tool: Tool) -> pin.Model:
-    """The model with the tool's mass on the link that holds it, or on a joint of its soft grip, and with its
-    striker's frame.
+    """The model with the tool's inertia, on the link that holds it or on the joint of its soft grip, and with
+    its striker's frame.
     """
     frame = model.frames[checks.check_frame(model, tool.frame, f"tool {tool.name!r}")]
     if frame.parentJoint == 0:
@@ -229,14 +242,19 @@ def with_tool(model: pin.Model, tool: Tool) -> pin.Model:
     if tool.grip is None:
         model = model.copy()
         model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
+    elif tool.grip_joint in build.joint_names(model):
+        raise InputError(
+            f"tool {tool.name!r}: the robot has a joint {tool.grip_joint!r} already; rename the tool"
+        )
     else:
-        model = _hung(model, tool, body)
+        joint = (tool.grip_joint, *grip_limits(tool.grip), tool.grip.range)
+        model = with_joint(model, tool.frame, tool.grip.placement, joint, tool.own_frame, body)
     build.add_striker(model, tool.striker)
     return model
 
 
 def without(whole: Any, part: Any) -> Any:
-    """The pin.Inertia that is left of a link when what it holds is taken away."""
+    """pin.Inertia of a body without a part of it, both in the same frame."""
     mass = whole.mass - part.mass
     if mass <= 1e-6:
         return pin.Inertia.Zero()
@@ -246,13 +264,13 @@ def without(whole: Any, part: Any) -> Any:
         c = np.array(body.lever)
         return np.array(body.inertia) + body.mass * (c @ c * np.eye(3) - np.outer(c, c))
 
-    left = about_origin(whole) - about_origin(part)
-    left -= mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
-    return pin.Inertia(mass, lever, left)
+    inertia = about_origin(whole) - about_origin(part)
+    inertia -= mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+    return pin.Inertia(mass, lever, inertia)
 
 
-def let_go(model: pin.Model, tool: Tool) -> pin.Model:
-    """The model whose link does not hold a tool that it has held firmly."""
+def without_tool(model: pin.Model, tool: Tool) -> pin.Model:
+    """The model without a rigidly held tool."""
     model = model.copy()
     frame = model.frames[model.getFrameId(tool.frame)]
     body = frame.placement.act(pin.Inertia(tool.mass, tool.center, tool.inertia))
@@ -260,19 +278,8 @@ def let_go(model: pin.Model, tool: Tool) -> pin.Model:
     return model
 
 
-def _hung(model: pin.Model, tool: Tool, body: Any) -> pin.Model:
-    """The model with one more joint, a soft grip's."""
-    grip: Any = tool.grip
-    if tool.grip_joint in build.joint_names(model):
-        raise InputError(
-            f"tool {tool.name!r}: the robot has a joint {tool.grip_joint!r} already; rename the tool"
-        )
-    joint = (tool.grip_joint, *grip_limits(grip), grip.range)
-    return hung(model, tool.frame, grip.placement, joint, tool.own_frame, body)
-
-
 def grip_limits(grip: SoftGrip) -> tuple[float, float]:
-    """Largest torque [N m] of a soft grip, that of its spring and damper at the ends of their ranges; largest
-    speed [rad/s].
+    """Torque limit [N m] of a soft grip, which spring and damper reach at the range's end and the largest
+    speed; and that speed [rad/s].
     """
     return grip.stiffness * grip.range + grip.damping * GRIP_SPEED, GRIP_SPEED

@@ -1,7 +1,7 @@
 """Reads a `pin.Model` and other data of a robot from a URDF.
 
-Pinocchio reads links and joints. It says nothing here of <mimic>, of Gazebo's extensions and of
-<transmission>: what of these changes the dynamics becomes a tie or a note of the `Description`.
+Pinocchio reads links and joints, but not <mimic>, Gazebo's extensions and <transmission>. Those of them that
+change the dynamics become ties or notes of the `Description`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from impactopt.robots.description import Description, Tie, between
 
 __all__ = ["read_urdf"]
 
-# [kg m2] of moments of inertia, and relative: decimals are rounded, and antennas are guessed
+# Negative principal moments of inertia that are tolerated, [kg m2] or relative to the largest entry: files
+# have rounded decimals, and guesses for small parts such as antennas.
 _ROUNDED = 1e-6
 
 
@@ -36,19 +37,19 @@ def read_urdf(
 ) -> Description:
     """The robot of a URDF, with an SRDF's reference configurations and rotors (as armature).
 
-    repaired : moments of inertia that no link can have are let through, as they are to be repaired.
+    repaired : do not check moments of inertia, as they will be repaired.
 
     Raises
     ------
-    InputError : the file cannot be read; links that no matter is made of.
+    InputError : the file cannot be read; links with non-physical inertias.
     """
     urdf = existing(path, "URDF")
     joints = (pin.JointModelFreeFlyer(),) if floating else ()
     root = _parsed(urdf)
     if any(tag.tagName.startswith("xacro:") for tag in root.getElementsByTagName("*")):
         raise InputError(
-            f"URDF {urdf} is written in xacro, which makes a URDF of it: run `xacro {Path(urdf).name} > "
-            "robot.urdf`, and give that"
+            f"{urdf} is a xacro file, not yet a URDF: run `xacro {Path(urdf).name} > robot.urdf`, and give "
+            "robot.urdf"
         )
     try:
         model = pin.buildModelFromUrdf(urdf, *joints)
@@ -71,8 +72,9 @@ def read_urdf(
 
 
 def _parsed(urdf: str) -> Any:
+    """Root element of a URDF."""
     try:
-        # robots have tags of others with prefixes that no one declares: no trouble of theirs
+        # files may have tags of other tools with undeclared prefixes, hence no namespaces
         return expatbuilder.parse(urdf, namespaces=False).documentElement
     except ExpatError as error:
         raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
@@ -102,7 +104,7 @@ def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:
 
 
 def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
-    """Links with shapes and without mass. Those without shapes may be there to join two joints."""
+    """Moving links with shapes and without mass. One without shapes may just connect two joints."""
     shaped = {
         link.getAttribute("name")
         for link in _children(root, "link")
@@ -110,8 +112,8 @@ def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
     }
     for frame in model.frames:
         joint = frame.parentJoint
-        light = model.joints[joint].nv == 1 and not model.inertias[joint].mass
-        if light and frame.type == pin.FrameType.BODY and str(frame.name) in shaped:
+        massless = model.joints[joint].nv == 1 and not model.inertias[joint].mass
+        if massless and frame.type == pin.FrameType.BODY and str(frame.name) in shaped:
             yield Tie(
                 text=f"the link {frame.name!r} has shapes and mass 0 kg",
                 joints=(str(model.names[joint]),),
@@ -121,7 +123,7 @@ def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
 
 
 def _springs(root: Any, model: pin.Model) -> dict[str, tuple[float, float]]:
-    """Gazebo's springs on joints: stiffness and angle at rest."""
+    """Gazebo's springs by joint: stiffness [N m/rad] and rest angle [rad]."""
     out = {}
     for gazebo in _children(root, "gazebo"):
         name = gazebo.getAttribute("reference")
@@ -132,7 +134,7 @@ def _springs(root: Any, model: pin.Model) -> dict[str, tuple[float, float]]:
 
 
 def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
-    """Closed loops, which Gazebo has and URDF has not."""
+    """Closed loops, which Gazebo's extensions can describe and URDF cannot."""
     for gazebo in _children(root, "gazebo"):
         for loop in _children(gazebo, "joint"):
             ends = [_text(end) for tag in ("parent", "child") for end in _children(loop, tag)]
@@ -150,7 +152,7 @@ def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
 
 
 def _weightless(root: Any) -> Iterator[str]:
-    """Links with mass on which Gazebo's gravity does not act."""
+    """Note on links with mass that have no gravity in Gazebo."""
     heavy = {link.getAttribute("name") for link in _children(root, "link") if _children(link, "inertial")}
     names = []
     for gazebo in _children(root, "gazebo"):
@@ -163,7 +165,7 @@ def _weightless(root: Any) -> Iterator[str]:
 
 
 def _rotors(root: Any) -> Iterator[str]:
-    """Rotors' inertia in <transmission>, for which there are several dialects."""
+    """Note on rotor inertias in <transmission>, which are not read, as there are several dialects."""
     names = [
         joint.getAttribute("name")
         for transmission in _children(root, "transmission")
@@ -175,9 +177,12 @@ def _rotors(root: Any) -> Iterator[str]:
 
 
 def _check_links(root: Any, urdf: str, *, moments: bool) -> None:
-    """InputError with all links that no matter is made of: what is fixed to another hides it in their sum.
+    """InputError with all links of a non-physical inertia.
 
-    Links without mass or inertia, as frames are, are none's trouble.
+    Pinocchio adds up links that are fixed to each other, and the sum may hide the mistake of one. Links
+    without mass or inertia are frames, and allowed.
+
+    moments : check the moments of inertia, too.
     """
     found = Mistakes()
     for link in _children(root, "link"):
@@ -211,7 +216,7 @@ def _children(element: Any, tag: str) -> list[Any]:
 
 
 def _urdf_number(text: str) -> float:
-    """A number of a URDF; 0 for what its parser, which has read it before, has taken for none."""
+    """A number of a URDF; 0 for text that is no number, as its parser has taken it before."""
     try:
         return float(text or 0.0)
     except ValueError:
@@ -223,7 +228,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _text(element: Any) -> str:
-    """Text of an element, or its attribute `link`, in which Gazebo's loops name theirs."""
+    """The attribute `link` of an element, which Gazebo's loops have, or else its text."""
     words = "".join(child.data for child in element.childNodes if child.nodeType == child.TEXT_NODE)
     return str(element.getAttribute("link") or words).strip()
 

@@ -325,7 +325,7 @@ def test_a_solve_that_fails_leaves_a_good_result_as_it_is(
     good = {path.name: path.read_bytes() for path in out.iterdir()}
     planner.solution = {"status": Status.INFEASIBLE}
     printed, _ = run("solve", file, "--out", out, code=1)
-    assert f"{out} holds a good result, which is left as it is" in printed
+    assert f"{out} holds a good result, which is kept" in printed
     assert f"{out / 'failed'}: solution.npz" in printed
     summary = json.loads(run("solve", file, "--out", out, "--json", code=1)[0])
     assert summary["set_aside"] == {"directory": str(out / "failed"), "kept": str(out)}

@@ -141,7 +141,7 @@ def test_a_plan_of_another_robot_is_refused(saved: Path, tmp_path: Path) -> None
     arrays = dict(load_record(saved).arrays)
     arrays["joints"] = arrays["joints"][::-1]
     other = resaved(saved, tmp_path / "other", arrays=arrays)
-    with pytest.raises(InputError, match="planned for another robot than 'talos'"):
+    with pytest.raises(InputError, match="planned for other joints than those of the robot 'talos'"):
         load_planned(other)
 
 

@@ -129,7 +129,7 @@ def column(value: Any) -> Array:
 
 
 def test_legs_that_share_a_motor_hold_one_sole_and_not_two() -> None:
-    with pytest.raises(InputError, match=r"legs share joints: .*left hip yaw move another held sole too"):
+    with pytest.raises(InputError, match=r"legs share joints: .*left hip yaw also move another fixed sole"):
         make_case(biped(followers=YAW), "half_sitting")
 
 
@@ -395,7 +395,7 @@ def test_a_leg_with_too_few_joints_is_an_input_error() -> None:
             reduced("left ankle roll", "left hip yaw"),
             r"sole 'left' has 4 joints.*needs 6 or more, or 5 and a",
         ),
-        (reduced("left ankle roll", waist=True), r"of the last 6 that lead to sole 'left', waist pitch move"),
+        (reduced("left ankle roll", waist=True), r"of the last 6 before sole 'left', waist pitch also move"),
     ):
         with pytest.raises(InputError, match=told):
             StanceCoordinates(robot, robot.soles, next(iter(robot.postures.values())))
@@ -409,7 +409,9 @@ def test_held_legs_share_no_joint() -> None:
 
 def test_a_hinge_turns_about_an_axis_that_the_leg_lacks() -> None:
     robot = biped(5, hinge="y")
-    with pytest.raises(InputError, match="'left' cannot be held: its hinge about y turns as"):
+    with pytest.raises(
+        InputError, match="'left' cannot be fixed: joints of its leg turn it about the axis y"
+    ):
         StanceCoordinates(robot, robot.soles, robot.posture("half_sitting"))
 
 

@@ -163,14 +163,14 @@ def test_what_cannot_hold_on_is_refused(problem: ImpactProblem) -> None:
         ({"stance": BothSoles()}, "none does"),
         ({"striker": "left_hand"}, "cannot carry the striker"),
         ({"collision": "sdc"}, 'needs collision="full"'),
-        ({"stance": BothSoles(hands=("left_toe",))}, "move something else that is held"),
+        ({"stance": BothSoles(hands=("left_toe",))}, "also move a fixed sole or another fixed hand"),
         ({"stance": BothSoles(hands=("left_hnd",))}, "left_hand"),
         ({"stance": BothSoles(hands=("left_hand",), base_mass=1e5, base_inertia=1e5)}, "exactly"),
     ):
         with pytest.raises(InputError, match=told):
             replace(problem, **changes)  # type: ignore[arg-type]
     short = load_robot("standin", locked=("left_wrist_yaw", "left_wrist_pitch"))
-    with pytest.raises(InputError, match="of the last 6 joints that lead to it, chest_yaw, chest_pitch"):
+    with pytest.raises(InputError, match="of the last 6 joints before it, chest_yaw, chest_pitch"):
         replace(
             problem, robot=short, start="half_sitting", stance=BothSoles(hands=("left_hand", "right_hand"))
         )

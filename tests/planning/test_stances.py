@@ -340,7 +340,7 @@ def test_a_problem_file_has_the_phases() -> None:
     ):
         with pytest.raises(InputError, match=message):
             problem_from_data({**data, "stances": stances}, where="wrong.toml")
-    with pytest.raises(InputError, match=r"\[stance\] holds one stance"):
+    with pytest.raises(InputError, match=r"\[stance\] is one stance"):
         problem_from_data({**data, "stance": {"soles": "left"}}, where="both.toml")
 
 

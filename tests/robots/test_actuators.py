@@ -113,7 +113,7 @@ def test_springs_are_the_files_until_an_actuator_has_its_own(tmp_path: Path) -> 
     assert robot.springs == {"elbow": (90.0, 0.3)}
     assert robot.with_actuators({"elbow": Actuator(spring_stiffness=20.0)}).springs == {"elbow": (20.0, 0.3)}
     assert not robot.with_actuators({"*": Actuator(spring_stiffness=0.0)}).springs
-    with pytest.raises(InputError, match="joint 'turn' has a spring and turns without end"):
+    with pytest.raises(InputError, match="joint 'turn' has a spring and is continuous"):
         arm().with_actuators({"turn": Actuator(spring_stiffness=9.0)})
 
 

@@ -247,7 +247,7 @@ def _between(link: str) -> list[Edit]:
     ]
 
 
-# by the beginning of a line's first column: edits of the file above; of what is told, or refused, a part
+# by the beginning of a line's first column: edits of the file above; a part of the note, or of the refusal
 URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     "`<inertial>`": ([('<mass value="1.0"/>', '<mass value="3.0"/>')], ""),
     "`<joint>` of type revolute": ([('<axis xyz="0 1 0"/>', '<axis xyz="1 1 0"/>')], ""),
@@ -271,7 +271,7 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
             ('type="revolute"', 'type="continuous"'),
             ('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j1"/></joint></robot>'),
         ],
-        "turns without end",
+        "is continuous",
     ),
     "`<mimic>` of a joint that does not": (
         [('velocity="6.0"/></joint></robot>', 'velocity="6.0"/><mimic joint="j"/></joint></robot>')],
@@ -327,7 +327,7 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`gravcomp` of some": (
         [('<body name="two"', '<body gravcomp="1" name="two"')],
-        "'two' have a gravcomp.*lock",
+        "'two' have another gravcomp.*lock",
     ),
     "`stiffness`, ": ([(J2, f'stiffness="9" springref=".5" {J2}')], ""),
     "`stiffness` that": ([(J2, f'stiffness="9 1" {J2}')], "'j2' has a spring whose torque is not linear"),
@@ -379,7 +379,7 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`<option>` with `density`": (
         [("<option/>", '<option density="1000" wind="1 0 0"/>')],
-        "drag of a medium",
+        "fluid drag",
     ),
     "`damping`, `frictionloss`, `armature`, `stiffness` of a free": (
         [('type="free"', 'type="free" damping="1"')],
@@ -394,8 +394,8 @@ MJCF_CASES: dict[str, tuple[list[Edit], str]] = {
 
 
 def _lines(kind: str) -> list[tuple[str, str]]:
-    """Of the table of a kind of file: what is in it, and what becomes of it."""
-    table = PAGE.read_text(encoding="utf-8").partition(f"| {kind} | what becomes of it |")[2]
+    """Features and their treatment, of the table of a kind of file."""
+    table = PAGE.read_text(encoding="utf-8").partition(f"| {kind} | treatment |")[2]
     rows = re.findall(r"^\| (.+?) \| (.+) \|$", table.split("\n\n")[0], flags=re.MULTILINE)
     return [row for row in rows if not row[0].startswith("---")]
 
@@ -439,7 +439,7 @@ def test_what_of_a_file_is_read_is_as_the_tables_say(
     notes = "; ".join(robot.source.notes)
     assert bool(re.search(said, notes)) if said else not notes
     assert (_shape(robot) != _shape(plain)) == becomes.startswith("read")
-    assert bool(said) == ("told" in becomes)
+    assert bool(said) == ("noted" in becomes)
 
 
 @pytest.mark.skipif(not hasattr(mujoco, "mj_printSchema"), reason="this MuJoCo does not tell its language")

@@ -231,7 +231,7 @@ def test_own_numbers_win_over_the_files(tree: Path) -> None:
         (
             "<actuator>",
             '<equality><joint joint1="elbow" joint2="turn"/></equality><actuator>',
-            "'elbow' cannot follow 'turn': 'turn' turns without end.*lock it",
+            "'elbow' cannot follow 'turn': 'turn' is continuous.*lock it",
         ),
         (
             '<freejoint/><geom size=".1"/>',

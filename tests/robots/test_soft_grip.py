@@ -26,7 +26,7 @@ from impactopt import (
     talos,
 )
 from impactopt.collision import Effects
-from impactopt.robots.tools import mapped
+from impactopt.robots.tools import extended
 from impactopt.simulation.motors import Servo
 
 ONLY_SERVO = Effects(bias=False, jdot=False, saturation=False, feedforward=False)
@@ -54,7 +54,7 @@ def test_a_grip_at_rest_makes_the_robot_with_the_firm_tool(frame: str) -> None:
     axis = np.array([0.6, 0.0, 0.8])
     soft = firm.with_grip("second", grip(axis=axis))
     q = pin.randomConfiguration(firm.model, firm.lower, firm.upper)
-    q_soft = mapped(firm.model, soft.model, q)
+    q_soft = extended(firm.model, soft.model, q)
     own = soft.joint_index("second_grip")
     others = np.delete(np.arange(soft.n), own)
     assert [soft.joint_names[k] for k in others] == list(firm.joint_names)

@@ -76,7 +76,7 @@ def test_a_tendon_that_does_more_is_refused_by_name(tmp_path: Path, old: str, ne
 def test_angles_that_a_tendon_does_not_let_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"posture 'bent'.*'tendon cord' at 2\.\d+ \(limits"):
         chain(tmp_path, postures={"bent": {"j2": 1.2}})
-    with pytest.raises(InputError, match="tendon 'cord' is out of its range by the angles"):
+    with pytest.raises(InputError, match="tendon 'cord' is out of its range at the angles"):
         text = CHAIN.replace('<joint joint="j3" coef=".7"/>', "")
         chain(tmp_path, text, locked={"j0": 0.0, "j1": 0.0, "j2": 1.2})
     model = chain(tmp_path).model

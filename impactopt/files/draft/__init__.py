@@ -1,12 +1,13 @@
-"""A problem file drafted for one's own robot, from its URDF or MJCF alone: `impactopt new --urdf FILE`.
+"""Drafts of problem files from a URDF or MJCF alone: `impactopt new --urdf FILE`.
 
 * description.py        finds the file
 * limbs.py              classifies joints as legs, arms, fingers and wheels
-* default_drives.py     fills in the drive parameters that the file lacks
+* default_drives.py     guesses the drive parameters that the file lacks
 * robot.py              makes a robot of the description
 * soles.py, strikers.py   find soles and strikers in the links' shapes and frames
-* postures.py           stands the robot up and bends its arms
+* postures.py           finds standing postures and bent arms
+* hits.py               chooses targets and contact laws
 * strong.py             finds the strongest postures of a bolted arm
-* target_placement.py   puts a target within reach of other arms
+* target_placement.py   places a target within reach of other arms
 * drafting.py           writes the problem file, with a comment to each guess
 """

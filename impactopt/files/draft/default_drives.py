@@ -1,4 +1,4 @@
-"""Default drive parameters that a robot description lacks, each marked as a guess."""
+"""Guesses of the drive parameters that a robot description lacks."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from impactopt.robots.gains import USUAL_ROTOR
 
 __all__ = ["Drives", "guess_drives"]
 
-LEAST = {True: 1e-3, False: 0.05}  # armature: [kg m2] of a hinge, [kg] of a slide
-SPEED = {True: 3.0, False: 0.3}  # [rad/s], [m/s]
-WEIGHT = 3.0  # torque limit over the largest that gravity asks for
-THIGH = 0.3  # [m] times the robot's weight: what a leg's joint can bear at least
-WEAKEST = {True: 2.0, False: 50.0}  # [N m], [N]
-BELIEVED = {True: 500.0, False: 1e4}  # more than that [N m], [N] is reported
-FAST = 60.0  # [rad/s], [m/s]: likewise
+# by joint type: True for a revolute joint, False for a prismatic one
+MIN_ARMATURE = {True: 1e-3, False: 0.05}  # [kg m2], [kg]
+SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]
+MIN_TORQUE = {True: 2.0, False: 50.0}  # [N m], [N]
+PLAUSIBLE_TORQUE = {True: 500.0, False: 1e4}  # [N m], [N]: larger limits are reported
+GRAVITY_FACTOR = 3.0  # guessed torque limit over the largest gravity torque
+LEVER = 0.3  # [m]: weight x lever is the least torque limit of a leg's joints
+PLAUSIBLE_SPEED = 60.0  # [rad/s], [m/s]: larger limits are reported
 DOUBT = "a GUESS"
 
 
 @dataclass(kw_only=True)
 class Drives:
-    """Numbers by joint, and what is said of them: armature [kg m2], torque [N m] and velocity [rad/s] limits
-    that the file lacks; said : sentences about what it has and is hard to believe.
+    """Guesses by joint: armature [kg m2], torque [N m] and velocity [rad/s] limits that the file lacks.
+
+    said : messages about implausible limits of the file.
     """
 
     armature: dict[str, float] = field(default_factory=dict)
@@ -37,35 +39,35 @@ class Drives:
 
 
 def guess_drives(model: pin.Model, known: Mapping[str, float], carrying: Collection[str] = ()) -> Drives:
-    """Guesses the missing drive parameters of each joint.
+    """Guesses of the missing drive parameters of each joint.
 
-    known : torque limits that the model itself has not got.  carrying : joints of legs, with the robot above.
+    known : torque limits that are not in the model.  carrying : joints of legs, which carry the robot.
     """
     out, joints = Drives(), joint_names(model)
     base, indices = model.nv - len(joints), joint_indices(model)
     torque, speed = effort_limit(model)[base:], velocity_limit(model)[base:]
-    lifting = _gravity(model)
-    weight = THIGH * 9.81 * sum(float(body.mass) for body in model.inertias)
+    gravity = _largest_gravity(model)
+    leg_torque = LEVER * 9.81 * sum(float(body.mass) for body in model.inertias)
     for k, joint in enumerate(joints):
-        turns = "JointModelP" not in model.joints[indices[k]].shortname()
+        revolute = "JointModelP" not in model.joints[indices[k]].shortname()
         limit = known.get(joint, float(torque[k]))
         if not 0 < limit < 1e15:
-            limit = _rounded(max(WEIGHT * lifting[k], WEAKEST[turns], weight * (joint in carrying)))
-            out.torque[joint] = limit
-        elif limit > BELIEVED[turns]:
-            unit = "N m" if turns else "N"
+            least = max(MIN_TORQUE[revolute], leg_torque * (joint in carrying))
+            out.torque[joint] = limit = _rounded(max(GRAVITY_FACTOR * gravity[k], least))
+        elif limit > PLAUSIBLE_TORQUE[revolute]:
+            unit = "N m" if revolute else "N"
             out.said.append(f"torque limit of {joint}, {limit:g} {unit}: hard to believe")
         if not 0 < speed[k] < 1e15:
-            out.velocity[joint] = SPEED[turns]
-        elif speed[k] > FAST:
+            out.velocity[joint] = SPEED[revolute]
+        elif speed[k] > PLAUSIBLE_SPEED:
             out.said.append(f"velocity limit of {joint}, {speed[k]:g} rad/s: hard to believe")
         if model.armature[base + k] == 0:
-            out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, LEAST[turns]))
+            out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, MIN_ARMATURE[revolute]))
     return out
 
 
-def _gravity(model: pin.Model) -> list[float]:
-    """The most that gravity can ask of each joint [N m], [N]: all that it moves, stretched out level."""
+def _largest_gravity(model: pin.Model) -> list[float]:
+    """Upper bound of the gravity torque [N m], [N] of each joint: its subtree stretched out horizontally."""
     first = 2 if is_floating(model) else 1
     mass = np.zeros(model.njoints)
     moment = np.zeros(model.njoints)
@@ -75,7 +77,7 @@ def _gravity(model: pin.Model) -> list[float]:
         parent, length = int(model.parents[j]), float(np.linalg.norm(model.jointPlacements[j].translation))
         mass[parent] += mass[j]
         moment[parent] += moment[j] + mass[j] * length
-    for name, law in couplings_of(model).items():  # the leader's motor moves both
+    for name, law in couplings_of(model).items():  # the leader's motor carries its followers, too
         follower, leader = (model.getJointId(joint) for joint in (name, law.leader))
         mass[leader] += abs(law.ratio) * mass[follower]
         moment[leader] += abs(law.ratio) * moment[follower]

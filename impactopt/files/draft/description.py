@@ -14,7 +14,7 @@ SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may 
 
 
 def find_description(given: str) -> Path:
-    """The URDF of a path, or of a name such as "panda" or "ur5_robot" that example-robot-data knows.
+    """The file at a path, or the URDF of a name in example-robot-data, such as "panda" or "ur5_robot".
 
     Raises
     ------

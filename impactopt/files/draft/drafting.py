@@ -1,4 +1,4 @@
-"""A whole problem file for a robot that nobody has prepared."""
+"""Draft of a whole problem file from a robot's description."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ from impactopt.robots.robot import Robot
 __all__ = ["Draft", "draft_problem"]
 
 Array = NDArray[np.float64]
-TRIED = 8  # targets
-SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # [s] of fast robots
-SHIFT = (0.6, 1.2)  # [s] from two feet to one, and back
+MAX_TARGETS = 8  # tried
+SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # durations [s] for fast robots
+SHIFT = (0.6, 1.2)  # duration [s] from two feet to one, and back
 START = "ready"
 FROM_ABOVE = ("chop", "nail")
 MOTIONS = ("punch", "kick", *FROM_ABOVE)
@@ -63,14 +63,14 @@ PEGGED = (
     f"a peg of {100 * PEG:g} cm is drafted on the striking link, as the links before it would touch the "
     "target first: mount one, or give your own tool in [[robot.tools]]"
 )
-TOE = 0.02  # [m] of the point of a toe above the sole
-BALL = 0.22  # [m]
-KICKS = (0.3, 0.2, 0.4)  # of the hip's height: how far ahead the ball lies
+TOE = 0.02  # [m] height of a toe's striking point above the sole
+BALL = 0.22  # [m] largest diameter
+KICKS = (0.3, 0.2, 0.4)  # distances of the ball ahead over the hip's height, in the order tried
 
 
 @dataclass(frozen=True, kw_only=True)
 class Draft:
-    """A drafted problem file: its text, and what is to be said of it."""
+    """A drafted problem file; said : messages for the user."""
 
     text: str
     said: tuple[str, ...]
@@ -88,15 +88,16 @@ def draft_problem(
 ) -> Draft:
     """The text of a problem file for the robot of a URDF, or an MJCF.
 
-    folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.  motion :
-    "punch", "kick", "chop" (a board, from above) or "nail" (with the hand, from above); None: a robot on legs
-    kicks where it has no arm to strike with, others punch.  planned : the whole motion to a bolted arm's blow
-    is solved, too, and the next blow taken where there is none.  report : is told what is done.
+    folder : folder of the file to be written.  bolted : fix the robot to the ground, even if it has legs.
+    motion : "punch", "kick", "chop" (a board, from above) or "nail" (with the hand, from above); None: a kick
+        for a robot on legs without arms, else a punch.
+    planned : for a bolted arm, also solve for the whole motion, and take the next strike if that fails.
+    report : called with messages on the progress.
 
     Raises
     ------
-    InputError : the file cannot be read; the robot is none that can be planned for, with the reason; no
-        posture or no target is found; an unknown motion, or a kick of a robot without legs.
+    InputError : the file cannot be read; the robot cannot be planned for, with the reason; no posture or no
+        target is found; an unknown motion, or a kick of a robot without legs.
     """
     if motion not in (None, *MOTIONS):
         raise InputError(f"motion: {motion!r}; give {', '.join(MOTIONS[:-1])} or {MOTIONS[-1]}")
@@ -115,7 +116,7 @@ def draft_problem(
     if soles and (motion == "kick" or not arms):
         return _kick(drafted, soles, strikers, forward, folder)
     if soles and motion in FROM_ABOVE:
-        say(f"{drafted.robot.name}: {drafted.robot.n} joints, on two legs; looking for a blow from above")
+        say(f"{drafted.robot.name}: {drafted.robot.n} joints, on two legs; looking for a strike from above")
         return _stroke(drafted, soles, strikers, arms[0], forward, motion, folder, say)
     if not soles:
         return _bolted(drafted, strikers, arms, motion, folder, say, planned=planned)
@@ -134,14 +135,14 @@ def draft_problem(
 def _standing(
     drafted: Drafted, soles: list[Sole], strikers: list[Striker], forward: Array
 ) -> tuple[Robot, tuple[Limb, ...], Array]:
-    """The robot on its soles with these strikers, its legs, and the configuration (nq,) that half sits."""
+    """The robot with soles and strikers, its legs, and its half-sitting configuration (nq,)."""
     robot = drafted.made(soles=soles, strikers=strikers)
     legs = tuple(renumbered(leg, drafted.robot.model, robot.model) for leg in drafted.legs)
     return robot, legs, half_sitting(robot, legs, soles, forward)
 
 
 def _renumbered(arms: Sequence[Arm], drafted: Drafted, robot: Robot) -> list[Arm]:
-    """The arms by the joints of a robot that has more frames."""
+    """The arms with joint indices of a robot with more joints or frames."""
     return [replace(arm, limb=renumbered(arm.limb, drafted.robot.model, robot.model)) for arm in arms]
 
 
@@ -153,7 +154,7 @@ def _punch(
     forward: Array,
     folder: Path,
 ) -> Draft:
-    """A draft of a punch ahead by a robot on its legs.
+    """Draft of a punch ahead by a robot on its legs.
 
     Raises
     ------
@@ -164,7 +165,7 @@ def _punch(
     q, way = ready(robot, arms, q, ways=WAYS[:1])
     data = _data(drafted, robot, soles, strikers, q, folder)
     data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
-    return Draft(text=_text(data, drafted, robot), said=tuple(_said(data, drafted, robot)))
+    return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
 
 
 def _bolted(
@@ -177,8 +178,8 @@ def _bolted(
     *,
     planned: bool,
 ) -> Draft:
-    """A draft for a robot on a fixed base: the hardest of the strikes that are solved, else a target within
-    its reach.
+    """Draft for a robot on a fixed base: the hardest of the strikes that are solved, else a target within
+    reach.
 
     Raises
     ------
@@ -186,39 +187,42 @@ def _bolted(
     """
     robot = drafted.made(soles=[], strikers=strikers)
     arms = _renumbered(arms, drafted, robot)
-    say(f"{robot.name}: {robot.n} joints, on a fixed base; trying blows (compiles the first time)")
+    say(f"{robot.name}: {robot.n} joints, on a fixed base; trying strikes (compiles the first time)")
     q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
-    drawn = hits(motion, robot)
-    strong, hit, edgewise = _hardest(robot, arms[0], q, drawn)
+    targets = hits(motion, robot)
+    strong, hit, edgewise = _hardest(robot, arms[0], q, targets)
     pegged = not strong and motion not in FROM_ABOVE
-    if pegged:
+    if pegged:  # the striking point may be behind the links: try again with one ahead of it
         other, with_peg = robot.with_tool(_peg(robot, arms[0])), replace(arms[0], name="peg")
-        strong, hit, edgewise = _hardest(other, with_peg, q, drawn)
+        strong, hit, edgewise = _hardest(other, with_peg, q, targets)
         robot, arms = (other, [with_peg, *arms[1:]]) if strong else (robot, arms)
     if strong:
-        tries = [_struck(drafted, robot, strikers, arms[0], blow, hit, edgewise, folder) for blow in strong]
-        taken = _planned(tries, folder, say) if planned else 0
+        tries = [
+            _strike_data(drafted, robot, strikers, arms[0], strike, hit, edgewise, folder)
+            for strike in strong
+        ]
+        taken = _first_planned(tries, folder, say) if planned else 0
         if taken is None:
             tries = [_slower(data) for data in tries]
-            taken = _planned(tries, folder, say)
+            taken = _first_planned(tries, folder, say)
         data = tries[taken or 0]
-        told = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
-        said = [told, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
+        result = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
+        messages = [result, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
     else:
         q, way = ready(robot, arms, q, ways=[tuple(DOWN)] if motion in FROM_ABOVE else WAYS)
         data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
         data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
-        said = [UNSOLVED]
-    return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
+        messages = [UNSOLVED]
+    return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
 
 
-def _hardest(robot: Robot, arm: Arm, q: Array, drawn: list[Hit]) -> tuple[list[Strong], Hit, bool]:
-    """The first hit with strikes that are solved, these, and whether they are edgewise; else none, of the
-    last one.
+def _hardest(robot: Robot, arm: Arm, q: Array, targets: list[Hit]) -> tuple[list[Strong], Hit, bool]:
+    """Solved strikes, their target, and True if they are edgewise: those of the first target that has some;
+    without any, an empty list and the last target.
     """
     strong: list[Strong] = []
-    # last edgewise: an arm of few joints cannot turn the link's face to where it moves
-    for edgewise, hit in product((False, True), drawn):
+    # edgewise last: for an arm of few joints, which cannot turn the link's face to its direction of motion
+    for edgewise, hit in product((False, True), targets):
         strong = strongest(robot, arm, q, hit, with_face=not edgewise)
         if strong:
             break
@@ -226,13 +230,13 @@ def _hardest(robot: Robot, arm: Arm, q: Array, drawn: list[Hit]) -> tuple[list[S
 
 
 def _slower(data: dict[str, Any]) -> dict[str, Any]:
-    """The data with phases that may last twice as long."""
-    short = {key: data[key]["duration_s"] for key in ("swing", "follow")}
-    return data | {key: data[key] | {"duration_s": [low, 2 * high]} for key, (low, high) in short.items()}
+    """The data with doubled upper bounds of the durations."""
+    durations = {key: data[key]["duration_s"] for key in ("swing", "follow")}
+    return data | {key: data[key] | {"duration_s": [low, 2 * high]} for key, (low, high) in durations.items()}
 
 
 def _peg(robot: Robot, arm: Arm) -> Tool:
-    """A rod ahead of the striking point of an arm, which strikes in its place."""
+    """A rod from the striking point of an arm along its axis, whose end is the new striking point."""
     striker = robot.striker(arm.name)
     frame = robot.model.frames[robot.model.getFrameId(striker.frame)]
     axis = np.round(frame.placement.rotation.T @ arm.axis, 4) + 0.0
@@ -247,7 +251,7 @@ def _peg(robot: Robot, arm: Arm) -> Tool:
     )
 
 
-def _struck(
+def _strike_data(
     drafted: Drafted,
     robot: Robot,
     strikers: list[Striker],
@@ -257,7 +261,7 @@ def _struck(
     edgewise: bool,
     folder: Path,
 ) -> dict[str, Any]:
-    """The data of a blow of a bolted arm."""
+    """Data of a bolted arm's strike."""
     data = {**_data(drafted, robot, [], strikers, strong.start, folder), **hit.data}
     way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
     for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
@@ -276,7 +280,7 @@ def _stroke(
     folder: Path,
     say: Callable[[str], None],
 ) -> Draft:
-    """A draft of a blow from above by a robot on its legs, with the side of the hand that is below.
+    """Draft of a strike from above by a robot on its legs, with the lower side of the hand.
 
     Raises
     ------
@@ -292,28 +296,28 @@ def _stroke(
     (hand,) = _renumbered([Arm(limb=arm.limb, name=name, axis=below)], drafted, robot)
     q, way = ready(robot, [hand], q, ways=[tuple(DOWN)])
     data: dict[str, Any] = {}
-    said = [UNSOLVED]
+    messages = [UNSOLVED]
     for k, (hit, edgewise) in enumerate(product(hits(motion, robot), (False, True)), start=1):
-        say(f"trying blow {k}")
+        say(f"trying strike {k}")
         if not edgewise:
             data = {**_data(drafted, robot, soles, strikers, q, folder), **hit.data}
             data = _aimed(data, name, aims(robot, hand, q, way), way, folder)
         tried = _edgewise(data) if edgewise else data
-        if _strikes(tried, folder):
-            data, said = tried, [EDGEWISE] if edgewise else []
+        if _strike_solved(tried, folder):
+            data, messages = tried, [EDGEWISE] if edgewise else []
             break
-    return Draft(text=_text(data, drafted, robot), said=(*_said(data, drafted, robot), *said))
+    return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
 
 
 def _edgewise(data: dict[str, Any]) -> dict[str, Any]:
-    """The data where any part of the striking link may touch first."""
+    """The data without the term that the link's face touches first."""
     return {**data, "terms": {**data.get("terms", {}), "first_touch": {"enabled": False}}}
 
 
-def _strikes(data: dict[str, Any], folder: Path) -> bool:
+def _strike_solved(data: dict[str, Any], folder: Path) -> bool:
     """True if the strike of drafted data is solved."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the draft is only tried
+        warnings.simplefilter("ignore")  # a failed trial is no result
         options = {"max_iterations": ITERATIONS}
         return optimize_strike(_built(data, folder), options=options, time_limit=SECONDS).status.usable
 
@@ -325,7 +329,7 @@ def _kick(
     forward: Array,
     folder: Path,
 ) -> Draft:
-    """A draft of a kick from two feet and back to them, with the toe, against a ball on the ground.
+    """Draft of a kick from two feet and back to them, with the toe, against a ball on the ground.
 
     Raises
     ------
@@ -339,35 +343,35 @@ def _kick(
     foot, stands = soles[lifted], soles[1 - lifted]
     place, corners = foot.placement, foot.polygon
     point = place.act(np.array([corners[:, 0].max(), corners[:, 1].mean(), TOE]))
-    assert foot.parent is not None  # it is drafted
+    assert foot.parent is not None  # as for every drafted sole
     toe = Striker(name=f"{foot.name}_toe", frame=foot.parent, point=np.round(point, 4) + 0.0)
     strikers = [*strikers, toe]
     robot, legs, q = _standing(drafted, soles, strikers, forward)
     at = striking_point(robot, toe.name, q)
-    hip = robot.model.createData()
-    pin.forwardKinematics(robot.model, hip, q)
-    length = float(hip.oMi[legs[1 - lifted].own[0]].translation[2])
+    kinematics = robot.model.createData()
+    pin.forwardKinematics(robot.model, kinematics, q)
+    hip_height = float(kinematics.oMi[legs[1 - lifted].own[0]].translation[2])
     data = _data(drafted, robot, soles, strikers, q, folder)
-    size = float(f"{min(BALL, 0.3 * length):.2g}")
+    size = float(f"{min(BALL, 0.3 * hip_height):.2g}")
     mass = float(f"{np.clip(0.005 * sum(body.mass for body in robot.model.inertias), 0.1, 0.45):.2g}")
     both = {"soles": [sole.name for sole in soles], "duration_s": list(SHIFT), "intervals": 8, "grading": 1.0}
     data["stances"] = [both, {"soles": [stands.name]}, both]
     data["target"] = {"mass_kg": mass, "body": {"shape": "ball", "size_m": [size]}}
     data["contact"] = {"stiffness_N_m": 2e4, "damping_N_s_m": 20.0}
-    points = (np.round([part * length, at[1], size / 2], 3) + 0.0 for part in KICKS)
+    points = (np.round([part * hip_height, at[1], size / 2], 3) + 0.0 for part in KICKS)
     data = _aimed(data, toe.name, points, np.array(WAYS[0]), folder)
-    return Draft(text=_text(data, drafted, robot), said=tuple(_said(data, drafted, robot)))
+    return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
 
 
-def _planned(tries: Sequence[dict[str, Any]], folder: Path, say: Callable[[str], None]) -> int | None:
-    """Index of the first data with a plan for the whole motion; None: no plan is found for any of them.
+def _first_planned(tries: Sequence[dict[str, Any]], folder: Path, say: Callable[[str], None]) -> int | None:
+    """Index of the first data for which a whole motion is solved; None if there is none.
 
-    A strike need not have one: its links may be beyond the target's plane just before.
+    A solved strike may have no motion, as links may be beyond the target's plane just before it.
     """
     for k, data in enumerate(tries):
-        say(f"planning the motion to blow {k + 1} of {len(tries)}")
+        say(f"planning the motion to strike {k + 1} of {len(tries)}")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the draft is only tried
+            warnings.simplefilter("ignore")  # a failed trial is no result
             with contextlib.suppress(InputError):
                 problem = _built(data, folder)
                 solution = solve(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
@@ -378,10 +382,10 @@ def _planned(tries: Sequence[dict[str, Any]], folder: Path, say: Callable[[str],
 
 def _strike_message(strong: Strong, *, tried: bool, found: bool) -> str:
     normal = ", ".join(f"{x:g}" for x in strong.normal)
-    ends = " that a whole motion leads to" if tried and found else ""
+    with_motion = " that have a whole motion" if tried and found else ""
     none = "; no whole motion to it, or to another one, was found" if not found else ""
     return (
-        f"the drafted blow, along [{normal}], is the hardest of the strikes tried{ends}: "
+        f"the drafted strike, along [{normal}], is the hardest of those tried{with_motion}: "
         f"{strong.objective:.3g} {strong.unit}{none}"
     )
 
@@ -405,10 +409,11 @@ def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
 def _data(
     drafted: Drafted, robot: Robot, soles: list[Sole], strikers: list[Striker], q: Array, folder: Path
 ) -> dict[str, Any]:
-    whole, base = drafted.path.resolve(), folder.resolve()
+    """Data of a problem file with a robot in its start posture q (nq,), without a hit point."""
+    absolute, base = drafted.path.resolve(), folder.resolve()
     kind = "mjcf" if drafted.mjcf else "urdf"
     options, keys = drafted.options, dict[str, Any]()
-    keys[kind] = os.path.relpath(whole, base) if whole.is_relative_to(base) else str(whole)
+    keys[kind] = os.path.relpath(absolute, base) if absolute.is_relative_to(base) else str(absolute)
     keys["name"] = robot.name
     if "floating" in options:
         keys["floating"] = options["floating"]
@@ -435,7 +440,7 @@ def _data(
         "follow": {"duration_s": list(FOLLOW), "intervals": 14 if soles else 10},
     }
     if soles:
-        part = mass / 90.0  # bounds that fit TALOS, which has 90 kg on soles 12 cm wide
+        part = mass / 90.0  # scales bounds that suit TALOS, with 90 kg on soles 12 cm wide
         width = min(float(np.ptp(sole.polygon, axis=0).min()) for sole in soles)
         margin = round(float(np.clip(0.15 * width, 0.005, 0.02)), 3)
         data["terms"] = {
@@ -452,15 +457,15 @@ def _data(
 def _aimed(
     data: dict[str, Any], striker: str, points: Iterator[Array], way: Array, folder: Path
 ) -> dict[str, Any]:
-    """The data with a target that check finds no fault with.
+    """The data with the first hit point for which the checks of a problem pass.
 
     Raises
     ------
-    InputError : there is none; with what was wrong with the first.
+    InputError : there is none; with the mistake of the first.
     """
     first = ""
     for k, point in enumerate(points):
-        if k == TRIED:
+        if k == MAX_TARGETS:
             break
         problem = {"striker": striker, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
         aimed = {**data, "problem": {"name": data["problem"]["name"], **problem, "start": START}}
@@ -481,18 +486,19 @@ def _aimed(
 
 
 def _built(data: dict[str, Any], folder: Path) -> ImpactProblem:
-    """The problem of drafted data, its inertias repaired."""
+    """The problem of drafted data, with repaired inertias."""
     tried = {**data, "robot": {**data["robot"], "inertias": REPAIRED}}
     return problem_file_from_data(tried, where=folder / "draft.toml").build()
 
 
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
+    """Text of the problem file, with comments on guesses."""
     guessed = {
-        "armature_kg_m2": f"{DOUBT}: {1e3 * USUAL_ROTOR:g} g m2 a N m of torque; give rotor inertia x gear^2",
-        "torque_limit_N_m": f"{DOUBT}: from what gravity can ask; the file has none",
+        "armature_kg_m2": f"{DOUBT}: {1e3 * USUAL_ROTOR:g} g m2 per N m; give rotor inertia x gear^2",
+        "torque_limit_N_m": f"{DOUBT}: from the largest gravity torques; the file has none",
         "velocity_limit_rad_s": f"{DOUBT}; the file has none",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
-        "strikers": "found in the shapes of the last links, where these end; move them to what is to hit",
+        "strikers": "found at the ends of the last links' shapes; move them to the striking points",
         "tools": f"{DOUBT}: a peg to be mounted, as the links before it would touch the target first",
         "locked_rad": "; ".join(_reasons(drafted.locked)),
     }
@@ -501,7 +507,7 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         if len(place) == 2 and place[0] == "robot" and str(place[1]) in guessed:
             return guessed[str(place[1])]
         if place == ("robot", "postures_rad", START):
-            return "soles level, knees ahead, arms bent" if data["robot"].get("soles") else "bent"
+            return "soles level, knees forward, arms bent" if data["robot"].get("soles") else "bent"
         return comment_at(data, place)
 
     def hidden(place: Place) -> Mapping[str, Any]:
@@ -509,7 +515,7 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
 
     head = [
         f"# A first strike of {robot.name}, drafted by `impactopt new`.",
-        f"# What is {DOUBT} is marked so: put the maker's numbers there. `impactopt check FILE` says more.",
+        f"# {DOUBT} marks numbers to replace by the manufacturer's. `impactopt check FILE` finds mistakes.",
     ]
     if _guessed_gains(robot).any():
         head.append(f"# Servo gains, kp and kd, are {DOUBT}: give those of your servos in [robot].")
@@ -517,8 +523,8 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         head.append(f"# {text}.")
     if drafted.wrong:
         head += [
-            f"# {len(drafted.wrong)} inertias are none of matter. Correct the {robot_kind(drafted)}, or take "
-            'the # away before `inertias = "repaired"`:',
+            f"# {len(drafted.wrong)} inertias are not physical. Correct the {robot_kind(drafted)}, or remove "
+            'the # before `inertias = "repaired"`:',
             *(f"#   {text.partition('; correct')[0]}" for text in drafted.wrong),
         ]
     text = write_toml(data, comment, hidden).rstrip("\n")
@@ -531,24 +537,25 @@ def robot_kind(drafted: Drafted) -> str:
 
 
 def _reasons(locked: Mapping[str, str]) -> Iterator[str]:
+    """Reasons for locked joints, each once with its count."""
     for reason in dict.fromkeys(locked.values()):
         count = sum(other == reason for other in locked.values())
         yield f"{reason}" if count == 1 else f"{count} x {reason}"
 
 
 def _frames(robot: Robot) -> Iterator[str]:
-    """Frames that soles and strikers can be on, as comments."""
+    """Comments with the frames for soles and strikers."""
     yield "# Frames for other strikers and soles, by the joint that moves them:"
     model = robot.model
     for joint in range(1, model.njoints):
-        of = [f for f in model.frames if f.parentJoint == joint and f.type != pin.FrameType.JOINT]
-        names = [str(f.name) for f in of if not str(f.name).startswith(("striker:", "sole:"))]
+        frames = [f for f in model.frames if f.parentJoint == joint and f.type != pin.FrameType.JOINT]
+        names = [str(f.name) for f in frames if not str(f.name).startswith(("striker:", "sole:"))]
         if names:
             yield f"#   {model.names[joint]}: {', '.join(names)}"
 
 
-def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[str]:
-    """Notes for the user before the first plan."""
+def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[str]:
+    """Messages for the user before the first plan."""
     stands = "on two legs" if drafted.legs else "on a fixed base"
     joints, striker = robot.n - int(robot.hinges.sum()), data["problem"]["striker"]
     yield f"{robot.name}: {joints} joints, {stands}; {striker!r} strikes"
@@ -560,8 +567,8 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
     for sole in robot.soles:
         if sole.hinge is not None:
             yield (
-                f"five joints hold sole {sole.name!r}: the foot may turn on it about {sole.hinge}, by "
-                f"{sole.hinge_range:g} rad, and it bears no moment about that axis"
+                f"sole {sole.name!r} has a leg of five joints: the foot may turn on it about {sole.hinge}, "
+                f"by {sole.hinge_range:g} rad, and it transmits no moment about that axis"
             )
     yield from shape_doubts(robot)
     if drafted.locked:
@@ -585,18 +592,18 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
         yield f"... and {len(drafted.drives.said) - 3} more such limits: see the file's head"
     if drafted.wrong:
         yield (
-            f"{len(drafted.wrong)} inertias are none of matter, listed at the file's head: correct them, or "
-            'say `inertias = "repaired"` there'
+            f"{len(drafted.wrong)} inertias are not physical, listed at the file's head: correct them, or "
+            'set `inertias = "repaired"` there'
         )
 
 
 def _guessed_gains(robot: Robot) -> NDArray[np.bool_]:
-    """(n,) : joints whose gains are the defaults of a description that has none."""
+    """Mask (n,) of joints whose gains are the defaults of a description without gains."""
     damping, stiffness = default_kd(robot.torque_limit), default_kp(robot.kd)
     return np.isclose(robot.kd, damping) & np.isclose(robot.kp, stiffness) & ~robot.hinges
 
 
 def _wide(polygon: list[list[float]]) -> bool:
-    """True if a sole is longer across than ahead, as no foot is."""
+    """True if a sole is wider than long, which is implausible."""
     length, width = np.ptp(np.array(polygon), axis=0)
     return bool(width > length)

@@ -1,4 +1,4 @@
-"""Targets and contact laws of drafted blows with an arm: a free mass, a board, a nail."""
+"""Targets and contact laws of drafted strikes with an arm: a free mass, a board, a nail."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ from impactopt.robots.robot import Robot
 __all__ = ["Hit", "hits"]
 
 Array = NDArray[np.float64]
-PART = 0.06  # of the robot's mass: a punched one
-FORCE = 30.0  # [N] for each kg of the robot's mass: what boards break at, and wood resists a nail with
-LEAST, MOST = 5.0, 600.0  # [N] of it
-SOFTER = (1.0, 0.5, 0.25)  # of it, where nothing is found for more
+MASS_RATIO = 0.06  # of a punched target to the robot
+FORCE_PER_MASS = 30.0  # [N/kg] of the robot: breaking force of a board, resistance of a nail
+MIN_FORCE, MAX_FORCE = 5.0, 600.0  # [N]
+FRACTIONS = (1.0, 0.5, 0.25)  # of that force, tried in this order
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hit:
-    """A target with its contact law; the normals (3,) along which it is hit; what is maximized, and the
-    bounds [s] of the contact's duration, where these are not the defaults.
+    """A target with its contact law, and the normals (3,) along which it may be hit.
+
+    objectives, duration : objectives, and bounds [s] of the contact's duration; () and None: the defaults.
     """
 
     law: ContactLaw
@@ -57,9 +58,10 @@ class Hit:
 
 
 def hits(motion: str | None, robot: Robot) -> list[Hit]:
-    """Hits of a robot in "chop", "nail", or else a punch: the hardest first."""
+    """Targets of a motion, "chop", "nail", or else a punch, the hardest first."""
     mass = sum(float(body.mass) for body in robot.model.inertias)
-    forces = [float(f"{part * np.clip(FORCE * mass, LEAST, MOST):.2g}") for part in SOFTER]
+    largest = np.clip(FORCE_PER_MASS * mass, MIN_FORCE, MAX_FORCE)
+    forces = [float(f"{fraction * largest:.2g}") for fraction in FRACTIONS]
     if motion == "chop":
         return [
             Hit(
@@ -82,5 +84,5 @@ def hits(motion: str | None, robot: Robot) -> list[Hit]:
             )
             for force in forces
         ]
-    target = FreeMass(mass=float(f"{np.clip(PART * mass, 0.5, 5.0):.1g}"))
+    target = FreeMass(mass=float(f"{np.clip(MASS_RATIO * mass, 0.5, 5.0):.1g}"))
     return [Hit(law=SpringDamper(stiffness=1e4, damping=300.0), target=target, normals=NORMALS)]

@@ -1,4 +1,4 @@
-"""Classifies a robot's joints as legs, arms, fingers and wheels, by its tree, its shapes and their names."""
+"""Classification of joints as legs, arms, fingers and wheels, by the tree, the links' shapes and names."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ _FINGERS = re.compile(r"finger|thumb|gripper|jaw|claw|knuckle|(?<![a-z])eyes?(?!
 _WHEELS = re.compile(r"wheel|caster|roller", re.IGNORECASE)
 _ARMS = re.compile(r"shoulder|elbow|wrist", re.IGNORECASE)
 _HEADS = re.compile(r"head|neck|eye|camera|face", re.IGNORECASE)
-LIGHT, SHORT = 0.03, 0.25  # of the robot's mass, and [m]: a finger's and all beyond it at most
-FLAT = 0.05  # of the robot's height: how far apart the lowest points of its feet may be
-TOE = 0.03  # [m] from an ankle to a toe's joint at least; half of it: how much higher its foot may end
-ABOVE = 0.1  # of that height: how much higher than the feet the root link ends
+# largest mass of a finger, with all beyond it, over the robot's; its largest length [m]
+FINGER_MASS, FINGER_LENGTH = 0.03, 0.25
+# Fractions of the robot's height: largest height of a foot's lowest point above the lowest of all, and least
+# height of the root link's.
+FOOT_HEIGHT, ROOT_HEIGHT = 0.05, 0.1
+TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: height of the foot above the toe
 
 
 @dataclass(frozen=True, kw_only=True)
 class Limb:
-    """A chain of joints to a tip: `path` (indices in the model, from the root on), of which the last `own`
-    are its own, and no other limb's.
+    """A chain of joints to a tip: `path`, their indices in the model from the root on, whose end `own` is in
+    no other limb.
     """
 
     path: tuple[int, ...]
@@ -44,7 +46,7 @@ class Limb:
 
 
 def limbs_of(model: pin.Model) -> tuple[Limb, ...]:
-    """All limbs, by their tips' order."""
+    """All limbs, in the order of their tips."""
     children = _children(model)
     first = 2 if is_floating(model) else 1
     out = []
@@ -58,12 +60,12 @@ def limbs_of(model: pin.Model) -> tuple[Limb, ...]:
 
 
 def to_lock(model: pin.Model) -> dict[str, str]:
-    """Joints that no plan should move, and why: fingers, wheels, joints without range or without mass, slides
-    that cannot lift what they carry.
+    """Joints that a plan should not move, with reasons: fingers, wheels, joints without range or mass,
+    prismatic joints too weak for their load.
     """
     children, out = _children(model), dict[str, str]()
     first = 2 if is_floating(model) else 1
-    mass, total = _beyond(model, children), sum(float(body.mass) for body in model.inertias)
+    mass, total = _moved_mass(model, children), sum(float(body.mass) for body in model.inertias)
     reach = _reach(model, children)
     effort = np.where(effort_limit(model) > 0, effort_limit(model), np.inf)  # zero: the file has none
     weight = np.abs(pin.computeGeneralizedGravity(model, model.createData(), neutral(model)))
@@ -75,7 +77,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
         )
         if low > high:
-            continue  # crossed limits are a mistake of the file, which the robot's checks tell
+            continue  # crossed limits are a mistake of the file, which the robot's checks report
         if not low < high:
             out[name] = "no range"
         elif _WHEELS.search(name) or (joint.nq == 2 and model.parents[j] < first and not children[j]):
@@ -86,19 +88,19 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             out[name] = "no mass"
         elif "JointModelP" in joint.shortname() and effort[joint.idx_v] < weight[joint.idx_v]:
             out[name] = f"{name} cannot lift what it carries"
-    for j in range(first, model.njoints):  # a hand: several short and light chains beside each other
-        small = [c for c in children[j] if mass[c] < LIGHT * total and reach[c] < SHORT]
+    for j in range(first, model.njoints):  # a hand: several short and light chains on one link
+        small = [c for c in children[j] if mass[c] < FINGER_MASS * total and reach[c] < FINGER_LENGTH]
         if len(small) > 1 and len(small) == len(children[j]):
-            out |= {str(model.names[i]): "a finger" for c in small for i in _below(c, children)}
-    if len(out) == model.njoints - first:  # a finger that is the whole robot
+            out |= {str(model.names[i]): "a finger" for c in small for i in _subtree(c, children)}
+    if len(out) == model.njoints - first:  # a robot that is a finger
         out = {name: why for name, why in out.items() if not _FINGERS.search(name)}
     return out
 
 
 def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[Limb, ...]:
-    """Limbs on which it stands in its zero posture: those that end lowest, well below the root link.
+    """Limbs on which the robot stands in its zero posture: those that end lowest, well below the root link.
 
-    pieces : by the joint that moves them.
+    pieces : convex hulls of the links, by the joint that moves them.
     """
     data = model.createData()
     pin.forwardKinematics(model, data, neutral(model))
@@ -108,28 +110,32 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
         return found if found.size else data.oMi[joint].translation[2:]
 
     everywhere = np.concatenate([heights(j) for j in range(1, model.njoints)])
-    lowest, tall = float(everywhere.min()), float(np.ptp(everywhere))
+    lowest, robot_height = float(everywhere.min()), float(np.ptp(everywhere))
     root = float(heights(1).min())
-    if root < lowest + ABOVE * tall:
+    if root < lowest + ROOT_HEIGHT * robot_height:
         return ()
     feet = (
         limb
         for limb in limbs_of(model)
-        if len(limb.own) > 1 and not _is_head(model, limb) and not _on_a_spine(model, limb)
+        # arms on a common trunk are no legs, which have no joints in common
+        if len(limb.own) > 1
+        and not _is_head(model, limb)
+        and (limb.own == limb.path or not _named(model, limb, _ARMS))
     )
-    found = tuple(limb for limb in feet if heights(limb.tip).min() < lowest + FLAT * tall)
-    return found if len(found) > 1 else ()  # an arm that hangs is no leg
+    highest = lowest + FOOT_HEIGHT * robot_height
+    found = tuple(limb for limb in feet if heights(limb.tip).min() < highest)
+    return found if len(found) > 1 else ()  # one limb is a hanging arm
 
 
 def arms_of(model: pin.Model, legs: tuple[Limb, ...]) -> tuple[Limb, ...]:
-    """Limbs that may strike: no legs, and no heads."""
+    """Limbs that may strike: those that are neither legs nor heads."""
     feet = {leg.tip for leg in legs}
     long = [limb for limb in limbs_of(model) if limb.tip not in feet and not _is_head(model, limb)]
     return tuple(limb for limb in long if len(limb.own) > 1) or tuple(long)
 
 
 def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Piece, ...]]) -> list[str]:
-    """Names of joints that end a leg beyond the sixth, on a link that stands on the ground itself."""
+    """Names of toe joints: at the end of a leg with more than six joints, where the foot is on the ground."""
     data = model.createData()
     pin.forwardKinematics(model, data, neutral(model))
 
@@ -140,15 +146,15 @@ def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Pi
     for own in map(list, unshared(model, legs)):
         while len(own) > LEG:
             foot, toe = own[-2:]
-            ahead = float(np.linalg.norm((data.oMi[toe].translation - data.oMi[foot].translation)[:2]))
-            if ahead < TOE or low(foot) > low(toe) + TOE / 2:
+            distance = float(np.linalg.norm((data.oMi[toe].translation - data.oMi[foot].translation)[:2]))
+            if distance < TOE or low(foot) > low(toe) + TOE / 2:
                 break
             out.append(str(model.names[own.pop()]))
     return out
 
 
 def unshared(model: pin.Model, legs: Sequence[Limb]) -> list[tuple[int, ...]]:
-    """Joints with a motor of each leg that lead to no other leg."""
+    """Driven joints of each leg that are not in the paths of other legs."""
     others = [{j for other in legs if other is not leg for j in other.path} for leg in legs]
     return [
         tuple(j for j in leg.path if j not in of and model.joints[j].nv)
@@ -166,18 +172,13 @@ def renumbered(limb: Limb, old: pin.Model, new: pin.Model) -> Limb:
 
 
 def _heights(data: Any, pieces: Mapping[int, tuple[Piece, ...]], joint: int) -> Array:
-    """[m] of the corners of what a joint moves, where the data (pin.Data) have it; none: it has no shapes."""
+    """Heights [m] of the vertices of a joint's shapes, (0,) without shapes; data : pin.Data."""
     found = [p.vertices @ data.oMi[joint].rotation[2] for p in pieces.get(joint, ())]
     return np.concatenate([np.zeros(0), *found]) + data.oMi[joint].translation[2]
 
 
 def _is_head(model: pin.Model, limb: Limb) -> bool:
     return _named(model, limb, _HEADS)
-
-
-def _on_a_spine(model: pin.Model, limb: Limb) -> bool:
-    """True if it is an arm of an upper body, where a waist would be above legs."""
-    return limb.own != limb.path and _named(model, limb, _ARMS)
 
 
 def _named(model: pin.Model, limb: Limb, names: re.Pattern[str]) -> bool:
@@ -191,19 +192,21 @@ def _children(model: pin.Model) -> dict[int, list[int]]:
     return out
 
 
-def _below(joint: int, children: Mapping[int, list[int]]) -> list[int]:
-    return [joint, *(i for c in children[joint] for i in _below(c, children))]
+def _subtree(joint: int, children: Mapping[int, list[int]]) -> list[int]:
+    return [joint, *(i for c in children[joint] for i in _subtree(c, children))]
 
 
-def _beyond(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:
+def _moved_mass(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:
     """Mass [kg] that each joint moves."""
-    return {j: sum(float(model.inertias[i].mass) for i in _below(j, children)) for j in range(model.njoints)}
+    return {
+        j: sum(float(model.inertias[i].mass) for i in _subtree(j, children)) for j in range(model.njoints)
+    }
 
 
 def _reach(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:
     """Length [m] of the longest chain beyond each joint, to the centre of mass of its last link."""
     out: dict[int, float] = {}
     for j in range(model.njoints - 1, -1, -1):
-        ways = [float(np.linalg.norm(model.jointPlacements[c].translation)) + out[c] for c in children[j]]
-        out[j] = max([float(np.linalg.norm(model.inertias[j].lever)), *ways])
+        lengths = [float(np.linalg.norm(model.jointPlacements[c].translation)) + out[c] for c in children[j]]
+        out[j] = max([float(np.linalg.norm(model.inertias[j].lever)), *lengths])
     return out

@@ -1,4 +1,4 @@
-"""Postures to start from: half sitting on flat soles, arms bent with their ends in front."""
+"""Start postures of drafts: half sitting on level soles, arms bent with their ends in front."""
 
 from __future__ import annotations
 
@@ -19,20 +19,22 @@ from impactopt.robots.robot import Robot, Sole
 __all__ = ["arm_length", "bend_arm", "eased", "half_sitting", "rested", "shoulder"]
 
 Array = NDArray[np.float64]
-BENT = 0.06  # of the legs' length: how much lower than straight it sits
-LEVEL = 1e-7  # [m], [rad] off its goal: a sole that stands
-STARTS = 10
-WIDTHS = (1.0, 0.9, 0.8)  # of the soles' distance in the zero posture: splayed legs may not stand level
-HELD = 0.5  # of its torque limit: what gravity may ask of a joint that does not strike
-INSIDE = 0.1  # of a joint's range that is left to its limits
-REST = 0.02  # [m] that the whole range of a joint costs: postures in the middle of their ranges
-LONG = 0.2  # of an arm's length: an upper arm at least
-ACROSS = 0.7  # largest cosine between a shoulder's axis and the arm, for its place along the axis to be free
-EDGE = 0.2  # of a range: zero is a joint's rest unless it is as near to a limit as that
+SQUAT = 0.06  # lowering of the hips, over the length of the legs
+LEVEL = 1e-7  # [m], [rad]: tolerance of a sole's placement
+STARTS = 10  # random initial guesses
+# distances of the soles tried, over that in the zero posture: with splayed legs they may not be level
+WIDTHS = (1.0, 0.9, 0.8)
+GRAVITY_SHARE = 0.5  # largest gravity torque of a joint that does not strike, over its limit
+MARGIN = 0.1  # of a joint's range, to both limits together
+RANGE_COST = 0.02  # [m]: position error that costs as much as a deviation by a joint's whole range
+UPPER_ARM = 0.2  # least length of an upper arm, over the arm's
+# largest cosine between a shoulder's axis and the arm for which the shoulder may be moved along the axis
+ACROSS = 0.7
+EDGE = 0.2  # of a joint's range: nearest that its rest angle 0 may be to a limit, else it is the middle
 
 
 def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array) -> Array:
-    """A configuration (nq,) with the soles level and beside each other, knees ahead, the weight above them.
+    """A configuration (nq,) with level soles side by side, knees forward, and the centre of mass above them.
 
     robot : with the soles.  forward (3,) : in the root's frame.
 
@@ -52,7 +54,7 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
 def _half_sitting(
     robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array, width: float
 ) -> Array:
-    """The same with the soles so far from each other, of their distance in the zero posture."""
+    """`half_sitting` with `width` times the soles' distance in the zero posture."""
     model, data = robot.model, robot.model.createData()
     q = rested(robot)
     pin.framesForwardKinematics(model, data, q)
@@ -63,10 +65,10 @@ def _half_sitting(
     aside = [width * float(spot @ turn[:, 1]) for spot in straight]
     below = [[j for j in leg.path if j > own[0]] for leg, own in zip(legs, chains, strict=True)]
     length = float(np.mean([_path(robot, joints) for joints in below]))
-    height = min(float(spot[2]) for spot in straight) + BENT * length
+    height = min(float(spot[2]) for spot in straight) + SQUAT * length
     ahead = float(np.mean([hip @ forward for hip in hips]))
     rng = np.random.default_rng(0)
-    for _ in range(4):  # feet go where the weight is
+    for _ in range(4):  # move the feet below the centre of mass, which moves with the legs
         for own, sole, out in zip(chains, soles, aside, strict=True):
             spot = ahead * turn[:, 0] + out * turn[:, 1] + height * turn[:, 2]
             q = _leg(robot, own, sole, pin.SE3(turn, spot), q, forward, rng)
@@ -85,13 +87,13 @@ def _half_sitting(
 def bend_arm(
     robot: Robot, arm: Limb, striker: str, axis: Array, q: Array, target: Array, way: Array
 ) -> tuple[Array, float]:
-    """The configuration with one arm's end near a place (3,) [m], pointing along `way` (3,), and how far off
-    [m] it is.
+    """The configuration with an arm's striking point near `target` (3,) [m], its last link along `way` (3,),
+    and the distance [m] of the point from the target.
 
-    axis (3,) : in which the last link points.  Its other joints stay as in q (nq,).
+    axis (3,) : direction of the last link, in its joint's frame.  All other joints are as in q (nq,).
     """
     model, data = robot.model, robot.model.createData()
-    fid, own = model.getFrameId(f"striker:{striker}"), _rows(robot, arm.own)
+    fid, own = model.getFrameId(f"striker:{striker}"), _columns(robot, arm.own)
     low, high = _limits(robot, own)
     span = high - low
     middle = np.where(np.minimum(high, -low) > EDGE * span, 0.0, (low + high) / 2)
@@ -104,7 +106,7 @@ def bend_arm(
         pin.updateFramePlacement(model, data, fid)
         gap = target - data.oMf[fid].translation
         points = data.oMi[arm.tip].rotation @ axis
-        return np.concatenate([gap, 0.02 * (points - way), REST * (angles - middle) / span])
+        return np.concatenate([gap, 0.02 * (points - way), RANGE_COST * (angles - middle) / span])
 
     for k in range(STARTS):
         start = np.clip(middle + (0.25 * span * rng.standard_normal(len(own)) if k else 0.05), low, high)
@@ -115,7 +117,9 @@ def bend_arm(
 
 
 def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
-    """Position of an arm's shoulder (3,) [m]: on the axis of its upper arm's joint, abreast of the arm."""
+    """Position of an arm's shoulder (3,) [m]: on the axis of the upper arm's joint, nearest to the centre of
+    mass of the arm.
+    """
     model, data = robot.model, robot.model.createData()
     first = arm.own[_upper(robot, arm)]
     pin.computeJointJacobians(model, data, q)
@@ -126,12 +130,12 @@ def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
     middle = joint.act(np.array(data.com[first])) - joint.translation
     along = float(axis @ middle)
     if abs(along) > ACROSS * np.linalg.norm(middle):
-        return np.array(joint.translation)  # the axis goes along the arm
+        return np.array(joint.translation)  # the axis is along the arm
     return np.asarray(joint.translation + along * axis)
 
 
 def arm_length(robot: Robot, arm: Limb, striker: str) -> float:
-    """Distance from the shoulder to the striking point with the arm stretched out [m]."""
+    """Distance [m] from the shoulder to the striking point of a stretched arm."""
     frame = robot.model.frames[robot.model.getFrameId(f"striker:{striker}")]
     beyond = _path(robot, arm.own[_upper(robot, arm) + 1 :])
     return beyond + float(np.linalg.norm(frame.placement.translation))
@@ -140,7 +144,7 @@ def arm_length(robot: Robot, arm: Limb, striker: str) -> float:
 def _upper(robot: Robot, arm: Limb) -> int:
     """Index of the last of an arm's own joints before its first long link."""
     steps = [float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in arm.own[1:]]
-    return next((k for k, step in enumerate(steps) if step > LONG * sum(steps)), 0)
+    return next((k for k, step in enumerate(steps) if step > UPPER_ARM * sum(steps)), 0)
 
 
 def _leg(
@@ -152,12 +156,12 @@ def _leg(
     forward: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """The configuration with a leg's sole at its goal, a pin.SE3, and its knee as far ahead as may be.
+    """The configuration with a leg's sole at its goal, a pin.SE3, and the knee as far forward as possible.
 
-    joints : of the leg; its last six move, or as many as there are.
+    joints : of the leg, of which the last six (or all) move.
     """
     model, data = robot.model, robot.model.createData()
-    fid, own = model.getFrameId(sole.frame), _rows(robot, joints[-LEG:])
+    fid, own = model.getFrameId(sole.frame), _columns(robot, joints[-LEG:])
     low, high = _limits(robot, own)
     now = robot.joint_positions(q)[own]
     best, nearest = None, np.inf
@@ -188,40 +192,42 @@ def _leg(
     return _set(robot, q, own, best[1])
 
 
-def _rows(robot: Robot, joints: Sequence[int]) -> NDArray[np.intp]:
-    """Indices into arrays of length n of joints of the model, each once: a follower's is its leader's."""
+def _columns(robot: Robot, joints: Sequence[int]) -> NDArray[np.intp]:
+    """Indices into arrays of length n of joints of the model, each once; a follower has its leader's."""
     base = robot.nv - robot.n
     return np.array(list(dict.fromkeys(robot.model.joints[j].idx_v - base for j in joints)), dtype=np.intp)
 
 
 def _limits(robot: Robot, own: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Limits of joints, with a margin; half a turn to both sides for joints without limits."""
+    """Position limits of joints, at most +-pi, tightened by a margin."""
     low, high = np.maximum(robot.lower[own], -np.pi), np.minimum(robot.upper[own], np.pi)
-    inside = np.minimum(INSIDE * (high - low) / 2, 0.15)
-    return low + inside, high - inside
+    margin = np.minimum(MARGIN * (high - low) / 2, 0.15)
+    return low + margin, high - margin
 
 
 def rested(robot: Robot) -> Array:
-    """The configuration (nq,) nearest to zero that is well inside the limits."""
+    """The configuration (nq,) nearest to zero that keeps a margin to the limits."""
     q, every = neutral(robot.model), np.arange(robot.n)
     low, high = _limits(robot, every)
     return _set(robot, q, every, np.clip(robot.joint_positions(q), low, high))
 
 
 def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
-    """The configuration (nq,) near q with limbs bent or hanging, so that gravity asks little of them.
+    """The configuration (nq,) near q with limbs moved so that their gravity torques are small.
 
-    Of several the one in which the fewest links touch.
+    Of several the one with the fewest collisions of links.
     """
-    own = _rows(robot, [joint for limb in limbs for joint in limb.own])
+    own = _columns(robot, [joint for limb in limbs for joint in limb.own])
     data = robot.model.createData()
     low, high = _limits(robot, own)
     rest, rng = robot.joint_positions(q)[own], np.random.default_rng(0)
 
     def errors(angles: Array) -> Array:
-        weight = robot.generalized_gravity(data, _set(robot, q, own, angles))
-        share = np.abs(weight[robot.nv - robot.n + own]) / robot.torque_limit[own]
-        return np.concatenate([np.maximum(share - HELD, 0.0), REST * (angles - rest) / (high - low)])
+        gravity = robot.generalized_gravity(data, _set(robot, q, own, angles))
+        share = np.abs(gravity[robot.nv - robot.n + own]) / robot.torque_limit[own]
+        return np.concatenate(
+            [np.maximum(share - GRAVITY_SHARE, 0.0), RANGE_COST * (angles - rest) / (high - low)]
+        )
 
     if not errors(rest)[: len(own)].any():
         return q
@@ -235,12 +241,14 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
 
 
 def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:
+    """The configuration with other angles of some joints; own : their indices in arrays of length n."""
     out, joints = q.copy(), robot.joint_models
-    for row, angle in zip(own, angles, strict=True):
-        joint = joints[int(row)]
+    for index, angle in zip(own, angles, strict=True):
+        joint = joints[int(index)]
         out[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
     return out
 
 
 def _path(robot: Robot, joints: Sequence[int]) -> float:
+    """Length [m] of the steps to each of these joints from the one before."""
     return sum(float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in joints)

@@ -1,4 +1,4 @@
-"""Makes a robot to try from a description: locks, guesses and repairs; finds its legs and arms."""
+"""Robot of a draft: locked joints, guessed drives and repaired inertias; its legs and arms."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Drafted:
-    """A robot on its way to a problem file, without soles, strikers and postures as yet.
+    """A robot of a draft, still without soles, strikers and postures.
 
-    options : of `Robot.from_urdf` or `Robot.from_mjcf`.  locked : joints that are, and why.  wrong :
-    inertias that no body can have, which are repaired here.
+    options : of `Robot.from_urdf` or `Robot.from_mjcf`.  locked : reasons, by locked joint.
+    wrong : messages about non-physical inertias, which are repaired here.
+    pieces : convex hulls of the links, by the joint that moves them.
     """
 
     robot: Robot
@@ -57,7 +58,7 @@ class Drafted:
         return self.mjcf and self.robot.floating and not is_floating(read_mjcf(self.path).model)
 
     def made(self, **more: Any) -> Robot:
-        """The robot anew, with more options."""
+        """The robot read again, with additional options."""
         make = Robot.from_mjcf if self.mjcf else Robot.from_urdf
         return make(self.path, inertias=REPAIRED, **{**self.options, **more})
 
@@ -69,8 +70,8 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
 
     Raises
     ------
-    InputError : it cannot be read; it has legs that no plan can hold, with the reason; its root has no mass,
-        and legs bear it; it is bolted, and nothing can strike.
+    InputError : it cannot be read; its legs cannot be planned for, with the reason; it stands on legs, and
+        its root has no mass; it is bolted, and no limb can strike.
     """
     first = _floating(path, mjcf, bolted)
     locked = _locked(first)
@@ -84,8 +85,8 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
     if is_floating(first.model) and not floats:
         _check_bolted(first, found)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
-    if led := _on_legs(found.robot, legs):  # a sole is held by six motors of its own leg
-        locked |= led
+    if coupled := _coupled_legs(found.robot, legs):
+        locked |= coupled
         found = _made(path, mjcf, True, locked)
         legs = legs_of(found.robot.model, found.pieces)
     if legs:
@@ -103,13 +104,15 @@ def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Draf
         found = _made(path, mjcf, False, {**found.locked, **idle})
         arms = arms_of(found.robot.model, legs)
     if not arms and not legs:
-        raise InputError(f"{path}: there is no limb, so nothing to strike with")
+        raise InputError(f"{path}: there is no limb to strike with")
     return replace(found, legs=legs, arms=arms)
 
 
-def _on_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
-    """Followers on legs whose leaders are not of the same leg alone, with their leaders, and why both are
-    locked: with one leg turned and the other not, a robot stands badly.
+def _coupled_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
+    """Reasons to lock followers on legs whose leaders are not in the same leg only, and these leaders.
+
+    A leg has to fix its sole by its own motors. Both are locked, as with one leg turned and the other not a
+    robot stands badly.
     """
     names, out = [str(name) for name in robot.model.names], dict[str, str]()
     for leg, own in zip(legs, unshared(robot.model, legs), strict=True):
@@ -121,9 +124,9 @@ def _on_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
 
 
 def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:
-    """Joints of a bolted robot's limbs that cannot strike, as of heads and sensors, and why they are locked.
+    """Reasons to lock joints of a bolted robot's limbs that cannot strike, such as heads and sensors.
 
-    On legs such joints help to balance.
+    For a robot on legs such joints help to balance.
     """
     striking = {arm.tip for arm in arms}
     return {
@@ -135,9 +138,9 @@ def _idle(model: pin.Model, arms: tuple[Limb, ...]) -> dict[str, str]:
 
 
 def _floating(path: Path, mjcf: bool, bolted: bool) -> Description:
-    """The robot with a free-flyer at its root, if it may have one.
+    """The robot with a free-flyer at its root, unless it is bolted or has several roots.
 
-    Many an MJCF of a humanoid has no free joint, so that a scene can place it.
+    Many MJCFs of humanoids have no free joint, as the scene adds it.
     """
     if bolted or not mjcf:
         return _read(path, mjcf, not bolted)
@@ -151,8 +154,9 @@ def _floating(path: Path, mjcf: bool, bolted: bool) -> Description:
 
 
 def _check_bolted(first: Description, found: Drafted) -> None:
-    """InputError if a robot stands on legs that has a free-flyer in `first`, and none in `found`, as its root
-    has no mass.
+    """InputError for a robot on legs whose root has no mass.
+
+    first : with a free-flyer.  found : without, as a free-flyer needs a mass.
     """
     model = lock_joints(first.model, found.options["locked"])
     if legs_of(model, {joint + 1: pieces for joint, pieces in found.pieces.items()}):
@@ -169,7 +173,7 @@ def _read(path: Path, mjcf: bool, floating: bool | None) -> Description:
 
 
 def _locked(read: Description) -> dict[str, str]:
-    """Joints that no plan should move, or that follow others: an own reason for each kind."""
+    """Reasons to lock joints: those of `to_lock`, and followers that plans do not support."""
     out = to_lock(read.model)
     ties = [tie for tie in read.ties if tie.follower]
     while stuck := [tie for tie in ties if tie.follower not in out and not _follows(read.model, tie, out)]:
@@ -178,14 +182,14 @@ def _locked(read: Description) -> dict[str, str]:
 
 
 def _follows(model: pin.Model, tie: Tie, locked: Collection[str]) -> bool:
-    """True if a plan can have the tie's follower follow."""
+    """True if the tie is a coupling that plans support, with an unlocked leader."""
     law = tie.coupling
     return law is not None and law.leader not in locked and not unfit(model, tie.follower, law)
 
 
 def _why_locked(tie: Tie) -> str:
     others = [joint for joint in tie.joints if joint != tie.follower]
-    return f"{tie.follower} follows {others[0]}" if others else f"{tie.follower} is held"
+    return f"{tie.follower} follows {others[0]}" if others else f"{tie.follower} is fixed"
 
 
 def _made(
@@ -230,7 +234,7 @@ def _made(
 
 
 def _rest(model: pin.Model, name: str) -> float:
-    """The angle nearest to zero that a joint can have."""
+    """The angle nearest to zero inside the limits."""
     joint = model.joints[model.getJointId(name)]
     if joint.nq != 1:
         return 0.0
@@ -239,9 +243,9 @@ def _rest(model: pin.Model, name: str) -> float:
 
 
 def _followed(model: pin.Model, tie: Tie, angles: Mapping[str, float]) -> float:
-    """The angle of a joint that follows another one: where that is locked, or bent by a quarter of its range.
+    """The angle at which a follower is locked: that for its leader's locked angle, or a quarter of its range.
 
-    An arm of which a follower is locked straight reaches little.
+    An arm with a follower that is locked straight has little reach.
     """
     follower = model.joints[model.getJointId(tie.follower)]
     leader = next((joint for joint in tie.joints if joint != tie.follower), None)
@@ -252,6 +256,7 @@ def _followed(model: pin.Model, tie: Tie, angles: Mapping[str, float]) -> float:
 
 
 def _bent(model: pin.Model, name: str) -> float:
+    """The angle of a joint at a quarter of its range; 0 without limits."""
     if not model.existJointName(name) or (joint := model.joints[model.getJointId(name)]).nq != 1:
         return 0.0
     low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
@@ -259,14 +264,14 @@ def _bent(model: pin.Model, name: str) -> float:
 
 
 def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> None:
-    """InputError for legs that no plan can hold."""
+    """InputError unless there are two legs with enough joints of their own."""
     model = robot.model
     own = unshared(model, legs)
-    told = "; ".join(", ".join(str(model.names[j]) for j in joints) for joints in own)
-    of = " or ".join(str(count) for count in sorted({len(joints) for joints in own}))
+    listed = "; ".join(", ".join(str(model.names[j]) for j in joints) for joints in own)
+    counts = " or ".join(str(count) for count in sorted({len(joints) for joints in own}))
     if len(legs) != 2 or min(map(len, own)) < LEG - 1:
         raise InputError(
-            f"{robot.name!r} has {len(legs)} legs of {of} joints of their own each ({told}), and impactopt "
-            f"plans for robots on two legs of {LEG} or more, which hold a sole in all its {LEG} directions, "
-            f"on two of {LEG - 1}, whose soles turn about one axis, or on a fixed base"
+            f"{robot.name!r} has {len(legs)} legs of {counts} joints of their own each ({listed}), and "
+            f"impactopt plans for robots on two legs of {LEG} or more, which fix a sole in all its {LEG} "
+            f"directions, on two of {LEG - 1}, whose soles turn about one axis, or on a fixed base"
         )

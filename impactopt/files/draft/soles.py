@@ -1,4 +1,4 @@
-"""Soles, found in the shapes of the links that end legs; sides of limbs."""
+"""Soles, from the shapes of the feet; names of limbs by their sides."""
 
 from __future__ import annotations
 
@@ -21,20 +21,22 @@ from impactopt.robots.checks import LEG
 __all__ = ["find_soles", "sides"]
 
 Array = NDArray[np.float64]
-SLICE = 0.005  # [m] of a foot above its lowest point, that stands on the ground
-STEEP = np.cos(np.radians(40))  # least cosine between a sole and the ground in the zero posture
-CORNERS = 8  # of a polygon at most
-SMALLEST = 2e-3  # [m2] of a sole
-AHEAD = 0.01  # [m] of a foot's middle ahead of its ankle that says which way is forward
-BENDS = 0.2  # [rad] of a knee's range more to one side than to the other, twice
-NEAR, FAR, DRAWN = 0.4, 0.3, 40  # [rad] about zero, [m]: postures in which axes of hinges are compared
-HELD = 5e-3  # of a leg with a hinge: its Jacobian's least singular value, moments by FAR, at least
+SLICE = 0.005  # [m]: the part of a foot so near to its lowest plane is the sole
+STEEP = np.cos(np.radians(40))  # least cosine between the normals of sole and ground in the zero posture
+MAX_CORNERS = 8  # of a polygon
+MIN_AREA = 2e-3  # [m2] of a sole
+AHEAD = 0.01  # [m] least distance from ankle to the foot's centre that shows the forward direction
+BENDS = 0.2  # [rad] least asymmetry |lower + upper| of a knee's limits that shows its bending direction
+# random postures in which axes of hinges are compared, within so many [rad] of zero
+POSTURES, SPREAD = 40, 0.4
+ARM = 0.3  # [m] by which lengths in a Jacobian are divided
+SINGULAR = 5e-3  # least singular value of the Jacobian of a leg with a hinge, so scaled, at least
 
 
 def find_soles(
     model: pin.Model, legs: Sequence[Limb], pieces: Mapping[int, tuple[Piece, ...]]
 ) -> tuple[list[Sole], Array]:
-    """A sole for each leg, on a new frame below the ankle, and the way forward (3,) in the root's frame.
+    """A sole for each leg, on a new frame below the ankle; the forward direction (3,) in the root's frame.
 
     Raises
     ------
@@ -62,14 +64,14 @@ def find_soles(
     soles = []
     for name, leg, own, (up, low, flat) in zip(names, legs, unshared(model, legs), flats, strict=True):
         x = data.oMi[leg.tip].rotation.T @ forward
-        x = _unit(x - up * (up @ x))
+        x = _unit(x - up * (up @ x))  # forward in the plane of the sole
         place = pin.SE3(np.column_stack([x, np.cross(up, x), up]), low * up)
         corners = (flat - place.translation) @ place.rotation[:, :2]
         polygon = _polygon(corners)
         if polygon is None:
             raise InputError(
-                f"the foot at joint {str(model.names[leg.tip])!r} has no flat face of {1e4 * SMALLEST:g} cm2 "
-                "to stand on: point feet and round ones cannot be held as soles"
+                f"the foot at joint {str(model.names[leg.tip])!r} has no flat face of {1e4 * MIN_AREA:g} cm2 "
+                "to stand on: point feet and round ones cannot be fixed as soles"
             )
         parent, above = first_link(model, leg.tip)
         soles.append(
@@ -86,21 +88,25 @@ def find_soles(
 
 
 def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> Array:
-    """Forward direction (3,): opposite to the knees' bend, else towards the feet's middles, feet (3,) [m]."""
+    """Forward direction (3,), an axis of the root: that in which the knees point, else that of the feet.
+
+    feet (3,) [m] : sum of the horizontal vectors from the root to the centres of the feet.
+    """
     back = np.zeros(3)
     pin.computeJointJacobians(model, data, neutral(model))
     for leg, own in zip(legs, unshared(model, legs), strict=True):
         hip, ankle = data.oMi[own[0]].translation, data.oMi[leg.tip].translation
 
-        def room(j: int, hip: Array = hip, ankle: Array = ankle) -> float:
+        def from_ends(j: int, hip: Array = hip, ankle: Array = ankle) -> float:
             at = data.oMi[j].translation
             return min(float(np.linalg.norm(at - hip)), float(np.linalg.norm(at - ankle)))
 
-        bend = max(own, key=room)
-        knee = model.joints[bend]
+        # the knee is the joint farthest from both hip and ankle; it moves the shin back
+        index = max(own, key=from_ends)
+        knee = model.joints[index]
         low, high = model.lowerPositionLimit[knee.idx_q], model.upperPositionLimit[knee.idx_q]
-        jac = np.array(pin.getJointJacobian(model, data, bend, pin.LOCAL_WORLD_ALIGNED))
-        axis, shin = jac[3:, knee.idx_v], ankle - data.oMi[bend].translation
+        jac = np.array(pin.getJointJacobian(model, data, index, pin.LOCAL_WORLD_ALIGNED))
+        axis, shin = jac[3:, knee.idx_v], ankle - data.oMi[index].translation
         if knee.nq == 1 and abs(low + high) > BENDS:
             back += np.sign(low + high) * np.cross(axis, shin) * [1.0, 1.0, 0.0]
     for way in (-back, feet):
@@ -111,12 +117,16 @@ def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> 
 
 
 def _hinge(model: pin.Model, leg: Limb, own: Sequence[int], place: Any) -> str:
-    """The axis of a sole, at a placement in its joint, about which a leg of these joints lacks a turn."""
+    """The axis of a sole for the hinge that best completes a leg of five joints.
+
+    That is the one with the largest least singular values of the leg's Jacobian with the hinge, (6, 6), in
+    random postures. place : pin.SE3 of the sole in its joint.
+    """
     data, rng = model.createData(), np.random.default_rng(0)
-    low, high = np.maximum(model.lowerPositionLimit, -NEAR), np.minimum(model.upperPositionLimit, NEAR)
-    columns, scale = [model.joints[j].idx_v for j in own], np.repeat([1 / FAR, 1.0], 3)[:, None]
-    worth: dict[str, list[float]] = {axis: [] for axis in "xyz"}
-    for _ in range(DRAWN):
+    low, high = np.maximum(model.lowerPositionLimit, -SPREAD), np.minimum(model.upperPositionLimit, SPREAD)
+    columns, scale = [model.joints[j].idx_v for j in own], np.repeat([1 / ARM, 1.0], 3)[:, None]
+    singular_values: dict[str, list[float]] = {axis: [] for axis in "xyz"}
+    for _ in range(POSTURES):
         q = neutral(model)
         for j in own:
             at = model.joints[j].idx_q
@@ -124,18 +134,18 @@ def _hinge(model: pin.Model, leg: Limb, own: Sequence[int], place: Any) -> str:
         jac = place.actionInverse @ pin.computeJointJacobian(model, data, q, leg.tip)[:, columns]
         for k, axis in enumerate("xyz"):
             whole = np.column_stack([jac, np.eye(6)[3 + k]]) * scale
-            worth[axis].append(float(np.linalg.svd(whole, compute_uv=False)[-1]))
-    best = max(worth, key=lambda axis: float(np.quantile(worth[axis], 0.1)))
-    if np.quantile(worth[best], 0.5) < HELD:
+            singular_values[axis].append(float(np.linalg.svd(whole, compute_uv=False)[-1]))
+    best = max(singular_values, key=lambda axis: float(np.quantile(singular_values[axis], 0.1)))
+    if np.quantile(singular_values[best], 0.5) < SINGULAR:
         raise InputError(
-            f"the leg {', '.join(str(model.names[j]) for j in own)} cannot hold its sole, about whichever "
-            "axis the foot may turn on it: two of its joints do the same"
+            f"the leg {', '.join(str(model.names[j]) for j in own)} cannot fix its sole with a hinge about "
+            "any axis: two of its joints move it in the same way"
         )
     return best
 
 
 def sides(model: pin.Model, tips: Sequence[int]) -> list[str]:
-    """Names for limbs: "left" and "right" where two are on both sides of the middle, else their links'."""
+    """Names of limbs: "left" and "right" for two on both sides of the robot, else those of the last links."""
     data = model.createData()
     pin.forwardKinematics(model, data, neutral(model))
     links = [first_link(model, tip)[0] for tip in tips]
@@ -151,7 +161,7 @@ def sides(model: pin.Model, tips: Sequence[int]) -> list[str]:
 
 
 def _side(name: str) -> str:
-    """Side that a link's name refers to."""
+    """Side in a link's name, "left" or "right"; else the name."""
     low = name.lower()
     if "left" in low or low.startswith(("l_", "l-")) or (name[:1] == "L" and name[1:2].isupper()):
         return "left"
@@ -161,7 +171,7 @@ def _side(name: str) -> str:
 
 
 def _face(points: Array, turn: Array) -> Array:
-    """Outward normal (3,) of a foot's largest flat face that looks down; turn (3, 3) : its joint's."""
+    """Outward normal (3,) of a foot's largest flat face that points down; turn (3, 3) : its rotation."""
     hull = ConvexHull(points)
     corners = points[hull.simplices]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
@@ -175,7 +185,10 @@ def _face(points: Array, turn: Array) -> Array:
 
 
 def _polygon(corners: Array) -> Array | None:
-    """A convex polygon (k, 2) inside the hull of points, counter-clockwise, few corners; None: too small."""
+    """A convex polygon (k, 2) inside the hull of points, counter-clockwise; None if it is too small.
+
+    Corners that enclose the smallest areas are removed, to at most `MAX_CORNERS`.
+    """
     try:
         points = corners[ConvexHull(corners).vertices]
     except (ValueError, RuntimeError):
@@ -184,16 +197,16 @@ def _polygon(corners: Array) -> Array | None:
         before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
         (ax, ay), (bx, by) = (points - before).T, (after - points).T
         lost = (ax * by - ay * bx) / 2
-        if len(points) <= 3 or (len(points) <= CORNERS and lost.min() > 2e-5):
+        if len(points) <= 3 or (len(points) <= MAX_CORNERS and lost.min() > 2e-5):
             break
         points = np.delete(points, int(np.argmin(lost)), axis=0)
     x, y = points.T
     area = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
-    return np.round(points, 4) + 0.0 if area > SMALLEST else None
+    return np.round(points, 4) + 0.0 if area > MIN_AREA else None
 
 
 def _neat(place: Any) -> Any:
-    """Placement without digits that are rounding errors."""
+    """Placement rounded for a file."""
     turn = np.where(
         np.abs(place.rotation - np.round(place.rotation)) < 1e-6, np.round(place.rotation), place.rotation
     )

@@ -1,4 +1,4 @@
-"""Striking points, found at the ends of limbs: by tool frames, else by the shapes of the last links."""
+"""Striking points at the ends of limbs, from tool frames, else from the shapes of the last links."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from impactopt.robots.couplings import axis_of
 __all__ = ["find_edge", "find_striker", "first_link"]
 
 Array = NDArray[np.float64]
-# the conventions of ROS-Industrial (tool0), of makers and of MuJoCo's menagerie (sites), the surest first
+# names of tool frames by ROS-Industrial (tool0), manufacturers and MuJoCo Menagerie (sites), the most
+# reliable first
 _TOOLS = tuple(
     re.compile(pattern, re.IGNORECASE)
     for pattern in (
@@ -28,23 +29,25 @@ _TOOLS = tuple(
         r"grip_?site|gripper_?(frame|tip|cent(er|re))|pinch|attachment_?site|(^|_)grasp",
     )
 )
-APART = 0.01  # [m] two places are apart, and a shape's middle is ahead of its joint
-SHORT = 0.06  # [m] a link so short at most, as a flange is, never folds back over the link before it
-EDGE = 5e-3  # [m] above its lowest point: what of a hand is its edge
-LONG = 0.12  # [m] a hand sticks out so far from a tool's frame at least
-ROLLS = np.cos(np.radians(25))  # least cosine between a joint's axis and what turns about it
-ASLANT = np.cos(np.radians(60))  # least cosine for a shape that is behind its joint rather than beside it
-STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
+APART = 0.01  # [m] least distance of two points that defines a direction
+SHORT = 0.06  # [m]: a link so short, such as a flange, does not fold back over the link before it
+EDGE = 5e-3  # [m]: the part of a hand so near to its lowest plane is its edge
+LONG = 0.12  # [m] least length of a hand from a tool's frame
+# least cosines of angles between
+ROLLS = np.cos(np.radians(25))  # a joint's axis and a link that rolls about it
+ASLANT = np.cos(np.radians(60))  # the arm's reverse direction and a link behind its joint, not beside it
+STRAIGHT = np.cos(np.radians(20))  # a limb and an axis of its frame that it is taken to be along
 
 
 def find_striker(
     model: pin.Model, limb: Limb, name: str, pieces: Mapping[int, tuple[Piece, ...]]
 ) -> tuple[Striker, Array]:
-    """The end of a limb, and the direction (3,) in which its last link points there, in that joint's frame.
+    """Striker at the end of a limb, and the direction (3,) of its last link, in that joint's frame.
 
-    A frame that is named as tools are is on the axis of the striking point; else the middle of the last
-    link's shapes is. The point is where these end, away from the arm; of a tool's frame at the joint itself
-    where a long hand ends. In place of shapes that are far from their link there is the box of its inertia.
+    The striking point is on an axis of the tool frame, if there is one; else on a line from the joint through
+    the centre of the last link's shapes. It is at the end of the shapes, away from the arm. For a tool frame
+    at the joint itself it is at the end of a long hand. Shapes that are far from their link are replaced by
+    the box of its inertia.
     """
     own = pieces.get(limb.tip, ())
     points = [p.vertices for p in own if not is_far(model, p, own)]
@@ -56,7 +59,7 @@ def find_striker(
         axes = np.column_stack([place.rotation, -place.rotation])
         reach = np.max([np.zeros(6), *(((p - place.translation) @ axes).max(axis=0) for p in points)], axis=0)
         way = place.translation + away * APART
-        if np.linalg.norm(way) <= 3 * APART:  # at the joint itself: to where a hand is, else as the arm goes
+        if np.linalg.norm(way) <= 3 * APART:  # at the joint itself: towards a long hand, else along the arm
             way = axes[:, int(np.argmax(reach))] if reach.max() > LONG else away
         k = int(np.argmax(axes.T @ way))
         axis, ahead = axes[:, k], float(reach[k])
@@ -73,10 +76,10 @@ def find_striker(
 def find_edge(
     model: pin.Model, limb: Limb, name: str, pieces: Mapping[int, tuple[Piece, ...]], axis: Array, q: Array
 ) -> tuple[Striker, Array]:
-    """The side of a limb's last link that is below in a configuration (nq,), and its direction (3,), in the
-    joint's frame.
+    """Striker on the lower side of a limb's last link in a configuration (nq,), and the direction (3,) of
+    that side, in the joint's frame.
 
-    axis (3,) : in which the link points; the direction is square to it.
+    axis (3,) : direction of the link, to which that of the side is perpendicular.
 
     Raises
     ------
@@ -98,7 +101,7 @@ def find_edge(
 
 
 def first_link(model: pin.Model, joint: int) -> tuple[str, pin.SE3]:
-    """The first link that a joint moves, and its placement."""
+    """The first link of a joint, and its placement there."""
     for frame in model.frames:
         if frame.parentJoint == joint and frame.type == pin.FrameType.BODY:
             return str(frame.name), frame.placement
@@ -106,14 +109,14 @@ def first_link(model: pin.Model, joint: int) -> tuple[str, pin.SE3]:
 
 
 def _tool(model: pin.Model, joint: int) -> pin.Frame | None:
-    """The frame of a tool that a joint moves, the surest; None: there is none."""
+    """The most reliable tool frame of a joint; None if there is none."""
     kinds = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)
     own = [f for f in model.frames if f.parentJoint == joint and f.type in kinds]
     return next((f for pattern in _TOOLS for f in own if pattern.search(str(f.name))), None)
 
 
 def _away(model: pin.Model, limb: Limb) -> Array:
-    """The direction (3,) from the arm to its last joint, in that joint's frame, where the arm is straight."""
+    """Direction (3,) of the zero posture's arm towards its last joint, in that joint's frame."""
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
     tip = data.oMi[limb.tip]
@@ -127,24 +130,27 @@ def _away(model: pin.Model, limb: Limb) -> Array:
 def _axis(
     model: pin.Model, limb: Limb, points: Sequence[Array], frames: Sequence[Array], away: Array
 ) -> Array:
-    """The direction (3,) in which a last link points."""
+    """Direction (3,) of a limb's last link, in its joint's frame.
+
+    points, frames : vertices of its shapes, (k, 3) each, and origins of its frames.  away : as of `_away`.
+    """
     middle = np.mean([(p.max(axis=0) + p.min(axis=0)) / 2 for p in points], axis=0) if points else np.zeros(3)
     axis = middle if np.linalg.norm(middle) > APART else np.array(max(frames, key=np.linalg.norm))
     size = float(np.linalg.norm(axis))
-    if size < 1e-6:  # nothing sticks out: on as the link before does
+    if size < 1e-6:  # no shapes or frames away from the joint: the direction of the link before
         return away
     axis = axis / size
-    turns = axis_of(model, limb.tip).subspace[3:]  # zero of a joint that slides
+    turns = axis_of(model, limb.tip).subspace[3:]  # zero for a prismatic joint
     onwards = float(axis @ away)
     if onwards < -STRAIGHT and (size < SHORT or abs(float(axis @ turns)) > ROLLS):
-        axis = -axis  # the link ends at its joint, and its shapes are behind that
+        axis = -axis  # the link ends at its joint, with its shapes behind
     elif onwards < -ASLANT and size < SHORT:
         axis = turns * np.sign(turns @ away) if abs(turns @ away) > ASLANT else away
     return _straightened(axis)
 
 
 def _straightened(axis: Array) -> Array:
-    """The unit vector (3,) along an axis of the frame, where that is near."""
+    """The unit vector (3,) of a direction, rounded to an axis of the frame if that is near."""
     axis = axis / np.linalg.norm(axis)
     k = int(np.argmax(np.abs(axis)))
     return np.eye(3)[k] * np.sign(axis[k]) if abs(axis[k]) > STRAIGHT else np.asarray(axis)

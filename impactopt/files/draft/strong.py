@@ -1,4 +1,4 @@
-"""Strongest postures of a bolted arm: blows estimated in many postures, the best solved as strikes."""
+"""Strongest impacts of a bolted arm: estimates in many postures, of which the best are solved as strikes."""
 
 from __future__ import annotations
 
@@ -27,21 +27,22 @@ from impactopt.robots.robot import Robot
 __all__ = ["ITERATIONS", "SECONDS", "Strong", "duration", "strongest", "touches"]
 
 Array = NDArray[np.float64]
-STRIKES, LOOKED_AT = 4, 60  # blows that are solved as strikes; estimated ones that are looked at for them
-ALIKE = 0.2  # of the reach: how far apart points with one normal are
-# [s] that joints at their contact speed need from the start to contact; and [rad], [m] that the one which
-# moves farthest goes there, between these
-RUN, BACK = 0.7, (0.35, 0.9)
-SHORTER = (1.0, 0.75, 0.55, 0.4)  # of that way, where joints or bodies leave no more
-BEHIND = 0.06, 0.15  # [m], and of the reach: of the start behind the target's plane, the smaller at least
-PARTS = (0.8, 3.0)  # of the time that joints need for their way: shortest and longest duration
-ITERATIONS, SECONDS = 150, 30.0  # of a strike, or a plan, that is tried: most are there in a third of it
+MAX_STRIKES, MAX_CANDIDATES = 4, 60  # impacts solved as strikes; estimated impacts considered for them
+MIN_DISTANCE = 0.2  # of hit points with the same normal, over the reach
+# The start posture is that of contact, moved back at the contact velocity for so long [s], so that the joint
+# that moves farthest travels between these [rad], [m].
+RUN_UP, TRAVEL = 0.7, (0.35, 0.9)
+TRAVEL_FACTORS = (1.0, 0.75, 0.55, 0.4)  # on the travel, tried while joint limits or bodies are in conflict
+# least distance of the start behind the target's plane: the smaller of so many [m] and so much of the reach
+BEHIND = 0.06, 0.15
+DURATION_FACTORS = (0.8, 3.0)  # shortest and longest duration over the time at the velocity limits
+ITERATIONS, SECONDS = 150, 30.0  # limits of a trial strike or plan: most need a third of that
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Strong:
-    """A drafted blow: configurations (nq,) to start from and at contact, point (3,) [m], normal (3,), and
-    what its strike maximizes, with its unit.
+    """A solved strike: configurations (nq,) at the start and at contact, hit point (3,) [m], normal (3,), and
+    the value of its objective, with the unit.
     """
 
     start: Array
@@ -53,17 +54,16 @@ class Strong:
 
 
 def strongest(robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = True) -> list[Strong]:
-    """Strikes of the blows that are estimated best, the hardest first; none: check finds a fault with all of
-    them, or none of the strikes is solved.
+    """Solved strikes of the impacts with the best estimates, the hardest first; may be empty.
 
-    q (nq,) : what does not strike stays as in it.  with_face : the link's face meets the target; else any
-    part of it may touch first.
+    q (nq,) : configuration of the joints that do not strike.  with_face : the striking link's face meets the
+    target; else any part of it may touch first.
     """
     given = {**hit.given, "terms": () if with_face else (FirstTouch(enabled=False),)}
     strength = Strength(robot=robot, striker=arm.name, law=hit.law, target=hit.target)
     found = []
     blows = drawn_blows(strength, q, hit.normals, with_face=with_face)
-    for problem, blow in _sound(robot, arm, blows, given):
+    for problem, blow in _candidates(robot, arm, blows, given):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
             solved = optimize_strike(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
@@ -82,47 +82,51 @@ def strongest(robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = T
 
 
 def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:
-    """[shortest, longest] [s] of a phase in which joints go a way (n,) [rad] there, or back and there.
+    """[shortest, longest] duration [s] of a phase in which joints travel `way` (n,) [rad], with or without
+    winding up.
 
-    The usual times are those of fast robots. Slow joints need the way over their largest speed at least;
-    thrice that leaves room to wind up, and no more than a spline of few intervals can follow.
+    usual : durations of fast robots, at least. Slow joints need at least the travel over their velocity
+    limit. Three times that is enough to wind up, and not too long for a spline of few intervals.
     """
     needed = float(np.max(np.abs(way) / robot.velocity_limit))
-    return [max(short, float(f"{part * needed:.2g}")) for short, part in zip(usual, PARTS, strict=True)]
+    return [
+        max(short, float(f"{factor * needed:.2g}"))
+        for short, factor in zip(usual, DURATION_FACTORS, strict=True)
+    ]
 
 
-def _sound(
+def _candidates(
     robot: Robot, arm: Arm, blows: list[Blow], given: Mapping[str, Any]
 ) -> Iterator[tuple[ImpactProblem, Blow]]:
-    """Problems of the best of estimated blows, unlike each other, that check finds no fault with."""
+    """Feasible problems of the best estimated impacts, with different hit points or normals."""
     blows = [blow for blow in blows if blow.point[2] > LOWEST / 2]
     reach = max((float(np.linalg.norm(blow.point)) for blow in blows), default=0.0)
     taken: list[Blow] = []
-    for blow in blows[:LOOKED_AT]:
+    for blow in blows[:MAX_CANDIDATES]:
         near = [b for b in taken if b.normal @ blow.normal > 0.9]
-        if any(np.linalg.norm(b.point - blow.point) < ALIKE * reach for b in near):
+        if any(np.linalg.norm(b.point - blow.point) < MIN_DISTANCE * reach for b in near):
             continue
         problem = _problem(robot, arm, blow, min(BEHIND[0], BEHIND[1] * reach), given)
         if problem is None:
             continue
         taken.append(blow)
         yield problem, blow
-        if len(taken) == STRIKES:
+        if len(taken) == MAX_STRIKES:
             return
 
 
 def _problem(
     robot: Robot, arm: Arm, blow: Blow, behind: float, given: Mapping[str, Any]
 ) -> ImpactProblem | None:
-    """A blow's problem, from a start on the way that it comes, so far behind the target's plane at least [m];
-    None: there is a fault in it.
+    """Problem of an estimated impact, with a start posture at least `behind` [m] behind the target's plane;
+    None if no start posture is feasible.
     """
-    # fewer than three joints reach a curve or a surface, which a rounded point is beside
+    # fewer than three joints reach a curve or a surface only, from which rounding would move the point
     point = np.round(blow.point, 3 if len(arm.limb.path) > 2 else 9) + 0.0
     size = float(np.abs(blow.v).max())
-    way = blow.v / size * float(np.clip(RUN * size, *BACK))
-    for part in SHORTER:
-        start = np.array(pin.integrate(robot.model, blow.q, -part * way))
+    way = blow.v / size * float(np.clip(RUN_UP * size, *TRAVEL))
+    for factor in TRAVEL_FACTORS:
+        start = np.array(pin.integrate(robot.model, blow.q, -factor * way))
         angles = robot.joint_positions(start)
         edge = 0.02 * np.minimum(robot.upper - robot.lower, 1.0)
         inside = np.all(angles > robot.lower + edge) and np.all(angles < robot.upper - edge)
@@ -148,7 +152,7 @@ def _problem(
 
 
 def touches(problem: ImpactProblem, *postures: Array) -> bool:
-    """True if bodies touch in one of these configurations (nq,), before contact."""
+    """True if bodies touch in one of these configurations (nq,), with the target as before contact."""
     none: Array = np.zeros(len(postures))
     at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
     return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)

@@ -1,4 +1,4 @@
-"""Placement of a drafted problem's target: ahead of an arm, within its reach, with room to swing."""
+"""Placement of a drafted problem's target: in front of an arm, within its reach, with room to swing."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from impactopt.robots.robot import Robot
 __all__ = ["AHEAD", "WAYS", "Arm", "aims", "ready"]
 
 Array = NDArray[np.float64]
-WAYS = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))
-# of the arm's length, from the shoulder: where its end waits (ahead, below), and where it may hit (ahead)
-WAITS = ((0.4, 0.3), (0.45, 0.0), (0.35, 0.5), (0.5, -0.3))
-RAISED = ((0.45, 0.0), (0.4, -0.2), (0.5, 0.2))  # the same before a blow from above
-BENCH = 0.6  # [m] a shoulder as low as that belongs to an arm on the ground, whose end waits level with it
-HITS = (0.75, 0.65, 0.85, 0.55)
-FALLS = (0.45, 0.35, 0.55)  # of the arm's length, below the shoulder: where it may hit from above
-FARTHER = 0.2  # of the arm's length, at most, than where it waits
+WAYS = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))  # horizontal strike directions
+# Positions relative to the shoulder, over the arm's length, in the order tried:
+STARTS = ((0.4, 0.3), (0.45, 0.0), (0.35, 0.5), (0.5, -0.3))  # (ahead, below) of the arm's end at the start
+RAISED = ((0.45, 0.0), (0.4, -0.2), (0.5, 0.2))  # the same before a strike from above
+HITS = (0.75, 0.65, 0.85, 0.55)  # ahead, of the hit point
+HITS_BELOW = (0.45, 0.35, 0.55)  # below, of the hit point of a strike from above
+FARTHER = 0.2  # largest distance of that hit point ahead of the start, over the arm's length
+LOW_SHOULDER = 0.6  # [m]: an arm with a lower shoulder is on the ground, and does not start below it
 AHEAD = np.array(WAYS[0])
 LOWEST = 0.25  # [m] above the ground
-NEAR = 0.03  # [m] off its place, as bent postures are preferred
+NEAR = 0.03  # [m] tolerance of the arm's end, as bent postures are preferred to exact ones
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arm:
-    """A limb that may strike, by its striker's name; axis (3,) : of its last link, to the striking point."""
+    """A limb that may strike, and the name of its striker; axis (3,) : direction of its last link."""
 
     limb: Limb
     name: str
@@ -41,29 +41,29 @@ class Arm:
 
 
 def _level(way: Array) -> Array:
-    """The way (3,) itself, or ahead where it is down."""
+    """A horizontal direction (3,): the way itself, or ahead for one from above."""
     return AHEAD if way[2] else way
 
 
 def ready(
     robot: Robot, arms: Sequence[Arm], q: Array, *, ways: Sequence[Sequence[float]]
 ) -> tuple[Array, Array]:
-    """The configuration (nq,) with all arms bent, and the way (3,) in which the first one strikes.
+    """The configuration (nq,) with all arms bent, and the strike direction (3,) of the first one.
 
-    arms : the first one strikes, and has to find a place.  ways : that may be struck in, the best first.
+    arms : the first one strikes.  ways : directions in which it may strike, the best first.
 
     Raises
     ------
-    InputError : the striking arm reaches none of the places where it could wait.
+    InputError : the striking arm reaches none of its start positions.
     """
     way, nearest = np.array(ways[0]), np.inf
     for k, arm in enumerate(arms):
         length = arm_length(robot, arm.limb, arm.name)
         root = shoulder(robot, arm.limb, q)
         best, off = q, np.inf
-        low = WAITS if root[2] > BENCH else WAITS[1:]
+        starts = STARTS if root[2] > LOW_SHOULDER else STARTS[1:]
         tries = ways if k == 0 else [_level(way)]
-        for to, ahead, below in ((one, *wait) for one in tries for wait in (RAISED if one[2] else low)):
+        for to, ahead, below in ((one, *start) for one in tries for start in (RAISED if one[2] else starts)):
             place = root + length * (ahead * _level(np.array(to)) - [0.0, 0.0, below])
             place[2] = max(place[2], LOWEST)
             tried, gap = bend_arm(robot, arm.limb, arm.name, arm.axis, q, place, np.array(to))
@@ -83,15 +83,15 @@ def ready(
 
 
 def aims(robot: Robot, arm: Arm, q: Array, way: Array) -> Iterator[Array]:
-    """Points (3,) [m] that the arm can hit from a configuration (nq,), the likeliest first."""
+    """Hit points (3,) [m] within the arm's reach from a configuration (nq,), the most promising first."""
     start = striking_point(robot, arm.name, q)
     root, length = shoulder(robot, arm.limb, q), arm_length(robot, arm.limb, arm.name)
-    for other, hit in product((0.0, 0.5, 1.0), FALLS if way[2] else HITS):
+    for part, hit in product((0.0, 0.5, 1.0), HITS_BELOW if way[2] else HITS):
         point = start + way * ((root - start) @ way + hit * length)
         if way[2]:
-            point += FARTHER * other * length * AHEAD
-        else:
-            point[2] += other * (max(root[2], LOWEST) - start[2])
+            point += FARTHER * part * length * AHEAD
+        else:  # from the height of the start to that of the shoulder
+            point[2] += part * (max(root[2], LOWEST) - start[2])
         gap = bend_arm(robot, arm.limb, arm.name, arm.axis, q, point, way)[1]
         if gap < NEAR and (point - start) @ way > 0.1 * length:
             yield np.round(point, 3) + 0.0

@@ -1,6 +1,6 @@
-"""Plans that leave the house: files that other programs read, one writer a file.
+"""Export of plans to files for other programs; one module per format.
 
-A new format is a file here with a function `write(export, directory)`, and a line in FORMATS.
+A new format is a module here with a function `write(export, directory)`, and a line in FORMATS.
 """
 
 from __future__ import annotations
@@ -22,19 +22,24 @@ __all__ = ["FORMATS", "Format", "export", "export_planned"]
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """module : of this package that writes it.  rate [Hz] : usual.  whole : effort is all that moves it."""
+    """Export format.
+
+    module : of this package, with its writer.  rate [Hz] : default.  needs_gravity : its reader does not
+    compensate gravity, so effort must include it.
+    """
 
     module: str
     rate: float = 1000.0
-    whole: bool = False
+    needs_gravity: bool = False
 
 
 FORMATS: Mapping[str, Format] = {
     "csv": Format(module="csv_files"),
     "ros2": Format(module="ros2"),
     "mcap": Format(module="mcap_file"),
-    "mujoco": Format(module="mujoco_scene", whole=True),
-    "mjlab": Format(module="mjlab", rate=50.0, whole=True),  # policies act at 50 Hz, a frame each time
+    "mujoco": Format(module="mujoco_scene", needs_gravity=True),
+    # policies act at 50 Hz, on one frame each
+    "mjlab": Format(module="mjlab", rate=50.0, needs_gravity=True),
 }
 
 
@@ -48,28 +53,26 @@ def export(
     gravity: bool = True,
     smooth: tuple[float, float] | None = None,
 ) -> list[Path]:
-    """Write a plan for other programs; the files.
+    """Write a plan for other programs; the paths of the files.
 
     to : "csv", "ros2", "mcap", "mujoco" or "mjlab".
     directory : is made; an earlier export to the same format in it is replaced.
-    rate [Hz] : of its rows; 1000, for mjlab 50.
-    joints : their order in all columns, each of the robot's once; the robot's own if left out.
-    gravity : False: effort is without the torque that holds the posture against gravity, for arms whose
-        controller adds that itself.
+    rate [Hz] : of the samples; default 1000, for mjlab 50.
+    joints : order of all joints in the columns; default the robot's own.
+    gravity : False: effort without the torque that balances gravity, for arms whose controller adds it.
     smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints, for bolted arms whose
-        controllers refuse jumps: the nearest motion within these. ``meta.json`` says what it costs.
+        controllers refuse jumps: the nearest motion within these. ``meta.json`` has its impulse.
 
     Raises
     ------
-    InputError : an unknown format, a plan that is not finished, joints that are no order of the robot's, a
-        directory with something else in it, a package that is missing; a robot on soles, or a format that
-        needs the whole effort, without gravity; a robot on soles, or limits that no motion is within,
-        smoothed. Nothing is written then.
+    InputError : an unknown format, a plan that is not solved, joints that are no permutation of the robot's,
+        a directory with other files, a missing package; no gravity for a robot on soles, or a format that
+        needs it; smoothing of a robot on soles, or limits that no motion satisfies. Nothing is written then.
     """
     check_choice("there is no format", to, FORMATS)
-    usual = FORMATS[to].rate
-    # before the record's numbers are computed
-    check_export(solution.status.value, solution.problem.robot, usual if rate is None else rate, joints)
+    default = FORMATS[to].rate
+    # first, as computing the record takes time
+    check_export(solution.status.value, solution.problem.robot, default if rate is None else rate, joints)
     record = record_of(solution)
     if not record.completed:
         raise InputError(f"there is no motion to export: {record.summary['note']}")
@@ -88,10 +91,10 @@ def export_planned(
     gravity: bool = True,
     smooth: tuple[float, float] | None = None,
 ) -> list[Path]:
-    """The same of a plan that was read from a disk."""
+    """Export of a saved plan; arguments as of `export`."""
     check_choice("there is no format", to, FORMATS)
     chosen = FORMATS[to]
-    if chosen.whole and not gravity:
+    if chosen.needs_gravity and not gravity:
         raise InputError(f"gravity: {to} needs the whole effort; leave gravity at its default")
     rate = chosen.rate if rate is None else rate
     content = export_of(planned, rate=rate, joints=joints, gravity=gravity, smooth=smooth)

@@ -1,4 +1,4 @@
-"""Content of an export: a plan's motions, servo, target, metadata in words; and the directory it goes to."""
+"""Content of an export: motions, servo, target and metadata of a plan; its directory."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.codegen.files import read_plain
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_choice, check_number
-from impactopt.files.export.motion import JUMP, Motion, motion_at, springs_at_rest
+from impactopt.files.export.motion import JUMP, Motion, motion_at, with_passive_at_rest
 from impactopt.files.export.smooth import Smoothness, smoothed
-from impactopt.files.output import plain
+from impactopt.files.output import plain, read_json
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
@@ -45,21 +44,21 @@ LARGEST = 1 << 24  # bytes of a meta.json
 def write_directory(
     directory: Path, to: str, meta: Mapping[str, Any], write: Callable[[Path], object]
 ) -> list[Path]:
-    """Let `write` fill a new directory that then takes the place of `directory`; the files, `META` first.
+    """Have `write` fill a new directory, which then replaces `directory`; paths of the files, `META` first.
 
     to : the format's name.
 
     Raises
     ------
-    InputError : it is there, and is no earlier export of this format; it cannot be written. What was there
-        is still there then, and nothing beside it.
+    InputError : it exists and is no earlier export of this format, or it cannot be written. Then nothing is
+        changed.
     """
     _check_replaceable(directory, to)
     directory = Path(os.path.abspath(directory))
     new, old = (
         directory.with_name(f".{directory.name[:64]}.{secrets.token_hex(8)}.{x}") for x in ("new", "old")
     )
-    above = [folder for folder in directory.parents if not folder.exists()]  # the nearest first
+    new_parents = [folder for folder in directory.parents if not folder.exists()]  # the nearest first
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
         new.mkdir()
@@ -75,7 +74,7 @@ def write_directory(
         with contextlib.suppress(OSError):
             if old.exists() and not directory.exists():
                 old.rename(directory)
-            for folder in above:
+            for folder in new_parents:
                 folder.rmdir()
         if not isinstance(error, OSError):
             raise
@@ -85,52 +84,46 @@ def write_directory(
 
 
 def _check_replaceable(directory: Path, to: str) -> None:
-    """InputError for what is no directory, or one with something else in it than an export of this format."""
+    """InputError unless a directory does not exist, is empty or contains only an export of this format."""
     if not os.path.lexists(directory):
         return
     if directory.is_symlink() or not directory.is_dir():
-        raise InputError(f"{directory} is there, and no directory; give another one with --out")
+        raise InputError(f"{directory} exists and is no directory; give another one with --out")
     try:
-        there = sorted(str(p.relative_to(directory)) for p in directory.rglob("*") if not p.is_dir())
+        names = sorted(str(p.relative_to(directory)) for p in directory.rglob("*") if not p.is_dir())
     except OSError as error:
         raise InputError(f"cannot read {directory}: {error.strerror}; give another one") from error
-    if not there:
+    if not names:
         return
-    made = _made(directory / META)
-    own = made.get("files") if made.get("made_by") == MADE_BY else None
-    if not isinstance(own, list):
-        raise InputError(f"{directory} holds something else ({there[0]}); give another directory with --out")
-    if made.get("to") != to:
+    meta = read_json(directory / META, LARGEST)
+    exported = meta.get("files") if meta.get("made_by") == MADE_BY else None
+    if not isinstance(exported, list):
+        raise InputError(f"{directory} holds something else ({names[0]}); give another directory with --out")
+    if meta.get("to") != to:
         raise InputError(
-            f"{directory} holds an export to {made.get('to')}; give another directory with --out"
+            f"{directory} holds an export to {meta.get('to')}; give another directory with --out"
         )
-    others = [name for name in there if name not in own]
+    others = [name for name in names if name not in exported]
     if others:
         raise InputError(f"{directory} holds {others[0]} too, which no export made; give another directory")
 
 
-def _made(path: Path) -> dict[str, Any]:
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        found = json.loads(read_plain(path, LARGEST))
-        return found if isinstance(found, dict) else {}
-    return {}
-
-
 Array = NDArray[np.float64]
-SLOWEST, FASTEST = 1.0, 1e5  # [Hz]
+MIN_RATE, MAX_RATE = 1.0, 1e5  # [Hz]
 PHASES = ("swing", "contact", "follow-through")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Export:
-    """Data that all writers get.
+    """Input of all writers.
 
     planned : the plan, its problem and its references.  joints : names, in the order of all columns.
-    order (n,) : where these are in the robot's own arrays.  rate [Hz].  gravity : effort bears it.
-    smooth : the limits that the motion is smoothed within, if it is, and what the replay of it brings.
-    motion : as planned, or smoothed.  missed : if nothing is hit, on the same time axis: both coast from
-    contact on, one until its contact ends, the other until the abort motion begins.  None where the plan has
-    none.
+    order (n,) : indices of these in the robot's own arrays.  rate [Hz].  gravity : effort includes it.
+    smooth : limits of a smoothed motion and its impulse in a replay; None: it is not smoothed.
+    motion : as planned, or smoothed.
+    missed : the motion if nothing is hit, on the same time axis; None for a plan without an abort motion.
+        From contact on both have constant joint velocities, `motion` until its contact ends, `missed` until
+        the abort motion begins.
     """
 
     planned: Planned
@@ -143,7 +136,7 @@ class Export:
     missed: Motion | None
 
     def standing(self, motion: Motion) -> dict[str, NDArray[np.bool_]]:
-        """Mask (k,) of the instants at which each sole stands, by its name; none without stance phases."""
+        """Mask (k,) of the instants at which each sole stands, by its name; {} without stance phases."""
         p = self.problem
         if motion.stance is None:
             return {}
@@ -159,12 +152,10 @@ class Export:
 
     @property
     def motions(self) -> dict[str, Motion]:
-        """Motions by the names of their files, as a servo is to follow them: a joint that nothing drives,
-        as a soft grip's, stays where its spring is at rest.
-        """
-        springs = self.robot.passive[self.order]
-        of = {"motion": self.motion, **({} if self.missed is None else {"missed": self.missed})}
-        return {name: springs_at_rest(motion, springs) for name, motion in of.items()}
+        """References of the servos by the names of their files; passive joints, as of soft grips, stay."""
+        passive = self.robot.passive[self.order]
+        motions = {"motion": self.motion, **({} if self.missed is None else {"missed": self.missed})}
+        return {name: with_passive_at_rest(motion, passive) for name, motion in motions.items()}
 
     def per_joint(self, values: Array) -> Array:
         """Numbers (n,) of the robot in the order of the export."""
@@ -172,11 +163,11 @@ class Export:
 
     @cached_property
     def meta(self) -> dict[str, Any]:
-        """All that is no history, for `meta.json`."""
+        """Content of `meta.json`: everything but histories."""
         p, robot, s = self.problem, self.robot, self.planned.record.summary
         striker = robot.striker(p.striker)
         frame = robot.model.frames[robot.model.getFrameId(striker.model_frame)]
-        blow = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
+        expected = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
         return plain(
             {
                 "problem": p.name,
@@ -217,18 +208,18 @@ class Export:
                     "link": body_name(robot, int(frame.parentJoint)),
                     "point_m": np.array(frame.placement.translation),
                 },
-                "expected": {name: s.get(name) for name in blow},
+                "expected": {name: s.get(name) for name in expected},
                 "support_polygon_m": self.planned.record.arrays["polygon"],
                 "versions": {**s.get("versions", {}), "export": __version__},
             }
         )
 
     def _joints(self) -> list[dict[str, Any]]:
-        robot, moves = self.robot, self.robot.joint_models
-        rows = []
+        robot, models = self.robot, self.robot.joint_models
+        out = []
         for name, k in zip(self.joints, self.order, strict=True):
-            prismatic = "JointModelP" in moves[k].shortname()
-            rows.append(
+            prismatic = "JointModelP" in models[k].shortname()
+            out.append(
                 {
                     "name": name,
                     **({"passive": True} if robot.passive[k] else {}),
@@ -240,7 +231,7 @@ class Export:
                     "position_limits": [robot.lower[k], robot.upper[k]],
                 }
             )
-        return rows
+        return out
 
 
 def export_of(
@@ -251,21 +242,21 @@ def export_of(
     gravity: bool = True,
     smooth: tuple[float, float] | None = None,
 ) -> Export:
-    """A plan at a rate [Hz].
+    """A plan sampled at a rate [Hz].
 
-    joints : their order in all columns; the robot's own if left out.  gravity : whether effort bears it.
-    smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints, if there are to be no jumps.
+    joints : order in all columns; default the robot's own.  gravity : effort includes it.
+    smooth : largest acceleration [rad/s^2] and jerk [rad/s^3] of all joints; None: not smoothed.
 
     Raises
     ------
-    InputError : the plan is not finished; joints that are no order of the robot's; a rate out of its range;
-        a robot on soles without gravity, or smoothed; limits that no motion is within.
+    InputError : the plan is not solved; joints that are no permutation of the robot's; a rate out of range;
+        a robot on soles without gravity, or smoothed; limits that no motion satisfies.
     """
     robot = planned.problem.robot
     order = check_export(planned.record.summary.get("status"), robot, rate, joints)
-    told: dict[str, float] | None = None
+    smoothing: dict[str, float] | None = None
     if smooth is not None:
-        planned, told = _smoothed(planned, smooth)
+        planned, smoothing = _smoothed(planned, smooth)
     reference, missed = planned.reference, planned.missed
     if not gravity:
         reference = _without_gravity(reference, robot)
@@ -276,52 +267,52 @@ def export_of(
         order=order,
         rate=rate,
         gravity=gravity,
-        smooth=told,
+        smooth=smoothing,
         motion=motion_at(reference, robot, rate, order, planned.record.arrays, jumps=smooth is None),
         missed=None if missed is None else motion_at(missed, robot, rate, order, {}),
     )
 
 
 def _smoothed(planned: Planned, limits: tuple[float, float]) -> tuple[Planned, dict[str, float]]:
-    """The plan with a smoothed reference and without an abort motion, which would begin by a jump; and what
-    the blow comes to in our replay.
+    """The plan with a smoothed reference and without its abort motion, which would begin with a jump; limits
+    and impulse of the smoothed motion in a replay.
     """
     within = Smoothness(acceleration=limits[0], jerk=limits[1])
     reference = smoothed(planned.reference, planned.problem, within)
     replayed = simulate(planned.problem, reference)
-    told = {
+    smoothing = {
         "acceleration_rad_s2": within.acceleration,
         "jerk_rad_s3": within.jerk,
         "impulse_Ns": replayed.impulse,
         "planned_impulse_Ns": float(planned.record.summary["impulse_Ns"]),
         "touches": len(replayed.touched),
     }
-    return dataclasses.replace(planned, reference=reference, missed=None), told
+    return dataclasses.replace(planned, reference=reference, missed=None), smoothing
 
 
 def _without_gravity(reference: Trajectory, robot: Robot) -> Trajectory:
-    """The reference with less feed-forward: without g(q) of each of its postures, where a motor bears it."""
+    """The reference with feed-forward less g(q), for joints with a motor."""
     if robot.floating:
         raise InputError(
-            "gravity: the legs of a robot on soles bear it, so no torque is gravity's alone; leave it at its "
-            "default"
+            "gravity: the torques of a robot on soles depend on the contact forces, so gravity's part of "
+            "them is not defined; leave it at its default"
         )
     model, data = robot.model, robot.model.createData()
-    held = np.array([pin.computeGeneralizedGravity(model, data, q) for q in reference.q])
-    return dataclasses.replace(reference, torque=reference.torque - np.where(robot.passive, 0.0, held))
+    weight = np.array([pin.computeGeneralizedGravity(model, data, q) for q in reference.q])
+    return dataclasses.replace(reference, torque=reference.torque - np.where(robot.passive, 0.0, weight))
 
 
 def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] | None) -> NDArray[np.intp]:
-    """The joints' order, if a plan of this status can be exported so; InputError as of `export_of`."""
+    """Indices of the joints in the order of the export; InputError as of `export_of`."""
     unusable = {s.value: s.message for s in Status if not s.usable}
     if status in unusable:
         raise InputError(
-            f"this plan is not finished ({status}), and a robot should not follow it: {unusable[status]} "
+            f"this plan is not solved ({status}), and a robot should not follow it: {unusable[status]} "
             "Solve the problem first"
         )
     rate = check_number("rate [Hz]", rate)
-    if not SLOWEST <= rate <= FASTEST:
-        raise InputError(f"rate [Hz]: {rate:g}; give a number from {SLOWEST:g} to {FASTEST:g}")
+    if not MIN_RATE <= rate <= MAX_RATE:
+        raise InputError(f"rate [Hz]: {rate:g}; give a number from {MIN_RATE:g} to {MAX_RATE:g}")
     return joint_order(robot, joints)
 
 
@@ -330,7 +321,7 @@ def joint_order(robot: Robot, joints: Sequence[str] | None) -> NDArray[np.intp]:
 
     Raises
     ------
-    InputError : a name that the robot does not have, has twice here, or that is left out.
+    InputError : a name that is unknown, given twice, or left out.
     """
     if joints is None:
         return np.arange(robot.n)
@@ -347,7 +338,7 @@ def joint_order(robot: Robot, joints: Sequence[str] | None) -> NDArray[np.intp]:
 
 
 def body_name(robot: Robot, joint: int) -> str:
-    """The link that a joint of the model moves, as its URDF calls it; the world's of joint 0."""
+    """Name of the link that a joint of the model moves; of joint 0, the link fixed to the world."""
     for frame in robot.model.frames:
         if frame.type == pin.FrameType.BODY and frame.parentJoint == joint and frame.name != "universe":
             return str(frame.name)
@@ -355,8 +346,8 @@ def body_name(robot: Robot, joint: int) -> str:
 
 
 def _numbers(thing: ContactLaw | Target) -> dict[str, float]:
-    """The numbers of a law or a target, by the names and units that problem files have for them."""
+    """Parameters of a law or a target, by their keys in problem files."""
     kind: Any = type(thing)
-    known = dataclasses.is_dataclass(kind)  # a law of one's own may be none
-    keys = {field.name: told.key_of(field.name) for field, told in (abouts(kind) if known else ())}
+    known = dataclasses.is_dataclass(kind)  # a user's own law may be none
+    keys = {field.name: about.key_of(field.name) for field, about in (abouts(kind) if known else ())}
     return {keys.get(name, name): value for name, value in thing.parameters.items()}

@@ -1,4 +1,4 @@
-"""CSV: a table for each motion, with a header that says each column's unit."""
+"""CSV: a table for each motion, whose header has names and units."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def write(export: Export, directory: Path) -> None:
 
 
 def _columns(export: Export, motion: Motion) -> dict[str, Array]:
-    """Values (k,) by what stands above them."""
+    """Columns (k,) by their headers."""
     inside = (motion.phase == 1).astype(float)
     phase = motion.phase.astype(float)
     out: dict[str, Array] = {"time [s]": motion.time, "phase": phase, "contact": inside}

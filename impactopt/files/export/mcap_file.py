@@ -19,9 +19,9 @@ from impactopt.files.export.ros2 import stamp
 
 __all__ = ["write"]
 
-WORLD = "world"  # frame of all that has one
-_RULE = "=" * 80
-# as in ROS 2's own packages, without their comments
+WORLD = "world"  # frame_id of all messages
+_RULE = "=" * 80  # between message definitions
+# definitions of ROS 2's own packages, without their comments
 _PARTS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
     "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
@@ -62,10 +62,10 @@ _TYPES: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 def write(export: Export, directory: Path) -> None:
-    """`motion.mcap`: topics /motion, /missed, /phase, /expected_force, /zmp, /base_pose, /base_twist, and of
+    """`motion.mcap`: topics /motion, /missed, /phase, /expected_force, /zmp, /base_pose, /base_twist, and for
     a plan with stance phases /stance.
 
-    meta.json is in it too, as an attachment.
+    meta.json is an attachment.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def _trajectory(export: Export, motion: Motion) -> dict[str, Any]:
 
 
 def _messages(export: Export, motion: Motion, k: int) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Topic, type and message of what is reported at each instant."""
+    """Topics, types and messages of instant k."""
     header = _header(motion.time[k])
     yield "/phase", "std_msgs/msg/UInt8", {"data": int(motion.phase[k])}
     if motion.stance is not None:

@@ -1,6 +1,6 @@
-"""mjlab (and BeyondMimic's whole_body_tracking): a motion for policies that track it, as one npz.
+"""mjlab (and BeyondMimic's whole_body_tracking): a reference motion for tracking policies, as one npz.
 
-Frames are 1 / fps apart: the reference's jumps stand between two of them.
+Frames are 1 / fps apart, so the reference's jumps are between two of them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def write(export: Export, directory: Path) -> None:
 
     Raises
     ------
-    InputError : joints that follow others: policies have all joints of their MJCF, in its order.
+    InputError : a robot with followers: policies have all joints of their MJCF, in its order.
     """
     if followers := ", ".join(map(repr, export.robot.couplings)):
         raise InputError(
@@ -41,7 +41,7 @@ def write(export: Export, directory: Path) -> None:
 
 
 def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
-    """Arrays that a MotionLoader reads, and the names of their columns.
+    """Arrays of mjlab's MotionLoader, and names of joints and bodies.
 
     The bodies are the root link and the link of each joint, in the order of the joints.
     """
@@ -56,6 +56,7 @@ def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
             turn[k, b] = pin.Quaternion(data.oMi[j].rotation).coeffs()[[3, 0, 1, 2]]
             velocity = pin.getVelocity(model, data, j, pin.LOCAL_WORLD_ALIGNED)
             linear[k, b], angular[k, b] = velocity.linear, velocity.angular
+    # of the quaternions q and -q of a rotation, the one nearer to the frame before
     turn[1:] *= np.where(np.cumsum((turn[1:] * turn[:-1]).sum(-1) < 0, axis=0) % 2, -1.0, 1.0)[..., None]
     return {
         "fps": np.array([export.rate]),
@@ -72,7 +73,7 @@ def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
 
 
 def _contacts(standing: dict[str, NDArray[np.bool_]]) -> dict[str, Any]:
-    """Mask (k, soles) of the soles that stand, and their names, of a motion with stance phases."""
+    """Mask (k, soles) of the soles that stand, and their names; {} without stance phases."""
     if not standing:
         return {}
     return {"sole_contact": np.column_stack(list(standing.values())), "sole_names": np.array(list(standing))}

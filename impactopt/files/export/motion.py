@@ -1,4 +1,4 @@
-"""A reference at chosen instants: what every writer of an export gets of a motion."""
+"""Sampling of a reference trajectory for exports: joint motion, effort, base, contact force and ZMP."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from impactopt.kinematics.support import zmp
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["JUMP", "Base", "Motion", "motion_at", "springs_at_rest"]
+__all__ = ["JUMP", "Base", "Motion", "motion_at", "with_passive_at_rest"]
 
 Array = NDArray[np.float64]
-JUMP = 1e-6  # [s] by which the later one of two rows at a jump is reported later
+JUMP = 1e-6  # [s] between the two samples at a jump, so that time is strictly ascending
 CONTACT = 1  # phase
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Base:
-    """The robot's root link at k instants, its origin and axes, in the world's axes.
+    """Pose and velocity of the robot's root link at k instants, along the world's axes.
 
     position (k, 3) [m]; quaternion (k, 4) : w, x, y, z; linear (k, 3) [m/s]; angular (k, 3) [rad/s].
     """
@@ -37,15 +37,15 @@ class Base:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """The servo's reference and what the plan expects, at k instants; joints in the order of the export.
+    """Reference of the servos, and planned force and ZMP, at k instants; joints in the order of the export.
 
     time (k,) [s], strictly ascending.  phase (k,) : 0 swing, 1 contact, 2 follow-through.
     position, velocity, acceleration, effort (k, n) : of the joints; effort is the feed-forward. In SI units
-    of revolute joints; of a prismatic joint m, m/s, m/s2, N.
-    base : None of a robot on a fixed base.
-    force (k,) [N] on the target, along its normal; zero outside of contact.  zmp (k, 2) [m], or None
-    without soles; nan where nothing is known of it.
-    contact_start, contact_end, end [s].  stance (k,) : number of the stance phase; None: there is one stance.
+    of revolute joints; for a prismatic joint m, m/s, m/s2, N.
+    base : None for a robot on a fixed base.
+    force (k,) [N] : on the target, along its normal; zero outside of contact.
+    zmp (k, 2) [m] : None without soles; nan where it is not defined.
+    contact_start, contact_end, end [s].  stance (k,) : index of the stance phase; None for one stance.
     """
 
     time: Array
@@ -63,11 +63,6 @@ class Motion:
     stance: NDArray[np.intp] | None = None
 
 
-def _frames(end: float, rate: float) -> Array:
-    """Instants 1 / rate [Hz] apart from 0 to the last one before `end` [s], and one more that is at rest."""
-    return np.arange(int(np.ceil(end * rate - 1e-9)) + 1) / rate
-
-
 def motion_at(
     reference: Trajectory,
     robot: Robot,
@@ -77,26 +72,27 @@ def motion_at(
     *,
     jumps: bool = True,
 ) -> Motion:
-    """The reference at `rate` [Hz], from its start to its end.
+    """The reference sampled at `rate` [Hz], from its start to its end.
 
-    Positions, velocities and accelerations are those of one curve, the quintic that has the reference's at
-    its own instants (some 1 ms apart), so velocities are no differences. Feed-forward goes straight between
-    them, as in the servo of our replays.
+    Positions, velocities and accelerations are those of one curve, the quintic spline through the reference's
+    at its own instants (some 1 ms apart), so they are consistent derivatives. Feed-forward is interpolated
+    linearly, as in the servo of our replays.
 
-    order (n,) : the robot's joints in the order of the export.
+    order (n,) : indices of the robot's joints in the order of the export.
     arrays : of the record, for `collision_*`; empty for a motion that hits nothing.
-    jumps : the reference's jumps are among the instants, from both sides, the later ones `JUMP` later;
-        else there is a frame at every multiple of 1 / rate, and none elsewhere.
+    jumps : add both sides of the reference's jumps to the samples, `JUMP` apart; else there are samples at
+        multiples of 1 / rate only.
     """
-    reference = _ending(reference)
-    grid = _frames(reference.end, rate)
+    reference = _with_rest_at_end(reference)
+    # multiples of 1 / rate, to the first one at or after the end, where the robot is at rest
+    grid = np.arange(int(np.ceil(reference.end * rate - 1e-9)) + 1) / rate
     grid = grid if not jumps else np.append(grid[grid < reference.end - JUMP], reference.end)
     edges = (reference.contact_start, reference.contact_end)
     curves = _curves(reference, robot)
     parts = []
     for phase in range(3):
-        rows = np.flatnonzero(reference.phase == phase)
-        first, last = reference.time[rows[0]], reference.time[rows[-1]]
+        own = np.flatnonzero(reference.phase == phase)
+        first, last = reference.time[own[0]], reference.time[own[-1]]
         if last - first < 2 * JUMP:  # an impact without duration
             continue
         gap = 2 * JUMP if jumps else 0.0
@@ -104,15 +100,16 @@ def motion_at(
         times = inside if not jumps else np.concatenate([[first] * (phase > 0), inside, [last] * (phase < 2)])
         if phase == 2 and jumps:
             times = np.append(times[times < reference.end], reference.end)
-        parts.append(_phase(phase, times, rows, reference, curves, arrays))
-    told = np.concatenate([part["time"] for part in parts])
-    late = np.flatnonzero(np.diff(told) <= 0) + 1
-    told[late] = told[late - 1] + JUMP
+        parts.append(_phase(phase, times, own, reference, curves, arrays))
+    time = np.concatenate([part["time"] for part in parts])
+    # the second of two samples at the same instant, at a jump
+    late = np.flatnonzero(np.diff(time) <= 0) + 1
+    time[late] = time[late - 1] + JUMP
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0] if name != "time"}
     joint = slice(-robot.n, None)
     soles = bool(np.any(reference.ground))
     return Motion(
-        time=told,
+        time=time,
         phase=whole["phase"],
         position=whole["position"][:, joint][:, order],
         velocity=whole["velocity"][:, joint][:, order],
@@ -124,89 +121,99 @@ def motion_at(
         contact_start=edges[0],
         contact_end=edges[1],
         end=reference.end,
-        stance=_stances(reference, told),
+        stance=_stances(reference, time),
     )
 
 
 def _stances(reference: Trajectory, time: Array) -> NDArray[np.intp] | None:
-    """Number of the stance phase at each instant (k,) [s]."""
+    """Index of the stance phase at each instant (k,) [s]; None without stance phases."""
     if not reference.stance.size:
         return None
-    rows = np.searchsorted(reference.time, time, side="right") - 1
-    return reference.stance[rows.clip(0)]
+    samples = np.searchsorted(reference.time, time, side="right") - 1
+    return reference.stance[samples.clip(0)]
 
 
-def springs_at_rest(motion: Motion, springs: NDArray[np.bool_]) -> Motion:
-    """The motion as servos get it, where some joints (n,) are springs: these are asked to stay, and to bear
-    what they bear at the start.
+def with_passive_at_rest(motion: Motion, passive: NDArray[np.bool_]) -> Motion:
+    """The motion with constant references of passive joints (n,): position and effort are those at the start.
+
+    Springs move these joints, which servos cannot.
     """
-    if not springs.any():
+    if not passive.any():
         return motion
-    held = {name: getattr(motion, name).copy() for name in ("position", "velocity", "acceleration", "effort")}
-    for name, value in held.items():
-        value[:, springs] = value[0, springs] if name in ("position", "effort") else 0.0
-    return dataclasses.replace(motion, **held)
+    fixed = {
+        name: getattr(motion, name).copy() for name in ("position", "velocity", "acceleration", "effort")
+    }
+    for name, value in fixed.items():
+        value[:, passive] = value[0, passive] if name in ("position", "effort") else 0.0
+    return dataclasses.replace(motion, **fixed)
 
 
-def _ending(reference: Trajectory) -> Trajectory:
-    """Reference with a last instant at rest: a curve through the instants about it would not be."""
+def _with_rest_at_end(reference: Trajectory) -> Trajectory:
+    """The reference with its last instant, at rest, at `end` exactly, and once more after it.
+
+    So the curve ends there. Through instants before and after `end` it would not be at rest.
+    """
     fields = {f.name: getattr(reference, f.name) for f in dataclasses.fields(reference)}
     histories = {name: value for name, value in fields.items() if np.ndim(value)}
     before = int(np.searchsorted(reference.time, reference.end - JUMP))
     if before < len(reference.time):
-        kept = {name: np.concatenate([x[:before], x[-1:], x[-1:]]) for name, x in histories.items()}
-        kept["time"][-2:] = reference.end, max(reference.time[-1], reference.end + JUMP)
-        histories = kept
+        histories = {name: np.concatenate([x[:before], x[-1:], x[-1:]]) for name, x in histories.items()}
+        histories["time"][-2:] = reference.end, max(reference.time[-1], reference.end + JUMP)
     return dataclasses.replace(reference, **histories)
 
 
 def _curves(reference: Trajectory, robot: Robot) -> tuple[Array, Array, Array]:
-    """Values, rates and second rates (k, d) of numbers that a polynomial may go through: base, then joints.
+    """Values, first and second time derivatives (k, d) of continuous coordinates: of the base, then joints.
 
     The base has seven: position, and quaternion w, x, y, z.
     """
     q, v, a = reference.q, reference.v, reference.a
-    joints = robot.joint_models
-    turning = [k for k, joint in enumerate(joints) if joint.nq == 2]
+    continuous = [k for k, joint in enumerate(robot.joint_models) if joint.nq == 2]
     angle = robot.joint_positions(q)
-    angle[:, turning] = np.unwrap(angle[:, turning], axis=0)
-    values, rates, bends = [angle], [v[:, -robot.n :]], [a[:, -robot.n :]]
+    angle[:, continuous] = np.unwrap(angle[:, continuous], axis=0)
+    values, firsts, seconds = [angle], [v[:, -robot.n :]], [a[:, -robot.n :]]
     if robot.floating:
+        # of the quaternions q and -q of a rotation, the one nearer to the sample before
         quaternion = q[:, [6, 3, 4, 5]].copy()
-        turns = np.cumsum(np.einsum("ij,ij->i", quaternion[1:], quaternion[:-1]) < 0) % 2
-        quaternion[1:][turns == 1] *= -1.0
-        spin, more = v[:, 3:6], a[:, 3:6]
+        flips = np.cumsum(np.einsum("ij,ij->i", quaternion[1:], quaternion[:-1]) < 0) % 2
+        quaternion[1:][flips == 1] *= -1.0
+        # v and a are along the base's axes: dq/dt = q w / 2, d2q/dt2 = (dq/dt w + q dw/dt) / 2
+        spin, spin_rate = v[:, 3:6], a[:, 3:6]
         rate = _product(quaternion, spin) / 2
-        bend = (_product(rate, spin) + _product(quaternion, more)) / 2
+        second = (_product(rate, spin) + _product(quaternion, spin_rate)) / 2
         linear = _turned(quaternion, v[:, :3])
-        gain = _turned(quaternion, a[:, :3] + np.cross(spin, v[:, :3]))
+        acceleration = _turned(quaternion, a[:, :3] + np.cross(spin, v[:, :3]))
         values = [q[:, :3], quaternion, *values]
-        rates, bends = [linear, rate, *rates], [gain, bend, *bends]
-    return np.hstack(values), np.hstack(rates), np.hstack(bends)
+        firsts, seconds = [linear, rate, *firsts], [acceleration, second, *seconds]
+    return np.hstack(values), np.hstack(firsts), np.hstack(seconds)
 
 
 def _phase(
     phase: int,
     times: Array,
-    rows: NDArray[np.intp],
+    own: NDArray[np.intp],
     reference: Trajectory,
     curves: tuple[Array, Array, Array],
     arrays: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """All that there is of one phase at its instants."""
-    own = reference.time[rows]
-    curve = BPoly.from_derivatives(own, np.stack([part[rows] for part in curves], axis=1))
-    ground = np.stack([np.interp(times, own, w) for w in reference.ground[rows].T], axis=1)
+    """Fields of `Motion`, with full curves, of one phase at its instants.
+
+    own : indices of the phase's samples in the reference.
+    """
+    knots = reference.time[own]
+    curve = BPoly.from_derivatives(knots, np.stack([part[own] for part in curves], axis=1))
+    ground = np.stack([np.interp(times, knots, w) for w in reference.ground[own].T], axis=1)
     force = np.zeros(len(times))
     since = times - reference.contact_start
     if phase == CONTACT and len(arrays.get("collision_time", ())) > 1:
+        # force and ground wrench in contact are those of the planned collision, not of the reference
         hit = arrays["collision_time"]
         force = np.clip(PchipInterpolator(hit, arrays["collision_force"])(since.clip(0, hit[-1])), 0.0, None)
         wrench = arrays["collision_ground"]
         if len(wrench) and np.any(wrench):
             at = hit[-len(wrench) :]
-            # the ground has the swing's last wrench until the blow is felt
-            at, wrench = np.append(0.0, at), np.vstack([reference.ground[rows[0] - 1], wrench])
+            # from the swing's last wrench to the first one of the collision
+            at, wrench = np.append(0.0, at), np.vstack([reference.ground[own[0] - 1], wrench])
             ground = np.stack([np.interp(since, at, w) for w in wrench.T], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         place = zmp(ground) if np.any(reference.ground) else np.zeros((len(times), 2))
@@ -216,19 +223,21 @@ def _phase(
         "position": curve(times),
         "velocity": curve.derivative()(times),
         "acceleration": curve.derivative(2)(times),
-        "effort": np.stack([np.interp(times, own, tau) for tau in reference.torque[rows].T], axis=1),
+        "effort": np.stack([np.interp(times, knots, tau) for tau in reference.torque[own].T], axis=1),
         "force": force,
         "zmp": place,
     }
 
 
 def _base(whole: Mapping[str, Any]) -> Base:
+    """Pose and velocity of the base from its curves, whose quaternions are only nearly of norm 1."""
     position, rate = whole["position"], whole["velocity"]
-    quaternion, turning = position[:, 3:7], rate[:, 3:7]
+    quaternion, derivative = position[:, 3:7], rate[:, 3:7]
     size = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    # the spin in the link's axes is twice the vector of conj(quaternion) x its rate
+    # the angular velocity in the link's axes is twice the vector part of conj(quaternion) x derivative
     w, vector = quaternion[:, :1], quaternion[:, 1:]
-    spin = 2 * (w * turning[:, 1:] - turning[:, :1] * vector - np.cross(vector, turning[:, 1:])) / size**2
+    spin = w * derivative[:, 1:] - derivative[:, :1] * vector - np.cross(vector, derivative[:, 1:])
+    spin = 2 * spin / size**2
     quaternion = quaternion / size
     return Base(
         position=position[:, :3],
@@ -239,14 +248,14 @@ def _base(whole: Mapping[str, Any]) -> Base:
 
 
 def _product(quaternion: Array, vector: Array) -> Array:
-    """Quaternions (k, 4) times vectors (k, 3)."""
+    """Products (k, 4) of quaternions (k, 4), w first, and vectors (k, 3)."""
     w, u = quaternion[:, :1], quaternion[:, 1:]
     real = -np.einsum("ij,ij->i", u, vector)[:, None]
     return np.hstack([real, w * vector + np.cross(u, vector)])
 
 
 def _turned(quaternion: Array, vector: Array) -> Array:
-    """Vectors (k, 3) turned by quaternions (k, 4) of length 1."""
+    """Vectors (k, 3) rotated by unit quaternions (k, 4)."""
     w, u = quaternion[:, :1], quaternion[:, 1:]
     twice = 2 * np.cross(u, vector)
     return np.asarray(vector + w * twice + np.cross(u, twice))

@@ -1,4 +1,4 @@
-"""MuJoCo: a scene with robot, floor and target, the reference beside it, and the lines that play it."""
+"""MuJoCo: a scene with robot, floor and target, the reference, and a script that plays it."""
 
 from __future__ import annotations
 
@@ -36,39 +36,38 @@ __all__ = ["PLAYER", "write"]
 
 Array = NDArray[np.float64]
 SCENE, REFERENCE, PLAYER, MESHES = "scene.xml", "reference.npz", "play.py", "meshes"
-LONGEST, HAND = 2e-4, 1.0  # [s] of a step; [kg] of a hand, about, where the target is heavier
-TRIANGLES, CELL = 20_000, 0.004  # of a mesh, and the cells [m] that a finer one is simplified to
-WOOD, OTHER = (
-    (0.72, 0.55, 0.35, 1.0),
-    (0.6, 0.6, 0.65, 0.35),
-)  # colours of the target, and of what stands about
+MAX_STEP = 2e-4  # [s]
+HAND_MASS = 1.0  # [kg] for the contact's fastest time, if the target is heavier
+MAX_TRIANGLES, CELL = 20_000, 0.004  # of a mesh, and the cells [m] to which a finer one is simplified
+TARGET_COLOUR, WORLD_COLOUR = (0.72, 0.55, 0.35, 1.0), (0.6, 0.6, 0.65, 0.35)
 
 
 def write(export: Export, directory: Path) -> None:
     """`scene.xml` with its meshes, `reference.npz`, and `play.py`.
 
-    The joint ``target`` slides along the normal, and the actuator ``contact`` measures how deep the striking
-    point is in the target, and pulls both together or apart.
+    The joint ``target`` slides along the normal. The actuator ``contact`` applies the contact force; its
+    length is the penetration of the striking point.
 
     Raises
     ------
-    InputError : MuJoCo is not installed; a law or a target without a formula here.
+    InputError : MuJoCo is not installed; a law or a target without a formula here; two strikers, gripping
+        hands, friction, a moving board.
     """
     p = export.problem
     if type(p.law) not in LAWS or type(p.target) not in (FreeMass, RigidWall, Nail, Board):
         raise InputError(
             f"mujoco: there is no formula for {type(p.law).__name__} on {type(p.target).__name__}; scenes "
-            "know the laws and targets of problem files: export to csv instead"
+            "have the laws and targets of problem files: export to csv instead"
         )
     if p.second is not None or p.stance.held_hands(p.robot):
         raise InputError(
-            "mujoco: the scene has one striker, and no hand that holds on; export to csv instead, or replay "
-            "here (impactopt validate)"
+            "mujoco: the scene has one striker, and no fixed hand; export to csv instead, or replay here "
+            "(impactopt validate)"
         )
     if p.friction is not None:
         raise InputError(
-            "mujoco: the scene's contact has no friction at the hit, the plan has: export to csv instead, or "
-            "replay here (impactopt validate)"
+            "mujoco: the scene's contact has no friction at the target, the plan has: export to csv instead, "
+            "or replay here (impactopt validate)"
         )
     if isinstance(p.target, Board) and p.target.initial_velocity:
         raise InputError("mujoco: the scene's board stands still before contact; export to csv instead")
@@ -96,11 +95,14 @@ def _write_scene(export: Export, directory: Path) -> None:
     _add_actuators(mujoco, spec, export)
     _add_keyframes(spec, export)
     (directory / SCENE).write_text(spec.to_xml(), encoding="utf-8")
-    mujoco.MjModel.from_xml_path(str(directory / SCENE))  # what is written can be read
+    mujoco.MjModel.from_xml_path(str(directory / SCENE))  # raises a ValueError if it cannot be read
 
 
 def _step(export: Export) -> float:
-    """[s] with which explicit steps follow the contact: a part of its fastest time."""
+    """Step [s] for which explicit integration of the contact is accurate: a fraction of its fastest time.
+
+    Stiffness and damping are those of the law at the planned peak force.
+    """
     p, summary = export.problem, export.planned.record.summary
     peak = float(summary.get("peak_force_N") or 1e3)
 
@@ -110,33 +112,33 @@ def _step(export: Export) -> float:
     depth = float(brentq(lambda x: force(x) - peak, 0.0, 10.0)) if force(10.0) > peak else 1e-3
     stiffness = (force(1.01 * depth) - force(depth)) / (0.01 * depth)
     damping = (force(depth, 1e-3) - force(depth)) / 1e-3
-    mass = min(HAND, p.target.parameters.get("mass", HAND))
+    mass = min(HAND_MASS, p.target.parameters.get("mass", HAND_MASS))
     fastest = (0.04 * np.sqrt(mass / max(stiffness, 1e-9)), 0.1 * mass / max(damping, 1e-9))
-    return float(f"{min(LONGEST, *fastest):.2g}")
+    return float(f"{min(MAX_STEP, *fastest):.2g}")
 
 
 def _draw_robot(mujoco: Any, spec: Any, bodies: list[Any], export: Export, meshes: Path) -> None:
-    """Its visual shapes, one mesh for each joint and colour; they touch nothing and weigh nothing."""
+    """Add the robot's visual shapes, one mesh for each joint and colour, without contacts and mass."""
     groups: dict[tuple[int, tuple[float, float, float]], list[Solid]] = {}
     for visual in visuals_of(export.robot):
         groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)
     meshes.mkdir()
     for k, ((joint, colour), solids) in enumerate(groups.items()):
         solid = joined(solids)
-        if len(solid.triangles) > TRIANGLES:
+        if len(solid.triangles) > MAX_TRIANGLES:
             solid = simplified(solid, CELL)
         name = f"{k:02d}"
         _write_stl(meshes / f"{name}.stl", solid)
-        # of a shell: thin meshes have no volume
+        # inertia of a shell, as MuJoCo refuses meshes without volume
         spec.add_mesh(name=name, file=f"{name}.stl", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         bodies[joint].add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=[*colour, 1.0], **_seen_only()
+            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=[*colour, 1.0], **_visual_only()
         )
     spec.assets = {path.name: path.read_bytes() for path in meshes.iterdir()}
 
 
 def _write_stl(path: Path, solid: Solid) -> None:
-    """Writes a solid as binary STL."""
+    """Write a solid as binary STL."""
     corners = solid.vertices[solid.triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
@@ -145,21 +147,22 @@ def _write_stl(path: Path, solid: Solid) -> None:
     path.write_bytes(bytes(80) + np.uint32(len(table)).tobytes() + table.tobytes())
 
 
-def _seen_only() -> dict[str, Any]:
+def _visual_only() -> dict[str, Any]:
+    """Attributes of geoms without contacts and mass."""
     return {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": 2}
 
 
 def _add_target(mujoco: Any, spec: Any, p: ImpactProblem, step: float) -> None:
-    """A body whose z axis is the normal, with its face at the origin, on a slide joint if it moves."""
-    rows = face_axes(p.normal)  # normal, across, up
-    axes = np.column_stack([rows[1], rows[2], rows[0]])
+    """Add a body whose z axis is the normal, with its face at the origin, on a slide joint if it moves."""
+    normal, across, up = face_axes(p.normal)
+    axes = np.column_stack([across, up, normal])
     body = spec.worldbody.add_body(name="target", pos=p.point, quat=quaternion(axes))
     body.add_site(name="face")
     target = p.target
     if not isinstance(target, RigidWall):
         body.gravcomp, body.explicitinertial, body.ipos = 1.0, True, np.zeros(3)
         body.mass = float(target.parameters["mass"])
-        body.inertia = np.full(3, 1e-3 * body.mass)  # it does not turn
+        body.inertia = np.full(3, 1e-3 * body.mass)  # any: it does not rotate
         spring = (
             {"stiffness": target.stiffness, "damping": target.damping} if isinstance(target, Board) else {}
         )
@@ -168,7 +171,7 @@ def _add_target(mujoco: Any, spec: Any, p: ImpactProblem, step: float) -> None:
         )
         if isinstance(target, Nail):
             joint.frictionloss = target.resistance + target.hardening * target.depth
-            # as stiff as steps allow: a softer one creeps under forces that are below the resistance
+            # as stiff as the step allows: softer friction creeps under forces below the resistance
             joint.solref_friction = [2 * step, 1.0]
             joint.solimp_friction = [0.999, 0.9999, 1e-3, 0.5, 2.0]
     place = pin.SE3(axes, np.asarray(p.point)).inverse()
@@ -177,15 +180,15 @@ def _add_target(mujoco: Any, spec: Any, p: ImpactProblem, step: float) -> None:
             shape = primitive(mujoco, solid)
             moved = place * pin.SE3(solid.rotation, solid.place)
             shape |= {"pos": moved.translation, "quat": quaternion(moved.rotation)}
-            body.add_geom(name=solid.name, rgba=WOOD, **shape, **_seen_only())
+            body.add_geom(name=solid.name, rgba=TARGET_COLOUR, **shape, **_visual_only())
 
 
 def _add_world(mujoco: Any, spec: Any, p: ImpactProblem) -> None:
-    """Adds the bodies of the world, light, and a grid on the floor."""
+    """Add the bodies of the world, light, and a grid on the floor."""
     for k, solid in enumerate(p.world):
         if not (solid.ground or solid.core or (solid.of_target and solid.moves)):
             shape = primitive(mujoco, solid)
-            spec.worldbody.add_geom(name=f"{solid.name} {k}", rgba=OTHER, **shape, **_seen_only())
+            spec.worldbody.add_geom(name=f"{solid.name} {k}", rgba=WORLD_COLOUR, **shape, **_visual_only())
     spec.worldbody.add_light(pos=[1.0, -2.0, 5.0], dir=[-0.2, 0.4, -1.0], castshadow=True)
     texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
     spec.add_texture(
@@ -215,7 +218,7 @@ def _add_world(mujoco: Any, spec: Any, p: ImpactProblem) -> None:
 
 
 def _add_actuators(mujoco: Any, spec: Any, export: Export) -> None:
-    """A motor for each joint, in the order of the export, and the contact last."""
+    """Add a motor for each joint, in the order of the export, and the contact last."""
     for name, limit in zip(export.joints, export.per_joint(export.robot.torque_limit), strict=True):
         spec.add_actuator(
             name=name,
@@ -224,7 +227,7 @@ def _add_actuators(mujoco: Any, spec: Any, export: Export) -> None:
             forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
             forcerange=[-limit, limit],
         )
-    # its length is how far the striker is beyond the face along the normal; it acts on both
+    # its length is the striker's position along the face's normal; its force acts on both
     spec.add_actuator(
         name="contact",
         target="striker",
@@ -235,11 +238,11 @@ def _add_actuators(mujoco: Any, spec: Any, export: Export) -> None:
 
 
 def _add_keyframes(spec: Any, export: Export) -> None:
-    """`start`, at rest, and `contact`, as planned just before it."""
+    """Add keyframes: `start`, at rest, and `contact`, the planned state just before it."""
     motion, model = export.motion, spec.compile()
-    at_contact = int(np.flatnonzero(motion.phase == 0)[-1])
-    coming = float(export.problem.target.speed_before())
-    for name, k in (("start", 0), ("contact", at_contact)):
+    before_contact = int(np.flatnonzero(motion.phase == 0)[-1])
+    target_speed = float(export.problem.target.speed_before())
+    for name, k in (("start", 0), ("contact", before_contact)):
         qpos, qvel = np.zeros(model.nq), np.zeros(model.nv)
         for column, joint in enumerate(export.joints):
             qpos[model.joint(joint).qposadr[0]] = motion.position[k, column]
@@ -249,9 +252,9 @@ def _add_keyframes(spec: Any, export: Export) -> None:
             qpos[:3], qpos[3:7] = base.position[k], base.quaternion[k]
             turned = pin.Quaternion(*base.quaternion[k]).toRotationMatrix()
             qvel[:3], qvel[3:6] = base.linear[k], turned.T @ base.angular[k]
-        if coming:
+        if target_speed:
             slide, until = model.joint("target"), float(motion.time[k]) - motion.contact_start
-            qpos[slide.qposadr[0]], qvel[slide.dofadr[0]] = coming * until, coming
+            qpos[slide.qposadr[0]], qvel[slide.dofadr[0]] = target_speed * until, target_speed
         spec.add_key(name=name, qpos=qpos, qvel=qvel, time=float(motion.time[k]))
 
 
@@ -271,6 +274,7 @@ def _reference(export: Export) -> dict[str, Any]:
 
 
 def _histories(motion: Motion | None) -> Iterator[tuple[str, Array]]:
+    """Names and arrays of a motion's histories; none for None."""
     names = ("time", "phase", "position", "velocity", "acceleration", "effort", "force", "zmp")
     for name in names if motion is not None else ():
         if getattr(motion, name) is not None:

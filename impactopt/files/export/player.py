@@ -1,4 +1,4 @@
-"""The lines that play an exported scene: plain MuJoCo and NumPy, nothing of this package."""
+"""Script that plays an exported scene, with MuJoCo and NumPy only."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["LAWS", "player"]
 
-# force [N] of a striker that is x [m] deep, and goes deeper at a rate [m/s]; below zero there is none
+# contact force [N] at a penetration x [m] and its rate [m/s]; negative values are replaced by zero
 LAWS: Mapping[type[ContactLaw], str] = {
     SpringDamper: "stiffness * x + damping * rate * (rate > 0)",
     KelvinVoigt: "stiffness * x + damping * rate",

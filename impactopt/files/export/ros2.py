@@ -23,7 +23,7 @@ def write(export: Export, directory: Path) -> None:
 
 
 def stamp(seconds: float) -> tuple[int, int]:
-    """Whole seconds, and what is left in nanoseconds."""
+    """Whole seconds, and the rest in nanoseconds."""
     return divmod(round(1e9 * seconds), 1_000_000_000)
 
 
@@ -31,7 +31,7 @@ def _lines(export: Export, motion: Motion) -> Iterator[str]:
     meta = export.meta
     yield f"# {json.dumps(meta['problem'])} for {json.dumps(meta['robot'])}, {export.rate:g} Hz; SI units"
     yield f"# contact from {motion.contact_start:.9g} to {motion.contact_end:.9g} s; meta.json has the rest"
-    # what is text in JSON is text in YAML, whatever is in the names
+    # a JSON string is also a YAML string, whatever characters the names have
     yield "trajectory:"
     yield f"  joint_names: {json.dumps(list(export.joints))}"
     yield "  points:"
@@ -44,6 +44,6 @@ def _lines(export: Export, motion: Motion) -> Iterator[str]:
         yield f"    time_from_start: {{sec: {sec}, nanosec: {nanosec}}}"
 
 
-def _numbers(row: Any) -> str:
-    """Numbers with a decimal point in each: ROS refuses whole numbers where it expects floats."""
-    return f"[{', '.join(repr(float(f'{x:.10g}')) for x in np.asarray(row))}]"
+def _numbers(values: Any) -> str:
+    """YAML list of numbers with decimal points: ROS does not accept integers for floats."""
+    return f"[{', '.join(repr(float(f'{x:.10g}')) for x in np.asarray(values))}]"

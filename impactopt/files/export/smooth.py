@@ -1,6 +1,4 @@
-"""A plan's reference without jumps, for arms whose controllers refuse them: within limits of acceleration and
-jerk.
-"""
+"""Smoothing of a reference within limits of acceleration and jerk, for controllers that refuse jumps."""
 
 from __future__ import annotations
 
@@ -18,20 +16,21 @@ from impactopt.transcription.plan import Trajectory, complete_reference
 __all__ = ["Smoothness", "smoothed"]
 
 Array = NDArray[np.float64]
-STEP, PIECES = 2e-3, 3000  # [s] of constant jerk at least, and how many of them there are at most
-REST = 0.1  # [s] longer than the plan
-NEARBY, WEIGHT = 0.05, 1e3  # [s] before contact in which, and up to its end, a deviation counts so much more
-LAG = 0.02  # [s] a position that is off by as much as a speed, times this, costs as much
-INSTANTS = 2  # a piece
+MIN_STEP, MAX_STEPS = 2e-3, 3000  # [s] of constant jerk, and their number
+EXTRA_TIME = 0.1  # [s] that the smoothed motion is longer
+# weight of deviations from so long [s] before contact to its end, where they cost impulse; 1 elsewhere
+BEFORE_CONTACT, CONTACT_WEIGHT = 0.05, 1e3
+POSITION_TIME = 0.02  # [s]: a position error is weighted as the velocity error position / POSITION_TIME
+SAMPLES_PER_STEP = 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Smoothness:
-    """Limits of every joint: acceleration [rad/s^2] and jerk [rad/s^3]; of slides [m/s^2], [m/s^3].
+    """Limits of all joints: acceleration [rad/s^2] and jerk [rad/s^3]; for prismatic ones [m/s^2], [m/s^3].
 
     Raises
     ------
-    InputError : one is no number above 0.
+    InputError : one of them is not positive.
     """
 
     acceleration: float
@@ -44,51 +43,52 @@ class Smoothness:
 
 
 def smoothed(reference: Trajectory, problem: ImpactProblem, limits: Smoothness) -> Trajectory:
-    """The trajectory nearest to a reference whose acceleration is continuous, within limits.
+    """The trajectory with continuous acceleration nearest to a reference, within limits.
 
-    Joint by joint a linear program: jerks, constant for 2 ms each, that minimize the sum of deviations of
-    position and velocity. Deviations before contact and in it cost more, as they cost impulse. It ends 0.1 s
-    later. Joints keep their ranges and their speeds. Feed-forward is that of the smoothed motion.
+    A linear program for each joint: piecewise constant jerks, for 2 ms each, minimize the weighted sum of
+    absolute deviations of position and velocity. Position and velocity limits hold, too. The motion ends
+    0.1 s later than the plan; its feed-forward is computed anew.
 
     Raises
     ------
-    InputError : the robot stands on soles, which other joints' motions would move; no motion within the
-        limits is at rest where the plan is.
+    InputError : the robot stands on soles, which joints smoothed one by one would move; no motion within the
+        limits ends at rest where the plan does.
     """
     robot, c = problem.robot, problem.coordinates
     if robot.floating:
         raise InputError("smooth: joints of legs cannot be smoothed one by one; it is for bolted robots")
     position = np.unwrap([c.split(q)[0] for q in reference.q], axis=0)
-    end = reference.end + REST
-    step = max(STEP, end / PIECES)
-    pieces = int(np.ceil(end / step))
-    nodes = np.linspace(0.0, pieces * step, pieces + 1)
-    near = (nodes > reference.contact_start - NEARBY) & (nodes < reference.contact_end)
+    end = reference.end + EXTRA_TIME
+    step = max(MIN_STEP, end / MAX_STEPS)
+    steps = int(np.ceil(end / step))
+    nodes = np.linspace(0.0, steps * step, steps + 1)
+    near = (nodes > reference.contact_start - BEFORE_CONTACT) & (nodes < reference.contact_end)
     parts = [
         _joint(
             name,
             step,
             np.interp(nodes, reference.time, position[:, k]),
             np.interp(nodes, reference.time, reference.v[:, k]),
-            np.where(near, WEIGHT, 1.0),
+            np.where(near, CONTACT_WEIGHT, 1.0),
             limits,
             (float(robot.lower[k]), float(robot.upper[k]), float(robot.velocity_limit[k])),
         )
         for k, name in enumerate(robot.joint_names)
     ]
     edges = [reference.contact_start, reference.contact_end]
-    fine = np.linspace(0.0, nodes[-1], INSTANTS * (len(nodes) - 1) + 1)
-    before, hit, after = (
+    fine = np.linspace(0.0, nodes[-1], SAMPLES_PER_STEP * (len(nodes) - 1) + 1)
+    # samples of the three phases, with both edges of each: an edge is in two phases
+    before, contact, after = (
         np.unique(np.concatenate([fine[(fine > low) & (fine < high)], np.clip([low, high], 0.0, fine[-1])]))
         for low, high in ((0.0, edges[0]), edges, (edges[1], fine[-1]))
     )
-    time = np.concatenate([before, hit, after])
+    time = np.concatenate([before, contact, after])
     y, yd, ydd = np.stack([_at(time, nodes, *part) for part in parts], axis=-1)
-    rows = complete_reference(problem, y, yd, ydd, np.zeros((len(time), 0)), np.zeros(0))
+    samples = complete_reference(problem, y, yd, ydd, np.zeros((len(time), 0)), np.zeros(0))
     return Trajectory(
         time=time,
-        phase=np.repeat(np.arange(3), [len(before), len(hit), len(after)]),
-        **rows._asdict(),
+        phase=np.repeat(np.arange(3), [len(before), len(contact), len(after)]),
+        **samples._asdict(),
         contact_start=reference.contact_start,
         contact_end=reference.contact_end,
         end=float(nodes[-1]),
@@ -104,23 +104,25 @@ def _joint(
     limits: Smoothness,
     own: tuple[float, float, float],
 ) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration (k,) of one joint at nodes `step` [s] apart.
+    """Smoothed position, velocity and acceleration (k,) of one joint at nodes `step` [s] apart.
 
-    position, velocity (k,) : of the reference there.  weight (k,) : of deviations.  own : the joint's lowest
-    and highest position, and its largest speed.
+    position, velocity (k,) : of the reference there.  weight (k,) : of deviations.  own : lower and upper
+    position limit, and velocity limit.
     """
     k, h = len(position), step
     one = sp.identity(k, format="csr")
-    here, on = one[:-1], one[1:] - one[:-1]
-    # unknowns: position, velocity, acceleration, jerk, and what the first two are off by at most
-    kept = sp.bmat(
+    here, increment = one[:-1], one[1:] - one[:-1]
+    # Unknowns, (k,) each: position, velocity, acceleration, jerk, bounds of the deviations of position and
+    # velocity. Equations: integration over a step of constant jerk.
+    integration = sp.bmat(
         [
-            [on, -h * here, -(h**2 / 2) * here, -(h**3 / 6) * here, 0 * here, 0 * here],
-            [None, on, -h * here, -(h**2 / 2) * here, None, None],
-            [None, None, on, -h * here, None, None],
+            [increment, -h * here, -(h**2 / 2) * here, -(h**3 / 6) * here, 0 * here, 0 * here],
+            [None, increment, -h * here, -(h**2 / 2) * here, None, None],
+            [None, None, increment, -h * here, None, None],
         ]
     )
-    off = sp.bmat(
+    # inequalities: |position - reference| <= bound, and the same of velocity
+    deviations = sp.bmat(
         [
             [one, None, None, None, -one, None],
             [-one, None, 0 * one, 0 * one, -one, None],
@@ -129,19 +131,20 @@ def _joint(
         ]
     )
     lowest, highest, fastest = own
+    # at both ends the joint is at rest, at the reference's position
     ends = np.zeros(k, dtype=bool)
     ends[[0, -1]] = True
-    still = [np.where(ends, 0.0, most) for most in (fastest, limits.acceleration)]
-    most = [np.where(ends, position, highest), *still, np.full(k, limits.jerk)]
-    least = [np.where(ends, position, lowest), *(-x for x in most[1:])]
+    at_rest = [np.where(ends, 0.0, most) for most in (fastest, limits.acceleration)]
+    upper = [np.where(ends, position, highest), *at_rest, np.full(k, limits.jerk)]
+    lower = [np.where(ends, position, lowest), *(-x for x in upper[1:])]
     found = linprog(
-        np.concatenate([np.zeros(4 * k), weight / LAG, weight]),
-        A_ub=off,
+        np.concatenate([np.zeros(4 * k), weight / POSITION_TIME, weight]),
+        A_ub=deviations,
         b_ub=np.concatenate([position, -position, velocity, -velocity]),
-        A_eq=kept,
+        A_eq=integration,
         b_eq=np.zeros(3 * (k - 1)),
         bounds=np.column_stack(
-            [np.concatenate([*least, np.zeros(2 * k)]), np.concatenate([*most, np.full(2 * k, np.inf)])]
+            [np.concatenate([*lower, np.zeros(2 * k)]), np.concatenate([*upper, np.full(2 * k, np.inf)])]
         ),
         method="highs-ds",
     )
@@ -155,7 +158,7 @@ def _joint(
 
 
 def _at(time: Array, nodes: Array, q: Array, v: Array, a: Array) -> Array:
-    """(3, m) Position, velocity, acceleration of a joint at m instants, from those at the nodes."""
+    """Position, velocity and acceleration (3, m) of a joint at m instants, from those at the nodes."""
     k = np.clip(np.searchsorted(nodes, time, side="right") - 1, 0, len(nodes) - 2)
     t, jerk = time - nodes[k], np.diff(a)[k] / (nodes[1] - nodes[0])
     return np.array(

@@ -1,13 +1,13 @@
 """Problem files: an `impactopt.problem.problem.ImpactProblem` written in TOML, in SI units.
 
-* values.py     what all sections have in common, and ranges of the keys' values
-* robot_sections.py   [robot]
-* sections.py   the other sections and keys of a file, what they make, and what they are in words
-* diagnostics.py   what is wrong in a file, in words: where, what was meant, what is allowed
-* reading.py    from file to problem, with other values by key paths; writing.py: back
+* values.py     base class of sections, types and ranges of the keys' values
+* robot_sections.py   section [robot]
+* sections.py   the other sections and keys of a file, what they build, and their descriptions
+* diagnostics.py   mistakes of a file: place, probable intention, permitted values
+* reading.py    file to problem, with changed values by key paths; writing.py: problem to file
 * toml.py       text from and to plain data
 * reference.py  docs/problem_files.md, and the comments of `impactopt new`
-* names.py      the files that come with the package, by name
+* names.py      the package's own files, by name
 """
 
 from impactopt.files.problem_file.names import problem_names

@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from impactopt.errors import did_you_mean, shortened
 from impactopt.files.problem_file.toml import Place
 
-# no two parts of these can take the same character: a long line costs its length, not its square
+# No two parts of these patterns match the same character, so that matching takes linear time.
 _HEADER = re.compile(r"""^\s*(\[\[?)([\w."'\s-]+)\]\]?\s*(?:#.*)?$""")
 _KEY = re.compile(r"""^\s*([\w."'-]+)\s*=""")
 
@@ -31,7 +31,7 @@ _KINDS = {
     "model_type": "give a section of its own",
     "model_attributes_type": "give a section of its own",
 }
-_MOST, _LONGEST = 100, 1000  # mistakes that are reported, and characters of each
+_MAX_MISTAKES, _MAX_LENGTH = 100, 1000  # mistakes in a message, and characters of each
 _SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
@@ -39,8 +39,9 @@ _SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 class Mistake:
     """A mistake at a place in the file.
 
-    place : path of keys and indices; the first `sections` of them name the table.  first : it is to be fixed
-    before the others.  meant : the key that a misspelt one probably is, or "".
+    place : path of keys and indices, whose first `sections` parts are the table.
+    first : report it before the others, as it should be fixed first.
+    meant : probable intention for a misspelt key, or "".
     """
 
     place: Place
@@ -59,26 +60,27 @@ class Mistake:
 
 
 def report_mistakes(where: str, lines: Mapping[Place, int], mistakes: Iterable[Mistake]) -> str:
-    """One message for all mistakes, in the order of the file, with the lines where they can be found.
+    """One message for all mistakes, in the order of the file, with line numbers.
 
-    where : the file, or what else it was.  lines : of keys (`key_lines`); 0 for what was set from outside.
+    where : name of the file or of another source.  lines : by key (`key_lines`); 0 for changed values.
     """
     found = []
     for mistake in mistakes:
         place = mistake.place
-        # what is missing has no line of its own, and neither has a key inside a value
+        # the line of the key, or of the nearest table above, for keys that are missing or inside a value
         line = next((lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in lines), None)
         at = "" if line is None else f"line {line}, " if line else "as set, "
         found.append((not mistake.first, line is None, line or 0, f"{at}{mistake}"))
-    rows = list(dict.fromkeys(shortened(row, _LONGEST) for *_, row in sorted(found)))
-    if len(rows) == 1:
-        return f"{where}, {rows[0]}" if rows[0].startswith(("line", "as set")) else f"{where}: {rows[0]}"
-    told = rows[:_MOST] + ([f"... and {len(rows) - _MOST} more"] if len(rows) > _MOST else [])
-    return "\n".join([f"{where} has {len(rows)} mistakes:", *(f"  {row}" for row in told)])
+    texts = list(dict.fromkeys(shortened(text, _MAX_LENGTH) for *_, text in sorted(found)))
+    if len(texts) == 1:
+        return f"{where}, {texts[0]}" if texts[0].startswith(("line", "as set")) else f"{where}: {texts[0]}"
+    more = len(texts) - _MAX_MISTAKES
+    shown = texts[:_MAX_MISTAKES] + ([f"... and {more} more"] if more > 0 else [])
+    return "\n".join([f"{where} has {len(texts)} mistakes:", *(f"  {text}" for text in shown)])
 
 
 def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]:
-    """Mistakes that pydantic found in a file that `model` describes."""
+    """Mistakes of a pydantic error, for a file that `model` describes."""
     out, meant = [], set()
     for e in error.errors(include_url=False):
         if e["type"] == "extra_forbidden":
@@ -93,7 +95,7 @@ def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]
         elif e["type"] != "missing":
             out.append(_mistake(model, e))
     for e in error.errors(include_url=False):
-        # a key that is there, misspelt, is not missing as well
+        # a key whose misspelling is reported is not reported as missing, too
         if e["type"] == "missing" and (e["loc"][:-1], e["loc"][-1]) not in meant:
             _, sections = section_at(model, e["loc"])
             out.append(Mistake(place=e["loc"], sections=sections, text="missing"))
@@ -101,6 +103,7 @@ def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]
 
 
 def _mistake(model: type[BaseModel], e: Mapping[str, Any]) -> Mistake:
+    """Mistake of a wrong value, from an entry of a pydantic error."""
     section, sections = section_at(model, e["loc"])
     context, value = e.get("ctx", {}), _show(e["input"])
     if e["type"] == "value_error":
@@ -109,9 +112,10 @@ def _mistake(model: type[BaseModel], e: Mapping[str, Any]) -> Mistake:
         wanted = context.get("min_length", context.get("max_length"))
         text = f"has {context['actual_length']} values; give {wanted}"
     elif e["type"] in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
-        text = f"{value}; give a number {_range(section, e['loc'][sections:]) or _bound(e)}"
+        bound = " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in context.items() if key in _SIGNS)
+        text = f"{value}; give a number {_range(section, e['loc'][sections:]) or bound}"
     elif e["type"] == "literal_error":
-        near = did_you_mean(str(e["input"]), _choices(context))
+        near = did_you_mean(str(e["input"]), re.findall(r"'([^']*)'", str(context["expected"])))
         text = f"{value} is unknown{near}; give {context['expected']}"
     else:
         text = f"{value}; {_KINDS.get(e['type'], e['msg'])}"
@@ -119,7 +123,7 @@ def _mistake(model: type[BaseModel], e: Mapping[str, Any]) -> Mistake:
 
 
 def section_at(model: type[BaseModel], place: Place) -> tuple[type[BaseModel], int]:
-    """The innermost table of the file that holds `place`, and how much of the place names it."""
+    """Model of the innermost table that contains `place`, and how many of the place's parts name it."""
     depth = 0
     while depth < len(place):
         fields: dict[str | int, Any] = {_key(model, name): info for name, info in model.model_fields.items()}
@@ -140,7 +144,7 @@ def _key(model: type[BaseModel], name: str) -> str:
 
 
 def _range(section: type[BaseModel], keys: Sequence[str | int]) -> str:
-    """The allowed range of a number, "> 0 and <= 1"; "" where it is not in the model."""
+    """The allowed range of a number, "> 0 and <= 1"; "" if the model has none."""
     for name, info in section.model_fields.items():
         if len(keys) == 1 and _key(section, name) == keys[0]:
             return range_of(info)
@@ -154,23 +158,16 @@ def range_of(info: FieldInfo) -> str:
     return " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in bounds)
 
 
-def _bound(e: Mapping[str, Any]) -> str:
-    return " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in e["ctx"].items() if key in _SIGNS)
-
-
-def _choices(context: Mapping[str, Any]) -> list[str]:
-    return re.findall(r"'([^']*)'", str(context.get("expected", "")))
-
-
 def _show(value: Any) -> str:
     text = repr(value) if not isinstance(value, Mapping) else "a table"
     return text if len(text) <= 40 else text[:37] + "..."
 
 
 def key_lines(text: str) -> dict[Place, int]:
-    """The line (from 1) of every section and key of a TOML text, as far as a glance tells.
+    """The line (from 1) of the sections and keys of a TOML text.
 
-    TOML parsers give no positions; keys inside inline tables and multi-line values are not looked for.
+    It is found by patterns, as TOML parsers give no positions. Keys inside inline tables and multi-line
+    values are not found.
     """
     lines: dict[Place, int] = {}
     table: Place = ()

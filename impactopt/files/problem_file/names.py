@@ -1,4 +1,4 @@
-"""Problems, robots and sweeps by name: the files that come with the package."""
+"""Names of the package's own problem and sweep files."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ __all__ = [
 
 
 def problem_names() -> tuple[str, ...]:
-    """Names of the problems that come with the package, as `load_problem` takes them."""
+    """Names of the package's problems, arguments of `load_problem`."""
     return tuple(named_files())
 
 
 def problem_file(name: str | os.PathLike[str]) -> Path:
-    """The file of a problem's name; a path to a file is returned as it is.
+    """The file of a problem's name; a path to a file is returned unchanged.
 
-    A path has a folder or a suffix, or there is a file of that name; what is neither has to be a name.
+    An argument with a folder or a suffix, or of an existing file, is a path; all else is a name.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def problem_file(name: str | os.PathLike[str]) -> Path:
 
 
 def sweep_names() -> tuple[str, ...]:
-    """Names of the sweeps that come with the package, as `read_sweep_file` takes them."""
+    """Names of the package's sweeps, arguments of `read_sweep_file`."""
     return tuple(named_files(SWEEPS))
 
 

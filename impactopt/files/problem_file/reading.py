@@ -1,7 +1,7 @@
-"""Reading of problem files: from text to a problem, all mistakes in one message; other values by key paths.
+"""Reading of problem files: text to problem, all mistakes in one message; changed values by key paths.
 
-A key may leave its unit out: `target.mass` is `target.mass_kg`. A part of a list is named by its index from 0
-(`problem.point.1`), an entry of a list of tables by its index or its name.
+The unit of a key may be left out: `target.mass` is `target.mass_kg`. An element of a list has its index from
+0 (`problem.point.1`), an entry of a list of tables its index or its name.
 """
 
 from __future__ import annotations
@@ -60,23 +60,23 @@ _WORD = re.compile(r"[A-Za-z_][\w -]*")
 
 
 def change_data(data: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a problem file's data with other values, which are not checked yet; the keys are.
+    """A copy of a problem file's data with changed values. Keys are checked, values are not.
 
     Parameters
     ----------
-    data : of a problem file, a table in tables, as `impactopt.files.problem_file.read_toml` gives it.
-    settings : values by key path, set one after the other. A key of [robot] where the file names a preset
-        in [problem] makes a section [robot] of it.
+    data : nested tables of a problem file, as of `impactopt.files.problem_file.read_toml`.
+    settings : values by key path, set one after the other. If the file names a preset in [problem], a key of
+        [robot] replaces that name by a section [robot].
 
     Raises
     ------
-    InputError : one message for all keys that there are not, with what was meant.
+    InputError : one message for all unknown keys, with the probable intentions.
     """
     return change_and_place(data, settings)[0]
 
 
 def key_place(data: Mapping[str, Any], key: str) -> Place:
-    """Place of a key path in a problem file's data, by the keys' full names and the entries' indices.
+    """Place of a key path in a problem file's data: full names of keys and indices of entries.
 
     Raises
     ------
@@ -89,34 +89,36 @@ def key_place(data: Mapping[str, Any], key: str) -> Place:
 
 
 def key_paths(data: Mapping[str, Any]) -> Iterator[str]:
-    """Key paths that a file may have beside these data; entries of lists are those that it has."""
+    """All key paths of a file with these data, given or not; entries of lists are those given."""
     yield from _paths(with_kinds(File, data), data, "")
 
 
 def _paths(section: type[Section], value: Any, above: str) -> Iterator[str]:
+    """Key paths of a section with this value; above : the section's own path, with a dot."""
     for name, info in section.model_fields.items():
         key, inner = info.alias or name, info.annotation
-        held = value.get(key) if isinstance(value, Mapping) else None
-        entries = [(f"{above}{key}", held)]
+        part = value.get(key) if isinstance(value, Mapping) else None
+        entries = [(f"{above}{key}", part)]
         if get_origin(inner) is list:
             (inner,) = get_args(inner)
             if isinstance(inner, type) and issubclass(inner, Section):
-                rows = enumerate(held if isinstance(held, list) else ())
-                named = ((row.get("name", k) if isinstance(row, Mapping) else k, row) for k, row in rows)
-                entries = [(f"{above}{key}.{entry}", row) for entry, row in named]
-        for path, there in entries:
+                entries = [
+                    (f"{above}{key}.{table.get('name', k) if isinstance(table, Mapping) else k}", table)
+                    for k, table in enumerate(part if isinstance(part, list) else ())
+                ]
+        for path, entry in entries:
             if isinstance(inner, type) and issubclass(inner, Section):
-                yield from _paths(inner, there, f"{path}.")
+                yield from _paths(inner, entry, f"{path}.")
             else:
                 yield path
 
 
 def parse_settings(texts: Iterable[str]) -> dict[str, Any]:
-    """Settings as a command line has them: KEY=VALUE, the value as in TOML; a bare word is text.
+    """Settings of a command line, KEY=VALUE, with values as in TOML; a bare word is text.
 
     Raises
     ------
-    InputError : one message for all that are no settings.
+    InputError : one message for all texts that are no settings.
     """
     settings, wrong = {}, []
     for text in texts:
@@ -138,7 +140,7 @@ def parse_settings(texts: Iterable[str]) -> dict[str, Any]:
 def change_and_place(
     data: Mapping[str, Any], settings: Mapping[str, Any]
 ) -> tuple[dict[str, Any], tuple[Place, ...]]:
-    """`change_data`, and where the values are."""
+    """`change_data`, and the places of the changed values."""
     changed, places, wrong = copy.deepcopy(dict(data)), list[Place](), list[str]()
     for key, value in settings.items():
         if key.split(".")[0] == "robot" and "robot" not in changed:
@@ -169,8 +171,8 @@ def _find(model: type[Section], data: Mapping[str, Any], key: str) -> Place:
     if len(key) > LONGEST_KEY:
         raise KeyError(f"{shortened(key)}: no key is so long")
     place: list[str | int] = []
-    kind: Any = model  # what is described here
-    value: Any = data  # what the file has of it
+    kind: Any = model  # model or type at this place
+    value: Any = data  # value in the file at this place
     for part in key.split("."):
         where = ".".join(map(str, place))
         if isinstance(kind, type) and issubclass(kind, Section):
@@ -196,7 +198,7 @@ def _find(model: type[Section], data: Mapping[str, Any], key: str) -> Place:
 
 
 def _field(section: type[Section], part: str, key: str, where: str) -> tuple[str, Any]:
-    """The key of a section with or without its unit, and what it holds."""
+    """The full name of a section's key, which may be given without its unit, and its type."""
     names = {info.alias or name: (name, info) for name, info in section.model_fields.items()}
     for known, (name, info) in names.items():
         if part in (known, name):
@@ -223,7 +225,7 @@ def _index(value: Any, part: str, key: str, where: str) -> int:
 
 
 _T = TypeVar("_T")
-# each entry is checked by itself, and most are part of the program: of thousands a file could say too much
+# lists of sections whose length is limited: each entry is checked, and most are part of the program
 _LISTS = (
     ("stances",),
     ("scenarios",),
@@ -233,7 +235,7 @@ _LISTS = (
     ("robot", "tools"),
 )
 
-# what stands for required keys that are missing or wrong, while the others' names are looked up
+# substitutes for required keys that are missing or wrong, so that the others can be checked
 _STAND_INS: Mapping[str, dict[str, Any]] = {
     "problem": {"striker": "-", "point_m": [0.0, 0.0, 0.0], "normal": [1.0, 0.0, 0.0]},
     "contact": {"stiffness_N_m": 1.0, "damping_N_s_m": 1.0},
@@ -241,14 +243,14 @@ _STAND_INS: Mapping[str, dict[str, Any]] = {
     "swing": {"duration_s": 1.0},
     "follow": {"duration_s": 1.0},
 }
-_ROUNDS = 4  # of mending what was found and looking again
+_ROUNDS = 4  # of correcting the mistakes found and checking again
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemFile:
-    """A problem file whose text is sound.
+    """A problem file whose text has been checked.
 
-    path, text : where it was read, and what it said, or says with its changes.  data : the same as tables.
+    path, text : of the file; the text has its changed values.  data : the same as nested tables.
     solver : its [solver] section.  controller : its [controller] section, or the defaults.
     """
 
@@ -261,11 +263,11 @@ class ProblemFile:
     lines: Mapping[Place, int] = field(repr=False, default_factory=dict)
 
     def changed(self, settings: Mapping[str, Any], *, names: bool = False) -> ProblemFile:
-        """The file with other values, by key paths (`change_data`); names : as of `read_problem_file`.
+        """The file with changed values, by key paths (`change_data`); names : as of `read_problem_file`.
 
         Raises
         ------
-        InputError : unknown keys; values that are wrong, as in a file.
+        InputError : unknown keys; wrong values.
         """
         if not settings:
             return self
@@ -281,11 +283,11 @@ class ProblemFile:
 
         Raises
         ------
-        InputError : what only shows with the robot: a URDF that is missing or not sound, an unknown joint or
-            frame; then an unknown striker, posture and sole, all at once; then a point out of reach.
+        InputError : mistakes that need the robot to be found: a URDF that is missing or not sound, an unknown
+            joint or frame; else unknown strikers, postures and soles; else a point out of reach.
         """
         content, mistakes = self.content, _Collector(self.lines)
-        robot, stance = _named(content, self.path.parent, mistakes)
+        robot, stance = _built_robot(content, self.path.parent, mistakes)
         mistakes.raise_if_any(self.path)
         assert robot is not None and stance is not None
         given = content.arguments()
@@ -297,7 +299,7 @@ class ProblemFile:
 
 
 def load_problem(path: str | os.PathLike[str]) -> ImpactProblem:
-    """The problem that a TOML file describes: its path, or the name of one that comes with the package.
+    """The problem of a TOML file, by its path, or by the name of one of the package's problems.
 
     Raises
     ------
@@ -307,9 +309,9 @@ def load_problem(path: str | os.PathLike[str]) -> ImpactProblem:
 
 
 def problem_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str]) -> ImpactProblem:
-    """The problem that a problem file's data describes, as `read_toml` or `change_data` gives them.
+    """The problem of a problem file's data, as of `read_toml` or `change_data`.
 
-    where : what messages call it; files that it names are relative to the folder of that path.
+    where : path of the file in messages; paths in the data are relative to its folder.
 
     Raises
     ------
@@ -332,11 +334,10 @@ def problem_file_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[
 def read_problem_file(
     path: str | os.PathLike[str], settings: Mapping[str, Any] | None = None, *, names: bool = False
 ) -> ProblemFile:
-    """A problem file, by path or name, checked as far as that is possible without its robot.
+    """A problem file, by path or name, checked as far as possible without its robot.
 
-    settings : values by key path, in place of the file's (`change_data`).
-    names : build the robot of a file with mistakes, too, so that names of its parts that are wrong are among
-        them.
+    settings : values by key path that replace the file's (`change_data`).
+    names : if there are mistakes, build the robot, too, to find wrong names of its parts in the same message.
 
     Raises
     ------
@@ -349,7 +350,7 @@ def read_problem_file(
 def parse_problem_file(
     text: str, path: Path, settings: Mapping[str, Any] | None = None, *, names: bool = False
 ) -> ProblemFile:
-    """A problem file's text, checked like the file; `path` is where it was: the place of the files it names.
+    """A problem file's text, checked like a file at `path`, to whose folder paths in it are relative.
 
     Raises
     ------
@@ -365,12 +366,16 @@ def parse_problem_file(
 def _checked(
     data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Place, int], names: bool = False
 ) -> ProblemFile:
+    """The problem file of these data; InputError with all mistakes.
+
+    lines, names : as of `report_mistakes` and `read_problem_file`.
+    """
     for place in _LISTS:
-        there: Any = data
+        entries: Any = data
         for key in place:
-            there = there.get(key) if isinstance(there, Mapping) else None
-        if isinstance(there, list) and len(there) > MANY:
-            raise InputError(f"{path}: there are {len(there)} [[{'.'.join(place)}]]; give at most {MANY}")
+            entries = entries.get(key) if isinstance(entries, Mapping) else None
+        if isinstance(entries, list) and len(entries) > MANY:
+            raise InputError(f"{path}: there are {len(entries)} [[{'.'.join(place)}]]; give at most {MANY}")
     if found := text_with_control(data):
         raise InputError(f"{path}: the text {shortened(repr(found))} has control characters; take them out")
     mistakes, model = _robot_given_once(data), with_kinds(File, data)
@@ -378,7 +383,7 @@ def _checked(
         content = model.model_validate(data)
     except ValidationError as error:
         mistakes += mistakes_of(error, model)
-        mistakes += _besides(data, mistakes, _Collector(lines), path.parent if names else None)
+        mistakes += _further(data, mistakes, _Collector(lines), path.parent if names else None)
     if mistakes:
         raise InputError(report_mistakes(str(path), lines, mistakes))
     given = content.solver.model_dump(exclude_unset=True) if content.solver else {}
@@ -392,8 +397,8 @@ def _checked(
     )
 
 
-def _named(content: File, folder: Path, mistakes: _Collector) -> tuple[Robot | None, Stance | None]:
-    """The robot and its stance; mistakes that only show with them: in it, and in names of its parts."""
+def _built_robot(content: File, folder: Path, mistakes: _Collector) -> tuple[Robot | None, Stance | None]:
+    """The robot and its stance, None if wrong; adds mistakes of the robot and in names of its parts."""
     try:
         robot = content.make_robot(folder)
     except InputError as error:
@@ -415,26 +420,26 @@ def _named(content: File, folder: Path, mistakes: _Collector) -> tuple[Robot | N
         except InputError as error:
             mistakes.add(("robot", "soles"), error, first=True)
     if mistakes or stance is None:
-        # the rest of the problem cannot be put together, but what its terms name can be looked at
+        # the problem cannot be built, but names in its terms can be checked
         for name, term in content.given_terms():
             mistakes.attempt(("terms", name), partial(check_names, robot, term))
     return robot, stance
 
 
-def _besides(
+def _further(
     data: Mapping[str, Any], mistakes: list[Mistake], found: _Collector, folder: Path | None
 ) -> list[Mistake]:
-    """Further mistakes of a file, which show once the others are mended: checks of whole sections, and with a
-    folder names of the robot's parts, where neither robot nor stance is wrong.
+    """Further mistakes of a file, which are found once the others are corrected: in checks of whole sections
+    and, with a folder, in names of the robot's parts, unless robot or stance is wrong.
 
-    For that, misspelt keys get their probable names, wrong ones are left out, and what is required and not
-    there has a stand-in.
+    For that, misspelt keys get their probable names, wrong keys are left out, and required ones that are
+    missing are substituted.
     """
-    rest: Any = {"problem": {}, **copy.deepcopy(dict(data))}
+    corrected: Any = {"problem": {}, **copy.deepcopy(dict(data))}
     further: list[Mistake] = []
     for _ in range(_ROUNDS):
         for mistake in [*mistakes, *further]:
-            table, (*above, key) = rest, mistake.place
+            table, (*above, key) = corrected, mistake.place
             for part in above:
                 inside = part in table if isinstance(table, dict) else part in range(len(table))
                 table = table[part] if inside else {}
@@ -443,12 +448,12 @@ def _besides(
                 table |= {mistake.meant: value} if mistake.meant and mistake.meant not in table else {}
         places = {mistake.place for mistake in (*mistakes, *further)}
         for section, values in _STAND_INS.items():
-            known = isinstance(rest.get(section), dict) and section in data
-            needed = {k: v for k, v in values.items() if not known or (section, k) in places}
-            rest[section] = needed | rest.get(section, {})
-        model = with_kinds(File, rest)
+            given = isinstance(corrected.get(section), dict) and section in data
+            needed = {k: v for k, v in values.items() if not given or (section, k) in places}
+            corrected[section] = needed | corrected.get(section, {})
+        model = with_kinds(File, corrected)
         try:
-            content = model.model_validate(rest)
+            content = model.model_validate(corrected)
         except ValidationError as error:
             found_now = mistakes_of(error, model)
             new = [m for m in found_now if m.text != "missing" and m.place not in places]
@@ -458,8 +463,8 @@ def _besides(
             continue
         wrong = {m.place[: 1 + (m.place[0] == "problem")] for m in [*mistakes, *further]}
         if folder is not None and not wrong & {("robot",), ("stance",), ("problem", "robot")}:
-            _named(content, folder, found)
-            if rest["problem"]["striker"] == _STAND_INS["problem"]["striker"]:
+            _built_robot(content, folder, found)
+            if corrected["problem"]["striker"] == _STAND_INS["problem"]["striker"]:
                 found.mistakes = [m for m in found.mistakes if m.place != ("problem", "striker")]
         break
     return further + found.mistakes
@@ -497,6 +502,7 @@ class _Collector:
 
 
 def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:
+    """Mistake of a file with both or neither of a preset in [problem] and a section [robot]."""
     section = data.get("problem")
     named, table = isinstance(section, Mapping) and "robot" in section, "robot" in data
     if named != table:

@@ -1,4 +1,4 @@
-"""All sections and keys as a page, docs/problem_files.md, and a problem file with a comment to each."""
+"""The page of all sections and keys, docs/problem_files.md, and problem files with a comment to each key."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ __all__ = ["problem_template", "reference"]
 
 
 def problem_template(name: str) -> str:
-    """The text of a named problem's file with all that can be said in its sections.
+    """The text of a named problem's file, with all keys of its sections.
 
-    Keys that the problem leaves out stand as comments with their defaults: whoever takes the # away has the
-    same problem.
+    Keys that the problem does not set are commented out, with their defaults: without the # it is the same
+    problem.
 
     Raises
     ------
@@ -53,10 +53,10 @@ def problem_template(name: str) -> str:
         table: Any = data
         for part in place:
             table = table[part]
-        usual = section.defaults()
+        defaults = section.defaults()
         keys = {f: info.alias or f for f, info in section.model_fields.items() if f != section.choice}
-        left = {f: key for f, key in keys.items() if key not in table and usual.get(f) not in (None, ())}
-        return {key: _short(f, plain_value(usual[f])) for f, key in left.items() if _is_value(usual[f])}
+        left = {f: key for f, key in keys.items() if key not in table and defaults.get(f) not in (None, ())}
+        return {key: _short(f, plain_value(defaults[f])) for f, key in left.items() if _is_value(defaults[f])}
 
     head = (
         f"# {problem_summary(name)}.",
@@ -68,6 +68,7 @@ def problem_template(name: str) -> str:
 
 
 def _short(field: str, value: Any) -> Any:
+    """A value of a field, where a duration of equal ends is one number."""
     return value[0] if field == "duration" and value[0] == value[1] else value
 
 
@@ -76,7 +77,7 @@ def _is_value(value: Any) -> bool:
 
 
 def _left_out(data: dict[str, Any]) -> list[str]:
-    """Sections that are not there, in a word each."""
+    """Comment lines about the sections that a file does not have."""
     found = [(name, info) for name, info in File.model_fields.items() if name not in data]
     found += [
         (f"terms.{name}", info)
@@ -122,7 +123,7 @@ Larger values are refused before work starts:
 
 This page is made by `impactopt new --reference`.
 """
-# what, and how much at most
+# quantity and its largest value, or range
 _LIMITS = (
     ("a file", f"{LONGEST_TEXT / 2**20:g} MiB"),
     ("tables and lists in each other", f"{DEEPEST} deep"),
@@ -138,7 +139,7 @@ _LIMITS = (
     ("`[collision] elements`", f"{MOST_ELEMENTS} a phase"),
     ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each"),
 )
-_SEVERAL = 4  # keys that sections share are listed once
+_SEVERAL = 4  # common first keys of two sections from which on they are listed once
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
 
@@ -152,17 +153,17 @@ def reference() -> str:
         kinds = several.get(name, {})
         for kind, section in kinds.items():
             (choice,) = (i.alias or n for n, i in section.model_fields.items() if n == section.choice)
-            usual = ". The default" if kind == section.model_fields[section.choice].default else ""
-            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, seen, usual))
+            note = ". The default" if kind == section.model_fields[section.choice].default else ""
+            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section, seen, note))
         below = _sections(name, info)
         if kinds:
-            next(below)  # the section itself, which its kinds have said all of
+            next(below)  # the section itself, whose keys are all listed by kind
         parts += [_part(header, section, seen) for header, section in below]
     return "\n".join(parts)
 
 
 def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel]]]:
-    """A section and those below it, with their headers."""
+    """A section and its subsections, with their headers."""
     section, many = _inner(info)
     if section is None:
         return
@@ -173,19 +174,22 @@ def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel
 
 
 def _inner(info: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
-    """The section that a field holds, if any, and whether it holds a list of them."""
+    """The section in a field, None if it has none; and True if it has a list of them."""
     many = get_origin(info.annotation) is list
     named = get_origin(info.annotation) is dict
     kind = get_args(info.annotation)[-1] if many or named else info.annotation
     return (kind, many) if isinstance(kind, type) and issubclass(kind, BaseModel) else (None, many)
 
 
-def _part(header: str, section: type[BaseModel], seen: dict[tuple[str, ...], str], usual: str = "") -> str:
-    """A section and its keys; `seen` has those of earlier sections, so that none is listed twice."""
-    lines = [f"## `{header}`", "", f"{about_section(section)}{usual}."]
+def _part(header: str, section: type[BaseModel], seen: dict[tuple[str, ...], str], note: str = "") -> str:
+    """Markdown of a section and its keys.
+
+    seen : headers of earlier sections by their keys, to refer to instead of listing the same keys again.
+    """
+    lines = [f"## `{header}`", "", f"{about_section(section)}{note}."]
     keys = list(_keys(section))
-    known = max(seen, key=lambda other: _alike(keys, other), default=())
-    same = _alike(keys, known)
+    known = max(seen, key=lambda other: _common(keys, other), default=())
+    same = _common(keys, known)
     if same >= _SEVERAL or (same > 1 and same == len(keys) == len(known)):
         last = "" if same == len(known) else f" up to {known[same - 1].split()[1]}"
         lines[-1] += f" Keys: as in `{seen[known]}`{last}{', and' if same < len(keys) else '.'}"
@@ -196,30 +200,30 @@ def _part(header: str, section: type[BaseModel], seen: dict[tuple[str, ...], str
     return "\n".join([*lines, ""])
 
 
-def _alike(keys: Sequence[str], others: Sequence[str]) -> int:
-    """Number of keys that two sections begin with."""
+def _common(keys: Sequence[str], others: Sequence[str]) -> int:
+    """Number of equal keys at the beginning of two sections."""
     return next(
         (k for k, (a, b) in enumerate(zip(keys, others, strict=False)) if a != b), min(len(keys), len(others))
     )
 
 
 def _keys(section: type[BaseModel]) -> Iterator[str]:
-    """A line for each key that stands in the section itself."""
-    usual = section.defaults() if issubclass(section, Section) else {}
+    """A line for each key of the section itself."""
+    defaults = section.defaults() if issubclass(section, Section) else {}
     for name, info in section.model_fields.items():
         if _inner(info)[0] is not None or name == getattr(section, "choice", ""):
-            continue  # a section of its own; or the header has it
+            continue  # a subsection, or in the header
         if info.is_required():
             default = "**needed**"
         else:
-            value = usual.get(name, info.default)
+            value = defaults.get(name, info.default)
             default = "" if value is None or np.size(value) == 0 else f"`{_show(value)}`"
-        said = "; ".join(part for part in (_allowed(info, bool(default)), default) if part)
-        yield f"- `{info.alias or name}` ({said}): {info.description}"
+        values = "; ".join(part for part in (_allowed(info, bool(default)), default) if part)
+        yield f"- `{info.alias or name}` ({values}): {info.description}"
 
 
 def _allowed(info: FieldInfo, defaulted: bool = False) -> str:
-    """Permitted values of a key; "" where its default shows that it is any number, text, or truth value."""
+    """Permitted values of a key; "" if they are all numbers, texts or truth values, as its default shows."""
     for check in reversed(info.metadata):
         if isinstance(check, (AfterValidator, PlainValidator)) and check.func.__doc__:
             return _sentence(check.func.__doc__)
@@ -239,12 +243,13 @@ def _allowed(info: FieldInfo, defaulted: bool = False) -> str:
     if length:
         return f"{length} numbers"
     entry = get_args(info.annotation)[0]
-    kind, *_ = get_args(entry) or (entry,)  # of what it is a list
+    kind, *_ = get_args(entry) or (entry,)  # type of the list's elements
     pairs = "pairs of " if get_origin(kind) is list else ""
     return f"list of {pairs}{'names' if kind is str or get_args(kind) == (str,) else 'numbers'}"
 
 
 def _sentence(text: str) -> str:
+    """First line of a validator's docstring, as a part of a sentence."""
     words = text.split("\n")[0].rstrip(".").removeprefix("A ").replace("number >", ">")
     return words[0].lower() + words[1:]
 

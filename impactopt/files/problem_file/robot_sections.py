@@ -1,4 +1,4 @@
-"""The section [robot]: a preset with changes, or a URDF or MJCF with what it lacks."""
+"""The section [robot]: a preset with changes, or a URDF or MJCF with soles, strikers, gains and limits."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SoleSection(Section):
     """A flat, convex sole, on a frame of the model or on a new one."""
 
     kind = Sole
-    name: str = required("what [stance] and messages call it")
+    name: str = required("its name in [stance] and messages")
     frame: str = required("frame at the sole, z up out of the ground, x forward")
     polygon: list[Point2] = required("corners in its x-y plane, counter-clockwise [m]", "polygon_m")
     parent: str = optional("frame of the model in which a new `frame` is placed")
@@ -72,16 +72,16 @@ class SoleSection(Section):
 
 
 class StrikerSection(Section):
-    """A point of the robot that hits."""
+    """A striking point of the robot."""
 
     kind = Striker
-    name: str = required("what [problem] calls it")
+    name: str = required("its name in [problem]")
     frame: str = required("frame of the model")
     point: Vector = required("position in the frame [m]", "point_m")
 
 
 class GripSection(Section):
-    """A hand that holds a tool by a spring and a damper about one axis."""
+    """A compliant grip: a spring and a damper about one axis between hand and tool."""
 
     kind = SoftGrip
     axis: Vector = required("unit vector, in the frame")
@@ -92,7 +92,7 @@ class GripSection(Section):
 
 
 class ToolSection(Section):
-    """A rigid body that a link holds, and the striker that it makes."""
+    """A rigid body that a link holds, with a striker."""
 
     kind = Tool
     name: str = required("name of the tool and of its striker")
@@ -100,8 +100,8 @@ class ToolSection(Section):
     mass: Positive = required("mass [kg]", "mass_kg")
     center: Vector = required("centre of mass in the frame [m]", "center_m")
     inertia: Inertia = required("about the centre of mass [kg m2]", "inertia_kg_m2")
-    head: Vector = required("the point that hits, in the frame [m]", "head_m")
-    bar: Vector = optional("of a hammer: from the bar's back to the face that hits [m]", "bar_m")
+    head: Vector = required("the striking point, in the frame [m]", "head_m")
+    bar: Vector = optional("of a hammer: from the bar's back to its striking face [m]", "bar_m")
     bar_width: Positive = optional("of that bar [m]", "bar_width_m")
 
 
@@ -118,24 +118,24 @@ class ActuatorSection(_OfActuator):
 
 
 class GainSection(Section):
-    """A factor on the stiffness of some joints; their damping gets its root, so its ratio stays."""
+    """A factor on the stiffness of some joints; their damping gets its root, so the ratio is constant."""
 
     joints: JointNames = required("names, or patterns; NAME_grip: a tool in a soft grip")
-    factor: Factor = required("the plan chooses from a range")
+    factor: Factor = required("a range is optimized over")
 
     @property
     def open(self) -> bool:
-        """True if the plan chooses the factor."""
+        """True if the factor is optimized."""
         return isinstance(self.factor, list)
 
     def build(self) -> Any:
-        """Range that the plan chooses from; None if nothing is left open."""
+        """Range of an optimized factor; None for a given one."""
         if not self.open:
             return None
         return GainFactor(joints=tuple(self.joints), factor=tuple(self.factor))
 
     @model_validator(mode="after")
-    def _leaves_a_choice(self) -> GainSection:
+    def _range_is_valid(self) -> GainSection:
         self.build()
         return self
 
@@ -165,10 +165,10 @@ class RobotSection(Section):
     position_limit: dict[str, Range] = optional("limits [lower, upper] by joint [rad]", "position_limit_rad")
     disable_collisions: list[Pair] = optional("pairs of links that may pass through each other")
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")
-    strikers: list[StrikerSection] = optional("points that hit")
-    tools: list[ToolSection] = optional("what the robot holds")
-    grips: dict[str, GripSection] = optional("tools that are held softly, by name")
-    actuators: list[ActuatorSection] = optional("motors and gears; joints that none names keep the preset's")
+    strikers: list[StrikerSection] = optional("striking points")
+    tools: list[ToolSection] = optional("tools that the robot holds")
+    grips: dict[str, GripSection] = optional("compliant grips, by the tool's name")
+    actuators: list[ActuatorSection] = optional("motors and gears; other joints keep the preset's")
     gains: list[GainSection] = optional("factors on gains of servos, and on springs of soft grips")
     postures: dict[str, dict[str, float]] = optional(
         "named postures, angles by joint; others 0 or the SRDF's [rad]", "postures_rad"
@@ -184,7 +184,7 @@ class RobotSection(Section):
         return self
 
     def make(self, folder: Path) -> Robot:
-        """The robot; relative files are in `folder`."""
+        """The robot; paths are relative to `folder`."""
         for key in ("soles", "strikers", "tools"):
             check_count(key.removesuffix("s"), getattr(self, key) or ())
         options = self.given()
@@ -197,8 +197,8 @@ class RobotSection(Section):
             options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
         strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
         tools = [tool.build() for tool in self.tools] if options.pop("tools", None) else []
-        held = self.grips if options.pop("grips", None) else {}
-        grips = {name: grip.build() for name, grip in held.items()}
+        sections = self.grips if options.pop("grips", None) else {}
+        grips = {name: section.build() for name, section in sections.items()}
         drives = {
             joint: section.build()
             for section in (self.actuators if options.pop("actuators", None) else ())
@@ -224,23 +224,21 @@ class RobotSection(Section):
 
     @property
     def choices(self) -> tuple[GainFactor, ...]:
-        """The gains that are left open."""
+        """The optimized gains."""
         return tuple(section.build() for section in self.gains or () if section.open)
 
-    def leg_mistake(self, folder: Path, held: str) -> InputError | None:
-        """Mistake in the legs of the constrained soles, "both" or one by its name, regardless of other
-        mistakes.
-        """
+    def leg_mistake(self, folder: Path, fixed: str) -> InputError | None:
+        """Mistake in the legs of the fixed soles, "both" or one by its name, regardless of other mistakes."""
         try:
             model = self._model(folder)
-            chosen = [s for s in self.soles or () if held in ("both", s.name)]
+            chosen = [s for s in self.soles or () if fixed in ("both", s.name)]
             built = [section.build() for section in chosen]
             for sole in built:
                 if sole.parent is not None:
                     add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")
             model = hinged(model, built)
         except (InputError, AttributeError):
-            return None  # it has no soles, or something else is wrong, which others tell
+            return None  # it has no soles, or there is a mistake that is reported elsewhere
         try:
             check_legs(model, [(sole.name, sole.frame) for sole in built])
         except InputError as error:
@@ -259,29 +257,28 @@ class RobotSection(Section):
         raise InputError("a preset")
 
     def mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
-        """All that keeps `make` from making a robot, `error` being the first of it, and of which key it is.
+        """All errors of `make`, with their keys; error : the first one.
 
-        Each key is tried by itself on the bare robot.
+        Each key is tried alone, on the robot of its file or preset.
         """
         bare = {key: getattr(self, key) for key in self.model_fields_set & _BARE}
-        if _tried(bare, folder):
+        if _error_with(bare, folder):
             return [((), error)]
         found: list[tuple[tuple[str, ...], InputError]] = []
         for key, info in type(self).model_fields.items():
             if key in self.model_fields_set - _BARE:
-                wanted = {key, *_AFTER.get(key, ())} & self.model_fields_set
-                wrong = _tried({**bare, **{k: getattr(self, k) for k in wanted}}, folder)
+                tried = {key, *_NEEDED.get(key, ())} & self.model_fields_set
+                wrong = _error_with({**bare, **{k: getattr(self, k) for k in tried}}, folder)
                 found += [((info.alias or key,), wrong)] if wrong else []
         return found or [((), error)]
 
 
-_BARE = {"preset", "urdf", "mjcf", "srdf", "floating", "locked", "inertias"}  # what the other keys are about
+_BARE = {"preset", "urdf", "mjcf", "srdf", "floating", "locked", "inertias"}  # of the model without changes
+_NEEDED = {"grips": ("tools",), "gains": ("tools", "grips")}  # keys whose joints or tools a key refers to
 
-_AFTER = {"grips": ("tools",), "gains": ("tools", "grips")}  # keys that speak of what others bring
 
-
-def _tried(keys: dict[str, Any], folder: Path) -> InputError | None:
-    """Error of a robot with these keys alone, if it has one."""
+def _error_with(keys: dict[str, Any], folder: Path) -> InputError | None:
+    """Error of a robot with these keys alone, if there is one."""
     try:
         RobotSection.model_construct(_fields_set=set(keys), **keys).make(folder)
     except InputError as error:

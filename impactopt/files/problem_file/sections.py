@@ -1,8 +1,8 @@
 """The sections of a problem file: their keys and units.
 
-Each model is a section; its fields are the keys, by their `alias` where a unit belongs to the name. `build`
-makes the class `kind` from the keys that are given: defaults and further checks are that class's own, and
-stand nowhere twice.
+Each pydantic model is a section, each field a key, whose name in the file is its `alias` if it has a unit.
+`build` makes an instance of the class `kind` from the keys given. Defaults and further checks are those of
+that class only.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ from impactopt.solvers.options import IPMOptions, SolverOptions, SQPOptions
 
 
 def _section(kind: type[SolverOptions], about: str) -> Any:
-    """A section with a key for each option but the time limit, as the options' own docstring describes it."""
-    said, hints = attribute_docs(kind), get_type_hints(kind)
-    keys: dict[str, Any] = {n: (hints[n], optional(said[n])) for n in hints if n != "time_limit"}
+    """A section with a key for each option but the time limit, described as in the class's docstring."""
+    docs, hints = attribute_docs(kind), get_type_hints(kind)
+    keys: dict[str, Any] = {n: (hints[n], optional(docs[n])) for n in hints if n != "time_limit"}
     section: Any = create_model(kind.__name__, __base__=Section, __doc__=about, **keys)
     section.kind = kind
     return section
@@ -77,7 +77,7 @@ SQP: Any = _section(SQPOptions, "Options of the SQP.")
 class SolverSettings:
     """Solver settings of a file's [solver] section.
 
-    name : of the solver.  time_limit [s] : None for no limit.  options : by solver, the solver's own.
+    name : of the solver.  time_limit [s] : None for no limit.  options : of each solver, by its name.
     """
 
     name: str = "ipm"
@@ -85,7 +85,7 @@ class SolverSettings:
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def arguments(self, solver: str | None = None, time_limit: float | None = None) -> dict[str, Any]:
-        """Solver arguments of `solve` and its like; given ones take precedence over the file's."""
+        """Solver arguments of `solve` and similar functions; given ones take precedence over the file's."""
         chosen = self.name if solver is None else solver
         limit = self.time_limit if time_limit is None else time_limit
         return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
@@ -107,22 +107,22 @@ class SolverSection(Section):
 
 _TERMS = {snake_case(kind.__name__): kind for kind in TERMS}
 _FIRST, *_, _LAST = list(_TERMS)[: len(DEFAULT_TERMS)]
-_ON_DEMAND = " and ".join(snake_case(type(term).__name__) for term in ON_DEMAND_TERMS)
+_LAZY = " and ".join(snake_case(type(term).__name__) for term in ON_DEMAND_TERMS)
 
 TermSections: Any = sections_of(
     "TermSections",
-    f"Constraints. Those from {_FIRST} to {_LAST}, and {_ON_DEMAND}, hold with their defaults if they are "
+    f"Constraints. Those from {_FIRST} to {_LAST}, and {_LAZY}, hold with their defaults if they are "
     "left out.",
     _TERMS,
 )
 ObjectiveSections: Any = sections_of(
     "ObjectiveSections",
-    "What is maximized: the impulse, or if there are sections here, only these.",
+    "Objectives: the impulse, or if there are sections here, only these.",
     {snake_case(kind.__name__): kind for kind in OBJECTIVES},
 )
 
 
-_FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # of a file that names none
+_FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # defaults
 TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)
 LawKind: Any = one_of(kind.word for kind in laws.LAWS)
 
@@ -136,12 +136,12 @@ class Target(Section):
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "target_kind"
     apart: ClassVar[tuple[str, ...]] = ("body",)
-    target_kind: TargetKind = Field(default=_FIRST_TARGET, alias="kind", description="what it is")
+    target_kind: TargetKind = Field(default=_FIRST_TARGET, alias="kind", description="kind of target")
     body: Body = optional("")
 
 
 class _KnownTarget(Target):
-    """One whose keys are its own."""
+    """Target of a known kind, without other keys."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -151,11 +151,11 @@ class Contact(Section):
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "law"
-    law: LawKind = Field(default=_FIRST_LAW, description="what gives the force")
+    law: LawKind = Field(default=_FIRST_LAW, description="contact law")
 
 
 class _KnownContact(Contact):
-    """One whose keys are its own."""
+    """Contact of a known law, without other keys."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -167,21 +167,21 @@ AnyFile = TypeVar("AnyFile", bound=Section)
 
 
 def with_kinds(file: type[AnyFile], data: Mapping[str, Any]) -> type[AnyFile]:
-    """The model of a file whose [target] and [contact] are of the kinds that its data name."""
+    """The model of a file, with [target] and [contact] of the kinds in its data."""
     found = {
-        "target": _chosen(data, "target", "kind", TARGETS, Target, _FIRST_TARGET),
-        "contact": _chosen(data, "contact", "law", LAWS, Contact, _FIRST_LAW),
+        "target": _section_of_kind(data, "target", "kind", TARGETS, Target, _FIRST_TARGET),
+        "contact": _section_of_kind(data, "contact", "law", LAWS, Contact, _FIRST_LAW),
     }
     return cast(type[AnyFile], _file_with(file, found["target"], found["contact"]))
 
 
-@cache  # a sweep reads thousands
+@cache  # a sweep reads thousands of files
 def _file_with(file: type[Section], target: type[Section], contact: type[Section]) -> type[Section]:
     fields: dict[str, Any] = {"target": (target, ...), "contact": (contact, ...)}
     return create_model(file.__name__, __base__=file, **fields)
 
 
-def _chosen(
+def _section_of_kind(
     data: Mapping[str, Any],
     section: str,
     key: str,
@@ -198,15 +198,15 @@ ELEMENTS = ("compression", "restitution")  # keys of ImpactProblem.collision_ele
 
 
 def _of_problem(section: type[Section]) -> dict[str, Any]:
-    """The defaults of the problem's own fields that a section sets."""
+    """Defaults of the fields of `ImpactProblem` that a section sets."""
     known = {f.name: f.default for f in fields(ImpactProblem) if f.default is not MISSING}
     return {name: known[name] for name in section.model_fields if name in known}
 
 
 class ProblemSection(Section):
-    """The robot, its striker, and where it hits."""
+    """The robot, its striker, and the hit point."""
 
-    name: str = optional("what reports call the problem")
+    name: str = optional("name of the problem in reports")
     robot: Preset = optional("see `impactopt robots`; else a section [robot]")
     striker: str = required("the robot's striker")
     point: Vector = required("hit point: x forward, y left, z up from the ground [m]", "point_m")
@@ -226,28 +226,28 @@ class SecondSection(Section):
 
     kind = SecondStriker
     striker: str = required("the robot's other striker")
-    point: Vector = required("where its striking point meets the target [m]", "point_m")
+    point: Vector = required("its hit point on the target [m]", "point_m")
 
 
 class StanceSection(Section):
-    """Soles that are fixed, and hands that hold on."""
+    """Fixed soles, and gripping hands."""
 
     soles: str = Field(
         default="both",
-        description='"both", or one; "none": it floats freely',
+        description='"both", or one; "none": the robot floats freely',
     )
     hands: HandNames = Field(
         default=[],
-        description="strikers that hold on, each where it is at the start; see [terms.grip]",
+        description="strikers that are fixed at their places in the start posture; see [terms.grip]",
     )
 
 
 class StancePhaseSection(Section):
-    """A phase in which the same soles stand."""
+    """A stance phase: an interval in which the same soles stand."""
 
     soles: list[str] = required("names of the soles that stand")
     duration: Duration = optional(
-        "duration [s]; of the phase with the blow left out: it has those of [swing] and [follow]",
+        "duration [s]; left out of the phase with the impact, which has those of [swing] and [follow]",
         "duration_s",
     )
     intervals: int = optional("intervals of the spline, at least 6, by default 12")
@@ -265,7 +265,7 @@ class StancePhaseSection(Section):
         if "duration" not in given and given:
             raise InputError(
                 f"[[stances]]: the phase on {' and '.join(soles)} has no duration_s: give it one, or leave "
-                f"{' and '.join(given)} out, as the blow falls in it"
+                f"{' and '.join(given)} out, as for the phase with the impact"
             )
         return StancePhase(soles=soles, phase=Phase(**given) if given else None, steps=steps)
 
@@ -274,7 +274,7 @@ class PhaseSection(Section):
     """A phase of the motion: its duration and its spline."""
 
     kind = Phase
-    duration: Duration = required("duration; the solver chooses from a range [s]", "duration_s")
+    duration: Duration = required("duration; a range is optimized over [s]", "duration_s")
     intervals: int = optional("intervals of the spline, at least 6; more: a freer motion, a longer solve")
     grading: AtLeastOne = optional("longest over shortest interval, the short ones at the contact")
 
@@ -291,8 +291,8 @@ class CollisionSection(Section):
     """Model and discretization of the collision."""
 
     collision: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full", "auto"] = optional(
-        '"full": the whole equation of motion; "sdc": frozen at contact; "sdc-paper": so, by the paper; '
-        '"auto": the cheapest that is good enough; "virtual-mass", "rigid": no duration',
+        '"full": the whole equation of motion; "sdc": frozen at contact; "sdc-paper": frozen, by the paper; '
+        '"auto": the cheapest that is accurate enough; "virtual-mass", "rigid": no duration',
         "model",
     )
     freezes: Freezes = optional('of the model "sdc", during contact')
@@ -304,7 +304,7 @@ class CollisionSection(Section):
         "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    touches: Touches = optional("times that a board is met; left out: as often as point masses meet it")
+    touches: Touches = optional("number of contacts with a board; left out: that of a point-mass model")
     compression: Fractions = optional("lengths of its collocation elements")
     restitution: Fractions = optional("lengths of its collocation elements")
 
@@ -338,7 +338,7 @@ class ObjectiveSection(Section):
 
 
 class File(Section):
-    """A whole problem file; its [target] and [contact] are of a kind (`with_kinds`)."""
+    """A whole problem file; `with_kinds` sets the classes of [target] and [contact]."""
 
     problem: ProblemSection
     robot: RobotSection = optional("")
@@ -361,41 +361,39 @@ class File(Section):
     controller: ControllerSection = optional("")
 
     def make_robot(self, folder: Path) -> Robot:
-        """The robot of [robot], or the preset that [problem] names."""
+        """The robot of [robot], or the preset in [problem]."""
         section = RobotSection(preset=self.problem.robot) if self.robot is None else self.robot
         return section.make(folder)
 
     def robot_mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
-        """All that keeps `make_robot` from making one, `error` being the first of it, and where it is."""
+        """All errors of `make_robot`, with their places; error : the first one."""
         if "robot" not in self.model_fields_set:
             return [(("problem", "robot"), error)]
         return [(("robot", *place), wrong) for place, wrong in self.robot.mistakes(folder, error)]
 
     def leg_mistake(self, folder: Path) -> InputError | None:
-        """Mistake in the legs of a robot that cannot be built, as far as its model can be."""
+        """Mistake in the legs of a robot that cannot be built, if its model can be."""
         if "robot" not in self.model_fields_set:
             return None
         return self.robot.leg_mistake(folder, self.stance.soles if self.stance else "both")
 
     def given_terms(self) -> Iterator[tuple[str, Any]]:
-        """The terms that the file has, by their sections' names."""
+        """Names and terms of the file's sections below [terms]."""
         for name in TermSections.model_fields if self.terms is not None else ():
             section = getattr(self.terms, name)
             if section is not None:
                 yield name, section.build()
 
     def make_stance(self, robot: Robot) -> Stance:
-        """Stance of a robot that [stance] describes; InputError for what it cannot stand on."""
+        """Stance of a robot by [stance]; InputError if the robot cannot have it."""
         if self.stance and self.stances:
-            raise InputError("[stance] holds one stance for all of the motion: leave it or [[stances]] out")
+            raise InputError("[stance] is one stance for the whole motion: leave it or [[stances]] out")
         soles = self.stance.soles if self.stance else "both"
         hands = tuple(self.stance.hands) if self.stance else ()
         stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
         if soles == "none":
             if hands:
-                raise InputError(
-                    "[stance]: a robot that floats freely holds on with no hand: leave hands out"
-                )
+                raise InputError("[stance]: a robot that floats freely has no fixed hands: leave hands out")
             stance = Free()
         if not robot.floating:
             if self.stance:
@@ -405,21 +403,21 @@ class File(Section):
         return stance
 
     def check_one_striker(self) -> None:
-        """InputError if there are two, which models of a collision alone have not."""
+        """InputError if there are two strikers, for commands that compute a collision alone."""
         if self.second is not None:
             raise InputError(
                 "[second]: a collision model has one striker: leave the section out, or solve the problem"
             )
 
     def make_start(self, robot: Robot) -> NDArray[np.float64]:
-        """The posture (nq,) to start from; InputError for one that the robot cannot have."""
+        """The start posture (nq,); InputError for one that the robot cannot have."""
         start = self.problem.start
         return (
             robot.posture(start) if isinstance(start, str) else robot.check_configuration(start, name="start")
         )
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of `ImpactProblem` but the robot and the stance, as far as the file gives them."""
+        """Arguments of `ImpactProblem` that the file gives, without robot and stance."""
         out = {name: value for name, value in self.problem.given().items() if name != "robot"}
         out |= {"law": self.contact.build(), "target": self.target.build()}
         out |= {
@@ -428,8 +426,8 @@ class File(Section):
         out |= self.objective.given() if self.objective else {}
         if self.collision is not None:
             given = self.collision.given()
-            usual = zip(ELEMENTS, ImpactProblem.collision_elements, strict=True)
-            elements = [given.pop(name, lengths) for name, lengths in usual]
+            defaults = zip(ELEMENTS, ImpactProblem.collision_elements, strict=True)
+            elements = [given.pop(name, lengths) for name, lengths in defaults]
             if "contact_duration" in given:
                 given["contact_duration"] = tuple(given["contact_duration"])
             out |= {**given, "collision_elements": tuple(tuple(lengths) for lengths in elements)}
@@ -460,7 +458,7 @@ def about_section(section: type[BaseModel]) -> str:
 
 
 def comment_at(data: Mapping[str, Any], place: Place) -> str:
-    """The comment to a key or a section of a file with these data; "" where there is nothing to say."""
+    """Comment on a key or a section of a file with these data; "" if there is none."""
     section, sections = section_at(with_kinds(File, data), place)
     if sections == len(place):
         return about_section(section)

@@ -28,8 +28,8 @@ _tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else
 TOMLError: type[ValueError] = _tomllib.TOMLDecodeError
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 LONGEST_TEXT = 1 << 22  # bytes: 400 times the longest of our files, and read in a few seconds
-DEEPEST = 32  # tables and lists in each other; ours are five deep
-_COMMENTS_FROM = 32  # column, where lines are shorter
+DEEPEST = 32  # nested tables and lists; our files have five levels
+_COMMENT_COLUMN = 32  # of comments behind short lines
 
 Place = tuple[str | int, ...]
 
@@ -39,7 +39,7 @@ def read_toml(text: str) -> dict[str, Any]:
 
     Raises
     ------
-    TOMLError : it is none; it is nested deeper, or has longer numbers, than anything here.
+    TOMLError : it is no TOML, too long, nested too deeply, or has whole numbers beyond 64 bits.
     """
     if len(text) > LONGEST_TEXT:
         raise TOMLError(f"longer than {LONGEST_TEXT / 2**20:g} MiB")
@@ -49,14 +49,14 @@ def read_toml(text: str) -> dict[str, Any]:
         raise
     except RecursionError:
         raise TOMLError(f"nested deeper than {DEEPEST}") from None
-    except ValueError as error:  # of numbers with thousands of digits
+    except ValueError as error:  # Python's, for numbers with thousands of digits
         raise TOMLError(str(error)) from None
     check_plain(data)
     return data
 
 
 def check_plain(data: Any) -> None:
-    """TOMLError for data that are nested deeper than anything here, or have whole numbers beyond 64 bits."""
+    """TOMLError for data that are nested deeper than `DEEPEST`, or have whole numbers beyond 64 bits."""
     level: list[Any] = [data]
     for _ in range(DEEPEST + 1):
         inner: list[Any] = []
@@ -78,14 +78,14 @@ def write_toml(
     comment: Callable[[Place], str] = lambda place: "",
     hidden: Callable[[Place], Mapping[str, Any]] = lambda place: {},
 ) -> str:
-    """Data as TOML that `read_toml` gives back exactly; numbers keep all their digits.
+    """Data as TOML text, which `read_toml` reads back exactly; numbers have all digits.
 
-    comment : of a key or a table at a place, "" for none; a key's stands behind it, a table's above.
-    hidden : keys of the table at a place that are shown, but as comments.
+    comment : comment on the key or the table at a place, "" for none; it is behind a key, above a table.
+    hidden : additional keys of the table at a place, which are commented out.
 
     Raises
     ------
-    TOMLError : the data have something that is no table, list, number or text.
+    TOMLError : the data have something else than tables, lists, numbers and text.
     """
     lines: list[str] = []
     _Writer(lines, comment, hidden).table(data, ())
@@ -93,7 +93,7 @@ def write_toml(
 
 
 def plain_value(value: Any) -> Any:
-    """A value as TOML knows it: NumPy's numbers and arrays, tuples and mappings become Python's own."""
+    """A value in the types of TOML: NumPy's numbers and arrays, tuples and mappings become Python's own."""
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -104,7 +104,7 @@ def plain_value(value: Any) -> Any:
 
 
 def text_with_control(data: Any) -> str:
-    """A key or a text with control characters, which a terminal would obey; "" if there is none."""
+    """The first key or text with control characters, which a terminal would execute; "" if there is none."""
     if isinstance(data, str):
         return data if has_control(data) else ""
     if isinstance(data, Mapping):
@@ -116,6 +116,8 @@ def text_with_control(data: Any) -> str:
 
 @dataclass(frozen=True)
 class _Writer:
+    """Writer of tables; arguments as of `write_toml`."""
+
     lines: list[str]
     comment: Callable[[Place], str]
     hidden: Callable[[Place], Mapping[str, Any]]
@@ -130,7 +132,7 @@ class _Writer:
                     self._header(f"[[{_key_path(inner)}]]", self.comment(inner) if i == 0 else "")
                     self._keys(entry, (*inner, i))
                 continue
-            # a table of tables alone needs no line of its own; its comment stands above the first of them
+            # a table that contains only tables has no header; its comment is above the first of them
             if not value or not all(_is_table(v) or _is_list_of_tables(v) for v in value.values()):
                 self._header(f"[{_key_path(inner)}]", self.comment(inner))
             elif self.comment(inner):
@@ -140,15 +142,14 @@ class _Writer:
     def _keys(self, table: Mapping[str, Any], place: Place) -> None:
         shown = [("", key, value) for key, value in table.items()]
         for mark, key, value in [*shown, *(("# ", *item) for item in self.hidden(place).items())]:
-            line, said = f"{mark}{_key(key)} = {_value(value)}", self.comment((*place, key))
-            self.lines.append(f"{line:<{_COMMENTS_FROM}} # {said}" if said else line)
+            line, comment = f"{mark}{_key(key)} = {_value(value)}", self.comment((*place, key))
+            self.lines.append(f"{line:<{_COMMENT_COLUMN}} # {comment}" if comment else line)
 
     def _header(self, header: str, comment: str) -> None:
-        said = [f"# {comment}"] if comment else []
-        above = self.lines[-2:-1] == [""] and self.lines[-1].startswith(
-            "# "
-        )  # the comment of all such tables
-        self.lines.extend([*([] if above else [""]), *said, header])
+        comments = [f"# {comment}"] if comment else []
+        # no empty line below the comment of a table of tables
+        commented = self.lines[-2:-1] == [""] and self.lines[-1].startswith("# ")
+        self.lines.extend([*([] if commented else [""]), *comments, header])
 
 
 def _is_table(value: Any) -> bool:

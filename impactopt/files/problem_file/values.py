@@ -1,7 +1,7 @@
-"""Sections of a problem file: their base class, the values of their keys, sections made from dataclasses.
+"""Base class of a problem file's sections, types of their values, and sections made from dataclasses.
 
 Validators raise ValueError, which pydantic collects, with the value and the fix in the message. Their
-docstrings are what the reference says of such values.
+docstrings are the descriptions of the values in the reference.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
 from impactopt.robots.presets import robot_names
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS
 
-# A problem file is data: with it IPOPT loads no library, and writes and reads no file. So this lists what is
-# known to do neither, not what does: a new IPOPT may bring more of that, and knows each option under prefixes
-# too ("resto.hsllib"). Not here, as they load HSL or Pardiso from wherever the loader finds them, or write
-# files: linear_solver, linear_system_scaling, nlp_scaling_method, dependency_detector, and the own options of
-# those solvers.
+# IPOPT options that a problem file may set. A problem file is data, which must not make IPOPT load a library,
+# or read or write a file. This is a list of safe options, not of unsafe ones: a new IPOPT may add some of
+# those, and each option also exists with prefixes ("resto.hsllib"). Left out are options that load HSL or
+# Pardiso from wherever the loader finds them, or write files: linear_solver, linear_system_scaling,
+# nlp_scaling_method, dependency_detector, and the options of those solvers.
 _NAMES = """
 tol s_max max_iter max_wall_time max_cpu_time dual_inf_tol constr_viol_tol compl_inf_tol acceptable_tol
 acceptable_iter acceptable_dual_inf_tol acceptable_constr_viol_tol acceptable_compl_inf_tol
@@ -218,7 +218,7 @@ def _inertia(value: Any) -> Any:
 
 def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
     """A table."""
-    # IPOPT itself is asked about each value, with a program of one variable
+    # each value is checked by IPOPT itself, with a program of one variable
     if len(options) > len(ALLOWED):
         raise ValueError(f"has {len(options)} keys; there are {len(ALLOWED)} to give")
     x, wrong = ca.MX.sym("x"), []
@@ -272,15 +272,15 @@ IpoptOptions = Annotated[dict[str, Any], AfterValidator(_ipopt_options)]
 
 
 def optional(about: str, key: str | None = None) -> Any:
-    """A key that may be left out; the class that is built has the default.
+    """An optional key, whose default is that of the class that the section builds.
 
-    about : what it is, with its unit in brackets.  key : its name in the file, if a unit belongs to it.
+    about : description, with the unit in brackets.  key : its name in the file, if that has a unit.
     """
     return Field(default=None, alias=key, description=about)
 
 
 def required(about: str, key: str | None = None) -> Any:
-    """A key that has to be there; see `optional`."""
+    """A required key; arguments as of `optional`."""
     return Field(alias=key, description=about)
 
 
@@ -290,8 +290,8 @@ def attribute_docs(kind: type) -> dict[str, str]:
     """
     out: dict[str, str] = {}
     for each in reversed(kind.__mro__):
-        said = inspect.cleandoc(each.__doc__ or "")  # Python 3.13 takes the margin away, older ones keep it
-        section = re.split(r"\nAttributes\n-+\n", said)[-1]
+        doc = inspect.cleandoc(each.__doc__ or "")  # Python 3.13 removes the indentation, older ones do not
+        section = re.split(r"\nAttributes\n-+\n", doc)[-1]
         entries = re.split(r"\n(?=[a-z_]+(?: \[\w+\])?(?:, [a-z_]+(?: \[\w+\])?)* : )", "\n" + section)
         for entry in entries[1:]:
             names, _, text = entry.partition(" : ")
@@ -301,11 +301,12 @@ def attribute_docs(kind: type) -> dict[str, str]:
 
 
 class Section(BaseModel):
-    """A section; unknown keys, NaN, infinity and text where a number belongs are refused.
+    """Base class of sections; unknown keys, NaN, infinity and text instead of numbers are refused.
 
-    Of a class below, the docstring's first sentence says in the reference what the section is about.
-    kind : the class that it describes.  choice : the field that only says which kind of section this is.
-    apart : fields that are sections of something else.
+    The first sentence of a subclass's docstring describes the section in the reference.
+
+    kind : the class that it builds.  choice : the field that selects the kind of section.
+    apart : fields that are sections of another class.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
@@ -314,7 +315,7 @@ class Section(BaseModel):
     apart: ClassVar[tuple[str, ...]] = ()
 
     def given(self) -> dict[str, Any]:
-        """The keys that the file has, by the names of the class's fields."""
+        """Values of the keys in the file, by the names of the class's fields."""
         return self.model_dump(exclude_unset=True, exclude={self.choice, *self.apart})
 
     def build(self) -> Any:
@@ -323,7 +324,7 @@ class Section(BaseModel):
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
-        """Default values of optional keys, by field; a field without a default is not in it."""
+        """Default values by field; a field without a default is left out."""
         if not is_dataclass(cls.kind):
             return {}
         made = {f.name: f.default_factory() for f in fields(cls.kind) if f.default_factory is not MISSING}
@@ -337,25 +338,22 @@ class Section(BaseModel):
 
 
 def section_of(kind: type, base: type[Section] = Section) -> Any:
-    """The section that describes a dataclass: a key for each field that says what it is.
-
-    What the section is about is the first sentence of the class's docstring.
-    """
+    """The section of a dataclass: a key for each field with metadata (`about`), the class's docstring."""
     hints = get_type_hints(kind)
     keys: dict[str, Any] = {}
-    for field, told in abouts(kind):
+    for field, description in abouts(kind):
         needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        key = told.key_of(field.name)
+        key = description.key_of(field.name)
         alias = None if key == field.name else key
-        give = required if needed else optional
-        keys[field.name] = (_value(hints[field.name], told), give(told.text, alias))
-    made = create_model(kind.__name__, __base__=base, __doc__=kind.__doc__, **keys)
-    made.kind = kind
-    return made
+        make_key = required if needed else optional
+        keys[field.name] = (_value(hints[field.name], description), make_key(description.text, alias))
+    section = create_model(kind.__name__, __base__=base, __doc__=kind.__doc__, **keys)
+    section.kind = kind
+    return section
 
 
 def sections_of(name: str, doc: str, kinds: Mapping[str, type]) -> Any:
-    """A section with one for each of these classes below it, all of which may be left out."""
+    """A section with an optional subsection for each of these classes."""
     parts: dict[str, Any] = {key: (section_of(kind), optional("")) for key, kind in kinds.items()}
     return create_model(name, __base__=Section, __doc__=doc, **parts)
 
@@ -365,24 +363,24 @@ def one_of(words: Iterable[str]) -> Any:
     return Literal[tuple(words)]
 
 
-def _value(hint: Any, told: About) -> Any:
+def _value(hint: Any, about: About) -> Any:
     """Type annotation of a field for pydantic: its own without None, with its range."""
     kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     kind = next(k for k in kinds if k is not type(None))
-    if told.by_joint:
+    if about.by_joint:
         return Annotated[Any, PlainValidator(per_joint)]
-    if told.none:
+    if about.none:
         return Annotated[Any, PlainValidator(any_margin)]
-    if told.choices:
-        return one_of(told.choices)
-    bounds = {"gt": told.above, "ge": told.least, "le": told.most}
+    if about.choices:
+        return one_of(about.choices)
+    bounds = {"gt": about.above, "ge": about.least, "le": about.most}
     limits: dict[str, Any] = {name: bound for name, bound in bounds.items() if bound is not None}
     if get_args(kind) == (float, ...):
         return list[Annotated[float, Field(**limits)]]
     if get_origin(kind) is tuple:
         size = len(get_args(kind))
         numbers = Annotated[list[float], Field(min_length=size, max_length=size)]
-        return Annotated[numbers, AfterValidator(unit_vector)] if told.direction else numbers
+        return Annotated[numbers, AfterValidator(unit_vector)] if about.direction else numbers
     if kind is float:
-        return Annotated[float, Field(**limits, allow_inf_nan=True if told.endless else None)]
+        return Annotated[float, Field(**limits, allow_inf_nan=True if about.endless else None)]
     return cast(Any, kind)

@@ -1,4 +1,4 @@
-"""Writing of a problem and its robot to a file: differences from the defaults, with a comment to each key."""
+"""Writing of problem files: differences of a problem and its robot from the defaults, with comments."""
 
 from __future__ import annotations
 
@@ -67,11 +67,11 @@ BY_JOINT = {
     "kd": "kd_N_m_s_rad",
     "kp": "kp_N_m_rad",
 }
-ROUNDS = 4  # a torque limit changes the default of kd, and that the one of kp
+ROUNDS = 4  # of comparing with the robot: a torque limit changes the default of kd, and kd that of kp
 
 
 def robot_data(robot: Robot, folder: Path) -> tuple[dict[str, Any], Robot]:
-    """The section [robot] of a file in `folder`, {"preset": name} where that says it all; and its robot.
+    """The section [robot] of a file in `folder`, {"preset": name} for an unchanged preset; and its robot.
 
     Raises
     ------
@@ -80,10 +80,10 @@ def robot_data(robot: Robot, folder: Path) -> tuple[dict[str, Any], Robot]:
     data = _source(robot, folder)
     for _ in range(ROUNDS):
         built = RobotSection.model_validate(data).make(folder)
-        more = _differences(built, robot)
-        if not more:
+        changes = _differences(built, robot)
+        if not changes:
             break
-        for key, value in more.items():
+        for key, value in changes.items():
             old = data.get(key)
             if isinstance(value, dict) and isinstance(old, (int, float)):
                 old = dict.fromkeys(robot.joint_names, old)
@@ -92,11 +92,12 @@ def robot_data(robot: Robot, folder: Path) -> tuple[dict[str, Any], Robot]:
 
 
 def _source(robot: Robot, folder: Path) -> dict[str, Any]:
+    """Keys of [robot] from the robot's source: its preset or file, and the options given there."""
     source = robot.source
     if source is None:
         raise InputError(
-            f"robot {robot.name!r} was made from a model in Python, which no file can name: make it with "
-            "`load_robot` or `Robot.from_urdf`"
+            f"robot {robot.name!r} was made from a model in Python, which a file cannot contain: make it "
+            "with `load_robot` or `Robot.from_urdf`"
         )
     options = {name: value for name, value in source.options.items() if value is not None}
     data: dict[str, Any] = {} if source.preset is None else {"preset": source.preset}
@@ -136,7 +137,7 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
 
 
 def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
-    """Keys of [robot] that make `built` more like `robot`."""
+    """Keys of [robot] in which `built` differs from `robot`, or some of them if others depend on these."""
     out: dict[str, Any] = {}
     if built.name != robot.name:
         out["name"] = robot.name
@@ -148,7 +149,7 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
         changed = {joint: float(b) for joint, a, b in zip(joints, old, new, strict=True) if a != b}
         if changed:
             out[key] = changed
-            return out  # the others' defaults may follow from it
+            return out  # defaults of the others may depend on it
     limits = zip(joints, built.lower, built.upper, robot.lower, robot.upper, strict=True)
     moved = {joint: [float(c), float(d)] for joint, a, b, c, d in limits if (a, b) != (c, d)}
     if moved:
@@ -157,40 +158,40 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
         out["actuators"] = _actuators(robot)
     if [sole_data(sole) for sole in built.soles] != [sole_data(sole) for sole in robot.soles]:
         out["soles"] = [sole_data(sole) for sole in robot.soles]
-    apart = [list(pair) for pair in robot.disable_collisions if pair not in built.disable_collisions]
-    if apart:
-        out["disable_collisions"] = apart
-    made = {tool.name for tool in (robot.source.tools if robot.source else ())}
+    pairs = [list(pair) for pair in robot.disable_collisions if pair not in built.disable_collisions]
+    if pairs:
+        out["disable_collisions"] = pairs
+    of_tools = {tool.name for tool in (robot.source.tools if robot.source else ())}
     strikers = [
         striker_data(striker)
         for name, striker in robot.strikers.items()
         if name not in built.strikers or striker_data(built.strikers[name]) != striker_data(striker)
-        if name not in made
+        if name not in of_tools
     ]
     return out | ({"strikers": strikers} if strikers else {})
 
 
 def _actuators(robot: Robot) -> list[dict[str, Any]]:
-    """A section for all joints whose motors and gears are alike."""
-    alike: dict[Actuator, list[str]] = {}
+    """A section for each group of joints with equal actuators."""
+    groups: dict[Actuator, list[str]] = {}
     for joint, actuator in zip(robot.joint_names, robot.actuators, strict=True):
-        alike.setdefault(actuator, []).append(joint)
-    usual = Actuator()
+        groups.setdefault(actuator, []).append(joint)
+    default = Actuator()
     return [
         {"joints": joints}
         | {
-            told.key_of(field.name): value
-            for field, told in abouts(Actuator)
-            if (value := getattr(actuator, field.name)) != getattr(usual, field.name)
+            description.key_of(field.name): value
+            for field, description in abouts(Actuator)
+            if (value := getattr(actuator, field.name)) != getattr(default, field.name)
         }
-        for actuator, joints in alike.items()
+        for actuator, joints in groups.items()
     ]
 
 
 def _relative(path: Any, folder: Path) -> str:
-    """A path relative to the folder if it is in or below it, else the whole path."""
-    whole, base = Path(path).expanduser().resolve(), folder.resolve()
-    return str(whole.relative_to(base) if whole.is_relative_to(base) else whole)
+    """A path relative to the folder if it is in or below it, else the absolute path."""
+    absolute, base = Path(path).expanduser().resolve(), folder.resolve()
+    return str(absolute.relative_to(base) if absolute.is_relative_to(base) else absolute)
 
 
 def sole_data(sole: Sole) -> dict[str, Any]:
@@ -233,19 +234,19 @@ def _grip(grip: SoftGrip) -> dict[str, Any]:
 def write_problem(
     problem: ImpactProblem, *, solver: SolverSettings | None = None, folder: str | os.PathLike[str] = "."
 ) -> str:
-    """A problem as the text of its file, which gives the same problem (`ImpactProblem.hash`) when read.
+    """Text of a problem's file, from which the same problem (`ImpactProblem.hash`) can be read.
 
     Defaults are left out; each key has a comment with its unit.
 
     Parameters
     ----------
-    problem : its robot is a preset or was read from a URDF, with or without changes.
+    problem : with a robot that is a preset or read from a file, with or without changes.
     solver : the file's [solver] section.
-    folder : that the file is to be in; a URDF in or below it is named relative to it.
+    folder : folder of the file, to which the path of a URDF in or below it is relative.
 
     Raises
     ------
-    InputError : what no file can say: a contact law, target or term of one's own; a robot built in Python.
+    InputError : contact laws, targets or terms that are not of this package; a robot built in Python.
     """
     data = problem_data(problem, folder=folder)
     if solver is not None:
@@ -253,37 +254,38 @@ def write_problem(
     read = problem_file_from_data(data, where=Path(folder) / "problem.toml")
     if read.build().hash != problem.hash:
         raise InputError(
-            f"the problem cannot be written to a file: its robot {problem.robot.name!r} is changed in what a "
-            "file cannot say, such as links or frames of its model"
+            f"the problem cannot be written to a file: its robot {problem.robot.name!r} has changes that a "
+            "file cannot contain, such as links or frames of its model"
         )
     return write_toml(data, lambda place: comment_at(data, place))
 
 
 def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = ".") -> dict[str, Any]:
-    """A problem as a problem file's data, without what is a default; see `write_problem`."""
-    usual: dict[str, Any] = {f.name: f.default_factory for f in fields(ImpactProblem)}
+    """Data of a problem's file, without defaults; see `write_problem`."""
+    factories: dict[str, Any] = {f.name: f.default_factory for f in fields(ImpactProblem)}
     robot, built = robot_data(problem.robot, Path(folder))
     if problem.gains:
         robot["gains"] = [{"joints": list(g.joints), "factor": list(g.factor)} for g in problem.gains]
-    named = robot.keys() == {"preset"}
+    preset_only = robot.keys() == {"preset"}
     start = problem.start
     if not isinstance(start, str) or not _equal(built.postures.get(start), problem.start_posture):
         start = problem.start_posture.tolist()
     data: dict[str, Any] = {
         "problem": {
             **_different(ProblemSection, {"name": problem.name}),
-            **({"robot": robot["preset"]} if named else {}),
+            **({"robot": robot["preset"]} if preset_only else {}),
             "striker": problem.striker,
             "point_m": problem.point.tolist(),
             "normal": problem.normal.tolist(),
             **_different(ProblemSection, {"start": start}),
         },
-        **({} if named else {"robot": robot}),
+        **({} if preset_only else {"robot": robot}),
         "target": target_data(problem.target),
         "contact": law_data(problem.law),
     }
     stance = problem.stance
-    hands = {"hands": [hand.name for hand in held]} if (held := stance.held_hands(problem.robot)) else {}
+    fixed_hands = stance.held_hands(problem.robot)
+    hands = {"hands": [hand.name for hand in fixed_hands]} if fixed_hands else {}
     data["stances"] = [
         {"soles": list(each.soles)}
         | ({} if each.phase is None else _section(StancePhaseSection, each.phase, ("soles", "steps")))
@@ -300,11 +302,11 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
         ("swing", SwingSection, problem.swing),
         ("follow", FollowSection, problem.follow),
     ):
-        if phase != usual[name]():
+        if phase != factories[name]():
             data[name] = _section(section, phase)
-    shape = dict(zip(ELEMENTS, problem.collision_elements, strict=True))
+    elements = dict(zip(ELEMENTS, problem.collision_elements, strict=True))
     for name, part in (("collision", CollisionSection), ("objective", ObjectiveSection)):
-        values = {key: shape.get(key, getattr(problem, key, None)) for key in part.model_fields}
+        values = {key: elements.get(key, getattr(problem, key, None)) for key in part.model_fields}
         data[name] = _different(part, values)
     data["scenarios"] = [_section(ScenarioSection, scenario) for scenario in problem.scenarios]
     if problem.objectives != ImpactProblem.objectives:
@@ -324,14 +326,14 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
 
 
 def _parts(section: type[Section], things: Any) -> dict[str, Any]:
-    """Sections of their own for the terms or the objectives, by the names that they have in `section`."""
+    """Sections of terms or objectives, by their names in the section above."""
     parts: dict[str, Any] = {name: info.annotation for name, info in section.model_fields.items()}
     kinds = {part.kind: (name, part) for name, part in parts.items()}
     out = {}
     for thing in things:
         if type(thing) not in kinds:
             raise InputError(
-                f"the problem cannot be written to a file, which knows no {type(thing).__name__}"
+                f"the problem cannot be written to a file, which has no section for {type(thing).__name__}"
             )
         name, part = kinds[type(thing)]
         out[name] = _section(part, thing)
@@ -339,12 +341,12 @@ def _parts(section: type[Section], things: Any) -> dict[str, Any]:
 
 
 def target_data(target: Target) -> dict[str, Any]:
-    """A target as a problem file's section, without what is a default."""
+    """Section of a target, without defaults."""
     return _of_kind("target", target, TARGETS, "kind")
 
 
 def law_data(law: ContactLaw) -> dict[str, Any]:
-    """A contact law as a problem file's section, without what is a default."""
+    """Section of a contact law, without defaults."""
     return _of_kind("law", law, LAWS, "law")
 
 
@@ -352,31 +354,32 @@ def _of_kind(what: str, thing: Any, kinds: Mapping[str, type[Section]], key: str
     names = {section.kind: name for name, section in kinds.items()}
     if type(thing) not in names:
         raise InputError(
-            f"the problem cannot be written to a file, which is data: its {what} {type(thing).__name__} is "
-            "made of functions in Python"
+            f"the problem cannot be written to a file, which contains only data: its {what} "
+            f"{type(thing).__name__} is a class in Python"
         )
     name = names[type(thing)]
     return {**({} if name == next(iter(kinds)) else {key: name}), **_section(kinds[name], thing)}
 
 
 def _section(section: type[Section], thing: Any, without: Sequence[str] = ()) -> dict[str, Any]:
-    """A thing that a section describes, without what is a default; `without`: keys that it has not."""
+    """Data of the section of a thing, without defaults; without : keys that the thing does not have."""
     left_out = (section.choice, *section.apart, *without)
     names = [name for name in section.model_fields if name not in left_out]
     return _different(section, {name: getattr(thing, name) for name in names})
 
 
 def _different(section: type[Section], values: Mapping[str, Any]) -> dict[str, Any]:
-    usual, out = section.defaults(), {}
+    """Values by key that are not the section's defaults."""
+    defaults, out = section.defaults(), {}
     for name, value in values.items():
-        if name not in usual or not _equal(usual[name], value):
+        if name not in defaults or not _equal(defaults[name], value):
             out[section.model_fields[name].alias or name] = _written(name, value)
     return out
 
 
 def _written(name: str, value: Any) -> Any:
-    """A field's value as the file has it."""
-    if value is None:  # the one that may be None and is no default
+    """A field's value in the file."""
+    if value is None:  # only the margin of `any_margin` may be None without None being its default
         return "anywhere"
     if name in ("duration", "contact_duration") and value[0] == value[1]:
         return value[0]

@@ -1,4 +1,4 @@
-"""The package's face: one object a model, whose methods return SX expressions of its symbols."""
+"""`RigidBody`: symbolic kinematics and dynamics of one model. Its methods return SX expressions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError
 from impactopt.robots.rigid_body import _dynamics
-from impactopt.robots.rigid_body import _dynamics as _momentum
 from impactopt.robots.rigid_body._dynamics import (
     Accelerations,
     Factor,
@@ -47,16 +46,16 @@ class RigidBody:
 
     Attributes
     ----------
-    q, v, a : SX symbols (nq), (nv), (nv), for convenience; every method takes q from here, v and a as
-        arguments.
+    q, v, a : SX symbols (nq), (nv), (nv). Every method uses this q; v and a are arguments, and these symbols
+        are for callers that need some.
     nq, nv : number of coordinates (of the chosen kind) and of velocities.
 
     Notes
     -----
     Velocities v and accelerations a = dv/dt are Pinocchio's in both cases: the free-flyer's six, [linear
     [m/s]; angular [rad/s]] in its own frame, then the joints'. Arguments `v` and `a` are SX or numbers, (nv),
-    dense or sparse; structural zeros save work. Every method builds only what it needs, and shares it with
-    the other methods.
+    dense or sparse; structural zeros make the expressions smaller. Subexpressions are built on demand and
+    shared between methods.
 
     Raises
     ------
@@ -146,15 +145,15 @@ class RigidBody:
     # ------------------------------------------------------------ momentum
     def com(self) -> Any:
         """Centre of mass, SX (3) [m]."""
-        return pack_vector(_momentum.com(self._composites))
+        return pack_vector(_dynamics.com(self._composites))
 
     def centroidal_map(self) -> Any:
         """A_g, SX (6, nv) sparse: centroidal momentum is A_g v (as `pin.computeCentroidalMap`)."""
-        return pack_entries((6, self.nv), _momentum.centroidal_map(self._crba()))
+        return pack_entries((6, self.nv), _dynamics.centroidal_map(self._crba()))
 
     def centroidal_momentum(self, v: Any) -> Any:
-        """A_g v, SX (6), without forming A_g: [linear [kg m/s]; angular [kg m2/s]] at the centre of mass."""
-        return pack_vector(_momentum.centroidal_momentum(self._composites, self._link_velocities(v)))
+        """A_g v, SX (6), without A_g: [linear [kg m/s]; angular, about the centre of mass [kg m2/s]]."""
+        return pack_vector(_dynamics.centroidal_momentum(self._composites, self._link_velocities(v)))
 
     # ------------------------------------------------------------ coordinates
     def velocity_map(self) -> Any:
@@ -166,8 +165,8 @@ class RigidBody:
         return self._coordinates.acceleration(self._numbers("qdot", qdot), self._numbers("qddot", qddot))
 
     def tangent_map(self) -> Any:
-        """dq/dv, SX (nq, nv) sparse: dq/dt = tangent_map v, so `jacobian(f, q) @ tangent_map` is df in v's
-        basis.
+        """Matrix G, SX (nq, nv) sparse, with dq/dt = G v. So `jacobian(f, q) @ G` is df/dt for each unit
+        velocity.
 
         With "rpy" it is singular at pitch = +-90 deg.
         """
@@ -188,7 +187,7 @@ class RigidBody:
         """Pinocchio's q, (model.nq) or (k, model.nq), of these coordinates, (nq) or (k, nq)."""
         return self._coordinates.to_pin(q)
 
-    # ------------------------------------------------------------ shared parts
+    # ------------------------------------------------------------ shared subexpressions
     def _crba(self) -> _dynamics.MassMatrix:
         if self._mass_matrix is None:
             self._mass_matrix = _dynamics.MassMatrix(self._composites)
@@ -213,5 +212,9 @@ class RigidBody:
 
 
 def _key(numbers: Vector) -> tuple[Any, ...]:
-    """Equal for equal lists: an expression is known by its node, which the cached list keeps alive."""
+    """Dictionary key of a list of numbers, equal for equal lists.
+
+    The hash of an SX entry identifies its node. The cached object keeps the list, and so the nodes, alive;
+    otherwise another node could get the same hash.
+    """
     return tuple((x.x.element_hash(),) if isinstance(x, Scalar) else x for x in numbers)

@@ -1,9 +1,8 @@
 """Kinematics and dynamics of a tree: placements, Jacobians, velocities; inertias, H, its factors, momentum.
 
-H does not contain the base's pose, so neither do its derivatives. Algorithms after Featherstone, Rigid Body
-Dynamics Algorithms (2008), chapters 5 and 6.
-
-They are in link frames; the world's axes enter at the end only, by one rotation.
+Algorithms after Featherstone, Rigid Body Dynamics Algorithms (2008), chapters 5 and 6. They run in link
+frames, and a rotation into the world's axes comes last. So H does not depend on the base's pose, and its
+derivatives have no entries for it.
 """
 
 from __future__ import annotations
@@ -55,15 +54,15 @@ class Kinematics:
             return add(joint.translation, scale(self.coordinates.travel(i), column(joint.rotation, 2)))
         return joint.translation
 
-    def up(self, i: int, a: Vector) -> Vector:
-        """A vector given in link i's frame, in its parent's."""
+    def to_parent(self, i: int, a: Vector) -> Vector:
+        """Rotate a vector from link i's axes to its parent's."""
         joint = self.tree.joints[i]
         if joint.kind is Kind.REVOLUTE:
             a = rotate_z(*self.coordinates.cos_sin(i), a)
         return times(joint.rotation, a)
 
-    def down(self, i: int, a: Vector) -> Vector:
-        """A vector given in the frame of link i's parent, in link i's."""
+    def from_parent(self, i: int, a: Vector) -> Vector:
+        """Rotate a vector from the axes of link i's parent to link i's."""
         joint = self.tree.joints[i]
         a = transpose_times(joint.rotation, a)
         return rotate_back_z(*self.coordinates.cos_sin(i), a) if joint.kind is Kind.REVOLUTE else a
@@ -96,12 +95,16 @@ class Kinematics:
         return self._frames[name]
 
     def jacobian(self, name: str) -> dict[tuple[int, int], Number]:
-        """Entries of the frame's Jacobian, (6, nv), LOCAL_WORLD_ALIGNED; other joints have no column."""
+        """Entries of the frame's Jacobian, (6, nv), LOCAL_WORLD_ALIGNED, by (row, column).
+
+        Only joints between the root and the frame have entries.
+        """
         _, point = self.frame(name)
         entries: dict[tuple[int, int], Number] = {}
         for j in self.tree.support(self.tree.frame(name)[0]):
             joint, (R, p) = self.tree.joints[j], self.placement(j)
             arm = subtract(point, p)
+            # (linear, angular) velocity of the frame per unit of each of the joint's velocities
             if joint.kind is Kind.FREE:
                 columns = [(column(R, c), zero_vector()) for c in range(3)]
                 columns += [(cross(column(R, c), arm), column(R, c)) for c in range(3)]
@@ -112,12 +115,13 @@ class Kinematics:
             for c, parts in enumerate(columns):
                 for r, entry in enumerate(joint.ratio * x for part in parts for x in part):
                     place = r, joint.v + c
+                    # a follower and its leader have the same column, so their parts are added
                     entries[place] = entries[place] + entry if place in entries else entry
         return entries
 
 
 class Velocities:
-    """Link velocities, in link frames, for one v (a list of nv numbers)."""
+    """Link velocities, in link frames, for one v (a list of nv numbers); each is computed once, on demand."""
 
     def __init__(self, kinematics: Kinematics, v: Vector) -> None:
         self.kinematics, self.tree, self.v = kinematics, kinematics.tree, v
@@ -132,7 +136,8 @@ class Velocities:
                 if joint.kind is Kind.FREE:
                     self._angular[j] = self.v[joint.v + 3 : joint.v + 6]
                     continue
-                x, y, z = self.kinematics.down(j, self._angular[joint.parent])
+                # the parent's, plus the joint's own rate about z
+                x, y, z = self.kinematics.from_parent(j, self._angular[joint.parent])
                 turning = joint.kind is Kind.REVOLUTE
                 self._angular[j] = [x, y, z + joint.along(self.v)] if turning else [x, y, z]
         return self._angular[i]
@@ -145,10 +150,11 @@ class Velocities:
                 if joint.kind is Kind.FREE:
                     self._linear[j] = self.v[joint.v : joint.v + 3]
                     continue
+                # the velocity of the parent's point at this origin, plus the joint's own rate along z
                 above = add(
                     self._linear[joint.parent], cross(self.angular(joint.parent), self.kinematics.offset(j))
                 )
-                x, y, z = self.kinematics.down(j, above)
+                x, y, z = self.kinematics.from_parent(j, above)
                 sliding = joint.kind is Kind.PRISMATIC
                 self._linear[j] = [x, y, z + joint.along(self.v)] if sliding else [x, y, z]
         return self._linear[i]
@@ -164,7 +170,8 @@ class Velocities:
 class Accelerations:
     """Link accelerations, in link frames, for one v and a: dw/dt, and the *point* acceleration of the origin.
 
-    Linear velocity is not needed for them, except the base's own.
+    A point acceleration depends on angular velocities only, except at the free-flyer, whose linear velocity
+    is given along turning axes.
     """
 
     def __init__(self, velocities: Velocities, a: Vector) -> None:
@@ -172,6 +179,7 @@ class Accelerations:
         self.kinematics, self.tree = velocities.kinematics, velocities.tree
         self._angular: dict[int, Vector] = {0: zero_vector()}
         self._spin: dict[int, Matrix] = {0: [zero_vector() for _ in range(3)]}
+        # with gravity as an upward acceleration of the universe (Featherstone 2008, section 5.3), and without
         self._linear: dict[bool, dict[int, Vector]] = {
             False: {0: zero_vector()},
             True: {0: scale(-1.0, self.tree.gravity)},
@@ -185,15 +193,18 @@ class Accelerations:
                 if joint.kind is Kind.FREE:
                     self._angular[j] = self.a[joint.v + 3 : joint.v + 6]
                     continue
-                x, y, z = self.kinematics.down(j, self._angular[joint.parent])
+                x, y, z = self.kinematics.from_parent(j, self._angular[joint.parent])
                 if joint.kind is Kind.REVOLUTE:
+                    # w x (0, 0, rate), as the axis turns with the link, and the joint's own about z
                     w, rate = self.velocities.angular(j), joint.along(self.velocities.v)
                     x, y, z = x + w[1] * rate, y - w[0] * rate, z + joint.along(self.a)
                 self._angular[j] = [x, y, z]
         return self._angular[i]
 
     def spin(self, i: int) -> Matrix:
-        """U = [dw/dt]x + [w]x [w]x: a point at r in link i accelerates by U r against the origin."""
+        """U = [dw/dt]x + [w]x [w]x, (3, 3): the acceleration of a point r of link i relative to its origin
+        is U r.
+        """
         if i not in self._spin:
             (x, y, z), (ax, ay, az) = self.velocities.angular(i), self.angular(i)
             xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
@@ -205,7 +216,9 @@ class Accelerations:
         return self._spin[i]
 
     def linear(self, i: int, *, gravity: bool) -> Vector:
-        """Acceleration of link i's origin [m/s2]; less gravity's (an accelerometer's) where `gravity`."""
+        """Acceleration of link i's origin [m/s2]; minus that of gravity (as an accelerometer measures it) if
+        `gravity`.
+        """
         known = self._linear[gravity]
         for j in self.tree.support(i):
             if j not in known:
@@ -216,12 +229,13 @@ class Accelerations:
         joint, v = self.tree.joints[i], self.velocities.v
         if joint.kind is Kind.FREE:
             R, _ = self.kinematics.placement(i)
-            # Pinocchio's a is dv/dt along the base's own, turning axes.
+            # Pinocchio's a is dv/dt along the base's own, turning axes: w x v is missing in it
             turning = cross(v[joint.v + 3 : joint.v + 6], v[joint.v : joint.v + 3])
             return add(add(self.a[joint.v : joint.v + 3], turning), transpose_times(R, above))
         at_joint = add(above, times(self.spin(joint.parent), self.kinematics.offset(i)))
-        x, y, z = self.kinematics.down(i, at_joint)
+        x, y, z = self.kinematics.from_parent(i, at_joint)
         if joint.kind is Kind.PRISMATIC:
+            # Coriolis acceleration 2 w x (0, 0, rate), and the joint's own along z
             w, rate = self.velocities.angular(i), joint.along(v)
             x, y, z = x + 2.0 * (w[1] * rate), y - 2.0 * (w[0] * rate), z + joint.along(self.a)
         return [x, y, z]
@@ -235,15 +249,16 @@ class Accelerations:
 
 
 class Factor:
-    """The factorization H = L' D L of a symmetric positive definite matrix with a tree's pattern.
+    """Factorization H = L' D L of a symmetric positive definite matrix with a tree's sparsity pattern.
 
-    L is unit lower triangular, D diagonal. Structural zeros of right-hand sides stay zeros, so a sparse one
-    costs what its own branch of the tree costs.
+    L is unit lower triangular, D diagonal. Eliminating from the leaves to the root makes no fill-in
+    (Featherstone 2008, section 6.5). Structural zeros of a right-hand side are kept, so that the cost of a
+    solve is that of the branches with nonzeros.
     """
 
     def __init__(self, parents: list[int], upper: Mapping[tuple[int, int], Number]) -> None:
         self._parents, self.nv = parents, len(parents)
-        A: dict[tuple[int, int], Number] = {}
+        A: dict[tuple[int, int], Number] = {}  # (k, j) with j <= k: the lower triangle, overwritten
         for k in range(self.nv):
             for j in (k, *self._ancestors(k)):
                 A[k, j] = upper.get((j, k), 0.0)
@@ -252,7 +267,7 @@ class Factor:
         for k in range(self.nv - 1, -1, -1):
             if is_zero(A[k, k]):
                 raise InputError(
-                    f"H: nothing resists velocity {k} (its row is zero); give the link inertia or armature"
+                    f"H: velocity {k} has no inertia (its row is zero); give the link inertia or armature"
                 )
             self._D[k] = A[k, k]
             above = [i for i in self._ancestors(k) if not is_zero(A[k, i])]
@@ -299,6 +314,7 @@ class Factor:
         return pack_entries((self.nv, len(columns)), entries)
 
     def _half(self, b: dict[int, Number]) -> dict[int, Number]:
+        """L^-T b by substitution from the leaves to the root; nonzeros spread to ancestors only."""
         y = dict(b)
         for k in range(self.nv - 1, -1, -1):
             if k in y:
@@ -308,6 +324,7 @@ class Factor:
         return y
 
     def _back(self, y: dict[int, Number]) -> dict[int, Number]:
+        """L^-1 D^-1 y by substitution from the root to the leaves."""
         x: dict[int, Number] = {}
         for k in range(self.nv):
             value: Number = y[k] / self._D[k] if k in y else 0.0
@@ -323,6 +340,7 @@ def tree_entries(parents: list[int], H: Any) -> dict[tuple[int, int], Number]:
     """The upper triangle of H, SX (nv, nv), checked to have the tree's pattern."""
     upper = {place: x for place, x in unpack_entries(H).items() if place[0] <= place[1] and not is_zero(x)}
     for i, j in upper:
+        # i has to be an ancestor of j
         k = j
         while k > i:
             k = parents[k]
@@ -343,7 +361,7 @@ def add_to_diagonal(
 
 
 class CompositeInertias:
-    """Mass, first moment and tensor of every link together with all that it carries, about its origin."""
+    """Mass, first moment and inertia tensor of each link's subtree, about the link's origin."""
 
     def __init__(self, kinematics: Kinematics) -> None:
         self.kinematics, self.tree = kinematics, kinematics.tree
@@ -351,7 +369,7 @@ class CompositeInertias:
         for i in range(len(self.tree) - 1, 0, -1):
             self.mass[self.tree.joints[i].parent] += self.mass[i]
         self._first_moments: list[Vector] | None = None
-        self._lifted: dict[int, Vector] = {}
+        self._first_moments_in_parent: dict[int, Vector] = {}  # along the parent's axes
         self._tensors: list[Vector] | None = None
 
     def first_moment(self, i: int) -> Vector:
@@ -361,8 +379,8 @@ class CompositeInertias:
             for j in range(len(self.tree) - 1, 0, -1):
                 joint = self.tree.joints[j]
                 if joint.kind is not Kind.FREE:
-                    self._lifted[j] = self.kinematics.up(j, h[j])
-                    moved = add(self._lifted[j], scale(self.mass[j], self.kinematics.offset(j)))
+                    in_parent = self._first_moments_in_parent[j] = self.kinematics.to_parent(j, h[j])
+                    moved = add(in_parent, scale(self.mass[j], self.kinematics.offset(j)))
                     h[joint.parent] = add(h[joint.parent], moved)
             self._first_moments = h
         return self._first_moments[i]
@@ -376,27 +394,31 @@ class CompositeInertias:
                 if joint.parent:
                     above = tensors[joint.parent]
                     tensors[joint.parent] = [
-                        x + y for x, y in zip(above, self._lift(j, tensors[j]), strict=True)
+                        x + y for x, y in zip(above, self._tensor_in_parent(j, tensors[j]), strict=True)
                     ]
             self._tensors = tensors
         return self._tensors[i]
 
-    def _lift(self, i: int, tensor: Vector) -> Vector:
-        """The subtree's tensor along the axes and about the origin of link i's parent."""
-        self.first_moment(i)
+    def _tensor_in_parent(self, i: int, tensor: Vector) -> Vector:
+        """Tensor of link i's subtree, along the axes and about the origin of link i's parent."""
+        self.first_moment(i)  # fills _first_moments_in_parent
         joint = self.tree.joints[i]
         if joint.kind is Kind.REVOLUTE:
             tensor = tensor_rotate_z(*self.kinematics.coordinates.cos_sin(i), tensor)
         tensor = tensor_rotate(joint.rotation, tensor)
-        return move_tensor(self.mass[i], self._lifted[i], tensor, self.kinematics.offset(i))
+        first_moment = self._first_moments_in_parent[i]
+        return move_tensor(self.mass[i], first_moment, tensor, self.kinematics.offset(i))
 
 
 class MassMatrix:
-    """H, read off the force that each joint's unit acceleration hands down the chain.
+    """Mass matrix H by the composite-rigid-body algorithm (Featherstone 2008, section 6.2).
+
+    Column k of H has the generalized forces of a unit acceleration of velocity k: the inertial force of the
+    moving subtree is propagated to the root, and projected on the axis of each joint that it passes.
 
     Attributes
     ----------
-    entries : {(i, j): H_ij} with i <= j along the tree, armature on the diagonal; what is missing is zero.
+    entries : {(i, j): H_ij} with i <= j along the tree, armature on the diagonal; entries left out are zero.
     root_forces : {k: (force, moment)} on the root link, about its origin, from a unit acceleration of
         velocity k.
     """
@@ -414,6 +436,7 @@ class MassMatrix:
         self.entries = {place: number for place, number in self.entries.items() if not is_zero(number)}
 
     def _free_flyer(self, i: int) -> None:
+        """Enter the base's own block: [[m 1, -[h]x], [[h]x, I]]."""
         m, (hx, hy, hz) = self.composites.mass[i], self.composites.first_moment(i)
         tensor = tensor_matrix(self.composites.tensor(i))
         k = self.tree.joints[i].v
@@ -421,7 +444,7 @@ class MassMatrix:
         for c in range(3):
             force: Vector = [m if r == c else 0.0 for r in range(3)]
             self.root_forces[k + c] = (force, [moments[r][c] for r in range(3)])
-            # A unit angular acceleration about axis c pulls with -[h]x e_c, the row c of [h]x.
+            # the force of a unit angular acceleration about axis c is -[h]x e_c, row c of [h]x
             self.root_forces[k + 3 + c] = (moments[c], tensor[c])
             self.entries[k + c, k + c] = m
             for r in range(3):
@@ -430,8 +453,10 @@ class MassMatrix:
                     self.entries[k + 3 + r, k + 3 + c] = tensor[r][c]
 
     def _joint(self, i: int) -> None:
+        """Enter the column of a joint with one degree of freedom."""
         joints, kinematics, m = self.tree.joints, self.kinematics, self.composites.mass[i]
         (hx, hy, _), k = self.composites.first_moment(i), joints[i].v
+        # force and moment on the subtree, about link i's origin, for a unit acceleration about or along z
         force: Vector
         moment: Vector
         if joints[i].kind is Kind.REVOLUTE:
@@ -441,38 +466,44 @@ class MassMatrix:
         else:
             force, moment, own = [0.0, 0.0, m], [hy, 0.0 - hx, 0.0], m
         ratio, j = joints[i].ratio, i
+        # a follower has no motor of its own: its armature is in that of its leader
         self._add(k, k, ratio**2 * own + (0.0 if joints[i].follows else self.tree.armature[k]))
         while j and joints[j].kind is not Kind.FREE:
-            force = kinematics.up(j, force)
-            moment = add(kinematics.up(j, moment), cross(kinematics.offset(j), force))
+            # to the parent's frame: the same force, its moment about the parent's origin
+            force = kinematics.to_parent(j, force)
+            moment = add(kinematics.to_parent(j, moment), cross(kinematics.offset(j), force))
             j = joints[j].parent
             if j and joints[j].kind is Kind.FREE:
                 for c in range(3):
                     self._add(c, k, ratio * force[c])
                     self._add(3 + c, k, ratio * moment[c])
             elif j:
-                both, at = ratio * joints[j].ratio, joints[j].v
-                part = both * (moment[2] if joints[j].kind is Kind.REVOLUTE else force[2])
-                self._add(at, k, 2.0 * part if at == k else part)
-        own_force, own_moment = self.root_forces.get(k, (zero_vector(), zero_vector()))
+                ratios, row = ratio * joints[j].ratio, joints[j].v
+                entry = ratios * (moment[2] if joints[j].kind is Kind.REVOLUTE else force[2])
+                # A follower above or below its leader has the same velocity k: H_ij and H_ji of the two
+                # joints both fall on the diagonal.
+                self._add(row, k, 2.0 * entry if row == k else entry)
+        # what has arrived at the root, in addition to that of followers with the same velocity
+        root_force, root_moment = self.root_forces.get(k, (zero_vector(), zero_vector()))
         self.root_forces[k] = (
-            add(own_force, scale(ratio, force)),
-            add(own_moment, scale(ratio, moment)),
+            add(root_force, scale(ratio, force)),
+            add(root_moment, scale(ratio, moment)),
         )
 
     def _add(self, i: int, j: int, number: Number) -> None:
-        """More of H_ij; followers and their leaders have one row."""
+        """Add to H_ij, to which a follower contributes besides its leader."""
         place = min(i, j), max(i, j)
         self.entries[place] = self.entries[place] + number if place in self.entries else number
 
 
 def rnea(accelerations: Accelerations, *, gravity: bool) -> Vector:
-    """tau (nv) = H a + C v + g, by Newton and Euler on each link and the forces handed down the tree.
+    """tau (nv) = H a + C v + g, by the recursive Newton-Euler algorithm (Featherstone 2008, section 5.3).
 
-    No link's linear velocity is needed: with U = [dw/dt]x + [w]x[w]x and the pseudo-inertia S = tr(I)/2 - I,
-    the force is m a + U h and the moment about the origin h x a + (the axial vector of U S).
+    With U = [dw/dt]x + [w]x[w]x and the pseudo-inertia S = tr(I)/2 - I, the force on a link is m a + U h,
+    and the moment about its origin h x a + (the axial vector of U S). So no link's linear velocity is needed.
     """
     kinematics, tree = accelerations.kinematics, accelerations.tree
+    # of each link alone, about its origin
     forces: list[Vector] = [zero_vector()]
     moments: list[Vector] = [zero_vector()]
     for i, joint in enumerate(tree.joints[1:], start=1):
@@ -489,6 +520,7 @@ def rnea(accelerations: Accelerations, *, gravity: bool) -> Vector:
         forces.append(add(scale(joint.mass, acceleration), times(U, joint.first_moment)))
         moments.append(add(axial, cross(joint.first_moment, acceleration)))
     tau: Vector = [0.0] * tree.nv
+    # from the leaves to the root: forces[i], moments[i] become those that joint i transmits to its link
     for i in range(len(tree) - 1, 0, -1):
         joint = tree.joints[i]
         if joint.kind is Kind.FREE:
@@ -499,8 +531,8 @@ def rnea(accelerations: Accelerations, *, gravity: bool) -> Vector:
         if not joint.follows:
             tau[joint.v] = tau[joint.v] + tree.armature[joint.v] * accelerations.a[joint.v]
         if joint.parent:
-            force = kinematics.up(i, forces[i])
-            moment = add(kinematics.up(i, moments[i]), cross(kinematics.offset(i), force))
+            force = kinematics.to_parent(i, forces[i])
+            moment = add(kinematics.to_parent(i, moments[i]), cross(kinematics.offset(i), force))
             forces[joint.parent] = add(forces[joint.parent], force)
             moments[joint.parent] = add(moments[joint.parent], moment)
     return tau
@@ -523,14 +555,18 @@ def com(composites: CompositeInertias) -> Vector:
 
 
 def centroidal_map(mass_matrix: MassMatrix) -> dict[tuple[int, int], Number]:
-    """Entries of A_g, (6, nv): the forces that CRBA hands to the root, taken to the centre of mass."""
+    """Entries of A_g, (6, nv): `MassMatrix.root_forces` moved to the centre of mass, along the world's axes.
+
+    The momentum of unit velocity k is, in numbers, the force of unit acceleration k.
+    """
     composites = mass_matrix.composites
     R, _ = composites.kinematics.placement(composites.tree.root)
     c = com_in_root(composites)
     floating = composites.tree.floating
     entries: dict[tuple[int, int], Number] = {}
     for k, (force, moment) in mass_matrix.root_forces.items():
-        # A free-flyer that only translates has no momentum about the centre of mass, whatever rounding says.
+        # A translating free-flyer has no momentum about the centre of mass. The difference would be zero up
+        # to rounding errors, and so no structural zero.
         about_com = zero_vector() if floating and k < 3 else subtract(moment, cross(c, force))
         linear, angular = times(R, force), times(R, about_com)
         for r in range(3):
@@ -541,18 +577,20 @@ def centroidal_map(mass_matrix: MassMatrix) -> dict[tuple[int, int], Number]:
 def centroidal_momentum(composites: CompositeInertias, velocities: Velocities) -> Vector:
     """Six numbers A_g v = [linear [kg m/s]; angular [kg m2/s]] from the links' momenta, without A_g."""
     kinematics, tree = composites.kinematics, composites.tree
+    # momentum of each link about its origin: m u + w x h, and I w + h x u
     linear: list[Vector] = [zero_vector()]
     angular: list[Vector] = [zero_vector()]
     for i, joint in enumerate(tree.joints[1:], start=1):
         u, w, h = velocities.linear(i), velocities.angular(i), joint.first_moment
         linear.append(add(scale(joint.mass, u), cross(w, h)))
         angular.append(add(times(tensor_matrix(joint.tensor), w), cross(h, u)))
+    # added up to the root, each moved to its parent's frame
     for i in range(len(tree) - 1, 0, -1):
         joint = tree.joints[i]
         if joint.kind is not Kind.FREE:
-            lifted = kinematics.up(i, linear[i])
-            moment = add(kinematics.up(i, angular[i]), cross(kinematics.offset(i), lifted))
-            linear[joint.parent] = add(linear[joint.parent], lifted)
+            in_parent = kinematics.to_parent(i, linear[i])
+            moment = add(kinematics.to_parent(i, angular[i]), cross(kinematics.offset(i), in_parent))
+            linear[joint.parent] = add(linear[joint.parent], in_parent)
             angular[joint.parent] = add(angular[joint.parent], moment)
     R, _ = kinematics.placement(tree.root)
     about_com = subtract(angular[tree.root], cross(com_in_root(composites), linear[tree.root]))

@@ -2,8 +2,8 @@
 
 The algorithms of this package work on Python lists whose entries are either plain floats or `Scalar`.
 Constants are folded before CasADi sees them (0 * x is the float 0.0, 1 * x is x), so structural zeros stay
-recognizable as floats. Products go straight to `SX.binary`: `a * b` on two SX spends ten times as long on
-finding out what a and b are.
+recognizable as floats. Products call `SX.binary` directly: `a * b` on two SX takes ten times as long, for
+finding out the types of a and b.
 
 A symmetric tensor is the list (xx, xy, yy, xz, yz, zz), Pinocchio's order. A rigid body's inertia about a
 point is ten numbers: its mass m [kg], first moment h = m c [kg m] and inertia tensor I about that point, not
@@ -25,7 +25,7 @@ _COS, _SIN, _TAN = ca.OP_COS, ca.OP_SIN, ca.OP_TAN
 _binary, _unary = ca.SX.binary, ca.SX.unary
 
 Number: TypeAlias = "float | Scalar"
-Vector: TypeAlias = "list[float | Scalar]"  # of 3 where nothing else is said
+Vector: TypeAlias = "list[float | Scalar]"  # (3,) unless stated otherwise
 Matrix: TypeAlias = "list[list[float | Scalar]]"  # rows
 
 
@@ -143,7 +143,7 @@ def pack_vector(vector: Iterable[Number]) -> Any:
 def pack_entries(shape: tuple[int, int], entries: Mapping[tuple[int, int], Number]) -> Any:
     """A sparse SX matrix of the entries that are not zero."""
     kept = {place: _to_sx(number) for place, number in entries.items() if not is_zero(number)}
-    # An expression may also have cancelled inside CasADi.
+    # CasADi may have simplified an expression to zero
     places = sorted((p for p, x in kept.items() if not x.is_zero()), key=lambda place: (place[1], place[0]))
     sparsity = ca.Sparsity.triplet(*shape, [r for r, _ in places], [c for _, c in places])
     return ca.SX(sparsity, ca.vertcat(*[kept[place] for place in places]))
@@ -223,7 +223,7 @@ def tensor_matrix(tensor: Sequence[Number]) -> Matrix:
 
 
 def tensor_rotate_z(c: Number, s: Number, tensor: Vector) -> Vector:
-    """Rz I Rz': half the work of two matrix products, and zz is untouched."""
+    """Rz I Rz', with half the operations of two matrix products."""
     xx, xy, yy, xz, yz, zz = tensor
     u = s * (xx - yy) + 2.0 * (c * xy)
     t = s * u
@@ -231,13 +231,16 @@ def tensor_rotate_z(c: Number, s: Number, tensor: Vector) -> Vector:
 
 
 def tensor_rotate(R: Matrix, tensor: Vector) -> Vector:
-    """R I R' for a constant R; costs nothing when R permutes axes."""
+    """R I R' for a constant R. If R permutes axes, folding of constants leaves no operations."""
     A = product(R, tensor_matrix(tensor))
     return [dot(A[i], R[j]) for i, j in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))]
 
 
 def move_tensor(m: Number, h: Vector, tensor: Vector, p: Vector) -> Vector:
-    """The tensor, of a body of mass m and first moment h, about a new origin that sees the old one at p."""
+    """Tensor of a body of mass m and first moment h about another origin, in whose frame the old one is at p.
+
+    The parallel axis theorem, without the centre of mass: I + 2 (w.p) 1 - w p' - p w' with w = h + m p/2.
+    """
     w = [h[k] + (0.5 * m) * p[k] for k in range(3)]
     x, y, z = (w[k] * p[k] for k in range(3))
     xx, xy, yy, xz, yz, zz = tensor

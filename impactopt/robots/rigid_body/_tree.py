@@ -1,8 +1,7 @@
-"""Tree of a `pin.Model`: its numbers, and its coordinates q.
+"""Kinematic tree of a `pin.Model`: constants of its joints and links, and its symbolic coordinates q.
 
-Each one-degree-of-freedom joint's frame is turned once, numerically, by Q (z of the turned frame is the
-joint's axis); for axes x, y and z this permutes the frame's axes. Link frames in this package are the turned
-ones.
+The frame of each joint with one degree of freedom is turned numerically by Q, so that its z is the joint's
+axis. For axes x, y and z this permutes the frame's axes. Link frames in this package are the turned ones.
 
 `"quaternion"` is Pinocchio's q: p, quaternion (x, y, z, w), joints; a continuous joint is (cos, sin).
 `"rpy"` has one number for each velocity: p, (roll, pitch, yaw), joints; R = Rz(yaw) Ry(pitch) Rx(roll). A
@@ -45,7 +44,9 @@ from impactopt.robots.rigid_body._spatial import (
     zero_vector,
 )
 
-SNAP = 1e-14  # rotation entries this near to 0, 1 or -1, lengths this short [m]: rounding, not design
+# Entries of rotations this near to 0, 1 or -1, and lengths this short [m], are rounded to these: structural
+# zeros make the expressions smaller.
+SNAP = 1e-14
 
 
 class Kind(enum.Enum):
@@ -57,7 +58,7 @@ class Kind(enum.Enum):
     PRISMATIC = "slides along z"
 
 
-_FOLLOWER = "JointModelMimic"  # turns or slides
+_FOLLOWER = "JointModelMimic"  # revolute or prismatic, which `_read_joint` finds out
 _KINDS = {
     "JointModelFreeFlyer": Kind.FREE,
     _FOLLOWER: Kind.REVOLUTE,
@@ -79,8 +80,8 @@ class Joint:
     parent: int
     v: int  # index of its (first) velocity; a follower's is its leader's
     q: int  # index of its (first) coordinate in Pinocchio's q
-    follows: bool  # another joint, whose velocity it has, times the ratio
-    ratio: float
+    follows: bool  # True for a follower: its velocity is its leader's times the ratio
+    ratio: float  # 1 for other joints
     continuous: bool  # a revolute joint with coordinates (cos, sin) in Pinocchio's q
     turn: Any  # (3, 3) Q, from the turned frame to Pinocchio's joint frame
     rotation: Matrix  # of the joint's frame at q = 0, in the parent's frame
@@ -90,7 +91,7 @@ class Joint:
     tensor: Vector  # about the frame's origin [kg m2]
 
     def along(self, values: Vector) -> Number:
-        """Entry of this joint of velocities or accelerations (nv)."""
+        """Velocity or acceleration of this joint, from those of the tree (nv)."""
         return self.ratio * values[self.v]
 
     @property
@@ -105,7 +106,7 @@ class Tree:
     Raises
     ------
     InputError : a joint of a type that is not supported (the joint is named), a free-flyer that is not the
-        only root, or armature on the free-flyer's rows.
+        only root, or armature of the free-flyer.
     """
 
     def __init__(self, model: Any) -> None:
@@ -123,8 +124,7 @@ class Tree:
         self._frames: dict[str, tuple[int, Matrix, Vector]] = {}
         if self.floating:
             self._check_free_flyer()
-        # Where a subtree that holds all moving mass is rooted.
-        self.root = 1 if self.floating else 0
+        self.root = 1 if self.floating else 0  # of the subtree with all moving mass
 
     def _check_free_flyer(self) -> None:
         roots = [i for i, joint in enumerate(self.joints) if i and joint.parent == 0]
@@ -136,7 +136,7 @@ class Tree:
             )
         if any(self.armature[:6]):
             raise InputError(
-                "armature: the free-flyer's six rows must be zero, rotors belong to joints; "
+                "armature: the free-flyer's six entries must be zero, rotors belong to joints; "
                 "set model.armature[:6] = 0"
             )
 
@@ -157,7 +157,7 @@ class Tree:
         Without followers that is the tree of single degrees of freedom, the six of a free-flyer being a chain
         (Featherstone 2008, expanded parent array). A follower couples its own branch with its leader's.
         """
-        before: list[set[int]] = [set() for _ in range(self.nv)]
+        before: list[set[int]] = [set() for _ in range(self.nv)]  # columns of the nonzeros of row k, up to k
         for i in range(1, len(self)):
             own = self.joints[i].velocities
             for j in self.support(i):
@@ -167,6 +167,7 @@ class Tree:
         parents = [-1] * self.nv
         for k in range(self.nv - 1, -1, -1):
             if coupled := before[k] - {k}:
+                # eliminating k makes all that it is coupled with dense: the fill-in goes to its parent
                 parents[k] = max(coupled)
                 before[parents[k]] |= coupled
         return parents
@@ -197,7 +198,7 @@ class Tree:
 
 
 def _universe() -> Joint:
-    # Mass that is fixed to the universe takes no part in anything, as in Pinocchio.
+    # mass that is fixed to the universe is left out, as in Pinocchio
     return Joint(
         name="universe",
         kind=Kind.FIXED,
@@ -262,6 +263,7 @@ def _turn_to_z(axis: Any) -> Any:
 
 
 def _snap(rotation: Any) -> Any:
+    """A copy of a rotation, whose entries near to 0, 1 or -1 are that."""
     rotation = np.array(rotation, dtype=float)
     for value in (0.0, 1.0, -1.0):
         rotation[np.abs(rotation - value) < SNAP] = value
@@ -276,7 +278,7 @@ BASES = ("quaternion", "rpy")
 
 
 class Coordinates:
-    """The symbols q of a tree, and every joint's cosine and sine, or travel, in them."""
+    """Symbols q of a tree, and each joint's cosine and sine, or travel, as expressions of them."""
 
     def __init__(self, tree: Tree, base: str) -> None:
         if base not in BASES:
@@ -329,8 +331,8 @@ class Coordinates:
 
     # ------------------------------------------------------------ q and v
     def velocity_map(self) -> Any:
-        """T(q), (nv, nv) sparse, with v = T dq/dt; for coordinates with one number a velocity."""
-        self._one_number_a_velocity("velocity_map")
+        """T(q), (nv, nv) sparse, with v = T dq/dt; needs nq = nv."""
+        self._require_nq_equal_nv("velocity_map")
         if not self.tree.floating:
             return ca.SX.eye(self.tree.nv)
         entries: dict[tuple[int, int], Number] = {}
@@ -343,14 +345,14 @@ class Coordinates:
 
     def acceleration(self, rate: Vector, second: Vector) -> Any:
         """a = dv/dt = T d2q/dt2 + dT/dt dq/dt, SX (nv), from dq/dt and d2q/dt2."""
-        self._one_number_a_velocity("acceleration")
+        self._require_nq_equal_nv("acceleration")
         if not self.tree.floating:
             return pack_vector(second)
         (cr, sr, cp, sp), (dr, dp, dy) = self._rpy, rate[3:6]
         W = self._rpy_rates_to_angular_velocity()
         angular_velocity = times(W, rate[3:6])
         velocity = transpose_times(self._rotation, rate[:3])
-        # v is measured along axes that turn with the base.
+        # v is given along axes that turn with the base, hence the term -w x v of its derivative
         linear = subtract(transpose_times(self._rotation, second[:3]), cross(angular_velocity, velocity))
         rate_of_W_times_rate = [
             -(cp * dp * dy),
@@ -361,7 +363,7 @@ class Coordinates:
         return pack_vector([*linear, *angular, *second[6:]])
 
     def tangent_map(self) -> Any:
-        """dq/dv, (nq, nv) sparse: dq/dt = tangent_map v. With "rpy" it is singular at pitch = +-90 deg."""
+        """Matrix G, (nq, nv) sparse, with dq/dt = G v. With "rpy" it is singular at pitch = +-90 deg."""
         entries: dict[tuple[int, int], Number] = {}
         if self.tree.floating:
             G = self._angular_velocity_to_rates()
@@ -386,6 +388,7 @@ class Coordinates:
             raise InputError("integrate: needs Pinocchio's q; build with base='quaternion'")
         q = ca.SX(self.q)
         if self.tree.floating:
+            # pose times exp(d): the product of two quaternions (vector, scalar)
             shift, quaternion = _exponential(d[:3], d[3:6])
             x, y, z, w = self._quaternion
             entries = {(r, c): self._rotation[r][c] for r in range(3) for c in range(3)}
@@ -406,7 +409,7 @@ class Coordinates:
                 q[joint.q] += d[joint.v]
         return q
 
-    def _one_number_a_velocity(self, method: str) -> None:
+    def _require_nq_equal_nv(self, method: str) -> None:
         if self.nq != self.tree.nv:
             raise InputError(
                 f"{method}: needs nq = nv, but nq = {self.nq}, nv = {self.tree.nv}; build with base='rpy'"
@@ -426,17 +429,19 @@ class Coordinates:
 
     # ------------------------------------------------------------ numeric
     @cached_property
-    def _one_number(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Places in q and in v of the joints that have one number in each: replays look them up often."""
+    def _single_coordinate_joints(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Indices in q and in v of the joints with one coordinate; cached, as replays need them often."""
         joints = [j for j in self.tree.joints[1:] if not j.continuous and j.kind is not Kind.FREE]
         return np.array([j.q for j in joints], dtype=np.intp), np.array([j.v for j in joints], dtype=np.intp)
 
     def from_pin(self, q: ArrayLike) -> NDArray[np.float64]:
-        """These coordinates of Pinocchio's q; angles in (-pi, pi] where q does not tell turns apart."""
+        """These coordinates (nq,) of Pinocchio's q; angles of continuous joints in (-pi, pi]."""
         q = check_array("q (pinocchio)", q, (self.tree.nq,))
-        unit = [("quaternion", 3, 7)] if self.tree.floating else []
-        unit += [(f"joint {j.name!r} (cos, sin)", j.q, j.q + 2) for j in self.tree.joints if j.continuous]
-        for part, k, end in unit:
+        unit_vectors = [("quaternion", 3, 7)] if self.tree.floating else []
+        unit_vectors += [
+            (f"joint {j.name!r} (cos, sin)", j.q, j.q + 2) for j in self.tree.joints if j.continuous
+        ]
+        for part, k, end in unit_vectors:
             if abs(np.linalg.norm(q[k:end]) - 1.0) > 1e-6:
                 raise InputError(
                     f"q (pinocchio): {part}, q[{k}:{end}], must be of norm 1; pin.normalize(model, q)"
@@ -453,15 +458,16 @@ class Coordinates:
         return out
 
     def to_pin(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Pinocchio's q of these coordinates, of one configuration or of a row of them."""
+        """Pinocchio's q, (..., model.nq), of one configuration (nq,) or of several (k, nq)."""
         q = check_array("q", q, (self.nq,) if np.ndim(q) < 2 else (None, self.nq))
         if self.base == "quaternion":
             return q
         out = np.empty((*q.shape[:-1], self.tree.nq))
         if self.tree.floating:
-            out[..., :3], out[..., 3:7] = q[..., :3], _quaternion(*np.moveaxis(q[..., 3:6] / 2, -1, 0))
-        places, columns = self._one_number
-        out[..., places] = q[..., columns]
+            half_angles = np.moveaxis(q[..., 3:6] / 2, -1, 0)
+            out[..., :3], out[..., 3:7] = q[..., :3], _quaternion(*half_angles)
+        in_q, in_v = self._single_coordinate_joints
+        out[..., in_q] = q[..., in_v]
         for joint in self.tree.joints[1:]:
             if joint.continuous:
                 out[..., joint.q], out[..., joint.q + 1] = np.cos(q[..., joint.v]), np.sin(q[..., joint.v])
@@ -469,7 +475,7 @@ class Coordinates:
 
 
 def _quaternion(roll: Any, pitch: Any, yaw: Any) -> NDArray[np.float64]:
-    """Quaternion (..., 4), the scalar last and not negative, of half of these angles [rad]."""
+    """Quaternion (..., 4), scalar last and not negative, of Rz(2 yaw) Ry(2 pitch) Rx(2 roll) [rad]."""
     (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, (roll, pitch, yaw))) for f in (np.cos, np.sin))
     parts = (sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy)
     out = np.stack([*parts, cr * cp * cy + sr * sp * sy], axis=-1)
@@ -485,8 +491,10 @@ def _quaternion_matrix(x: Scalar, y: Scalar, z: Scalar, w: Scalar) -> Matrix:
 
 
 def _exponential(linear: Any, angular: Any) -> tuple[Any, Any]:
-    """(translation (3), quaternion (4)) of the twist's exponential; series where the angle is small."""
+    """(translation (3), quaternion (4)) of the twist's exponential, by series for small angles."""
     square = ca.dot(angular, angular)
+    # Below 1e-3 rad the terms that the series leave out are less than 2e-15, while the closed forms lose
+    # digits by cancellation and are 0/0 at zero.
     small = square < 1e-6
     angle = ca.sqrt(ca.if_else(small, 1.0, square))
     half = ca.if_else(small, 0.5 - square / 48.0, ca.sin(angle / 2) / angle)

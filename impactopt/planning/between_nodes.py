@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from impactopt.errors import InputError
 from impactopt.planning.budget import Budget, touching, with_effort_of
-from impactopt.planning.clearance_constraints import Margins, clearance_violations, solved_apart
+from impactopt.planning.clearance_constraints import Margins, clearance_violations, solve_with_clearance
 from impactopt.planning.contact_replay import AGREED, REFUTED
 from impactopt.planning.refinement import Additions, Guess, Outcome, program_for, refine, start_of
 from impactopt.transcription.contact_refinement import ASKED, all_halved, refined_elements
@@ -43,7 +43,7 @@ class BetweenNodes:
         """Outcome refined by this oracle alone, and checked: penetration that is left is no solution."""
 
         def solve(guess: Guess[Transcription]) -> Outcome[Transcription]:
-            return solved_apart(self._budget, self._margins, guess)
+            return solve_with_clearance(self._budget, self._margins, guess)
 
         return self._checked(refine(outcome, [self], solve, self._budget))
 
@@ -98,7 +98,7 @@ class BetweenNodes:
         # a contact that is far off breaks the finer program's constraints by far
         far = elements is not None and error is not None and abs(error.pct) > AGREED
         barrier = _BARRIER_DEEP if far else None if violated is None else _BARRIER
-        added = {} if violated is None else violated.rows
+        added = {} if violated is None else violated.constraints
         name = _name(nodes.total - t.nodes.total, elements, len(added))
         self._rounds += 1
 

@@ -19,7 +19,7 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
 from impactopt.planning.causes import Cause, search
-from impactopt.planning.clearance_constraints import Margins, same_bodies, solved_apart
+from impactopt.planning.clearance_constraints import Margins, same_bodies, solve_with_clearance
 from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
 from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, window_caution, with_rows
@@ -226,14 +226,14 @@ class PlanSolver:
         own = replace(self, refined=True)
 
         def solve(guess: Guess[Transcription]) -> Outcome[Transcription]:
-            return solved_apart(self.budget, self.margins, guess)
+            return solve_with_clearance(self.budget, self.margins, guess)
 
         outcome = refine(outcome, [BetweenNodes(self.budget, self.margins)], solve, self.budget)
         return refine(outcome, [LazyTerms(self.budget.report)], own._solved, self.budget)
 
     def _solved(self, guess: Guess[Transcription]) -> Outcome[Transcription]:
         """Outcome of an initial guess, refined between nodes; by a second solver where the first gives up."""
-        outcome = solved_apart(self.budget, self.margins, guess)
+        outcome = solve_with_clearance(self.budget, self.margins, guess)
         if not self.refined:
             return outcome if self.margins is not None else self._looked_at(outcome)
         if self._stuck(outcome.result) and outcome.program.apart_rows and self.budget.left != 0:

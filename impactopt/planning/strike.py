@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
 from impactopt.planning.budget import Budget, touching
-from impactopt.planning.clearance_constraints import Margins, deepest_penetration, solved_apart
+from impactopt.planning.clearance_constraints import Margins, deepest_penetration, solve_with_clearance
 from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_of, roomy, settled
 from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, rows_on_demand, with_rows
@@ -204,7 +204,10 @@ def clear_strike(
 
     def solve(guess: Guess[StrikeTranscription]) -> Outcome[StrikeTranscription]:
         return refine(
-            solved_apart(budget, margins, guess), [Freezes()], partial(solved_apart, budget, margins), budget
+            solve_with_clearance(budget, margins, guess),
+            [Freezes()],
+            partial(solve_with_clearance, budget, margins),
+            budget,
         )
 
     outcome = solve(replace(guess, barrier=BARRIER_ON))

@@ -9,7 +9,7 @@ from dataclasses import replace
 from impactopt.errors import InputError
 from impactopt.planning.budget import Budget, touching, with_effort_of
 from impactopt.planning.clearance_constraints import Margins, clearance_violations, solve_with_clearance
-from impactopt.planning.contact_replay import AGREED, REFUTED
+from impactopt.planning.contact_replay import ACCEPTABLE_WITHIN, SOLVED_WITHIN
 from impactopt.planning.refinement import Additions, Guess, Outcome, program_for, refine, start_of
 from impactopt.transcription.contact_refinement import ASKED, all_halved, refined_elements
 from impactopt.transcription.initial_guess import first_iterate
@@ -91,12 +91,12 @@ class BetweenNodes:
             replay = outcome.at.replay if self._refined < _MESH_ROUNDS else None
             if replay is None or replay.off <= ASKED or replay.unforeseen:
                 return None
-            missed, elements = missed or replay.off > REFUTED, all_halved(t.hit.elements)
+            missed, elements = missed or replay.off > ACCEPTABLE_WITHIN, all_halved(t.hit.elements)
             if elements is None:
                 return None
             self._refined += 1
         # a contact that is far off breaks the finer program's constraints by far
-        far = elements is not None and error is not None and abs(error.pct) > AGREED
+        far = elements is not None and error is not None and abs(error.pct) > SOLVED_WITHIN
         barrier = _BARRIER_DEEP if far else None if violated is None else _BARRIER
         added = {} if violated is None else violated.constraints
         name = _name(nodes.total - t.nodes.total, elements, len(added))

@@ -16,7 +16,7 @@ import numpy as np
 
 from impactopt.errors import InputError
 from impactopt.planning.budget import Budget, rank_of
-from impactopt.planning.gain_selection import roomy
+from impactopt.planning.gain_selection import with_room_for_gains
 from impactopt.planning.models import climbed
 from impactopt.planning.refinement import Guess, Outcome, Program, Solve
 from impactopt.planning.solution import Solved
@@ -92,7 +92,8 @@ def best_of_starts(
 
         return climbed(problem, run, budget)
     if workers > 1 and starts > 1:
-        block_functions(roomy(problem), problem.coordinates, budget.report)  # compiled here, not by each
+        # compiled here, not by each worker
+        block_functions(with_room_for_gains(problem), problem.coordinates, budget.report)
         return _best_side_by_side(partial(one, problem, start), budget, starts=starts, workers=workers)
     return one(problem, start, budget, range(starts), starts + MORE)
 

@@ -15,7 +15,7 @@ from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
 
-__all__ = ["Parameter", "changed", "moved_problem", "parameter_of"]
+__all__ = ["Parameter", "changed", "moved_problem", "parameter_of", "with_term"]
 
 # what no term changes but that on the world's bodies, which may be switched off
 _BODIES = ("world", "bodies")
@@ -76,7 +76,7 @@ def moved_problem(
     if margin is not None:
         cone = problem.term(ContactWrenchCone)
         both = {"margin": margin} | ({} if cone.collision_margin is None else {"collision_margin": margin})
-        new["terms"] = _with_term(problem, dataclasses.replace(cone, **both))
+        new["terms"] = with_term(problem, dataclasses.replace(cone, **both))
     if not new:
         raise InputError("nothing is moved: give point, normal, mass, stiffness, damping or margin")
     return changed(problem, **new)
@@ -88,7 +88,7 @@ def _with(thing: Any, name: str, value: float) -> Any:
     return dataclasses.replace(thing, **{name: value})
 
 
-def _with_term(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
+def with_term(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
     others = [other for other in problem.terms if type(other) is not type(term)]
     return (*others, term)
 
@@ -119,7 +119,7 @@ class Parameter:
         if self._field == "terms":
             kind, name = self._part
             term = dataclasses.replace(self.problem.term(kind), **{name: value})
-            return changed(self.problem, terms=_with_term(self.problem, term))
+            return changed(self.problem, terms=with_term(self.problem, term))
         part = getattr(self.problem, self._field)
         return changed(self.problem, **{self._field: _with(part, self._part, value)})
 

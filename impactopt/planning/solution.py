@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.planning.causes import Cause
-from impactopt.planning.contact_replay import AGREED, ContactReplay, ModelError, PlannedContact
+from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
-from impactopt.planning.lazy_constraints import gear_caution, rows_on_demand, slide, slide_caution
+from impactopt.planning.lazy_constraints import gear_caution, lazy_terms_of, slide, slide_caution
 from impactopt.planning.refinement import Attempt
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads
@@ -86,7 +86,7 @@ class Solved:
     def caution(self) -> str:
         """Warning about effects that the planned contact leaves out; empty if the replay agrees with it."""
         replay = self.contact_replay
-        return str(replay) if replay is not None and (replay.unforeseen or replay.off > AGREED) else ""
+        return str(replay) if replay is not None and (replay.unforeseen or replay.off > SOLVED_WITHIN) else ""
 
     @property
     def status(self) -> Status:
@@ -109,7 +109,7 @@ class Solved:
             "collision_model": self.problem.collision,
             "freezes": self.problem.freezes,
             **({"touches": self.problem.touches} if self.problem.touches is not None else {}),
-            "rows_on_demand": list(rows_on_demand(self.problem)),
+            "rows_on_demand": list(lazy_terms_of(self.problem)),
             "style": self.problem.style,
             "price_scale": self.problem.price_scale,
             "model_error_pct": None if self.model_error is None else self.model_error.impulse_pct,

@@ -20,9 +20,14 @@ from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
 from impactopt.planning.causes import Cause, search
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solve_with_clearance
-from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
-from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, window_caution, with_rows
+from impactopt.planning.diagnosis import ended_with_violations, ipopt_retry, with_reason, with_soles_kept
+from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
+from impactopt.planning.lazy_constraints import (
+    LazyTerms,
+    lazy_terms_of,
+    window_caution,
+    with_lazy_constraints,
+)
 from impactopt.planning.models import carried_start, with_touches, with_touches_of
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
@@ -161,12 +166,12 @@ def _planned(
     outcome = best_of(guesses, solver.from_guess, budget, len(which))
     if refined and margins is None:
         outcome = solver.on(outcome)
-    known = hopeless(t.problem) if lacks_rows(outcome.program, outcome.result) else []
+    known = hopeless(t.problem) if ended_with_violations(outcome.program, outcome.result) else []
     causes: tuple[Cause, ...] = ()
     if not known:
         outcome, causes = _diagnosed(outcome, solver)
-    gains = chosen_of(outcome.program, outcome.result.x)
-    outcome = settled(outcome, gains, budget)
+    gains = chosen_gains(outcome.program, outcome.result.x)
+    outcome = with_gains_fixed(outcome, gains, budget)
     t, solved = outcome.program, time.perf_counter()
     outcome = replace(outcome, result=with_reason(t, outcome.result, causes, known=known)).checked()
     usable = outcome.usable
@@ -189,16 +194,16 @@ def _program(
     """A problem's nonlinear program, on the mesh of a given solution, and the given start on it."""
     if not isinstance(start, Solution):
         problem = with_touches(problem, budget.say)
-        t = program_on(roomy(problem), NO_MORE, (), (), budget.report)
+        t = program_on(with_room_for_gains(problem), NO_MORE, (), (), budget.report)
         if isinstance(start, str):
             return with_first_scale(t), start
         return t, check_array("start", start, (t.program.n,))
     # a neighbour is likely to need the same constraints and prices
-    problem = with_rows(problem, rows_on_demand(start.problem))
+    problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
     if problem.style == start.problem.style:
         problem = replace(problem, price_scale=start.problem.price_scale)
     problem = with_touches_of(start, problem)
-    t = program_on(roomy(problem), start.nodes, start.elements, start.shares, budget.report)
+    t = program_on(with_room_for_gains(problem), start.nodes, start.elements, start.shares, budget.report)
     apart = start.apart if same_bodies(problem, start.problem) else {}
     given = carried_start(t, partial(program_of, start), start, apart)
     check_array("start", given.x, (t.program.n,))
@@ -249,7 +254,7 @@ class PlanSolver:
     def _looked_at(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
         """Outcome without a diagnosis, with that of another solver from the same guess."""
         t, old = outcome.program, outcome.result
-        new = second_look(self.budget, t.program, outcome.origin.x, old)
+        new = ipopt_retry(self.budget, t.program, outcome.origin.x, old)
         return outcome if new is old else outcome.then(Outcome.of(t, new))
 
     def _stuck(self, result: SolverResult) -> bool:
@@ -281,7 +286,7 @@ def _diagnosed(
     """
     budget, old = solver.budget, outcome.result
     limited = old.status is Status.ITERATION_LIMIT and "max_iterations" in (budget.options or {})
-    if limited or not lacks_rows(outcome.program, old) or budget.left == 0:
+    if limited or not ended_with_violations(outcome.program, old) or budget.left == 0:
         return outcome, ()
     if outcome.origin.program.problem.style_prices != MotionPrices():
         budget.say("no motion was found from there: again without prices on motion")

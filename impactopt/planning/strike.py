@@ -15,8 +15,8 @@ from impactopt.errors import InputError, check_array
 from impactopt.planning.budget import Budget, touching
 from impactopt.planning.clearance_constraints import Margins, deepest_penetration, solve_with_clearance
 from impactopt.planning.diagnosis import with_reason
-from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, rows_on_demand, with_rows
+from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
+from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, lazy_terms_of, with_lazy_constraints
 from impactopt.planning.models import carried_start, with_touches, with_touches_of
 from impactopt.planning.multistart import (
     Guesses,
@@ -135,9 +135,9 @@ def _optimized(
     _last: int,
 ) -> StrikeSolution:
     """The best strike from these starts, or from the given one."""
-    began, problem = time.perf_counter(), roomy(problem)
+    began, problem = time.perf_counter(), with_room_for_gains(problem)
     if isinstance(start, StrikeSolution):
-        problem = with_rows(problem, rows_on_demand(start.problem))
+        problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
         problem = with_touches_of(start, problem)
     else:
         problem = with_touches(problem, budget.say)
@@ -162,8 +162,8 @@ def _optimized(
     if start is not None:
         guesses = [("given", partial(Guess, program=t, start=check_array("start", start, (t.program.n,))))]
     outcome = best_of(guesses, bounded, budget, len(which))
-    gains = chosen_of(outcome.program, outcome.result.x)
-    outcome = settled(outcome, gains, budget)
+    gains = chosen_gains(outcome.program, outcome.result.x)
+    outcome = with_gains_fixed(outcome, gains, budget)
     t, at, solved = outcome.program, outcome.at, time.perf_counter()
     outcome = replace(outcome, result=with_reason(t, outcome.result)).checked()
     return StrikeSolution(

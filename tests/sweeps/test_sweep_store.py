@@ -176,7 +176,7 @@ def test_a_full_disk_is_said_and_what_was_there_is_kept(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, hard))
     try:
-        with pytest.raises(InputError, match=r"cannot write .*; what was finished before is kept"):
+        with pytest.raises(InputError, match=r"cannot write .*; finished cases are kept"):
             journal.add(entry(1, count=3000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

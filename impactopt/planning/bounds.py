@@ -112,6 +112,7 @@ def _durations(t: Transcription) -> Iterator[Bound]:
         if name.endswith(" duration"):
             kind = {"swing": "swing", "follow": "follow", "abort": "follow"}.get(name.split()[0], "contact")
             found.setdefault(kind, []).append(group.offset)
+    # [s] units of the duration variables, as of the transcription
     scale = {kind: 0.01 if kind == "contact" else 0.1 for kind in found}
     for kind, numbers in found.items():
         field = "contact_duration" if kind == "contact" else kind

@@ -256,6 +256,7 @@ def refine(
 
     for _ in range(oracle.most):
         lacks = oracle.missing(outcome) if outcome.usable else None
+        # without time left, a solution that is not valid without the additions still has to become a failure
         if lacks is None or (budget.left == 0 and not lacks.without):
             break
         budget.say(lacks.why)

@@ -217,6 +217,7 @@ class CollisionBatch:
             speed = np.full(count, section.speed)
         normal = np.asarray(model.normal)
         states = self.states.rows(posture, joints, speed, normal, count, velocity=section.velocity)
+        # collisions whose state at contact is impossible stay nan, with its reason
         out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.measures}
         out["reason"] = states.reason
         good = np.flatnonzero(states.reason == "")

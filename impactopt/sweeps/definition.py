@@ -303,6 +303,7 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
         raise InputError(f"{path}: the text {shortened(repr(found))} has control characters; take them out")
     lines, mistakes = key_lines(text), list[Mistake]()
 
+    # called after each stage: a later stage needs a file that has passed the earlier ones
     def raise_if_any() -> None:
         if mistakes:
             raise InputError(report_mistakes(str(path), lines, mistakes))
@@ -314,6 +315,7 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
     raise_if_any()
     given = content.sweep
     mistakes += of_other_kinds(content)
+    # every case is this problem with the values of its varied keys
     base = read_problem_file(_near(given.problem, path)).changed(dict(flat(content.set)))
     reader = VariedKeys(base, mistakes, sweep_place if given.case_kind == "collision" else key_place)
     grid = [a for key, what in flat(content.grid) if (a := reader.axis("grid", key, what)) is not None]

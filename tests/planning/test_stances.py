@@ -225,7 +225,7 @@ def test_what_is_said_of_each_phase(plan: Plan) -> None:
     ("stances", "message"),
     [
         ((BOTH, StancePhase(soles=("left",), phase=Phase(duration=0.5))), "the impact is in one phase"),
-        ((BOTH, StancePhase(soles=("left",)), StancePhase(soles=("left", "right"))), "and 2 of"),
+        ((BOTH, StancePhase(soles=("left",)), StancePhase(soles=("left", "right"))), "but 2 of"),
         ((StancePhase(soles=("left",)),), "no schedule"),
         ((BOTH, StancePhase(soles=("left", "right"))), "lift off or to touch down"),
         (

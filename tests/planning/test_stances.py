@@ -226,7 +226,7 @@ def test_what_is_said_of_each_phase(plan: Plan) -> None:
     [
         ((BOTH, StancePhase(soles=("left",), phase=Phase(duration=0.5))), "the impact is in one phase"),
         ((BOTH, StancePhase(soles=("left",)), StancePhase(soles=("left", "right"))), "but 2 of"),
-        ((StancePhase(soles=("left",)),), "no schedule"),
+        ((StancePhase(soles=("left",)),), "no sequence"),
         ((BOTH, StancePhase(soles=("left", "right"))), "lift off or to touch down"),
         (
             (StancePhase(soles=("left",), phase=Phase(duration=0.5)), StancePhase(soles=("right",))),

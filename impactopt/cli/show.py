@@ -13,8 +13,8 @@ from impactopt.cli.options import OtherProblem
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
-    from impactopt.live.collision_page import LiveBlow
-    from impactopt.live.plan_page import LiveLook
+    from impactopt.live.collision_page import CollisionPage
+    from impactopt.live.plan_page import PlanPage
     from impactopt.report.report import Report
 
 PAGE = "report.html"
@@ -120,22 +120,22 @@ def _live(what: Path, problem: Path | None, port: int | None, open_: bool) -> No
         look.run()
 
 
-def _page(what: Path, problem: Path | None, port: int) -> LiveLook | LiveBlow:
+def _page(what: Path, problem: Path | None, port: int) -> PlanPage | CollisionPage:
     """Page of a result, or of a problem file's collision."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file
     from impactopt.files.replay import load_planned, resumed
-    from impactopt.live.collision_page import LiveBlow
-    from impactopt.live.plan_page import LiveLook
+    from impactopt.live.collision_page import CollisionPage
+    from impactopt.live.plan_page import PlanPage
 
     if not _is_robot(what):
         planned = load_planned(what, problem_file=problem)
-        return LiveLook(resumed(planned.record, planned.problem), port=port)
+        return PlanPage(resumed(planned.record, planned.problem), port=port)
     if what.suffix != ".toml" or problem is not None:
         raise InputError(
             f"--live is for a result, or for a problem file alone: {str(what)!r} does not say what is hit"
         )
-    return LiveBlow(read_problem_file(what).build(), port=port)
+    return CollisionPage(read_problem_file(what).build(), port=port)
 
 
 def _is_robot(what: Path) -> bool:

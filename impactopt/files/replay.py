@@ -17,7 +17,7 @@ from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
 from impactopt.planning.gain_selection import ChosenGains, with_chosen
-from impactopt.planning.lazy_constraints import gear_caution, with_rows
+from impactopt.planning.lazy_constraints import gear_caution, with_lazy_constraints
 from impactopt.planning.reconstruction import program_on, solution_of
 from impactopt.planning.refinement import Outcome
 from impactopt.planning.solution import Solution
@@ -105,7 +105,7 @@ def solution_of_record(record: Record, t: Transcription) -> Solution:
         solver=str(summary["solver"]),
         seconds=(float(summary["build_seconds"]), float(summary["solve_seconds"])),
         statement=str(record.arrays["program_statement"]),
-        gains=tuple(map(ChosenGains.told, summary.get("gains", ()))),
+        gains=tuple(map(ChosenGains.from_summary, summary.get("gains", ()))),
     )
 
 
@@ -235,7 +235,7 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
             problem = replace(problem, price_scale=scale)
         if problem.touches is None and (touches := record.summary.get("touches")) is not None:
             problem = replace(problem, touches=touches)
-        return with_rows(problem, record.summary.get("rows_on_demand", ()))
+        return with_lazy_constraints(problem, record.summary.get("rows_on_demand", ()))
     except InputError as error:
         if given:
             raise

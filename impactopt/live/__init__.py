@@ -1,1 +1,1 @@
-"""A live look at a plan: a page on this machine whose sliders and hit point make new plans."""
+"""Live pages on this machine: a plan or a collision in 3D, with sliders that change it at once."""

@@ -1,4 +1,4 @@
-"""Live page of one collision: sliders for the posture and the speed, with force and ZMP at once."""
+"""Live page of one collision, with sliders for the posture and the speed."""
 
 from __future__ import annotations
 
@@ -21,19 +21,21 @@ from impactopt.live.requests import LatestRequest
 from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["Blow", "LiveBlow"]
+__all__ = ["CollisionPage", "ShownCollision"]
 
 Array = NDArray[np.float64]
-_SPEED = 0.05, 1.0, 4.0  # [m/s] least, at first, and most
-_STEPS = 200  # of a slider
+_MIN_SPEED, _FIRST_SPEED, _MAX_SPEED = 0.05, 1.0, 4.0  # [m/s]
+_SLIDER_STEPS = 200
 _FREEZES = 4
-_ENDLESS = np.pi  # [rad] of a joint without limits
+_UNLIMITED = np.pi  # [rad] largest angle of the slider of a joint without limits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Blow:
-    """Collision of a posture. q (nq): as drawn; collision: None if there is none, and why gives the
-    reason.
+class ShownCollision:
+    """Collision in a posture.
+
+    q (nq,) : as drawn.  collision : None if there is none.  seconds : of the computation.  why : reason that
+    there is no collision, or that it has not ended; else "".
     """
 
     q: Array | None = None
@@ -42,22 +44,22 @@ class Blow:
     why: str = ""
 
 
-class LiveBlow(LivePage):
-    """A page that is served until it is closed: the robot hits with its hand where that is, along the normal.
+class CollisionPage(LivePage):
+    """Page of a collision, served until it is closed: the striker hits where it is, along the normal.
 
-    problem : its robot, stance, contact law and target; the posture at first reaches its point. What holds
-        the soles stays, as legs follow by inverse kinematics. The model is the SDC with 4 freezes.
-    host, port : where the page is served; 0: a port that is free.
+    problem : its robot, stance, contact law and target; the first posture reaches its point. The soles stay
+        in place, as the legs follow by inverse kinematics. The model is the SDC with 4 freezes.
+    host, port : address of the page; port 0: a free one.
 
     Attributes
     ----------
-    address : of the page.  blow : the newest.  joints : sliders [rad] by name; speed : that of the hand
-    [m/s].
+    address : of the page.  shown : the latest collision.  joints : sliders [rad] by name.  speed : slider of
+    the striker's speed [m/s].
 
     Raises
     ------
-    InputError : viser is missing; a problem with two strikers, or a hand that holds on; host or port cannot
-        be had.
+    InputError : viser is missing; a problem with two strikers, a supporting hand or friction; host or port
+        are not available.
     """
 
     def __init__(self, problem: ImpactProblem, *, host: str = LOCAL, port: int = 0) -> None:
@@ -77,39 +79,40 @@ class LiveBlow(LivePage):
         self._drawing.polygon(self._polygon)
         model = problem.robot.model
         mass = np.array(pin.centerOfMass(model, model.createData(), problem.contact_posture))
-        self._drawing.watch(mass, problem.point, problem.normal, float(mass[1]))
-        self._controls()
-        self.blow = Blow()
-        self._latest = LatestRequest(self._strike, self._told)
+        self._drawing.aim_camera(mass, problem.point, problem.normal, float(mass[1]))
+        self._add_controls()
+        self.shown = ShownCollision()
+        self._latest = LatestRequest(self._collide, self._show)
         self.changed()
 
     def changed(self) -> None:
-        """Collide in the posture and at the speed that the sliders say."""
+        """Request the collision in the posture and at the speed of the sliders."""
         self._latest.ask(np.array([float(s.value) for s in (self.speed, *self.joints.values())]))
 
     def run(self) -> None:
-        """Serves the page until Ctrl-C."""
+        """Serve the page until Ctrl-C."""
         while True:
             time.sleep(1.0)
 
-    def _controls(self) -> None:
+    def _add_controls(self) -> None:
         gui, robot, c = self._server.gui, self.problem.robot, self.problem.coordinates
         gui.configure_theme(show_share_button=False, show_logo=False)
-        self.told = gui.add_markdown("Colliding ...")
-        least, first, most = _SPEED
-        self.speed = gui.add_slider("speed [m/s]", least, most, (most - least) / _STEPS, first)
+        self.text = gui.add_markdown("Colliding ...")
+        step = (_MAX_SPEED - _MIN_SPEED) / _SLIDER_STEPS
+        self.speed = gui.add_slider("speed [m/s]", _MIN_SPEED, _MAX_SPEED, step, _FIRST_SPEED)
         self.joints: dict[str, Any] = {}
         with gui.add_folder("Posture [rad]"):
             for k, joint in enumerate(c.independent):
-                low, high = max(robot.lower[joint], -_ENDLESS), min(robot.upper[joint], _ENDLESS)
+                low, high = max(robot.lower[joint], -_UNLIMITED), min(robot.upper[joint], _UNLIMITED)
                 value = float(np.clip(self._y[c.base + k], low, high))
-                step = float(high - low) / _STEPS
+                step = float(high - low) / _SLIDER_STEPS
                 name = robot.joint_names[joint]
                 self.joints[name] = gui.add_slider(name, float(low), float(high), step, value)
         for slider in (self.speed, *self.joints.values()):
             slider.on_update(lambda _: self.changed())
 
-    def _strike(self, request: Array, stale: Callable[[], bool]) -> Blow:
+    def _collide(self, request: Array, stale: Callable[[], bool]) -> ShownCollision:
+        """Collision for a request: speed [m/s], and the sliders' angles [rad]."""
         began = time.perf_counter()
         p, c = self.problem, self.problem.coordinates
         speed, y = float(request[0]), self._y.copy()
@@ -120,61 +123,63 @@ class LiveBlow(LivePage):
             torque = holding_torque(p.robot, q, v, stance=p.stance)
             collision = self._model.collide(q, v, torque, require_separation=False)
         except InputError as error:
-            return Blow(q=q, seconds=time.perf_counter() - began, why=str(error))
+            return ShownCollision(q=q, seconds=time.perf_counter() - began, why=str(error))
         why = "" if collision.separated else "the contact does not end"
-        return Blow(q=q, collision=collision, seconds=time.perf_counter() - began, why=why)
+        return ShownCollision(q=q, collision=collision, seconds=time.perf_counter() - began, why=why)
 
-    def _told(self, _: Array, blow: Blow | Exception) -> None:
-        if isinstance(blow, Exception):  # a fault of ours, which must not end the page
-            traceback.print_exception(blow)
-            self.told.content = f"This is a fault of impactopt: {type(blow).__name__}: {blow}"
+    def _show(self, _: Array, outcome: ShownCollision | Exception) -> None:
+        if isinstance(outcome, Exception):  # an internal error, which must not end the page
+            traceback.print_exception(outcome)
+            self.text.content = f"This is a fault of impactopt: {type(outcome).__name__}: {outcome}"
             return
-        self.blow = blow
+        self.shown = outcome
         with self._server.atomic():
-            self._draw(blow)
-        self.told.content = self._words(blow)
+            self._draw(outcome)
+        self.text.content = self._summary(outcome)
 
-    def _draw(self, blow: Blow) -> None:
-        assert blow.q is not None
-        robot, hit = self.problem.robot, blow.collision
+    def _draw(self, shown: ShownCollision) -> None:
+        assert shown.q is not None
+        robot, collision = self.problem.robot, shown.collision
         model, data = robot.model, robot.model.createData()
-        pin.framesForwardKinematics(model, data, blow.q)
-        places = np.array([pin.SE3ToXYZQUAT(place) for place in data.oMi])
+        pin.framesForwardKinematics(model, data, shown.q)
+        placements = np.array([pin.SE3ToXYZQUAT(placement) for placement in data.oMi])
         zmp = np.full(2, np.nan)
-        if hit is not None and hit.zmp is not None and len(self._polygon):
-            inside = margin(self._polygon, hit.zmp)
-            zmp = hit.zmp[int(np.argmin(np.where(np.isfinite(inside), inside, np.inf)))]
-            self._drawing.path("/path of the ZMP", np.column_stack([hit.zmp, np.zeros(len(hit.zmp))]))
+        if collision is not None and collision.zmp is not None and len(self._polygon):
+            # drawn where its margin is least
+            inside = margin(self._polygon, collision.zmp)
+            zmp = collision.zmp[int(np.argmin(np.where(np.isfinite(inside), inside, np.inf)))]
+            path = np.column_stack([collision.zmp, np.zeros(len(collision.zmp))])
+            self._drawing.path("/path of the ZMP", path)
         frame = model.getFrameId(robot.striker(self.problem.striker).model_frame)
-        force = 0.0 if hit is None else hit.peak_force
+        force = 0.0 if collision is None else collision.peak_force
         self._drawing.largest = max(self._drawing.largest, force)
-        self._drawing.at(
+        self._drawing.draw(
             Moment(
                 time=0.0,
-                place=places[:, :3],
-                turn=places[:, [6, 3, 4, 5]],
+                place=placements[:, :3],
+                turn=placements[:, [6, 3, 4, 5]],  # Pinocchio has w last, viser first
                 hand=np.array(data.oMf[frame].translation),
-                mass=np.array(pin.centerOfMass(model, data, blow.q)),
+                mass=np.array(pin.centerOfMass(model, data, shown.q)),
                 force=force,
                 travel=0.0,
                 zmp=zmp,
             )
         )
 
-    def _words(self, blow: Blow) -> str:
-        hit = blow.collision
-        if hit is None:
-            return f"**No collision.** {blow.why}"
-        lines = [f"**{hit.impulse:.3g} N s**" + (f" ({blow.why})" if blow.why else "")]
-        lines.append(f"- {hit.peak_force:.0f} N at most, for {1e3 * hit.duration:.1f} ms")
-        if hit.zmp is not None and len(self._polygon):
-            inside = float(np.min(margin(self._polygon, hit.zmp)))
+    def _summary(self, shown: ShownCollision) -> str:
+        collision = shown.collision
+        if collision is None:
+            return f"**No collision.** {shown.why}"
+        lines = [f"**{collision.impulse:.3g} N s**" + (f" ({shown.why})" if shown.why else "")]
+        lines.append(f"- {collision.peak_force:.0f} N at most, for {1e3 * collision.duration:.1f} ms")
+        if collision.zmp is not None and len(self._polygon):
+            inside = float(np.min(margin(self._polygon, collision.zmp)))
             lines.append(
                 f"- ZMP margin {1e3 * inside:.0f} mm" + ("" if inside > 0 else ": it leaves the soles")
             )
-        if hit.demand is not None:
-            ratio = np.abs(hit.demand / self.problem.robot.torque_limit).max(axis=0)
+        if collision.demand is not None:
+            ratio = np.abs(collision.demand / self.problem.robot.torque_limit).max(axis=0)
             worst = int(np.argmax(ratio))
             name = self.problem.robot.joint_names[worst]
             lines.append(f"- torque demand {100 * ratio[worst]:.0f} % of the limit ({name})")
-        return "\n".join([*lines, f"\n{blow.seconds:.2f} s"])
+        return "\n".join([*lines, f"\n{shown.seconds:.2f} s"])

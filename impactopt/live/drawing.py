@@ -1,4 +1,4 @@
-"""The 3D scene of a live page, drawn by viser: robot, world, force, ZMP, the hand's path, the motion."""
+"""3D scene of a live page, drawn by viser: robot, world, force, ZMP, centre of mass and path of the hand."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moment:
-    """An instant of a :class:`~impactopt.report.tracks.Track`: the same numbers at one time.
+    """State of a motion at one time, as in :class:`~impactopt.report.tracks.Track`.
 
-    place (joints, 3) [m], turn (joints, 4): of the joints in the world, quaternions w, x, y, z.
+    place (joints, 3) [m], turn (joints, 4) : placements of the joints in the world, with quaternions w, x, y,
+    z.
     """
 
     time: float
@@ -40,44 +41,45 @@ class Moment:
 
 
 def moment_of(track: Track, time: float) -> Moment:
-    """State at a time [s], clipped to the track's ends; right of a jump."""
+    """State at a time [s], clipped to the track's ends; after a jump, if the time is at one."""
     at = float(np.clip(time, track.time[0], track.time[-1]))
     after = min(int(np.searchsorted(track.time, at, side="right")), len(track.time) - 1)
     before = max(after - 1, 0)
     span = float(track.time[after] - track.time[before])
-    share = (at - float(track.time[before])) / span if span > 0 else 1.0
+    fraction = (at - float(track.time[before])) / span if span > 0 else 1.0
 
-    def between(values: Array) -> Array:
-        return np.asarray((1 - share) * values[before] + share * values[after])
+    def interpolated(values: Array) -> Array:
+        return np.asarray((1 - fraction) * values[before] + fraction * values[after])
 
     one, other = track.places[before, :, 3:], track.places[after, :, 3:]
-    same = np.where((one * other).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)  # of two signs, one is far
-    turn = (1 - share) * one + share * same * other
+    # q and -q are the same rotation: interpolate between the nearer ones
+    sign = np.where((one * other).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+    turn = (1 - fraction) * one + fraction * sign * other
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     return Moment(
         time=at,
-        place=between(track.places[:, :, :3]),
-        turn=turn[:, [3, 0, 1, 2]],
-        hand=between(track.hand),
-        mass=between(track.mass),
-        force=float(between(track.force)),
-        travel=float(between(track.travel)),
-        zmp=between(track.zmp),
+        place=interpolated(track.places[:, :, :3]),
+        turn=turn[:, [3, 0, 1, 2]],  # w first
+        hand=interpolated(track.hand),
+        mass=interpolated(track.mass),
+        force=float(interpolated(track.force)),
+        travel=float(interpolated(track.travel)),
+        zmp=interpolated(track.zmp),
     )
 
 
 RED, BLUE, GREEN, WOOD, GREY = (214, 69, 65), (31, 119, 180), (44, 160, 44), (201, 160, 106), (150, 155, 160)
-LONGEST = 0.4  # [m] arrow of the largest force
-MARK = 0.05, 0.01  # [m] radius and thickness of the mark where no body of the target is known
-CLEAR = 0.35  # opacity
-AWAY = 1.8  # [m] of the camera
-LEVEL = 1e-3  # a normal that is less so has no side
+MAX_ARROW = 0.4  # [m] length of the arrow of the largest force
+MARK = 0.05, 0.01  # [m] radius and thickness of the disc that stands for a target without a known body
+OPACITY = 0.35  # of transparent parts
+CAMERA_DISTANCE = 1.8  # [m]
+MIN_HORIZONTAL = 1e-3  # horizontal part of a normal: one with less has no left and right
 
 
 class Drawing:
-    """A robot on a server's scene, and what it hits.
+    """Scene of a server with a robot and what it hits.
 
-    server : a `viser.ViserServer`.  floor : its height [m]; None: there is none.
+    server : a `viser.ViserServer`.  floor : height [m]; None: no floor.
     """
 
     def __init__(self, server: Any, robot: Robot, floor: float | None) -> None:
@@ -106,7 +108,7 @@ class Drawing:
         self.normal, self.point, self.largest = np.zeros(3), np.zeros(3), 1.0
 
     def show(self, problem: ImpactProblem, track: Track, polygon: Array) -> None:
-        """Take a plan's world, path and support polygon (k, 2) [m] in place of those before."""
+        """Draw a plan's world, path and support polygon (k, 2) [m] in place of those before."""
         self.normal, self.point = problem.normal, problem.point
         self.largest = max(float(track.force.max()), 1e-9)
         for _, handle in self.parts:
@@ -121,32 +123,33 @@ class Drawing:
         self.polygon(polygon)
 
     def path(self, name: str, places: Array, colour: tuple[int, int, int] = BLUE) -> None:
-        """A line through these (k, 3) [m]."""
+        """Draw a line through points (k, 3) [m]."""
         self._lines(name, np.stack([places[:-1], places[1:]], axis=1), colour)
 
     def polygon(self, polygon: Array) -> None:
-        """The support polygon's edges."""
+        """Draw the support polygon's edges."""
         if len(polygon):
             corners = np.column_stack([polygon, np.full(len(polygon), 1e-3)])
             edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
             self._lines("/support polygon", edges, BLUE)
 
-    def watch(self, mass: Array, point: Array, normal: Array, middle: float) -> None:
-        """Put the camera beside the blow, a little ahead and above, on the side where the hand is.
+    def aim_camera(self, mass: Array, point: Array, normal: Array, middle: float) -> None:
+        """Set the camera beside the impact, a little ahead and above, on the hand's side of the robot.
 
-        mass, point (3,) [m]: centre of mass and hit point.  middle [m]: y of the robot's middle.
+        mass, point (3,) [m] : centre of mass and hit point.  middle [m] : y of the robot's middle.
         """
-        aside = np.array([normal[1], -normal[0], 0.0])  # to the right of the way that the hand goes
+        aside = np.array([normal[1], -normal[0], 0.0])  # to the right of the normal
         size = float(np.linalg.norm(aside))
-        aside = aside / size if size > LEVEL else np.array([0.0, -1.0, 0.0])
+        aside = aside / size if size > MIN_HORIZONTAL else np.array([0.0, -1.0, 0.0])
         if (point[1] - middle) * aside[1] < 0:
             aside = -aside
         ahead = normal * [1.0, 1.0, 0.0]
+        offset = CAMERA_DISTANCE * aside + 0.5 * CAMERA_DISTANCE * ahead
         self.camera.look_at = 0.4 * mass + 0.6 * point
-        self.camera.position = self.camera.look_at + AWAY * aside + 0.5 * AWAY * ahead + [0.0, 0.0, 0.5]
+        self.camera.position = self.camera.look_at + offset + [0.0, 0.0, 0.5]
 
-    def at(self, moment: Moment) -> None:
-        """Put all where it is at this instant."""
+    def draw(self, moment: Moment) -> None:
+        """Move everything to its place at an instant."""
         for joint, handle in self.joints.items():
             handle.position, handle.wxyz = moment.place[joint], moment.turn[joint]
         for part, handle in self.parts:
@@ -161,7 +164,7 @@ class Drawing:
         self.zmp.visible = bool(np.isfinite(moment.zmp).all())
         if self.zmp.visible:
             self.zmp.position = np.append(moment.zmp, 0.0)
-        length = LONGEST * moment.force / self.largest
+        length = MAX_ARROW * moment.force / self.largest
         ends = np.array([[moment.hand, moment.hand + max(length, 1e-6) * self.normal]])
         if self.mark is not None:
             self.mark.remove()
@@ -175,7 +178,7 @@ class Drawing:
             part.solid.vertices.astype(np.float32),
             part.solid.triangles.astype(np.uint32),
             color=WOOD if part.kind == "target" else GREY,
-            opacity=CLEAR if part.clear else None,
+            opacity=OPACITY if part.clear else None,
             flat_shading=True,
             side="double",
         )

@@ -1,4 +1,4 @@
-"""Re-plans for a request: by a parametric step from the first plan, or by a solve from the last one."""
+"""Re-planning for requests of a live page: from the first plan, or by a solve from the latest one."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from impactopt.transcription.plan import Plan, Trajectory
 
 __all__ = ["Answer", "Replanning"]
 
-PATIENCE = 20.0  # [s] that each of the two ways may take
-_STEPS = 3e-3, 1e-2  # [s] least and most between instants of the motion that is drawn
-_IN_CONTACT = 6  # instants, if the least step allows it
-_WORST = 5  # constraints that are reported
-# of the solver: impulses are within 0.15 %, in two thirds of the iterations. With a looser complementarity
-# the barrier holds plans off their bounds: 1e-3 took a tenth of a nail stroke's impulse
+TIME_LIMIT = 20.0  # [s] of each of the two solves
+_STEP_RANGE = 3e-3, 1e-2  # [s] between the instants of the motion that is drawn
+_CONTACT_SAMPLES = 6  # instants of the contact, within that range
+MAX_VIOLATIONS = 5  # that are reported
+# Solver tolerances with which impulses are within 0.15 %, after two thirds of the iterations. A looser
+# complementarity would keep plans off their bounds: 1e-3 took a tenth of the impulse of a blow on a nail.
 _LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-5}
 
 
@@ -35,8 +35,8 @@ _LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-5}
 class Answer:
     """Answer to a request.
 
-    solution, track, margins : the plan, its motion, its `Plan.margins`; None where there is none.  seconds :
-    it took.  why : there is none, with the worst constraints.
+    solution, track, margins : the plan, its motion, and its `Plan.margins`; None and {} without a plan.
+    seconds : of the computation.  why : reason that there is no plan, with the worst constraints; else "".
     """
 
     solution: Solution | None = None
@@ -47,18 +47,17 @@ class Answer:
 
 
 class Replanning:
-    """Plans for requests, from a first plan.
+    """Planner for requests, from a first plan.
 
-    The first plan is bent (`moved_solution`): one setting of the sliders then gives one plan, whatever came
-    before. Where that fails, the request is solved from the last plan that there was, which may be nearer.
+    A request is re-planned from the first plan (`moved_solution`), so that the same sliders give the same
+    plan, whatever came before. If that fails, it is solved from the latest plan, which may be nearer.
     """
 
-    def __init__(self, first: Solution, *, patience: float = PATIENCE) -> None:
-        self.first = self.last = first
-        self.patience = patience
-        with contextlib.suppress(
-            InputError
-        ):  # what that needs is made now, and not when the first slider moves
+    def __init__(self, first: Solution, *, time_limit: float = TIME_LIMIT) -> None:
+        self.first = self.latest = first
+        self.time_limit = time_limit
+        # builds what re-planning needs now, and not when the first slider moves
+        with contextlib.suppress(InputError):
             moved_solution(first, point=first.problem.point, options=_LOOSE)
 
     def __call__(self, request: PlanRequest, stale: Callable[[], bool]) -> Answer:
@@ -66,13 +65,13 @@ class Replanning:
         try:
             solution = self._plan(request.changes(self.first.problem), stale)
             if not solution.status.usable:
-                return Answer(seconds=time.perf_counter() - began, why=why_not(solution))
+                return Answer(seconds=time.perf_counter() - began, why=failure_reason(solution))
             reference = _reference(solution.plan)
             track = planned_track(solution, reference)
         except InputError as error:
             return Answer(seconds=time.perf_counter() - began, why=str(error))
         if not stale():
-            self.last = solution
+            self.latest = solution
         margins = solution.plan.margins(solution.collision, reference)
         seconds = time.perf_counter() - began
         return Answer(solution=solution, track=track, margins=margins, seconds=seconds)
@@ -84,26 +83,28 @@ class Replanning:
         def stop(_: IterationRecord) -> bool:
             return stale()
 
-        common: dict[str, Any] = {"callback": stop, "time_limit": self.patience, "options": _LOOSE}
+        common: dict[str, Any] = {"callback": stop, "time_limit": self.time_limit, "options": _LOOSE}
         try:
-            bent = moved_solution(self.first, **changes, **common)
-        except InputError:  # its program has other constraints, or there is no such problem
-            bent = None
-        if bent is not None and (bent.status.usable or stale()):
-            return bent
+            moved = moved_solution(self.first, **changes, **common)
+        except (
+            InputError
+        ):  # the program has other constraints, or the problem is wrong: the solve raises again
+            moved = None
+        if moved is not None and (moved.status.usable or stale()):
+            return moved
         problem = moved_problem(self.first.problem, **changes)
-        return solve(problem, start=self.last, **common)
+        return solve(problem, start=self.latest, **common)
 
 
 def _reference(plan: Plan) -> Trajectory:
-    """Reference of a plan, coarse enough for a picture: computing it costs as much as some iterations."""
+    """Reference of a plan with few instants, for a picture: computing it costs as much as some iterations."""
     duration = plan.compression + plan.restitution
-    return plan.trajectory(step=float(np.clip(duration / _IN_CONTACT, *_STEPS)), hold=0.2)
+    return plan.trajectory(step=float(np.clip(duration / _CONTACT_SAMPLES, *_STEP_RANGE)), hold=0.2)
 
 
-def why_not(solution: Solution) -> str:
-    """Reason why a solution is no plan, and its worst constraints."""
-    rows = [f"- {row}" for row in solution.violations[:_WORST]]
-    time_limit = solution.status is Status.TIME_LIMIT
-    told = "no plan was found in time" if time_limit else solution.result.message
-    return "\n".join([told, *rows])
+def failure_reason(solution: Solution) -> str:
+    """Reason why a solution is not usable, and its worst constraints."""
+    violations = [f"- {violation}" for violation in solution.violations[:MAX_VIOLATIONS]]
+    in_time = solution.status is not Status.TIME_LIMIT
+    reason = solution.result.message if in_time else "no plan was found in time"
+    return "\n".join([reason, *violations])

@@ -1,4 +1,4 @@
-"""Requests of the live page: another hit point, other parameters; the latest one counts."""
+"""Requests of live pages, and the thread that answers the latest one."""
 
 from __future__ import annotations
 
@@ -13,45 +13,46 @@ import numpy as np
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone
 
-__all__ = ["LatestRequest", "Number", "PlanRequest", "numbers_of", "request_of"]
+__all__ = ["LatestRequest", "PlanRequest", "SliderParameter", "request_of", "slider_parameters"]
 
 Request = TypeVar("Request")
 Outcome = TypeVar("Outcome")
 
 
 class LatestRequest(Generic[Request, Outcome]):
-    """Answers requests one after the other. One that comes while another is worked on takes its place.
+    """Thread that answers requests. A request that comes during the work on another one replaces it.
 
-    work : from a request to its outcome. Its second argument says whether a newer request is there: then it
-        may stop, as nobody will ask for what it returns.
-    tell : is given each outcome that is still requested, or what the work raised, in the same thread.
+    work : makes the outcome of a request. Its second argument returns True once there is a newer request:
+        then it may stop, as its outcome is dropped.
+    show : called with a request and its outcome, or the exception that the work raised, in the same thread.
     """
 
     def __init__(
         self,
         work: Callable[[Request, Callable[[], bool]], Outcome],
-        tell: Callable[[Request, Outcome | Exception], object],
+        show: Callable[[Request, Outcome | Exception], object],
     ) -> None:
-        self._work, self._tell = work, tell
+        self._work, self._show = work, show
         self._changed = threading.Condition()
-        self._asked, self._answered, self._closed = 0, 0, False
+        # numbers of the latest request, and of the latest one that is answered
+        self._requested, self._answered, self._closed = 0, 0, False
         self._request: Request
-        self._thread = threading.Thread(target=self._run, name="newest request", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="latest request", daemon=True)
         self._thread.start()
 
     def ask(self, request: Request) -> None:
-        """Take this request in place of all before it."""
+        """Replace all earlier requests by this one."""
         with self._changed:
-            self._request, self._asked = request, self._asked + 1
+            self._request, self._requested = request, self._requested + 1
             self._changed.notify_all()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until nothing is asked for any more; False after so long [s]."""
+        """Wait until the latest request is answered; False after ``timeout`` [s]."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._answered == self._asked, timeout)
+            return self._changed.wait_for(lambda: self._answered == self._requested, timeout)
 
     def close(self, timeout: float | None = None) -> None:
-        """Stop: what is worked on is reported no more."""
+        """End the thread; the outcome of present work is dropped."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -60,13 +61,13 @@ class LatestRequest(Generic[Request, Outcome]):
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._answered != self._asked)
+                self._changed.wait_for(lambda: self._closed or self._answered != self._requested)
                 if self._closed:
                     return
-                number, request = self._asked, self._request
+                number, request = self._requested, self._request
 
             def stale(number: int = number) -> bool:
-                return self._closed or self._asked != number
+                return self._closed or self._requested != number
 
             outcome: Outcome | Exception
             try:
@@ -74,22 +75,22 @@ class LatestRequest(Generic[Request, Outcome]):
             except Exception as error:
                 outcome = error
             if not stale():
-                self._tell(request, outcome)
+                self._show(request, outcome)
             with self._changed:
                 self._answered = number
                 self._changed.notify_all()
 
 
-_RANGE = 4.0  # a slider goes from so much below a problem's number to so much above
-_STEPS = 200
-_MARGIN = 0.06  # [m] the largest margin of the ZMP that can be asked for, at least
+_RANGE = 4.0  # factor from a parameter's value in the problem to the ends of its slider
+_STEPS = 200  # of a slider
+_MARGIN = 0.06  # [m] end of the slider for the ZMP's margin, or more
 
 
 @dataclass(frozen=True, kw_only=True)
-class Number:
-    """One that a slider sets.
+class SliderParameter:
+    """Parameter of a problem with a slider.
 
-    name : as an argument of `Solution.moved`.  label : with its unit.  value, least, most, step : in that
+    name : as an argument of `Solution.moved`.  label : with the unit.  value, least, most, step : in that
     unit.
     """
 
@@ -103,29 +104,31 @@ class Number:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanRequest:
-    """A problem that is asked for. point [m]; numbers : by their names, those that the problem has."""
+    """Request of a plan.
+
+    point [m] : hit point.  parameters : names and values of the sliders.
+    """
 
     point: tuple[float, float, float]
-    numbers: tuple[tuple[str, float], ...]
+    parameters: tuple[tuple[str, float], ...]
 
     def changes(self, problem: ImpactProblem) -> dict[str, Any]:
-        """Differences from this problem: arguments of `Solution.moved`."""
+        """Differences from a problem, as arguments of `Solution.moved`."""
         own = request_of(problem)
         out: dict[str, Any] = {} if self.point == own.point else {"point": np.array(self.point)}
-        return out | dict(sorted(set(self.numbers) - set(own.numbers)))
+        return out | dict(sorted(set(self.parameters) - set(own.parameters)))
 
 
 def request_of(problem: ImpactProblem) -> PlanRequest:
-    """Request that corresponds to the problem as it is."""
+    """Request of the plan for the problem itself."""
     x, y, z = (float(v) for v in problem.point)
-    return PlanRequest(point=(x, y, z), numbers=tuple((n.name, n.value) for n in numbers_of(problem)))
+    parameters = tuple((p.name, p.value) for p in slider_parameters(problem))
+    return PlanRequest(point=(x, y, z), parameters=parameters)
 
 
-def numbers_of(problem: ImpactProblem) -> tuple[Number, ...]:
-    """Parameters that a plan can be adapted to: mass of the target, stiffness of the contact, margin of the
-    ZMP.
-
-    A wall has no mass, and an arm that is bolted down no ZMP.
+def slider_parameters(problem: ImpactProblem) -> tuple[SliderParameter, ...]:
+    """Parameters with sliders: mass of the target, stiffness of the contact, margin of the ZMP; those that
+    the problem has.
     """
     found = []
     parts: tuple[tuple[str, str, Any], ...] = (
@@ -146,5 +149,6 @@ def numbers_of(problem: ImpactProblem) -> tuple[Number, ...]:
     return tuple(found)
 
 
-def _between(name: str, label: str, value: float, least: float, most: float) -> Number:
-    return Number(name=name, label=label, value=value, least=least, most=most, step=(most - least) / _STEPS)
+def _between(name: str, label: str, value: float, least: float, most: float) -> SliderParameter:
+    step = (most - least) / _STEPS
+    return SliderParameter(name=name, label=label, value=value, least=least, most=most, step=step)

@@ -1,4 +1,4 @@
-"""Pages served by viser on this machine."""
+"""Server of live pages: viser, with a token in the address; and the base class of pages."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ Page = TypeVar("Page", bound="LivePage")
 
 
 class LivePage:
-    """A page that answers the latest request of its watcher, until it is closed."""
+    """Base class of pages that answer the latest request of their user until they are closed."""
 
     _server: Any
     _latest: LatestRequest[Any, Any]
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait for the newest answer; False after so long [s]."""
+        """Wait until the latest request is answered; False after ``timeout`` [s]."""
         return self._latest.wait(timeout)
 
     def close(self) -> None:
         """End all work and the page."""
         self._latest.close(timeout=1.0)
-        with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it has stopped
             self._server.stop()
 
     def __enter__(self: Page) -> Page:
@@ -52,20 +52,20 @@ def _family(host: str) -> socket.AddressFamily:
 
 
 def served(host: str, port: int) -> tuple[Any, str]:
-    """A `viser.ViserServer` there, and the address of its page; port 0: one that is free.
+    """`viser.ViserServer` at a host and port (0: a free one), and the address of its page.
 
-    The address ends in a random token. Without it, and from a page of another origin in the same browser,
-    every request is refused: the page is for those alone who were given its address.
+    The address ends in a random token. Requests without it, and those from a page of another origin in the
+    same browser, are refused: only those who know the address can see the page.
 
     Raises
     ------
-    InputError : viser is missing, or lets no request be checked; host or port cannot be had.
+    InputError : viser is missing, or has no check of requests; host or port are not available.
     """
     try:
         import viser
     except ImportError as error:
         raise missing_package("a live look", "viser", "live") from error
-    # viser would take another port than the one that is asked for
+    # viser would silently take another port if this one is in use
     try:
         with socket.create_server((host, port), family=_family(host)):
             pass
@@ -74,7 +74,7 @@ def served(host: str, port: int) -> tuple[Any, str]:
         fix = "give another --port, or none" if taken else "give another host or port"
         raise InputError(f"cannot serve a page at {host}:{port}: {error}; {fix}") from error
     token = secrets.token_hex(16)
-    with _guarded(token) as guards, contextlib.redirect_stdout(io.StringIO()):  # it has a banner
+    with _guarded(token) as guards, contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         server = viser.ViserServer(host=host, port=port, label="impactopt", verbose=False)
         if not guards:
             server.stop()
@@ -84,33 +84,34 @@ def served(host: str, port: int) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def _guarded(token: str) -> Iterator[list[bool]]:
-    """A context in which websockets' servers check requests before they answer: viser has no such option.
+    """Context in which servers of websockets check requests before they answer, as viser has no such option.
 
-    Yields a list with an item for each server that was made.
+    It replaces `websockets.asyncio.server.serve`. Yields a list with an item for each server that was made.
     """
     import websockets.asyncio.server as library
 
-    usual, made = library.serve, list[bool]()
+    original, made = library.serve, list[bool]()
 
     def serve(*args: Any, process_request: Any, **more: Any) -> Any:
         def checked(connection: Any, request: Any) -> Any:
             if not _allowed(request, token):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "open the address that was printed\n")
+            # viser sees the path without the token
             path = request.path.replace(f"/{token}", "", 1) or "/"
             return process_request(connection, dataclasses.replace(request, path=path))
 
         made.append(True)
-        return usual(*args, process_request=checked, **more)
+        return original(*args, process_request=checked, **more)
 
     library.serve = serve  # type: ignore[assignment,misc]
     try:
         yield made
     finally:
-        library.serve = usual  # type: ignore[misc]
+        library.serve = original  # type: ignore[misc]
 
 
 def _allowed(request: Any, token: str) -> bool:
-    """True if a request has the token, and comes from no page of another origin."""
+    """True if a request has the token, and does not come from a page of another origin."""
     first = request.path.partition("?")[0].lstrip("/").partition("/")[0]
     if not secrets.compare_digest(first.encode(), token.encode()):
         return False

@@ -1,4 +1,6 @@
-"""The numbers of a problem that bound its program: how they give way, and what they say where they have."""
+"""Bounds of a nonlinear program that come from parameters of its problem: their relaxation, and the
+parameter values that a relaxed solution needs.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.fields import abouts, snake_case
 from impactopt.errors import InputError
-from impactopt.planning.parameter_changes import changed
+from impactopt.planning.parameter_changes import changed, with_term
 from impactopt.planning.refinement import program_for
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
@@ -34,19 +36,23 @@ from impactopt.solvers.relaxed import Relaxation
 from impactopt.transcription.layout import Row
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["MET", "USUAL", "Bound", "Cause", "bounds_of", "changed_or_none"]
+__all__ = ["FEASIBLE", "TYPICAL_DURATION", "Bound", "Cause", "bounds_of", "changed_or_none"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-Chosen = Callable[[Row], bool]
-MET = 1e-5  # violation of constraints that counts as none here
-USUAL = 1.0  # [s] of a motion
-_NO = np.zeros(0, dtype=np.intp)
-_TIMES = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}
-_ROOM = 0.02  # by how much more a value is reported than what it takes: there the feasible set is one point
-_FAR = 0.1  # [m] between bodies that count as much as a bound's own size
-_PROBES = 6  # of a term's number, at most
-_OF_TERM: dict[str, type[Term]] = {
+Selector = Callable[[Row], bool]
+FEASIBLE = 1e-5  # largest violation of the (scaled) constraints that counts as none here
+TYPICAL_DURATION = 1.0  # [s] of a swing or a follow-through
+_NO_INDICES = np.zeros(0, dtype=np.intp)
+_PHASE_NAMES = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}
+# A reported value is beyond the least one by this part of the change: with the least one the feasible set is
+# a single point, which no solver finds.
+_RESERVE = 0.02
+# [m] Shift of a clearance that costs as much in the relaxation as a shift of another bound by its own size.
+_CLEARANCE_UNIT = 0.1
+_MAX_PROBES = 6  # evaluations of the program for the value of a term's parameter
+# Terms whose constraints have names of their own. The others' names begin with the term's.
+_TERM_OF: dict[str, type[Term]] = {
     "capture point": Balance,
     "vertical speed": Balance,
     "angular momentum": Balance,
@@ -56,46 +62,46 @@ _OF_TERM: dict[str, type[Term]] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cause:
-    """A bound that stands alone between a problem and a plan.
+    """Bound that alone makes a problem infeasible.
 
-    first : its kind in a word: "time", "speed".  text : with the value that would do.
-    problem : with that value; None where no value does that the bound may take.
-    nearer : of a time: the same with a value that is so far (0 to 1) on the way to a usual one.
+    kind : "time", "speed", or another kind of bound in a word.  text : the bound, with the value that would
+    make the problem feasible.  problem : with that value; None if the bound may not take it.
+    nearer : of a duration: the same cause with a value between the least one (0) and a typical one (1).
     """
 
-    first: str
+    kind: str
     text: str
     problem: ImpactProblem | None
     nearer: Callable[[float], Cause] | None = None
 
     def __str__(self) -> str:
-        return f"{self.first}: {self.text}"
+        return f"{self.kind}: {self.text}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bound:
-    """Bounds of a program that come from one number of its problem.
+    """Bounds of a program that come from one parameter of its problem.
 
-    chosen : which constraints; variables : and whose bounds.  unit : as of a `Relaxation`.
-    told : for variables (n,) that meet all else, the causes that they show.
+    select : picks the constraints that it bounds.  variables : indices of those that it bounds.  unit : as of
+    a `Relaxation`.  causes : by variables (n,) that meet all other bounds, the values that it would need.
     """
 
     name: str
-    chosen: Chosen | None
+    select: Selector | None
     variables: Index
     unit: float
-    told: Callable[[Array], Iterable[Cause]]
+    causes: Callable[[Array], Iterable[Cause]]
     is_time: bool = False
 
     def relaxation(self, t: Transcription) -> Relaxation:
         """Relaxation of this bound in any program with the same variables."""
-        rows = _NO if self.chosen is None else _rows(t, self.chosen)
-        return Relaxation(rows, self.variables, self.unit)
+        constraints = _NO_INDICES if self.select is None else _inequalities(t, self.select)
+        return Relaxation(constraints, self.variables, self.unit)
 
 
 def bounds_of(t: Transcription) -> list[Bound]:
-    """All bounds of a program that are numbers of its problem."""
-    return [bound for of in (_durations, _of_bodies, _of_terms) for bound in of(t)]
+    """All bounds of a program that come from parameters of its problem."""
+    return [bound for group in (_durations, _clearances, _terms) for bound in group(t)]
 
 
 def _durations(t: Transcription) -> Iterator[Bound]:
@@ -106,12 +112,13 @@ def _durations(t: Transcription) -> Iterator[Bound]:
         if name.endswith(" duration"):
             kind = {"swing": "swing", "follow": "follow", "abort": "follow"}.get(name.split()[0], "contact")
             found.setdefault(kind, []).append(group.offset)
+    # [s] units of the duration variables, as of the transcription
     scale = {kind: 0.01 if kind == "contact" else 0.1 for kind in found}
     for kind, numbers in found.items():
         field = "contact_duration" if kind == "contact" else kind
         at = np.array(numbers, dtype=np.intp)
 
-        def told(x: Array, at: Index = at, kind: str = kind, field: str = field) -> Iterator[Cause]:
+        def causes(x: Array, at: Index = at, kind: str = kind, field: str = field) -> Iterator[Cause]:
             own = getattr(p, field)
             low, high = own if kind == "contact" else own.duration
             times = x[at] * scale[kind]
@@ -121,57 +128,70 @@ def _durations(t: Transcription) -> Iterator[Bound]:
                 return
             common = {"name": kind, "low": low, "high": high, "longer": longer}
 
-            def cause(more: float, least: float = value, common: dict[str, Any] = common) -> Cause:
-                return _time(p, least * (USUAL / least) ** more, **common)
+            # geometric interpolation from the least value (0) to the typical duration (1)
+            def cause(fraction: float, least: float = value, common: dict[str, Any] = common) -> Cause:
+                return _duration_cause(p, least * (TYPICAL_DURATION / least) ** fraction, **common)
 
             yield replace(cause(0.0), nearer=None if kind == "contact" else cause)
 
         yield Bound(
             name=kind,
-            chosen=None,
+            select=None,
             variables=at,
             unit=float(t.program.x_upper[at].max()),
-            told=told,
+            causes=causes,
             is_time=True,
         )
 
 
-def _time(p: ImpactProblem, value: float, *, name: str, low: float, high: float, longer: bool) -> Cause:
-    """A duration that would do beside its bounds."""
+def _duration_cause(
+    p: ImpactProblem, value: float, *, name: str, low: float, high: float, longer: bool
+) -> Cause:
+    """Cause that a duration [s] has to be outside of its bounds, low and high."""
     bound = high if longer else low
     value = _outward(value, bound)
     both = (value, value) if low == high else (low, value) if longer else (value, high)
-    text = f"{_TIMES[name]}: {value:.3g} s for {bound:.3g} s"
+    text = f"{_PHASE_NAMES[name]}: {value:.3g} s for {bound:.3g} s"
     if name == "contact":
         new = changed_or_none(p, contact_duration=both)
-        return Cause(first="time", text=f"{text} ([collision] duration_s)", problem=new)
+        return Cause(kind="time", text=f"{text} ([collision] duration_s)", problem=new)
     new = changed_or_none(p, **{name: replace(getattr(p, name), duration=both)})
-    return Cause(first="time", text=f"{text} ([{name}] duration_s)", problem=new)
+    return Cause(kind="time", text=f"{text} ([{name}] duration_s)", problem=new)
 
 
-def _of_bodies(t: Transcription) -> Iterator[Bound]:
-    """Pairs of bodies."""
+def _clearances(t: Transcription) -> Iterator[Bound]:
+    """Clearance of each pair of bodies that has constraints."""
     kinds = KeepOut.name, SelfCollision.name
     for term, pair in dict.fromkeys((r.term, r.component) for r in t.program.origins if r.term in kinds):
 
-        def chosen(row: Row, term: str = term, pair: str = pair) -> bool:
-            return row.term == term and row.component == pair
+        def select(constraint: Row, term: str = term, pair: str = pair) -> bool:
+            return constraint.term == term and constraint.component == pair
 
-        def told(x: Array, chosen: Chosen = chosen, term: str = term, pair: str = pair) -> Iterator[Cause]:
-            off = 1e3 * _off(t, x, chosen)
-            kind = KeepOut if term == KeepOut.name else SelfCollision
-            free = kind(enabled=False)
-            first = "the floor" if "ground" in pair.split(" and ")[1:] else term
-            words = f"{pair}: {off:.2g} mm nearer than they may be"
+        def causes(
+            x: Array, select: Selector = select, term: str = term, pair: str = pair
+        ) -> Iterator[Cause]:
+            missing = 1e3 * _violation(t, x, select)
+            free = (KeepOut if term == KeepOut.name else SelfCollision)(enabled=False)
             yield Cause(
-                first=first, text=words, problem=changed_or_none(t.problem, terms=_with(t.problem, free))
+                kind="the floor" if "ground" in pair.split(" and ")[1:] else term,
+                text=f"{pair}: {missing:.2g} mm nearer than they may be",
+                problem=changed_or_none(t.problem, terms=with_term(t.problem, free)),
             )
 
-        yield Bound(name=f"{term}, {pair}", chosen=chosen, variables=_NO, unit=_FAR, told=told)
+        yield Bound(
+            name=f"{term}, {pair}",
+            select=select,
+            variables=_NO_INDICES,
+            unit=_CLEARANCE_UNIT,
+            causes=causes,
+        )
 
 
-def _of_terms(t: Transcription) -> Iterator[Bound]:
-    """Numbers of terms."""
+def _terms(t: Transcription) -> Iterator[Bound]:
+    """Parameters of all terms, lazy ones included, that have constraints or bounded variables.
+
+    Clearances have bounds of their own, and limits of position are not relaxed.
+    """
     p = t.problem
     terms = [p.term(type(term)) for term in (*DEFAULT_TERMS, *ON_DEMAND_TERMS)]
     terms += [term for term in p.active_terms if not any(type(term) is type(other) for other in terms)]
@@ -180,137 +200,140 @@ def _of_terms(t: Transcription) -> Iterator[Bound]:
         if isinstance(term, (KeepOut, SelfCollision, PositionLimit)):
             continue
 
-        def chosen(row: Row, term: Term = term) -> bool:
-            return _OF_TERM.get(row.term) is type(term) or row.term.startswith(term.name)
+        def select(constraint: Row, term: Term = term) -> bool:
+            return _TERM_OF.get(constraint.term) is type(term) or constraint.term.startswith(term.name)
 
         if isinstance(term, GearLoad):
-            yield from _of_gears(t, term)
+            yield from _gear_loads(t, term)
             continue
-        variables = _torques(t) if isinstance(term, TorqueLimit) else _NO
-        if not _rows(t, chosen).size and not variables.size:
+        variables = _torques(t) if isinstance(term, TorqueLimit) else _NO_INDICES
+        if not _inequalities(t, select).size and not variables.size:
             continue
+        # velocity constraints are multiplied by the duration, so that they are linear in the variables
         unit = swing if isinstance(term, VelocityLimit) else 1.0
 
-        def told(x: Array, term: Term = term, chosen: Chosen = chosen) -> Iterator[Cause]:
-            yield from _fields(t, x, term, chosen)
+        def causes(x: Array, term: Term = term, select: Selector = select) -> Iterator[Cause]:
+            yield from _term_causes(t, x, term, select)
 
-        yield Bound(name=term.name, chosen=chosen, variables=variables, unit=unit, told=told)
+        yield Bound(name=term.name, select=select, variables=variables, unit=unit, causes=causes)
 
 
-def _of_gears(t: Transcription, term: GearLoad) -> Iterator[Bound]:
+def _gear_loads(t: Transcription, term: GearLoad) -> Iterator[Bound]:
+    """Gear load limit of each joint that has constraints."""
     most, names = np.asarray(term.most(t.robot), dtype=float), t.robot.joint_names
     for k, joint in enumerate(names):
 
-        def chosen(row: Row, joint: str = joint) -> bool:
-            return row.term == term.name and row.component == joint
+        def select(constraint: Row, joint: str = joint) -> bool:
+            return constraint.term == term.name and constraint.component == joint
 
-        if not _rows(t, chosen).size:
+        if not _inequalities(t, select).size:
             continue
 
-        def told(x: Array, k: int = k, joint: str = joint, chosen: Chosen = chosen) -> Iterator[Cause]:
-            off = _off(t, x, chosen)
-            value = _outward(float(most[k]) + off, float(most[k]))
+        def causes(x: Array, k: int = k, joint: str = joint, select: Selector = select) -> Iterator[Cause]:
+            value = _outward(float(most[k]) + _violation(t, x, select), float(most[k]))
             limits = {n: float(m) for n, m in zip(names, most, strict=True) if np.isfinite(m)}
             bounded = replace(term, limit=limits | {joint: value})
-            words = f"gear of {joint}: {value:.3g} for {most[k]:.3g} of its torque limit"
-            at = changed_or_none(t.problem, terms=_with(t.problem, bounded))
-            yield Cause(first="gears", text=f"{words} ([terms.gear_load] limit)", problem=at)
+            text = f"gear of {joint}: {value:.3g} for {most[k]:.3g} of its torque limit"
+            at = changed_or_none(t.problem, terms=with_term(t.problem, bounded))
+            yield Cause(kind="gears", text=f"{text} ([terms.gear_load] limit)", problem=at)
 
-        yield Bound(name=f"gear of {joint}", chosen=chosen, variables=_NO, unit=float(most[k]), told=told)
+        yield Bound(
+            name=f"gear of {joint}",
+            select=select,
+            variables=_NO_INDICES,
+            unit=float(most[k]),
+            causes=causes,
+        )
 
 
-def _fields(t: Transcription, x: Array, term: Term, chosen: Chosen) -> Iterator[Cause]:
-    """The numbers of a term any one of which would do, with their values."""
-    first = {TorqueLimit: "torque", VelocityLimit: "speed"}.get(type(term), term.name)
-    kind = type(term).__name__
-    written = f"[terms.{snake_case(kind)}] " if type(term) in TERMS else f"{kind}."
-    allowed = {field.name: about for field, about in abouts(type(term))}
-    rows = _rows(t, chosen).tolist()
-    off = row_violations(t.program, t.program.constraints(x))
-    worst = max(rows, key=lambda i: off[i], default=None)
+def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> Iterator[Cause]:
+    """Parameters of a term each of which alone, with another value, makes variables (n,) feasible."""
+    kind = {TorqueLimit: "torque", VelocityLimit: "speed"}.get(type(term), term.name)
+    type_name = type(term).__name__
+    section = f"[terms.{snake_case(type_name)}] " if type(term) in TERMS else f"{type_name}."
+    about_field = {field.name: about for field, about in abouts(type(term))}
+    constraints = _inequalities(t, select).tolist()
+    violations = row_violations(t.program, t.program.constraints(x))
+    worst = max(constraints, key=lambda i: violations[i], default=None)
     where = ""
-    if worst is not None and off[worst] > MET:
-        row, _ = t.program.describe_violation(worst, x, float(off[worst]))
-        where = f"; {row.partition(', ')[2]}"
+    if worst is not None and violations[worst] > FEASIBLE:
+        name, _ = t.program.describe_violation(worst, x, float(violations[worst]))
+        where = f"; {name.partition(', ')[2]}"
     for field in fields(term):
         old = getattr(term, field.name)
         if isinstance(old, bool) or not isinstance(old, float) or not np.isfinite(old):
             continue
 
-        def off_at(value: float, name: str = field.name) -> float:
-            p = changed(t.problem, terms=_with(t.problem, replace(term, **{name: value})))
-            return _off(program_for(t.with_apart({}), p), x, chosen, torques=type(term) is TorqueLimit)
+        def violation_at(value: float, name: str = field.name) -> float:
+            p = changed(t.problem, terms=with_term(t.problem, replace(term, **{name: value})))
+            return _violation(program_for(t.with_apart({}), p), x, select, torques=type(term) is TorqueLimit)
 
-        needed = _where_met(off_at, old)
+        needed = _feasible_value(violation_at, old)
         if needed is None:
             continue
         value = _outward(needed, old)
-        unit = allowed[field.name].unit if field.name in allowed else ""
-        words = f"{term.name}: {value:.3g} for {old:.3g}{' ' + unit if unit else ''}"
-        new = None
-        with contextlib.suppress(InputError):
-            new = changed(t.problem, terms=_with(t.problem, replace(term, **{field.name: value})))
-        yield Cause(first=first, text=f"{words} ({written}{field.name}{where})", problem=new)
+        unit = about_field[field.name].unit if field.name in about_field else ""
+        text = f"{term.name}: {value:.3g} for {old:.3g}{' ' + unit if unit else ''}"
+        new = changed_or_none(t.problem, terms=with_term(t.problem, replace(term, **{field.name: value})))
+        yield Cause(kind=kind, text=f"{text} ({section}{field.name}{where})", problem=new)
 
 
-def _where_met(off: Callable[[float], float], old: float) -> float | None:
-    """The value of a number, next to the old one, at which nothing is off; None if it changes nothing, or may
-    not have such values.
+def _feasible_value(violation: Callable[[float], float], old: float) -> float | None:
+    """Value of a parameter, next to the old one, at which nothing is violated, by the secant method.
+
+    None if the violation does not depend on it, or the parameter may not have such values.
     """
     step = 0.05 * max(abs(old), 0.01)
     try:
-        before = off(old)
+        before = violation(old)
         value = old + step
         after = None
         with contextlib.suppress(InputError):
-            after = off(value)
-        if after is None or after > before - 1e-9:
+            after = violation(value)
+        if after is None or after > before - 1e-9:  # upwards is no better: downwards
             value = old - step
-            after = off(value)
-        if before <= MET or after > before - 1e-9:
+            after = violation(value)
+        if before <= FEASIBLE or after > before - 1e-9:
             return None
         points = [(old, before), (value, after)]
-        for _ in range(_PROBES):
+        for _ in range(_MAX_PROBES):
             (a, fa), (b, fb) = points[-2:]
-            if fb <= MET:
+            if fb <= FEASIBLE:
                 return b
             if fb >= fa:
                 return None
-            new = b + 1.001 * fb * (b - a) / (fa - fb)
-            points.append((new, off(new)))
+            new = b + 1.001 * fb * (b - a) / (fa - fb)  # slightly beyond the root, to end at no violation
+            points.append((new, violation(new)))
     except InputError:
         return None
     return None
 
 
-def _off(t: Transcription, x: Array, chosen: Chosen, *, torques: bool = False) -> float:
-    rows = _rows(t, chosen)
-    off = row_violations(t.program, t.program.constraints(x))[rows].max(initial=0.0)
+def _violation(t: Transcription, x: Array, select: Selector, *, torques: bool = False) -> float:
+    """Largest violation of the selected inequalities, and of the bounds of ``torques``, at variables (n,)."""
+    found = _inequalities(t, select)
+    most = row_violations(t.program, t.program.constraints(x))[found].max(initial=0.0)
     if torques:
         j = _torques(t)
         beyond = np.maximum(t.program.x_lower[j] - x[j], x[j] - t.program.x_upper[j])
-        off = max(off, beyond.max(initial=0.0))
-    return float(off)
+        most = max(most, beyond.max(initial=0.0))
+    return float(most)
 
 
-def _rows(t: Transcription, chosen: Chosen) -> Index:
-    """Numbers of the constraints that are chosen, of those that are bounds."""
-    found = np.array([i for i, row in enumerate(t.program.origins) if chosen(row)], dtype=np.intp)
+def _inequalities(t: Transcription, select: Selector) -> Index:
+    """Indices of the selected constraints that are inequalities."""
+    found = np.array([i for i, origin in enumerate(t.program.origins) if select(origin)], dtype=np.intp)
     return found[t.program.g_lower[found] < t.program.g_upper[found]]
 
 
 def _torques(t: Transcription) -> Index:
-    """Variables that are torques with the limit as their bounds."""
+    """Indices of the variables that are torques, bounded by the torque limit."""
     found = [
         np.arange(group.offset, group.offset + group.count * group.size)
         for name, group in t.layout.groups.items()
         if name.startswith(("torque, ", "torque in collision, ")) or name == "feed-forward at contact"
     ]
-    return np.concatenate([_NO, *found])
-
-
-def _with(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
-    return (*(other for other in problem.terms if type(other) is not type(term)), term)
+    return np.concatenate([_NO_INDICES, *found])
 
 
 def changed_or_none(problem: ImpactProblem, **new: object) -> ImpactProblem | None:
@@ -321,8 +344,8 @@ def changed_or_none(problem: ImpactProblem, **new: object) -> ImpactProblem | No
 
 
 def _outward(value: float, bound: float) -> float:
-    """Value with some room, in three digits, away from the bound."""
+    """Value beyond a bound, moved farther from it by a reserve and rounded outward to three digits."""
     up = value > bound
-    value += _ROOM * (value - bound) + (1 if up else -1) * 1e-3 * abs(value)
+    value += _RESERVE * (value - bound) + (1 if up else -1) * 1e-3 * abs(value)
     size = 10.0 ** (np.floor(np.log10(max(abs(value), 1e-12))) - 2)
     return float(f"{(np.ceil if up else np.floor)(value / size) * size:.3g}")

@@ -1,4 +1,4 @@
-"""Solver call in the time that is left, and what its results are compared by."""
+"""Solver call with its options and the remaining time, and comparison of results."""
 
 from __future__ import annotations
 
@@ -25,14 +25,16 @@ from impactopt.solvers.sqp import SQPOptions, solve_sqp
 Array = NDArray[np.float64]
 SOLVERS = (*OPTIONS, "ipopt")
 EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
-VIOLATED = 1e-4  # larger violations are named; an iterate without any is a solution, if not an optimum
-_PUSH = 1e-6  # into its bounds, of a start that is to stay where it is
+# Violations of the (scaled) constraints above it are listed. An iterate without any is feasible, if not an
+# optimum.
+VIOLATED = 1e-4
+_PUSH = 1e-6  # distance that the solver keeps an initial guess from its bounds, if that is to stay as it is
 
 
 class Stop:
     """Flag by which a signal ends the work at its next step.
 
-    armed : whether there is something to keep. Until then, and the second time, a signal raises
+    armed : whether there is an iterate to keep. Before that, and the second time, a signal raises
         KeyboardInterrupt at once.
     """
 
@@ -48,10 +50,10 @@ class Stop:
 
 @contextlib.contextmanager
 def stopping() -> Iterator[Stop]:
-    """A `Stop` for SIGINT, and for SIGTERM where that raises KeyboardInterrupt too, as in commands.
+    """Context with a `Stop` for SIGINT, and for SIGTERM if that raises KeyboardInterrupt too, as in commands.
 
-    Handlers of a caller's own stay, and so do those of threads that are not the main one. Within another one
-    it is that one's.
+    Handlers that the caller has set stay, as do all handlers if this is not the main thread. A nested context
+    has the outer one's `Stop`.
     """
     main = threading.current_thread() is threading.main_thread()
     numbers = [signal.SIGINT, signal.SIGTERM] if main else []
@@ -73,14 +75,16 @@ def stopping() -> Iterator[Stop]:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """A solver with its options, and the time [s] that is left for all that it is given; None: any.
+    """Solver with its options, and the time limit [s] of all its calls together; None: no limit.
 
-    report : called with a line of text where work goes on.  stop : what Ctrl-C asks.
+    callback : called with each iteration's record; True stops the solver.  report : called with lines of
+    text.
+    since : when the time began (`time.perf_counter`).  stop : flag that Ctrl-C sets.
 
     Raises
     ------
-    InputError : an unknown solver; a time that is none; options that the SQP does not have (IPOPT is asked
-        about its own when it starts).
+    InputError : an unknown solver; a time limit that is not positive; unknown options of our solvers (IPOPT
+        checks its own when it starts).
     """
 
     solver: str
@@ -98,7 +102,7 @@ class Budget:
         if self.options is None:
             return
         if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):
-            raise InputError(f"options are those of the solver by name, not {self.options!r}")
+            raise InputError(f"options must be a mapping from names of solver options, not {self.options!r}")
         if kind := OPTIONS.get(self.solver):
             known = [f.name for f in fields(kind)]
             for name in self.options:
@@ -106,13 +110,13 @@ class Budget:
             kind(**self.options)
 
     def started(self) -> Budget:
-        """The same with all its time, which begins now; from here on an iterate is kept if it is stopped."""
+        """Budget whose time begins now; from here on a stop keeps the best iterate."""
         self.stop.armed = True
         return replace(self, since=time.perf_counter())
 
     def near_by(self) -> Budget:
-        """The same, whose solver hardly moves a start off its bounds: it is a solution, or next to one, and
-        what is moved may come to another.
+        """Budget for an initial guess that is nearly a solution: the solver hardly moves it off its bounds,
+        as from a moved one it may converge to another solution.
         """
         return replace(self, options={"push": _PUSH, **(self.options or {})}) if self.interior else self
 
@@ -123,7 +127,7 @@ class Budget:
 
     @property
     def left(self) -> float | None:
-        """[s]; none where it has been stopped."""
+        """Remaining time [s]; 0 after a stop, None without a limit."""
         if self.stop.asked:
             return 0.0
         if self.time_limit is None:
@@ -135,10 +139,10 @@ class Budget:
         if self.report is not None:
             self.report(text)
 
-    def _told(self, record: IterationRecord) -> bool:
-        """Reports an iteration to the caller; true if the solver is to stop after it."""
-        asked = self.callback is not None and self.callback(record) is True
-        return asked or self.stop.asked
+    def _on_iteration(self, record: IterationRecord) -> bool:
+        """Callback of the solver: reports an iteration to the caller; True stops the solver."""
+        stops = self.callback is not None and self.callback(record) is True
+        return stops or self.stop.asked
 
     def run(
         self,
@@ -150,11 +154,12 @@ class Budget:
         *,
         path: Path | None = None,
     ) -> SolverResult:
-        """Let the solver work on a program in the time that is left.
+        """Solve a program in the remaining time.
 
-        start : variables (n,); or a neighbouring program's result, whose multipliers our solvers take too.
-        barrier : the first of "ipm" from a result, where that is not as near as it looks.
-        most : iterations of our solvers, if the options do not say how many.
+        start : initial guess (n,); or a similar program's result for a warm start, whose multipliers our
+        solvers use too.
+        barrier : first one of "ipm" for a warm start, if that is farther from the solution than it seems.
+        most : largest number of iterations of our solvers, unless the options set it.
         watch, path : as of `solve_ipm`.
         """
         left, y, z = None if self.stop.asked else self.left, None, None
@@ -163,13 +168,15 @@ class Budget:
         else:
             x0 = start
         if self.solver == "ipopt":
-            return solve_ipopt(program, x0, options=self.options, callback=self._told, time_limit=left)
+            return solve_ipopt(
+                program, x0, options=self.options, callback=self._on_iteration, time_limit=left
+            )
         settings = dict(self.options or {})
         if most is not None:
             settings.setdefault("max_iterations", most)
         if left is not None:
             settings["time_limit"] = max(left, 1e-9)
-        common: dict[str, Any] = {"callback": self._told, "multipliers": y, "bound_multipliers": z}
+        common: dict[str, Any] = {"callback": self._on_iteration, "multipliers": y, "bound_multipliers": z}
         if not self.interior:
             return solve_sqp(program, x0, options=SQPOptions(**settings), **common)
         if barrier is not None and z is not None:
@@ -178,15 +185,13 @@ class Budget:
 
 
 def rank_of(result: SolverResult) -> tuple[bool, float]:
-    """Less is better: those that meet their constraints by their objective, then the others by their
-    violation.
-    """
+    """Sorting key, best first: feasible results by their objective, then the others by their violation."""
     met = result.status.usable or result.max_violation <= VIOLATED
     return not met, result.objective if met else result.max_violation
 
 
 def one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
-    """The new result, with the effort of both."""
+    """New result with the history and the effort of both."""
     later = tuple(
         replace(r, iteration=old.iterations + r.iteration, seconds=old.seconds + r.seconds)
         for r in new.history
@@ -196,14 +201,15 @@ def one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
 
 
 def with_effort_of(kept: SolverResult, last: SolverResult) -> SolverResult:
-    """A result that an earlier round had, with the effort until the last one."""
+    """Result of an earlier round, with the history and the effort of the last one."""
     return replace(kept, history=last.history, **{key: getattr(last, key) for key in EFFORT})
 
 
 def touching(result: SolverResult, depth: float, names: Iterable[str], what: str) -> SolverResult:
-    """A result whose bodies penetrate by so much [m]: no solution.  names : of the pairs of bodies.
+    """Failed result whose bodies penetrate each other by ``depth`` [m].
 
-    Where nothing else is found it is still told, but goes before no start that is clean.
+    names : of the pairs of bodies.  what : "solution" or "strike", for the message.
+    The depth counts as a violation, so results without penetration rank before it (`rank_of`).
     """
     pairs = "; ".join(sorted(set(names))[:3])
     found = f"no {what} was found in which they do not"

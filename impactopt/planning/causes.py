@@ -1,8 +1,8 @@
-"""The single bound that keeps a problem from having a plan, and where it would have to be.
+"""Search for the single bound that makes a problem infeasible, and for the value that it would need.
 
-From the point of least violation the bounds of one kind after the other give way, by as little as it takes to
-meet all others (`impactopt.solvers.relaxed`). What is named is a number of the problem, with a value at which
-a motion is known that meets the whole program.
+From the point of least violation, the bounds of each kind in turn are relaxed by as little as all others
+require (`impactopt.solvers.relaxed`). A cause is a parameter of the problem, with a value at which a feasible
+motion is known.
 """
 
 from __future__ import annotations
@@ -17,9 +17,16 @@ from numpy.typing import NDArray
 from impactopt.contact.fields import snake_case
 from impactopt.contact.laws import ContactLaw
 from impactopt.errors import InputError
-from impactopt.planning.bounds import MET, USUAL, Bound, Cause, bounds_of, changed_or_none
+from impactopt.planning.bounds import (
+    FEASIBLE,
+    TYPICAL_DURATION,
+    Bound,
+    Cause,
+    bounds_of,
+    changed_or_none,
+)
 from impactopt.planning.budget import Budget
-from impactopt.planning.lazy_constraints import with_rows
+from impactopt.planning.lazy_constraints import with_lazy_constraints
 from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import program_for
 from impactopt.problem.scenario import LONGEST, SHORTEST, Phase
@@ -32,26 +39,31 @@ from impactopt.transcription.transcription import Transcription
 __all__ = ["Cause", "Search", "search"]
 
 Array = NDArray[np.float64]
-_LOOSE = 4.0  # times longer, or shorter, that durations may become, or usual
-_CONTACT = 0.2  # [s] that a phase of contact may become
-# at most, of all bounds together, of one, and of a plain start where it has moved: most take a third of it
-_ITERATIONS, _SINGLE, _PLAIN = 100, 60, 200
-_LEAST = 400  # of the whole search, at least
-_TRIED = 5  # bounds that are tried alone
-_FACTORS = tuple(10.0 ** (sign * k / 2) for k in (1, 2, 3, 4) for sign in (1, -1))  # of stiffness
-_STIFF = 50  # iterations of each: where there is a solution, most are there in half of them
-_BARRIER, _PUSH = 1e-2, 1e-3  # of a program that is nearly met
-_ROUGH = 1e-4  # its tolerance: three digits are reported
-_TRIES = 4  # of a value
-_NONE = 1e-4  # what a relaxation comes to that is none
+# In the search durations may be so many times longer or shorter, or typical.
+_DURATION_FACTOR = 4.0
+_MAX_CONTACT_PHASE = 0.2  # [s] longest duration of a phase of contact in the search
+# Iterations at most: with all bounds relaxed, with a single one, and of a program with a changed bound from
+# its initial guess. Most need a third of it.
+_ITERATIONS_ALL, _ITERATIONS_SINGLE, _ITERATIONS_CHANGED = 100, 60, 200
+_MIN_ITERATIONS = 400  # that the whole search may take, after however short a solve
+_MAX_SINGLE = 5  # bounds that are relaxed alone
+# Stiffnesses over the problem's, from one half order of magnitude to two. Where there is a solution, most are
+# found in half of the iterations.
+_STIFFNESS_FACTORS = tuple(10.0 ** (sign * k / 2) for k in (1, 2, 3, 4) for sign in (1, -1))
+_ITERATIONS_STIFFNESS = 50
+_BARRIER, _PUSH = 1e-2, 1e-3  # solver options for an initial guess that is nearly feasible
+_TOLERANCE = 1e-4  # values are reported with three digits
+_MAX_VALUES = 4  # of one bound that are tried
+_NOT_RELAXED = 1e-4  # smaller relaxations count as none
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Search:
     """Result of a search for the bounds that make a problem infeasible.
 
-    causes : bounds any one of which would do, the one that moves least first.  met : a program of
-    the problem with constraints of all lazy terms, and variables (n,) that meet it; None if none are known.
+    causes : bounds each of which alone, if changed, makes the problem feasible.
+    met : program of the problem with the constraints of all lazy terms, and feasible variables (n,); None if
+        none are known.
     """
 
     causes: tuple[Cause, ...] = ()
@@ -61,94 +73,104 @@ class Search:
 def search(t: Transcription, result: SolverResult, budget: Budget) -> Search:
     """Searches for the cause of a program's infeasibility, in about as many iterations as its solve took.
 
-    result : of the program, where its violation is least.
+    result : of the program, with the least violation that its solver found.
     """
     if budget.left == 0:
         return Search()
     try:
-        return _Relaxing(t, result, budget).found()
-    except InputError:  # of a problem with looser durations: nothing is known then
+        return _CauseSearch(t, result, budget).found()
+    except InputError:  # the problem with wider durations is refused: no cause is known then
         return Search()
 
 
-class _Relaxing:
-    """A program with looser durations, and the bounds that hold it to those of the problem."""
+class _CauseSearch:
+    """Relaxations of a program: it has wider bounds of the durations, `loose`, and `bounds` narrow them to
+    those of the problem.
+    """
 
     def __init__(self, t: Transcription, result: SolverResult, budget: Budget) -> None:
         self.given, self._budget = t.problem, budget
-        self._iterations = max(_LEAST, result.iterations)
-        # a bound that has moved would else break what has no constraints yet
-        p = with_rows(t.problem, [snake_case(type(term).__name__) for term in t.problem.on_demand])
+        self._iterations = max(_MIN_ITERATIONS, result.iterations)
+        # With the constraints of all lazy terms, or a changed bound would be confirmed by a motion that
+        # violates those.
+        names = [snake_case(type(term).__name__) for term in t.problem.on_demand]
+        p = with_lazy_constraints(t.problem, names)
         self.t = program_for(t, p)
-        nothing = np.zeros(t.program.m), np.zeros(t.layout.n)
-        own = carried_over(self.t, t, result.x, *nothing)[0]
+        zero_multipliers = np.zeros(t.program.m), np.zeros(t.layout.n)
+        own = carried_over(self.t, t, result.x, *zero_multipliers)[0]
         shortest, longest = p.contact_duration
         loose = changed(
             p,
             swing=_loosened(p.swing),
             follow=_loosened(p.follow),
-            contact_duration=(shortest, max(_CONTACT, longest)),
+            contact_duration=(shortest, max(_MAX_CONTACT_PHASE, longest)),
         )
         self.loose = program_for(self.t, loose)
-        once = (USUAL, USUAL)
-        usual = changed(
-            loose, swing=replace(loose.swing, duration=once), follow=replace(loose.follow, duration=once)
+        fixed = (TYPICAL_DURATION, TYPICAL_DURATION)
+        typical = changed(
+            loose, swing=replace(loose.swing, duration=fixed), follow=replace(loose.follow, duration=fixed)
         )
-        self.starts = own, first_iterate(program_for(self.t, usual))
+        # initial guesses: the failed solve's last point, and the problem's own with typical durations
+        self.guesses = own, first_iterate(program_for(self.t, typical))
         self.bounds = bounds_of(self.t)
 
     def found(self) -> Search:
-        common = self._common()
-        if common is None:
+        relaxed = self._all_relaxed()
+        if relaxed is None:
             return Search(causes=tuple(self._stiffness()))
-        x, sizes = common
-        if sizes.max(initial=0.0) <= _NONE and self._meets(x):
+        x, sizes = relaxed
+        if sizes.max(initial=0.0) <= _NOT_RELAXED and self._is_feasible(x):
             return Search(met=(self.t, x))
+        # those that were relaxed most first, then all durations
         order = np.argsort(-sizes, kind="stable").tolist()
-        tried = [self.bounds[k] for k in order if sizes[k] > _NONE]
-        tried += [bound for bound in self.bounds if bound.is_time and bound not in tried]
+        candidates = [self.bounds[k] for k in order if sizes[k] > _NOT_RELAXED]
+        candidates += [bound for bound in self.bounds if bound.is_time and bound not in candidates]
         causes: list[Cause] = []
-        for bound in tried[:_TRIED]:
-            alone = self._solved([bound], x, _SINGLE)
+        for bound in candidates[:_MAX_SINGLE]:
+            alone = self._relaxed([bound], x, _ITERATIONS_SINGLE)
             if alone is not None:
-                causes += filter(None, map(self._confirmed, bound.told(alone[0])))
+                causes += filter(None, map(self._confirmed, bound.causes(alone[0])))
         if not any(cause.problem for cause in causes):
             causes += self._stiffness()
         causes.sort(key=lambda cause: cause.problem is None)
         return Search(causes=tuple(causes))
 
-    def _common(self) -> tuple[Array, Array] | None:
-        """A point that meets the program with all bounds relaxed at once, if a start leads to one (see
-        `_solved`).
+    def _all_relaxed(self) -> tuple[Array, Array] | None:
+        """A point that is feasible with all bounds relaxed at once, if an initial guess leads to one (see
+        `_relaxed`).
         """
-        for start in self.starts:
-            found = self._solved(self.bounds, start, _ITERATIONS)
+        for guess in self.guesses:
+            found = self._relaxed(self.bounds, guess, _ITERATIONS_ALL)
             if found is not None:
                 return found
         return None
 
     def _confirmed(self, cause: Cause) -> Cause | None:
-        """A cause whose value makes the problem solvable from a plain start; of a time where the least one
-        does not, one nearer to usual ones. None if it does not; one that may not be is as it is.
+        """A cause whose value makes the problem solvable from its initial guess; None if no value does.
+
+        If the least duration does not, values nearer to a typical one are tried. A cause whose bound may not
+        take the value is returned as it is.
         """
-        for again in range(_TRIES):
-            if cause.problem is None or (again and cause.nearer is None):
+        for attempt in range(_MAX_VALUES):
+            if cause.problem is None or (attempt and cause.nearer is None):
                 break
-            one = cause if not again or cause.nearer is None else cause.nearer(again / _TRIES)
+            one = cause if not attempt or cause.nearer is None else cause.nearer(attempt / _MAX_VALUES)
             if one.problem is None:
                 break
             t = program_for(self.t, one.problem)
-            self._iterations += _PLAIN
-            if self._run(t.program, first_iterate(t), _PLAIN) is not None:
+            self._iterations += _ITERATIONS_CHANGED
+            if self._run(t.program, first_iterate(t), _ITERATIONS_CHANGED) is not None:
                 return replace(one, nearer=None)
         return replace(cause, nearer=None) if cause.problem is None else None
 
     def _stiffness(self) -> Iterator[Cause]:
-        """A contact as stiff as it would have to be: what no bound says, and is found by trying."""
+        """The first contact stiffness with a solution, among multiples of the problem's: no bound of the
+        program contains it.
+        """
         p = self.t.problem
         known = p.law.parameters.get("stiffness")
-        self._iterations = _STIFF * len(_FACTORS)
-        for factor in () if known is None else _FACTORS:
+        self._iterations = _ITERATIONS_STIFFNESS * len(_STIFFNESS_FACTORS)
+        for factor in () if known is None else _STIFFNESS_FACTORS:
             value = float(f"{known * factor:.2g}")
             law: ContactLaw = replace(p.law, stiffness=value)  # type: ignore[type-var]
             new = changed_or_none(p, law=law)
@@ -157,46 +179,49 @@ class _Relaxing:
             if self._budget.left == 0:
                 return
             t = program_for(self.t.with_apart({}), new)
-            if self._run(t.program, first_iterate(t), _STIFF) is not None:
-                words = f"stiffness of the contact: {value:.2g} N/m for {known:.2g} N/m"
-                kind = "a soft contact" if factor > 1 else "a stiff contact"
-                at = changed(self.given, law=law)
-                yield Cause(first=kind, text=f"{words} ([contact] stiffness_N_m)", problem=at)
+            if self._run(t.program, first_iterate(t), _ITERATIONS_STIFFNESS) is not None:
+                yield Cause(
+                    kind="a soft contact" if factor > 1 else "a stiff contact",
+                    text=f"stiffness of the contact: {value:.2g} N/m for {known:.2g} N/m "
+                    "([contact] stiffness_N_m)",
+                    problem=changed(self.given, law=law),
+                )
                 return
 
     def _run(self, program: NonlinearProgram, start: Array, most: int, **more: Any) -> SolverResult | None:
-        """A solver's result after so many iterations at most; None if it is no solution."""
+        """Result of the solver in ``most`` iterations, out of those left; None if it is not a solution."""
         most, left = min(most, self._iterations), self._budget.left
         if not most or left == 0:
             return None
         options = IPMOptions(
             max_iterations=most,
             time_limit=left,
-            kkt_tolerance=_ROUGH,
-            complementarity_tolerance=_ROUGH,
+            kkt_tolerance=_TOLERANCE,
+            complementarity_tolerance=_TOLERANCE,
             **more,
         )
         result = solve_ipm(program, start, options=options, callback=lambda _: self._budget.stop.asked)
         self._iterations -= min(result.iterations, self._iterations)
         return result if result.status.usable else None
 
-    def _meets(self, x: Array) -> bool:
+    def _is_feasible(self, x: Array) -> bool:
         program = self.t.program
-        return max_violation(program, x, program.constraints(x)) <= MET
+        return max_violation(program, x, program.constraints(x)) <= FEASIBLE
 
-    def _solved(self, bounds: Sequence[Bound], start: Array, most: int) -> tuple[Array, Array] | None:
-        """Variables (n,) and how far each of the bounds has moved, at least; None if nothing is found."""
+    def _relaxed(self, bounds: Sequence[Bound], guess: Array, most: int) -> tuple[Array, Array] | None:
+        """Variables (n,) and least relaxations (len(bounds),) that are feasible; None if none are found."""
+        # The relaxation is relative to the problem's own bounds, while durations stay within the loose ones.
         program, own = self.loose.program, self.t.program
         wide = program.x_lower.copy(), program.x_upper.copy()
         program.x_lower, program.x_upper = own.x_lower, own.x_upper
         try:
-            relaxed = RelaxedProgram(program, [bound.relaxation(self.loose) for bound in bounds], start)
+            relaxed = RelaxedProgram(program, [bound.relaxation(self.loose) for bound in bounds], guess)
         finally:
             program.x_lower, program.x_upper = wide
         durations = np.array([j for bound in bounds if bound.is_time for j in bound.variables], dtype=np.intp)
         relaxed.x_lower[durations] = np.maximum(relaxed.x_lower[durations], wide[0][durations])
         relaxed.x_upper[durations] = np.minimum(relaxed.x_upper[durations], wide[1][durations])
-        result = self._run(relaxed, relaxed.start(start, _BARRIER), most, barrier=_BARRIER, push=_PUSH)
+        result = self._run(relaxed, relaxed.start(guess, _BARRIER), most, barrier=_BARRIER, push=_PUSH)
         if result is None:
             return None
         return result.x[: program.n], relaxed.sizes(result.x)
@@ -204,5 +229,6 @@ class _Relaxing:
 
 def _loosened(phase: Phase) -> Phase:
     shortest, longest = phase.duration
-    shortest, longest = min(shortest / _LOOSE, USUAL), max(longest * _LOOSE, USUAL)
+    shortest = min(shortest / _DURATION_FACTOR, TYPICAL_DURATION)
+    longest = max(longest * _DURATION_FACTOR, TYPICAL_DURATION)
     return replace(phase, duration=(max(shortest, SHORTEST), min(longest, LONGEST)))

@@ -1,8 +1,8 @@
-"""The check of a plan's contact: integrated once more from the state at contact, with its events.
+"""Replay of a plan's contact in full dynamics with all events, and the model error of its collision model.
 
-A program has one branch of each force in each phase, and events where its phases end. What it cannot know is
-whether they come there first: whether a board has broken before, a nail starts again, bodies have parted in
-between. So what is solved is followed in full dynamics, by the engine of replays, from its own state at
+A program has one branch of each force in each phase, and one event at each phase's end. It cannot know
+whether another event comes first: a board that breaks earlier, a nail that starts again, bodies that part in
+between. So the contact of a solution is integrated again, by the engine of replays, from its own state at
 contact and under its own reference.
 """
 
@@ -30,7 +30,7 @@ from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.plan import Plan, PlannedStrike, Trajectory
 
 __all__ = [
-    "AGREED",
+    "SOLVED_WITHIN",
     "ContactReplay",
     "ModelError",
     "PlannedContact",
@@ -41,22 +41,25 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-AGREED, REFUTED = 1.0, 5.0  # [%] of the impulse: a plan that is off by more is not solved; is none
-_STEP, _STEPS = 8e-4, 60  # [s] at most; of the planned contact, at least
-_LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that comes back, or goes on, is seen
-_SAMPLED = 1e-3  # [s] of a coasting reference
-# freezes of the SDC that stands for full dynamics
-_OFTEN, _MOST_FREEZES = 8, 64
-_HORIZON = 0.2  # [s] at least, of the collisions that a model is compared in
-_REPORTED_GAP = 1e-3  # of the planned contact's duration: a gap that is reported
+# [%] Largest differences between planned and replayed impulse of a solved, and of an acceptable plan.
+SOLVED_WITHIN, ACCEPTABLE_WITHIN = 1.0, 5.0
+_MAX_STEP, _MIN_STEPS = 8e-4, 60  # of the replay: [s], and steps of the planned contact
+# Length of the replay over that of the planned contact, so that bodies that meet again are seen; and its most
+# where contact lasts.
+_REPLAY_LENGTH, _MAX_REPLAY_LENGTH = 1.5, 4.0
+_SAMPLE_STEP = 1e-3  # [s] of a strike's coasting reference
+# Model errors compare with an SDC frozen at least so often, in place of full dynamics; and at most so often.
+_MIN_FREEZES, _MAX_FREEZES = 8, 64
+_MIN_HORIZON = 0.2  # [s] of the collisions that models are compared in
+_MIN_GAP = 1e-3  # of the planned contact's duration: shorter gaps between touches do not count
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
     """Error of a collision model against full dynamics, at a plan's state at contact.
 
-    impulse_pct : [%], positive where it promises too much.  zmp_mm : largest distance; None where one of them
-    has no ZMP.
+    impulse_pct : [%], positive if the model's impulse is too large.  zmp_mm : largest distance between the
+    ZMPs; None if one of them has no ZMP.
     """
 
     impulse_pct: float
@@ -71,12 +74,12 @@ class ModelError:
 class ContactReplay:
     """A planned contact in full dynamics, from the plan's state at contact.
 
-    planned, impulse [N s] : to the target, as planned and as it is.  peak [N] : largest force.  outcome : of
-    the target, by name and unit.  contact [s] : from the first touch to the end of the last.  events [s] :
-    since contact, when the target has switched, such as a board that breaks.  partings : how often striker
-    and target part and meet again.  planned_partings : how often they are planned to.
-    guards : names of the target's events, in their order.  known [%] : what of `impulse_pct` is reported as
-    the error of the model of the collision.
+    planned, impulse [N s] : to the target, as planned and as replayed.  peak [N] : largest force.
+    outcome : of the target, by name and unit.  contact [s] : from the first touch to the end of the last one.
+    events [s] : times since contact at which the target switches its mode, such as a board that breaks.
+    partings, planned_partings : numbers of times that striker and target part and meet again.
+    guards : names of the target's events, in their order.  known [%] : part of `impulse_pct` that is reported
+        as the model error.
     """
 
     planned: float
@@ -92,19 +95,17 @@ class ContactReplay:
 
     @property
     def unforeseen(self) -> bool:
-        """True if they part more often, or less often, than is planned."""
+        """True if striker and target part more often, or less often, than planned."""
         return self.partings != self.planned_partings
 
     @property
     def impulse_pct(self) -> float:
-        """Planned impulse over that in full dynamics, less one [%]: positive where a plan promises too
-        much.
-        """
+        """Error of the planned impulse against full dynamics [%]; positive if it is too large."""
         return 100 * (self.planned / self.impulse - 1) if self.impulse > 0 else np.inf
 
     @property
     def off(self) -> float:
-        """[%] of the impulse that nothing else tells."""
+        """Difference of the impulses [%] beyond the reported model error."""
         return abs(self.impulse_pct - self.known)
 
     def __str__(self) -> str:
@@ -114,12 +115,12 @@ class ContactReplay:
             times = "once" if self.partings == 1 else f"{self.partings} times"
             contacts = f"{self.planned_partings + 1} touches" if self.planned_partings else "one contact"
             return (
-                f"striker and target part and meet again {times} within the blow, which is planned as "
+                f"striker and target part and meet again {times} within the impact, which is planned as "
                 f"{contacts}: {off}, and the largest force is {self.peak:.0f} N, whatever is planned"
             )
         names = [self.guards[k % len(self.guards)] for k in range(len(self.events))] if self.guards else []
-        told = [f"{name} at {1e3 * t:.3g} ms" for name, t in zip(names, self.events, strict=False)]
-        when = f" (the target's events: {', '.join(told)})" if told else ""
+        events = [f"{name} at {1e3 * t:.3g} ms" for name, t in zip(names, self.events, strict=False)]
+        when = f" (the target's events: {', '.join(events)})" if events else ""
         return (
             "the contact, followed in full dynamics from the plan's state at contact, lasts "
             f"{1e3 * self.contact:.3g} ms{when}: {off}"
@@ -128,9 +129,9 @@ class ContactReplay:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedContact:
-    """The contact of a plan or a strike, with what comes of it in full dynamics once that is asked for.
+    """The contact of a plan or a strike, and its replay, which runs on first access.
 
-    model_error : estimated one of the model of the collision; None where nothing is frozen in it.
+    model_error : of the collision model, estimated; None if the model freezes nothing.
     """
 
     problem: ImpactProblem
@@ -139,14 +140,14 @@ class PlannedContact:
 
     @cached_property
     def reference(self) -> Trajectory:
-        """The servo's; of a strike, one that coasts."""
+        """Reference of the servo; a strike's coasts."""
         if isinstance(self.planned, Plan):
             return self.planned.reference
         return _coasting(self.problem, self.planned)
 
     @cached_property
     def replay(self) -> ContactReplay | None:
-        """None of an impact without duration, and where the motion cannot be followed."""
+        """Replay of the contact; None for an impact without duration, and where legs do not reach."""
         problem, planned = self.problem, self.planned
         duration = planned.compression + planned.restitution
         if not problem.lasts or not duration > 0:
@@ -156,18 +157,18 @@ class PlannedContact:
                 problem.robot,
                 self.reference,
                 scene_of(problem),
-                step=min(_STEP, duration / _STEPS),
-                # a strike has no motion that takes the striker away
-                until=duration * (_LONGER if isinstance(planned, Plan) else 1.0),
-                longest=_LONGEST * duration,
+                step=min(_MAX_STEP, duration / _MIN_STEPS),
+                # a strike plans no motion after contact that moves the striker away
+                until=duration * (_REPLAY_LENGTH if isinstance(planned, Plan) else 1.0),
+                longest=_MAX_REPLAY_LENGTH * duration,
             )
-        except InputError:  # legs that do not reach
+        except InputError:  # legs out of reach
             return None
         known = 0.0 if self.model_error is None else self.model_error.impulse_pct
-        return _told(problem, planned, found, known)
+        return _contact_replay(problem, planned, found, known)
 
 
-def _told(
+def _contact_replay(
     problem: ImpactProblem, planned: Plan | PlannedStrike, found: Followed, known: float
 ) -> ContactReplay:
     duration = planned.compression + planned.restitution
@@ -179,7 +180,7 @@ def _told(
         outcome=found.outcome,
         contact=found.touches[-1][1] - found.touches[0][0] if found.touches else 0.0,
         events=found.events,
-        partings=sum(gap > _REPORTED_GAP * duration for gap in gaps),
+        partings=sum(gap > _MIN_GAP * duration for gap in gaps),
         planned_partings=problem.planned_touches - 1,
         guards=problem.target.guards,
         known=known,
@@ -187,32 +188,34 @@ def _told(
 
 
 def checked(result: SolverResult, replay: ContactReplay | None) -> SolverResult:
-    """A result whose contact is what it says, as it is; else not a solved one, or none at all."""
-    if replay is None or not result.status.usable or replay.off <= AGREED:
+    """The result itself if its replay agrees; else acceptable or failed, by the impulses' difference."""
+    if replay is None or not result.status.usable or replay.off <= SOLVED_WITHIN:
         return result
     off, message = replay.off, f"The planned contact is off by {replay.off:.2g} %: {replay}."
-    if off <= REFUTED:
+    if off <= ACCEPTABLE_WITHIN:
         return replace(result, status=Status.ACCEPTABLE, message=message)
-    # counted as a violation, so that other guesses rank before it (`rank_of`), and `Outcome.refused` knows it
+    # Counted as a violation, so that results of other guesses rank before it (`rank_of`), and
+    # `Outcome.refused` tells it from violated constraints.
     worst = max(result.max_violation, min(off / 100, 1.0), 2 * VIOLATED)
     return replace(result, status=Status.FAILED, max_violation=worst, message=message)
 
 
 def _coasting(problem: ImpactProblem, strike: PlannedStrike) -> Trajectory:
-    """The reference of a strike: it goes on at the rates at contact, as a plan's does while contact lasts.
+    """Reference of a strike: it continues at the rates at contact, as a plan's does during contact.
 
     Raises
     ------
-    InputError : legs that do not reach.
+    InputError : legs out of reach.
     """
-    c, longest = problem.coordinates, _LONGEST * (strike.compression + strike.restitution)
+    c, longest = problem.coordinates, _MAX_REPLAY_LENGTH * (strike.compression + strike.restitution)
     y, legs = c.split(strike.posture)
-    rates, still = independent_rates(c, y, strike.velocity), np.zeros(c.ny)
-    times, rows = np.linspace(0.0, longest, max(2, round(longest / _SAMPLED) + 1)), []
+    rates, zero = independent_rates(c, y, strike.velocity), np.zeros(c.ny)
+    times, samples = np.linspace(0.0, longest, max(2, round(longest / _SAMPLE_STEP) + 1)), []
     for t in times:
         legs = c.solve_legs(y + rates * t, legs)
-        rows.append(c.complete_motion(y + rates * t, rates, still, legs))
-    q, v, a = (np.array(column) for column in zip(*[rows[0], *rows], strict=True))
+        samples.append(c.complete_motion(y + rates * t, rates, zero, legs))
+    # the first sample stands twice: in the phase before contact (0), and in contact (1)
+    q, v, a = (np.array(column) for column in zip(*[samples[0], *samples], strict=True))
     return Trajectory(
         time=np.concatenate([[0.0], times]),
         phase=np.array([0] + [1] * len(times)),
@@ -231,8 +234,9 @@ def _coasting(problem: ImpactProblem, strike: PlannedStrike) -> Trajectory:
 def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = None) -> ModelError | None:
     """Error of a program's collision model against full dynamics, for solver variables (n,).
 
-    problem : whose model it is, if not the program's problem's.
-    None where nothing is frozen; for an impact with a given restitution; and where a contact has no end.
+    problem : the one with the model; None: the program's.
+    The result is None for full dynamics, for an impact with a given restitution, and if a contact does not
+    end.
     """
     problem, c = problem or t.problem, t.coordinates
     if problem.collision in ("full", "auto", "rigid"):
@@ -246,7 +250,7 @@ def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = Non
 def planned_contact(
     t: ContactProgram, x: Array, planned: Plan | PlannedStrike, problem: ImpactProblem | None = None
 ) -> PlannedContact:
-    """The contact that a program plans at solver variables (n,); ``problem``: as of `model_error`."""
+    """Planned contact of a program at solver variables (n,); ``problem``: as of `model_error`."""
     error = model_error(t, x, problem)
     return PlannedContact(problem=problem or t.problem, planned=planned, model_error=error)
 
@@ -254,18 +258,23 @@ def planned_contact(
 def collision_error(
     problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: float
 ) -> ModelError | None:
-    """Model error for a collision of about this duration [s]."""
+    """Error of a problem's collision model against the often frozen SDC, for a collision of about this
+    duration [s] that begins at q (nq,) and v (nv,) with the feed-forward ``torque`` (n,) [N m].
+
+    None if a contact does not end.
+    """
     names = ("robot", "striker", "normal", "law", "target", "stance")
     scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
-    scene["horizon"] = max(_HORIZON, 4 * duration)
+    scene["horizon"] = max(_MIN_HORIZON, 4 * duration)
     own = frozen_model(problem.collision, problem.freezes, **scene)
-    often = min(max(_OFTEN, 4 * problem.freezes), _MOST_FREEZES)
+    freezes = min(max(_MIN_FREEZES, 4 * problem.freezes), _MAX_FREEZES)
     try:
-        bend: dict[str, Any] = {**coasting_reference(problem.coordinates, q, v, until=2 * duration)}
-        known = {name: x for name, x in bend.items() if name in own.settings}
-        alone = own.collide(q, v, torque, **known)
-        full = frozen_model("sdc", often, **scene).collide(q, v, torque, **bend)
+        reference: dict[str, Any] = {**coasting_reference(problem.coordinates, q, v, until=2 * duration)}
+        # the coarser models have no settings for all of the reference
+        known = {name: x for name, x in reference.items() if name in own.settings}
+        coarse = own.collide(q, v, torque, **known)
+        full = frozen_model("sdc", freezes, **scene).collide(q, v, torque, **reference)
     except InputError:  # a contact that does not end
         return None
-    told = errors_against(alone, full)
-    return ModelError(impulse_pct=float(told["impulse_error_pct"] or 0.0), zmp_mm=told["zmp_error_mm"])
+    errors = errors_against(coarse, full)
+    return ModelError(impulse_pct=float(errors["impulse_error_pct"] or 0.0), zmp_mm=errors["zmp_error_mm"])

@@ -22,22 +22,23 @@ from impactopt.transcription.contact_guess import Parting, fastest_at_contact, p
 from impactopt.transcription.contact_program import ContactProgram
 
 Array = NDArray[np.float64]
-TOLD = 3  # margins at most, in a message
+MAX_NAMED = 3  # margins in a message
 
 
-def second_look(budget: Budget, program: NonlinearProgram, start: Array, old: SolverResult) -> SolverResult:
-    """The result that IPOPT comes to from the same start, where ours gave up, if it says more.
+def ipopt_retry(budget: Budget, program: NonlinearProgram, start: Array, old: SolverResult) -> SolverResult:
+    """Result of IPOPT from the same initial guess, if our solver has failed without a diagnosis and IPOPT's
+    result is better; else the old result.
 
-    It scales constraints, and restores them by another way, so it rarely fails on the same programs. A limit
-    that the caller has set is an answer, and stays one.
+    IPOPT scales constraints, and has another restoration phase, so it rarely fails on the same programs. A
+    limit that the caller has set is a diagnosis.
     """
-    open_end = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
-    if budget.solver == "ipopt" or not open_end or budget.left == 0:
+    undiagnosed = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
+    if budget.solver == "ipopt" or not undiagnosed or budget.left == 0:
         return old
-    rows = max_violation(program, old.x, program.constraints(old.x))
-    if old.status is Status.FAILED and rows <= VIOLATED < old.max_violation:
-        return old  # it has been refused for what is no constraint
-    budget.say("our solver ends without a diagnosis: IPOPT tries once, from the same start")
+    violation = max_violation(program, old.x, program.constraints(old.x))
+    if old.status is Status.FAILED and violation <= VIOLATED < old.max_violation:
+        return old  # its constraints are met: it was refused for a penetration or its replay
+    budget.say("our solver ends without a diagnosis: IPOPT tries once, from the same initial guess")
     new = replace(budget, solver="ipopt", options=None).run(program, start)
     if new.status is Status.INTERRUPTED or _rank(new) < _rank(old):
         return new
@@ -45,11 +46,11 @@ def second_look(budget: Budget, program: NonlinearProgram, start: Array, old: So
 
 
 def _rank(result: SolverResult) -> tuple[bool, bool, float]:
-    """Solutions first, then what has a diagnosis, then what is least violated."""
+    """Sorting key: solutions first, then diagnosed results, then by the violation."""
     return not result.status.usable, result.status is not Status.INFEASIBLE, result.max_violation
 
 
-def lacks_rows(t: ContactProgram, result: SolverResult) -> bool:
+def ended_with_violations(t: ContactProgram, result: SolverResult) -> bool:
     """True if a solver has ended by itself with violated constraints."""
     if result.status not in (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT):
         return False
@@ -59,12 +60,12 @@ def lacks_rows(t: ContactProgram, result: SolverResult) -> bool:
 def with_reason(
     t: ContactProgram, result: SolverResult, causes: Sequence[Cause] = (), *, known: Sequence[str] = ()
 ) -> SolverResult:
-    """A result without a solution, and why there is none: what is ``known`` of the problem anyway, a bound
-    that would have to move, or what a blow of point masses says.
+    """A failed result, with the reason that the problem is infeasible in its message and status: reasons
+    ``known`` beforehand, a bound that would have to change, or an estimate by colliding point masses.
 
-    Such a program is infeasible, whatever its solver ended with.
+    Results that end otherwise, and those without a reason, are returned as they are.
     """
-    if not lacks_rows(t, result):
+    if not ended_with_violations(t, result):
         return result
     would_do = [cause for cause in causes if cause.problem is not None]
     weak = too_weak(t.problem)
@@ -72,63 +73,68 @@ def with_reason(
         why = f"Infeasible: {'; '.join(known)}."
     elif would_do:
         first, *others = would_do
-        why = f"Infeasible: {first.first}. {first.text} would do, with all else as it is"
+        why = f"Infeasible: {first.kind}. {first.text} would do, with all else as it is"
         why += "".join(f"; or {other.text}" for other in others) + "."
-        # what point masses say is of the contact alone, and not always of what keeps a plan from being
-        masses = (_too_stiff(t) or _too_long(t)) if "contact" in first.first else ""
+        # the point masses explain the contact only, which need not be what makes the problem infeasible
+        masses = (_too_stiff(t) or _too_soft(t)) if "contact" in first.kind else ""
         why += "".join(f" Besides, {text}." for text in (weak, masses) if text)
     else:
-        beyond = [f"{cause.first}: {cause.text}, which may not be" for cause in causes]
-        found = weak or _too_stiff(t) or _too_long(t) or "".join(beyond[:1])
+        not_allowed = [f"{cause.kind}: {cause.text}, which is not allowed" for cause in causes]
+        found = weak or _too_stiff(t) or _too_soft(t) or "".join(not_allowed[:1])
         if not found:
             return result
         why = f"Infeasible: {found}."
+    # the solver's first sentence says how it ended, which the reason replaces
     rest = result.message.partition(". ")[2] or result.message
     return replace(result, status=Status.INFEASIBLE, message=f"{why} {rest}")
 
 
 def with_soles_kept(solution: Solution) -> Solution:
-    """A solution whose soles keep at least half of each margin between its program's nodes, too; one of which
-    some keeps less is acceptable at best, and says so.
+    """The solution itself if its soles keep at least half of each margin between nodes, too; else with the
+    status acceptable, and a message that names the margins.
     """
     if solution.status is not Status.SOLVED:
         return solution
-    with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
+    with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it
         if short := shortfalls(solution.sole_margins()):
-            message = f"A sole keeps less than half of a margin between nodes: {'; '.join(short[:TOLD])}."
+            message = (
+                f"A sole keeps less than half of a margin between nodes: {'; '.join(short[:MAX_NAMED])}."
+            )
             result = replace(solution.result, status=Status.ACCEPTABLE, message=message)
             return replace(solution, result=result)
     return solution
 
 
 def _too_stiff(t: ContactProgram) -> str:
-    """The target's last event does not happen in one contact, however fast the robot is."""
+    """Message that the target's last event does not happen in one contact, even at the largest speed that the
+    joints allow; "" if it may.
+    """
     p = t.problem
     if not isinstance(t.expected, Collision) or not p.target.guards or p.planned_touches > 1:
         return ""
     limit = fastest_at_contact(p)
     found = parting(p.law, p.target, t.hit.mass, limit)
-    return "" if found is None else _told(found, limit, fixed=bool(met_once(p)))
+    return "" if found is None else _parting_message(found, limit, one_touch=bool(met_once(p)))
 
 
-def _told(found: Parting, limit: float, *, fixed: bool) -> str:
-    """fixed : whether a plan can have one touch only."""
-    words = (
+def _parting_message(found: Parting, limit: float, *, one_touch: bool) -> str:
+    """limit [m/s] : largest speed.  one_touch : whether a plan can have one touch only."""
+    message = (
         f"one contact is not enough: even at {limit:.2g} m/s, the most that the joints allow, point masses "
         f"as heavy as striker and target separate {1e3 * found.time:.2g} ms after they touch, before the "
         f"target's {found.event!r}"
     )
-    if found.touches is not None and not fixed:
-        words += f"; `[collision] touches = {found.touches}` plans them"
+    if found.touches is not None and not one_touch:
+        message += f"; `[collision] touches = {found.touches}` plans them"
     if found.needed is not None:
-        words += f"; {found.needed:.2g} m/s would be enough"
+        message += f"; {found.needed:.2g} m/s would be enough"
     if found.stiffness is not None:
-        words += f"; a contact stiffness of {found.stiffness:.1g} would do"
-    return words
+        message += f"; a contact stiffness of {found.stiffness:.1g} would do"
+    return message
 
 
-def _too_long(t: ContactProgram) -> str:
-    """A blow of point masses takes longer than the contact may last."""
+def _too_soft(t: ContactProgram) -> str:
+    """Message that an impact of point masses takes longer than the contact may last; "" if it does not."""
     longest = t.problem.contact_duration[1]
     if not isinstance(t.expected, Collision) or t.expected.natural <= longest:
         return ""

@@ -1,4 +1,6 @@
-"""Gains that a plan has chosen: from a program with them as variables to that of a robot that has them."""
+"""Servo gains as variables of a plan: programs that choose gains, and the program of the robot with the
+chosen ones.
+"""
 
 from __future__ import annotations
 
@@ -17,19 +19,27 @@ from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.contact_program import ContactProgram
 
-__all__ = ["ChosenGains", "chosen_of", "roomy", "settled", "with_chosen", "with_factors_of"]
+__all__ = [
+    "ChosenGains",
+    "chosen_gains",
+    "with_chosen",
+    "with_factors_of",
+    "with_gains_fixed",
+    "with_room_for_gains",
+]
 
 Array = NDArray[np.float64]
-_BARRIER = 1e-7  # of the settled program, whose start is a solution
-_AT_BOUND = 1e-3  # of a factor's logarithm
+_BARRIER = 1e-7  # first one of the program with fixed gains, whose initial guess is a solution
+_AT_BOUND = 1e-3  # largest distance of a factor's logarithm from its bound's that counts as at it
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenGains:
     """Servo gains that a plan has chosen for a `GainFactor`.
 
-    joints : their names.  factor : on their stiffness; its root is that on their damping.  between : (least,
-    largest) that it might be.  stiffness [N m/rad], damping [N m s/rad] : by joint, as chosen.
+    joints : their names.  factor : of their stiffness; that of their damping is its square root.
+    between : bounds (least, largest) of the factor.  stiffness [N m/rad], damping [N m s/rad] : by joint, as
+    chosen.
     """
 
     joints: tuple[str, ...]
@@ -39,8 +49,8 @@ class ChosenGains:
     damping: dict[str, float]
 
     @classmethod
-    def told(cls, summary: Mapping[str, Any]) -> ChosenGains:
-        """Reads the gains back from their `summary`."""
+    def from_summary(cls, summary: Mapping[str, Any]) -> ChosenGains:
+        """Gains of which this is the `summary`."""
         least, largest = summary["between"]
         return cls(
             joints=tuple(summary["joints"]),
@@ -67,8 +77,8 @@ class ChosenGains:
         }
 
 
-def roomy(problem: ImpactProblem) -> ImpactProblem:
-    """The same for a program that chooses gains: its robot's springs have room for the stiffest."""
+def with_room_for_gains(problem: ImpactProblem) -> ImpactProblem:
+    """Problem whose robot has room for the stiffest gains that its program may choose (`gains.with_room`)."""
     if not problem.gains:
         return problem
     names, each = problem.robot.joint_names, zip(problem.gain_joints, problem.gains, strict=True)
@@ -77,8 +87,8 @@ def roomy(problem: ImpactProblem) -> ImpactProblem:
 
 
 def with_chosen(problem: ImpactProblem, factors: Sequence[float]) -> ImpactProblem:
-    """A problem whose robot has gains with these factors in place of those that it leaves open; itself if it
-    leaves none.
+    """Problem whose robot has gains with these factors (len(problem.gains),) in place of the open ones;
+    itself if it has no open gains.
     """
     if not problem.gains:
         return problem
@@ -88,26 +98,32 @@ def with_chosen(problem: ImpactProblem, factors: Sequence[float]) -> ImpactProbl
 
 
 def with_factors_of(t: ContactProgram, robot: Robot, start: SolverResult) -> SolverResult:
-    """A start of a program that chooses gains, with those of the robot that it is of, where bounds let it."""
+    """Initial guess of a program that chooses gains, from a solution of the same robot with other gains: with
+    these as its choice, within their bounds.
+
+    robot : of the solution.  start : the solution, mapped to the program.
+    """
     own, logs = t.problem.robot, []
     for joints, gain in zip(t.problem.gain_joints, t.problem.gains, strict=True):
-        there = np.array([robot.kp[k] / own.kp[k] for k in joints if own.kp[k] > 0])
-        factor = float(np.median(there)) if there.size and np.all(there > 0) else 1.0
+        ratios = np.array([robot.kp[k] / own.kp[k] for k in joints if own.kp[k] > 0])
+        factor = float(np.median(ratios)) if ratios.size and np.all(ratios > 0) else 1.0
         logs.append(np.log(np.clip(factor, *gain.factor)))
-    start = _in_torques_of(t, robot, start)
+    start = _with_rescaled_torques(t, robot, start)
     t.hit.contact.gains.write(start.x, logs)
     return start
 
 
-def _in_torques_of(t: ContactProgram, robot: Robot, start: SolverResult) -> SolverResult:
-    """A start of a program that is of the same robot but for torque limits, which its torques are over."""
+def _with_rescaled_torques(t: ContactProgram, robot: Robot, start: SolverResult) -> SolverResult:
+    """Initial guess with the torques of a solution for a robot with other torque limits, by which the torque
+    variables are scaled.
+    """
     x = start.x.copy()
     t.feedforward.write(x, t.feedforward.read(x) * robot.torque_limit / t.robot.torque_limit)
     return replace(start, x=t.with_lifted(x))
 
 
-def chosen_of(t: ContactProgram, x: Array) -> tuple[ChosenGains, ...]:
-    """Gains that variables (n,) choose for what the problem leaves open."""
+def chosen_gains(t: ContactProgram, x: Array) -> tuple[ChosenGains, ...]:
+    """Gains that solver variables (n,) choose for the problem's open ones."""
     if not t.problem.gains:
         return ()
     factors = np.exp(t.hit.contact.gains.read(x)[0])
@@ -124,19 +140,21 @@ def chosen_of(t: ContactProgram, x: Array) -> tuple[ChosenGains, ...]:
     )
 
 
-def settled(outcome: Outcome[Program], chosen: Sequence[ChosenGains], budget: Budget) -> Outcome[Program]:
-    """Outcome of the program of the robot with the gains that a solution has chosen.
+def with_gains_fixed(
+    outcome: Outcome[Program], chosen: Sequence[ChosenGains], budget: Budget
+) -> Outcome[Program]:
+    """Outcome of the program of the robot with the chosen gains, fixed.
 
-    Where gains are best, the same motion is best for them as they are: it is solved once more from there, to
-    be so to the last digit. What comes after, such as replays, knows of no choice.
+    At the best gains the motion is optimal for fixed gains, too. So this program is solved from there, which
+    refines the solution, and all that follows, such as replays, sees a robot with its gains.
     """
     if not chosen:
         return outcome
     t, old = outcome.program, outcome.result
-    words = "; ".join(f"{', '.join(c.joints)} x {c.factor:.3g}" for c in chosen)
-    budget.say(f"gains are chosen: {words}; on with these")
+    factors = "; ".join(f"{', '.join(c.joints)} x {c.factor:.3g}" for c in chosen)
+    budget.say(f"gains are chosen: {factors}; solving again with these fixed")
     new = program_for(t, with_chosen(t.problem, [c.factor for c in chosen]))
-    result = _in_torques_of(new, t.robot, carried(new, t, old))
+    result = _with_rescaled_torques(new, t.robot, carried(new, t, old))
     if old.status.usable and budget.left != 0:
         polished = budget.near_by().run(new.program, result, _BARRIER)
         if polished.status.usable:

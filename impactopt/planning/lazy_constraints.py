@@ -1,4 +1,6 @@
-"""Lazy constraints of gear loads, slide and reference, where a plan without them breaks them; cautions."""
+"""Lazy constraints of gear loads, slide and servo reference, which enter once a solution violates them; and
+warnings about such violations.
+"""
 
 from __future__ import annotations
 
@@ -29,60 +31,61 @@ __all__ = [
     "LazyTerms",
     "gear_caution",
     "gears_beyond",
+    "lazy_terms_of",
     "reference_beyond",
-    "rows_on_demand",
     "slide",
     "slide_caution",
     "slides_beyond",
     "window_caution",
-    "with_rows",
+    "with_lazy_constraints",
 ]
 
-REPLAYED = 0.1  # beyond what gears may bear: replays of a plan that keeps to it stay within this
-FAR = 0.15  # [m] across the target's face: a plan that slides so far is reported so
-INSTANTS = 9  # of the contact
-BEYOND = 1e-3  # [rad] of a reference out of its range: no more than a mesh leaves it
-MORE = 0.03  # of what it may be: no more than a mesh leaves it
-_AT = 1e-3  # of the bound: so near is at it
-_COSTLY = 0.1  # of the objective, for a window twice as long and to first order: what is said
+# Tolerances beyond a limit. In replays of a plan that keeps its gear limits, loads stay within the first one
+# (of the limit). The others are what a plan with constraints exceeds between its nodes.
+REPLAY_GEAR_TOLERANCE = 0.1
+REFERENCE_TOLERANCE = 1e-3  # [rad]
+SLIDE_TOLERANCE = 0.03  # of the limit
+FAR = 0.15  # [m] across the target's face: a longer slide gets a warning
+CONTACT_SAMPLES = 9  # instants of the contact at which the slide is measured
+_AT_BOUND = 1e-3  # of a duration's bound: nearer ones are at it
+# A contact window gets a warning if twice its length gains this part of the objective, to first order.
+_COSTLY = 0.1
 
 
 def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: float = GEAR) -> str:
-    """The gear that bears most beyond what a problem lets it, in words; "" if none does.
+    """Message with the gear whose load is farthest beyond its limit; "" if none is beyond the tolerance.
 
-    more : by so much at least, of what it may bear. Rows would keep it within 3 % between the program's
-    points.
+    more : tolerance, of the limit. The default of 3 % is what constraints leave between the program's nodes.
     """
     most = problem.gear_load.most(problem.robot)
-    worst, said = 1.0 + more, ""
+    worst, message = 1.0 + more, ""
     for loads in found:
-        share = np.nan_to_num(loads.gear / most)
-        k = int(share.argmax())
-        if share[k] > worst:
+        ratio = np.nan_to_num(loads.gear / most)
+        k = int(ratio.argmax())
+        if ratio[k] > worst:
             of_limit = f"{loads.gear[k]:.3g} times its torque limit, which may be {most[k]:.3g}"
-            worst, said = share[k], f"gear of {loads.joints[k]}: {of_limit}"
-    return said
+            worst, message = ratio[k], f"gear of {loads.joints[k]}: {of_limit}"
+    return message
 
 
 def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> dict[str, str]:
     """Warning about overloaded gears, for a plan that permits them or for replays; {} if there are none."""
     loads = [one for one in found if one is not None]
     if problem.gear_load.active:
-        text = gears_beyond(problem, loads, more=REPLAYED)
+        text = gears_beyond(problem, loads, more=REPLAY_GEAR_TOLERANCE)
         return {"gear_caution": f"{text}, more than it may"} if text else {}
     beyond = [text for one in loads if (text := one.beyond_peak())]
     return {"gear_caution": beyond[0]} if beyond else {}
 
 
 def slide(problem: ImpactProblem, plan: Plan) -> float:
-    """[m] across the normal that the striking point goes while the contact lasts, as planned."""
+    """Largest distance [m] of the striking point, across the normal, from where contact begins."""
     if len(plan.collision.time) < 2 or plan.collision.time[-1] <= 0:
         return 0.0
-    postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, INSTANTS)))
-    places = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
-    way = places - places[0]
-    aside = way @ across(problem.normal).T
-    return float(np.linalg.norm(aside, axis=1).max())
+    postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, CONTACT_SAMPLES)))
+    points = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
+    tangential = (points - points[0]) @ across(problem.normal).T
+    return float(np.linalg.norm(tangential, axis=1).max())
 
 
 def slides_beyond(term: Slide, plan: Plan) -> str:
@@ -91,9 +94,9 @@ def slides_beyond(term: Slide, plan: Plan) -> str:
     """
     problem = plan.problem
     after = plan.closed(plan.through_contact(np.ones(1)))[0]
-    away = striking_point(problem.robot, problem.striker, after) - problem.point
-    far = float(np.abs(across(problem.normal) @ away).max())
-    if far <= (1 + MORE) * term.most:
+    offset = striking_point(problem.robot, problem.striker, after) - problem.point
+    far = float(np.abs(across(problem.normal) @ offset).max())
+    if far <= (1 + SLIDE_TOLERANCE) * term.most:
         return ""
     most = f"which may be {1e3 * term.most:.0f} mm"
     return f"the striking point slides {1e3 * far:.0f} mm across the target, {most}"
@@ -104,11 +107,12 @@ def reference_beyond(term: ReferenceRange, plan: Plan) -> str:
     than a tolerance.
     """
     reference, robot = plan.reference, plan.problem.robot
-    angles = robot.joint_positions(reference.q[reference.phase == 1][-1:])  # where it has gone farthest
+    # it coasts at constant rates during contact, so it is farthest at the end
+    angles = robot.joint_positions(reference.q[reference.phase == 1][-1:])
     lower, upper = term.limits(robot)
     beyond = np.maximum(lower - angles, angles - upper).max(axis=0)
     k = int(beyond.argmax())
-    if beyond[k] <= BEYOND:
+    if beyond[k] <= REFERENCE_TOLERANCE:
         return ""
     return f"the servo's reference of {robot.joint_names[k]} coasts {beyond[k]:.3f} rad beyond its range"
 
@@ -124,9 +128,9 @@ def slide_caution(length: float) -> str:
 
 
 def window_caution(t: Transcription, result: SolverResult) -> str:
-    """Warning about a contact that ends because it may not last longer; "" if none does.
+    """Warning about a contact whose duration is at its bound, if the bound limits the objective; else "".
 
-    The price is the multiplier of the bound times the bound.
+    The gain of a window twice as long is, to first order, the multiplier of the bound times the bound.
     """
     longest = t.problem.contact_duration[1]
     objective = abs(
@@ -138,8 +142,7 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
             continue
         for phase, group in zip(t.problem.contact_phases, hit.T, strict=True):
             j = group.offset
-            if result.x[j] * group.scale[0] >= (1 - _AT) * longest:
-                # multiplier: slope of the objective by the bound; a window twice as long moves it by itself
+            if result.x[j] * group.scale[0] >= (1 - _AT_BOUND) * longest:
                 price += max(float(result.bound_multipliers[j]), 0.0) * float(result.x[j])
                 named.append(phase.name)
     if not named or objective <= 0 or price < _COSTLY * objective:
@@ -147,25 +150,29 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
     share = 100 * min(price / objective, 9.99)
     return (
         f"The contact's {' and '.join(dict.fromkeys(named))} takes all the time that [collision] duration_s "
-        f"leaves it, {1e3 * longest:.3g} ms, and that bound is costly: twice as long gains {share:.0f} % of "
+        f"allows, {1e3 * longest:.3g} ms, and that bound is costly: twice as long gains {share:.0f} % of "
         "the objective, to first order. Give it longer, unless this is to be a blow and not a push."
     )
 
 
-_BARRIER = 1e-2  # a plan within such limits is another one: at a low barrier the way there is a crawl
-_OTHER = 0.5  # beyond what a gear may bear: the motion within it is another one, and a warm start a detour
+# First barrier after lazy constraints have entered: the new solution is far, and progress towards it is slow
+# at a low barrier.
+_BARRIER = 1e-2
+# Excess over a gear limit (of it) from which the initial guess is tried before the warm start: the motion
+# within the limit is a different one.
+_FAR_BEYOND = 0.5
 _KINDS: dict[str, type[Term]] = {snake_case(type(term).__name__): type(term) for term in ON_DEMAND_TERMS}
 
 
-def rows_on_demand(problem: ImpactProblem) -> tuple[str, ...]:
+def lazy_terms_of(problem: ImpactProblem) -> tuple[str, ...]:
     """Names, as in files, of the lazy terms whose constraints a problem's programs have from the start."""
     own = {type(term) for term in problem.active_terms}
     return tuple(name for name, kind in _KINDS.items() if kind in own)
 
 
-def with_rows(problem: ImpactProblem, names: Iterable[str]) -> ImpactProblem:
-    """The same with the constraints of these lazy terms from the start; itself if it has them, or has
-    switched them off.
+def with_lazy_constraints(problem: ImpactProblem, names: Iterable[str]) -> ImpactProblem:
+    """Problem with the constraints of these lazy terms from the start; itself if it has them, or has switched
+    them off.
     """
     kinds = [_KINDS[name] for name in names if name in _KINDS and problem.extra(_KINDS[name]) is None]
     if not kinds:
@@ -174,24 +181,24 @@ def with_rows(problem: ImpactProblem, names: Iterable[str]) -> ImpactProblem:
 
 
 class LazyTerms(Generic[Program]):
-    """Oracle for terms that hold in every problem and get constraints once a solution breaks them.
+    """Oracle for the terms of every problem that get constraints once a solution violates them.
 
-    report : called with a line of text.  finer : whether gears are checked at more instants of the contact
-    than the program's, where these are known.
+    report : called with a line of text.  finer : check gears on the finer contact of the error estimate,
+    where there is one.
     """
 
-    most = len(_KINDS)  # constraints of one may break another
+    most = len(_KINDS)  # rounds: the constraints of one term may lead to a violation of another
 
     def __init__(self, report: Callable[[str], None] | None = None, *, finer: bool = True) -> None:
         self._report, self._finer = report, finer
 
     def missing(self, outcome: Outcome[Program]) -> Additions[Program] | None:
-        """Constraints of the lazy terms that a solution breaks."""
-        broken = self._broken(outcome)
-        if not broken:
+        """Constraints of the lazy terms that a solution violates."""
+        violated = self._violated(outcome)
+        if not violated:
             return None
         t, origin = outcome.program, outcome.origin
-        bounded, said = with_rows(t.problem, broken), "; ".join(broken.values())
+        bounded, violations = with_lazy_constraints(t.problem, violated), "; ".join(violated.values())
 
         def warm() -> Guess[Program]:
             new = program_for(t, bounded, report=self._report)
@@ -201,33 +208,34 @@ class LazyTerms(Generic[Program]):
             new = program_for(origin.program, bounded, constraints={}, report=self._report)
             return Guess(program=new, start=start_of(new, origin.program, origin.x))
 
-        far = "gear_load" in broken and gears_beyond(t.problem, self._gears(outcome), more=_OTHER)
-
+        far = "gear_load" in violated and gears_beyond(t.problem, self._gears(outcome), more=_FAR_BEYOND)
+        sections = ", ".join(f"[terms.{name}]" for name in violated)
         return Additions(
             name="lazy constraints",
-            why=f"{said}: on with constraints of {', '.join(_KINDS[name].name for name in broken)}",
+            why=f"{violations}: solving again with constraints of "
+            f"{', '.join(_KINDS[name].name for name in violated)}",
             guesses=(guess() for guess in ((cold, warm) if far else (warm, cold))),
-            without=f"Without {', '.join(f'[terms.{name}]' for name in broken)} there is a plan, but {said}.",
+            without=f"Without {sections} there is a plan, but {violations}.",
         )
 
-    def _broken(self, outcome: Outcome[Program]) -> dict[str, str]:
-        """Violations of lazy terms that have no constraints yet: message by name of the term."""
+    def _violated(self, outcome: Outcome[Program]) -> dict[str, str]:
+        """Messages of the violated lazy terms that have no constraints yet, by name of the term."""
         problem, planned = outcome.program.problem, outcome.at.planned
-        has, out = rows_on_demand(problem), dict[str, str]()
+        has, out = lazy_terms_of(problem), dict[str, str]()
         for name, kind in _KINDS.items():
             term = problem.term(kind)
             if name in has or term not in problem.on_demand:
                 continue
-            words = ""
+            message = ""
             if isinstance(term, GearLoad):
-                words = gears_beyond(problem, self._gears(outcome))
+                message = gears_beyond(problem, self._gears(outcome))
             elif isinstance(term, Slide) and isinstance(planned, Plan):
-                words = slides_beyond(term, planned)
+                message = slides_beyond(term, planned)
             elif isinstance(term, ReferenceRange) and isinstance(planned, Plan):
-                with contextlib.suppress(InputError):  # legs that do not reach
-                    words = reference_beyond(term, planned)
-            if words:
-                out[name] = words
+                with contextlib.suppress(InputError):  # legs out of reach
+                    message = reference_beyond(term, planned)
+            if message:
+                out[name] = message
         return out
 
     def _gears(self, outcome: Outcome[Program]) -> list[DriveLoads]:
@@ -241,10 +249,10 @@ def _loads(
     robot: Robot, planned: Plan | PlannedStrike, finer: tuple[PlannedCollision, ...]
 ) -> list[DriveLoads]:
     """Gear and motor loads of all motions and all collisions."""
-    hits = finer or [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
+    collisions = finer or [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
     if isinstance(planned, PlannedStrike):
-        still = np.zeros(robot.nv)
-        return [strike_loads(robot, still, still, hit) for hit in hits]
-    with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
-        return plan_loads(robot, planned, hits)
+        zero = np.zeros(robot.nv)
+        return [strike_loads(robot, zero, zero, collision) for collision in collisions]
+    with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it
+        return plan_loads(robot, planned, collisions)
     return []

@@ -1,11 +1,12 @@
 """Minimum-jerk reach to the target: a baseline without optimization, at the highest speed that the limits
 allow.
 
-From rest to a posture at the hit point (by inverse kinematics) with the striking point moving along the
-normal, and back, each on the minimum-jerk polynomial (Flash and Hogan 1985) in the independent coordinates;
-the swing's duration is the best of several, the way back has the problem's own.  The speed is the greatest
-for which position, velocity and torque limits and the contact wrench cones hold on the way and, re-simulated
-in full dynamics with the same servo, ZMP and torque stay inside while and after it hits.
+The robot moves from rest to a posture at the hit point (by inverse kinematics), where the striking point
+moves along the normal, and back. Both motions are minimum-jerk polynomials (Flash and Hogan 1985) in the
+independent coordinates. The duration of the first is the best of several, that of the second the mean of the
+problem's follow-through. The speed is the largest for which both motions keep the limits of position,
+velocity and torque and the contact wrench cones, and a replay in full dynamics with the same servo keeps ZMP
+and torque inside their limits during and after the impact.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """The reach: duration [s] of the swing, speed [m/s] of the striking point that it was planned with, the
-    servo's reference, and what came of it.
+    """Minimum-jerk reach and its replay.
+
+    duration [s] : of the swing.  speed [m/s] : of the striking point at contact, as planned.  reference : of
+    the servo.
     """
 
     duration: float
@@ -50,63 +53,69 @@ class Baseline:
         return float(self.summary["impulse_Ns"])
 
     def describe(self) -> dict[str, Any]:
-        """The numbers for ``summary.json``, all simulated but the swing's duration."""
+        """Entries of ``summary.json``, all of them simulated except for the swing's duration."""
         return {"method": "minimum jerk", "swing_s": self.duration, **self.summary}
 
 
-DURATIONS = (0.6, 0.8, 1.0, 1.3, 1.7)  # [s] of the swing that are tried
-SLOWEST = 0.01  # [m/s] that is tried
-SLOWER = 0.93  # factor from a speed whose replay does not keep the limits to the next
+SWING_DURATIONS = (0.6, 0.8, 1.0, 1.3, 1.7)  # [s] that are tried
+MIN_SPEED = 0.01  # [m/s] that is tried
+SPEED_FACTOR = 0.93  # from a speed whose replay violates the limits to the next one
 
 
 def minimum_jerk_baseline(
     problem: ImpactProblem, *, fastest: float = 5.0, tolerance: float = 0.02
 ) -> Baseline:
-    """The hardest minimum-jerk reach; ``tolerance``: of its speed, relative; ``fastest`` [m/s] that is tried.
+    """The minimum-jerk reach with the largest impulse.
 
-    It may use the soles up to their edges: with the margins that plans keep it could hardly move.
-    All reaches strike in one posture and direction, so that the impulse grows with the speed: they are taken
-    by descending speed, and the first whose replay keeps the limits is the hardest.
+    fastest [m/s] : largest speed that is tried.  tolerance : of the speed, relative.
+
+    The reach may use the soles up to their edges: with the margins that plans keep it could hardly move.
+    All reaches strike in one posture and direction, so the impulse grows with the speed. They are tried by
+    falling speed, and the first one whose replay keeps the limits is the result.
 
     Raises
     ------
-    InputError : not even a touch at 1 cm/s keeps the limits; a problem with stance phases.
+    InputError : not even a touch at 1 cm/s keeps the limits; the base floats, or the problem has stance
+        phases.
     """
     if problem.floats:
         raise InputError("a minimum-jerk reach gives the base a motion: it has none where nothing holds it")
     if problem.stances:
         raise InputError("a minimum-jerk reach keeps one stance: there is none for stance phases")
-    # (-speed, bound, duration): the fastest reach without contact, or where `bound` is 1 no more than a bound
-    reaches = [(-fastest, 1, duration) for duration in DURATIONS]
+    # Queue of (-speed, is_bound, duration), the fastest first. A speed is that of a reach that keeps the
+    # limits without contact; or, with is_bound = 1, an upper bound of it.
+    reaches = [(-fastest, 1, duration) for duration in SWING_DURATIONS]
     heapq.heapify(reaches)
     while reaches:
-        negative, bound, duration = heapq.heappop(reaches)
+        negative, is_bound, duration = heapq.heappop(reaches)
         speed = -negative
-        if bound:
+        if is_bound:
+            # a duration matters only if it permits more than the fastest reach that is known
             best = max((-other for other, unknown, _ in reaches if not unknown), default=0.0)
-            slow = max(best, SLOWEST)
-            if _holds(problem, duration, slow):
+            slow = max(best, MIN_SPEED)
+            if _keeps_limits(problem, duration, slow):
                 heapq.heappush(reaches, (-_fastest(problem, duration, slow, speed, tolerance), 0, duration))
             elif best:
                 heapq.heappush(reaches, (-slow, 1, duration))
         elif (found := _replayed(problem, duration, speed)) is not None:
             return found
-        elif SLOWER * speed >= SLOWEST:
-            heapq.heappush(reaches, (-SLOWER * speed, 0, duration))
-    raise InputError(f"not even a minimum-jerk reach that hits at {SLOWEST} m/s keeps the limits")
+        elif SPEED_FACTOR * speed >= MIN_SPEED:
+            heapq.heappush(reaches, (-SPEED_FACTOR * speed, 0, duration))
+    raise InputError(f"not even a minimum-jerk reach that hits at {MIN_SPEED} m/s keeps the limits")
 
 
 def _fastest(problem: ImpactProblem, duration: float, slow: float, fast: float, tolerance: float) -> float:
-    """Speed [m/s] of the fastest reach without contact between one that keeps the limits and a bound."""
-    # limits without contact are cheap, and monotonic in speed
+    """Speed [m/s] of the fastest reach without contact, by bisection between a speed that keeps the limits
+    and an upper bound.
+    """
     while fast > (1 + tolerance) * slow:
         middle = float(np.sqrt(fast * slow))
-        slow, fast = (middle, fast) if _holds(problem, duration, middle) else (slow, middle)
+        slow, fast = (middle, fast) if _keeps_limits(problem, duration, middle) else (slow, middle)
     return slow
 
 
 def _replayed(problem: ImpactProblem, duration: float, speed: float) -> Baseline | None:
-    """The reach in full dynamics; None if it does not keep the limits there."""
+    """The reach replayed in full dynamics; None if it violates limits there."""
     scene, reference = scene_of(problem), _reference(problem, duration, speed)
     simulation = simulate_pinocchio(problem.robot, reference, scene, step=2e-4)
     summary = simulation.summary(
@@ -122,23 +131,24 @@ def _replayed(problem: ImpactProblem, duration: float, speed: float) -> Baseline
 
 
 def _phases(
-    problem: ImpactProblem, there: float, speed: float
+    problem: ImpactProblem, swing_duration: float, speed: float
 ) -> list[tuple[float, tuple[Array, Array, Array, Array]]]:
-    """(duration, (start, start rate, end, end rate)) of the way there and of the way back."""
+    """(duration, (start, start rate, end, end rate)) of the reach and of the return."""
     c = problem.coordinates
     y0 = c.start
     hit, legs = c.split(problem.contact_posture)
-    rates = strike_rates(c, problem.strikers, hit, legs, speed * problem.normal, base=0.02)  # by the arm
+    # with so small a weight on the base the arm moves, and the base hardly
+    rates = strike_rates(c, problem.strikers, hit, legs, speed * problem.normal, base=0.02)
     zero = np.zeros(c.ny)
-    back = float(np.mean(problem.follow.duration))
-    return [(there, (y0, zero, hit, rates)), (back, (hit, rates, y0, zero))]
+    return_duration = float(np.mean(problem.follow.duration))
+    return [(swing_duration, (y0, zero, hit, rates)), (return_duration, (hit, rates, y0, zero))]
 
 
 def _profile(
     duration: float, ends: tuple[Array, Array, Array, Array], time: Array
 ) -> tuple[Array, Array, Array]:
     """y, ydot, yddot (k, ny) of the quintic at times [s]; it rests after ``duration``."""
-    nodes = np.linspace(0, 1, 6)
+    nodes = np.linspace(0, 1, 6)  # six points determine the polynomial, whose derivatives follow
     fit = np.polynomial.polynomial.polyfit(nodes, quintic(*ends[:2], *ends[2:], duration, nodes), 5)
     s = np.clip(time / duration, 0.0, 1.0)
     out = []
@@ -149,17 +159,17 @@ def _profile(
     return out[0], out[1], out[2]
 
 
-def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) -> bool:
+def _keeps_limits(problem: ImpactProblem, swing_duration: float, speed: float, nodes: int = 25) -> bool:
     """True if the reach without contact keeps the limits at ``nodes`` instants of each of its two motions."""
     c, r = problem.coordinates, problem.robot
     lower, upper = inside(r, problem.term(PositionLimit).margin)
     legs0 = c.start_legs
-    for duration, ends in _phases(problem, there, speed):
+    for duration, ends in _phases(problem, swing_duration, speed):
         y, yd, ydd = _profile(duration, ends, np.linspace(0, duration, nodes)[1:])
         wrench = np.tile(static_wrenches(c, ends[0], legs0), (len(y), 1))
         try:
             q, v, a, *_ = complete_reference(problem, y, yd, ydd, wrench, legs0)
-        except InputError:  # a leg too short for the base's way
+        except InputError:  # a leg is too short for the base's motion
             return False
         joints, rates = r.ranges.positions(q[:, -r.n :]), v[:, -r.n :]
         if (joints < lower).any() or (joints > upper).any():
@@ -172,8 +182,8 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
 
 
 def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> bool:
-    """True if wrenches that soles can transmit balance the motion with torques inside the limits (a linear
-    program).
+    """True if some wrenches of the soles within their cones balance the motion, with torques inside the
+    limits: feasibility of a linear program in the wrenches (6 a leg).
     """
     c, r = problem.coordinates, problem.robot
     tau = r.inverse_dynamics(c.data, q, v, a)
@@ -183,7 +193,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     cone = problem.term(ContactWrenchCone)
     jac, _ = c.sole_jacobians(q)
     n = 6 * len(c.legs)
-    rows, bounds = [], []
+    rows, bounds = [], []  # rows @ wrenches <= bounds
     for k, leg in enumerate(c.legs):
         if leg.sole is None:
             grip = problem.extra(Grip)
@@ -198,6 +208,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
         block[:, 6 * k : 6 * k + 6] = -facets
         rows.append(block)
         bounds.append(np.zeros(len(facets)))
+    # the joints' torques, tau - J'w, stay inside the limits, and the wrenches replace the torque on the base
     legs = jac[:, c.base :].T
     rows += [-legs, legs]
     bounds += [limit - tau[c.base :], limit + tau[c.base :]]
@@ -213,13 +224,13 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     return bool(found.status == 0)
 
 
-def _reference(problem: ImpactProblem, there: float, speed: float) -> Trajectory:
-    """The servo's reference: there and back, as if there were no target."""
+def _reference(problem: ImpactProblem, swing_duration: float, speed: float) -> Trajectory:
+    """Reference of the servo: reach and return, as if there were no target."""
     c = problem.coordinates
     legs = c.start_legs
     parts, start = [], 0.0
-    for phase, (duration, ends) in zip((0, 2), _phases(problem, there, speed), strict=True):
-        length = duration + (0.5 if phase else 0.0)
+    for phase, (duration, ends) in zip((0, 2), _phases(problem, swing_duration, speed), strict=True):
+        length = duration + (0.5 if phase else 0.0)  # half a second of rest at the end
         time = np.linspace(0.0, length, round(length / 1e-3) + 1)
         y, yd, ydd = _profile(duration, ends, time)
         wrench = np.tile(static_wrenches(c, ends[0], legs), (len(time), 1))
@@ -228,13 +239,12 @@ def _reference(problem: ImpactProblem, there: float, speed: float) -> Trajectory
         )
         legs = c.split(parts[-1][2][-1])[1]
         start += duration
-    columns = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-    time, phases, *rows = columns
+    time, phases, *columns = (np.concatenate(both) for both in zip(*parts, strict=True))
     hit = float(parts[0][0][-1])
     return Trajectory(
         time=time,
         phase=phases,
-        **Completed(*rows)._asdict(),
+        **Completed(*columns)._asdict(),
         contact_start=hit,
         contact_end=hit,
         end=start,

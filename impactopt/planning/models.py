@@ -1,7 +1,8 @@
-"""Models of the collision for a plan: how far each is from full dynamics; the cheapest that is good enough.
+"""Collision model and number of touches of a plan: the cheapest model that is accurate enough, and warm
+starts between models.
 
-That is asked of models alone, at the plan's state at contact: collisions of the compiled SDC, which take
-microseconds. Full dynamics are there the SDC that is frozen so often that it makes no difference.
+A model's error is estimated without solving a program, by collisions of the compiled SDC from the plan's
+state at contact, which take microseconds. The often frozen SDC stands for full dynamics.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from impactopt.kinematics.operational_space import holding_torque
 from impactopt.planning.budget import Budget
 from impactopt.planning.contact_replay import ModelError, collision_error
 from impactopt.planning.gain_selection import with_factors_of
-from impactopt.planning.lazy_constraints import rows_on_demand
+from impactopt.planning.lazy_constraints import lazy_terms_of
 from impactopt.planning.parameter_changes import changed
 from impactopt.planning.refinement import carried
 from impactopt.planning.solution import Solved
@@ -37,33 +38,34 @@ from impactopt.transcription.initial_guess import strike_rates
 
 Array = NDArray[np.float64]
 AnySolution = TypeVar("AnySolution", bound=Solved)
-_MODELS = ("sdc", "full")  # of "auto"; in a program a freeze on the way costs as much as full dynamics
-# of the fastest blow, or [m/s] where there is none: how the first model is chosen
-_SHARE, _GUESSED = 0.5, 1.0
+# Models that "auto" tries. Not the SDC with more freezes: in a program a freeze during contact costs as much
+# as full dynamics.
+_MODELS = ("sdc", "full")
+# Speed at which the first model is tested: part of the fastest impact's; or [m/s] if that is unbounded.
+_TEST_FRACTION, _TEST_SPEED = 0.5, 1.0
 
 
 def carried_start(
-    t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, rows: Any
+    t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, constraints: Any
 ) -> SolverResult:
-    """Maps a solution to the initial guess of a program with another collision model, lazy constraints or
-    gains.
+    """Solution mapped to the warm start of a program with another collision model, lazy constraints or gains.
 
-    old : makes the solution's program.  rows : between bodies, of the new one.
+    old : makes the solution's program.  constraints : clearance constraints of the new one.
     """
-    was, now = ((p.collision, p.freezes, rows_on_demand(p), p.gains) for p in (start.problem, t.problem))
-    if was == now:
+    before, now = ((p.collision, p.freezes, lazy_terms_of(p), p.gains) for p in (start.problem, t.problem))
+    if before == now:
         return start.result
-    new = t.with_apart(rows)
+    new = t.with_apart(constraints)
     found = carried(new, old().with_apart(start.apart), start.result)
     return with_factors_of(new, start.problem.robot, found) if now[-1] else found
 
 
 def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactProblem:
-    """The same with as many touches as point masses need, where it leaves their number open.
+    """Problem with the number of touches that point masses need; itself if it gives the number.
 
     Raises
     ------
-    InputError : it gives a number of them that point masses do not meet in.
+    InputError : point masses never meet as often as it says.
     """
     if met_once(problem) or problem.touches == 1 or (problem.scenarios and problem.touches is None):
         return problem
@@ -86,20 +88,20 @@ def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactPr
 
 
 def with_touches_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
-    """The same with the touches of a solution that it starts from.
+    """Problem with the number of touches of the solution that it starts from.
 
     Raises
     ------
-    InputError : it has others.
+    InputError : the problem gives another number.
     """
-    own, its = problem.planned_touches, start.problem.planned_touches
-    if own == its:
+    own, of_start = problem.planned_touches, start.problem.planned_touches
+    if own == of_start:
         return problem
     if problem.touches is None and not met_once(problem):
-        return changed(problem, touches=its)
+        return changed(problem, touches=of_start)
     raise InputError(
-        f"start: the solution meets its target {its} times in the blow, and this problem's is met {own} "
-        "times: leave start out"
+        f"start: the solution touches its target {of_start} times in the impact, and this problem's plan "
+        f"{own} times: leave start out"
     )
 
 
@@ -108,9 +110,9 @@ def climbed(
     run: Callable[[ImpactProblem, AnySolution | None, Budget], AnySolution],
     budget: Budget,
 ) -> AnySolution:
-    """The solution of a problem by the cheapest model of the collision that is good enough for it.
+    """Solution of a problem with the cheapest collision model that is accurate enough.
 
-    run : solves a problem, from a solution by another model, or None: from the start asked for.
+    run : solves a problem from a solution with another model; None: from the user's initial guess.
     """
     began, limit = time.perf_counter(), budget.time_limit
     models = _MODELS[1:] if _skips_first(problem, budget.say) else _MODELS
@@ -126,9 +128,10 @@ def climbed(
             or (error is not None and good_enough(problem, error))
         ):
             break
-        # none: a contact that does not end by one of the models, so the plan's says nothing
+        # without an estimate, a contact does not end with one of the models
         budget.say(
-            f"{model}: {error or 'no estimate of its error'}, not what was asked for: on with full dynamics"
+            f"{model}: {error or 'no estimate of its error'}, less accurate than required: solving again "
+            "with full dynamics"
         )
     assert done is not None
     return done
@@ -140,14 +143,15 @@ def good_enough(problem: ImpactProblem, error: ModelError) -> bool:
 
 
 def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
-    """True if the coarsest model is not accurate enough in the posture of the initial guess.
+    """True if the coarsest model is not accurate enough in the posture of the initial guess, for an impact
+    half as fast as the joints allow.
 
-    Of a blow half as fast as the joints allow: a fast one moves the robot far while it lasts.
+    A faster impact moves the robot farther during contact, so the frozen model's error grows with the speed.
     """
     first, c = replace(problem, collision=_MODELS[0]), problem.coordinates
     y, legs = c.split(problem.contact_posture)
     most = fastest_at_contact(problem)
-    speed = _SHARE * most if np.isfinite(most) else _GUESSED
+    speed = _TEST_FRACTION * most if np.isfinite(most) else _TEST_SPEED
     try:
         legs = c.solve_legs(y, legs)
         rates = strike_rates(c, problem.strikers, y, legs, speed * problem.normal)
@@ -158,13 +162,13 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
     error = collision_error(first, q, v, torque, 0.05)
     if error is not None and good_enough(problem, error):
         return False
-    told = error or "no estimate of its error"
-    say(f"{_MODELS[0]} at {speed:.2g} m/s: {told}, not what was asked for: {_MODELS[1]} at once")
+    estimate = error or "no estimate of its error"
+    say(f"{_MODELS[0]} at {speed:.2g} m/s: {estimate}, less accurate than required: {_MODELS[1]} at once")
     return True
 
 
 def _both(old: AnySolution, new: AnySolution) -> AnySolution:
-    """The new solution, with the time and the attempts of both."""
+    """New solution with the time and the attempts of both."""
     attempts = [*(replace(a, kept=False) for a in old.attempts), *new.attempts]
     return replace(
         new,

@@ -1,4 +1,4 @@
-"""Reduction of the prices of a motion style to the share of the objective that a problem allows them."""
+"""Reduction of a motion style's prices until they are a small enough share of the objective."""
 
 from __future__ import annotations
 
@@ -14,48 +14,52 @@ from impactopt.transcription.transcription import Transcription
 
 __all__ = ["MotionPrice", "unpriced", "with_first_scale"]
 
-_USUAL = 4.0  # [N s] of an initial guess, that of `punch`: prices are chosen for it
-_LEAST = 0.02  # factor on prices, where a guess is worth next to nothing
-_TRIES = 3  # reductions: with lower prices there is more to be priced, so one may not be enough
-_TOLERANCE = 0.02  # of the share: a plan that is within it is not solved again
-_BELOW = 0.9  # of the allowed share is aimed at
+# [N s] Objective of the initial guess of the problem `punch`, for which the prices were chosen.
+_REFERENCE_OBJECTIVE = 4.0
+_MIN_SCALE = 0.02  # of the prices, if the objective of the initial guess is nearly zero
+# Reductions at most: lower prices permit a motion that costs more, so one may not be enough.
+_MAX_REDUCTIONS = 3
+_TOLERANCE = 0.02  # of the allowed share: a plan within it is not solved again
+_AIM = 0.9  # of the allowed share, that a reduction aims at
 
 
 def with_first_scale(t: Transcription) -> Transcription:
-    """The program with prices of the motion style that fit what its initial guess is worth.
+    """Program whose prices of the motion style are scaled by the objective of its initial guess.
 
-    The prices are for blows of some newton seconds. A reach as the guess has it gives a part of what the plan
-    will; where even `_USUAL` is far more than that, prices would outweigh the objective.
+    The prices are for impacts of some newton seconds. The guess has a part of the objective of the plan. If
+    that is far less than `_REFERENCE_OBJECTIVE`, unscaled prices would outweigh the objective.
     """
     p = t.problem
     if p.price_scale != 1.0 or p.style_prices == MotionPrices():
         return t
-    worth = t.worth(first_iterate(t))
-    scale = float(np.clip(worth / _USUAL, _LEAST, 1.0)) if np.isfinite(worth) else 1.0
-    return t if scale == 1.0 else program_for(t, replace(p, price_scale=scale))
+    objective = t.worth(first_iterate(t))
+    scale = float(np.clip(objective / _REFERENCE_OBJECTIVE, _MIN_SCALE, 1.0))
+    if not np.isfinite(objective) or scale == 1.0:
+        return t
+    return program_for(t, replace(p, price_scale=scale))
 
 
 def unpriced(t: Transcription) -> Transcription:
-    """The same program without prices of the motion style."""
+    """Program without prices of the motion style."""
     return program_for(t, replace(t.problem, price_scale=0.0))
 
 
 class MotionPrice:
-    """Oracle for prices of the motion style: they take no more of the objective than
-    `ImpactProblem.motion_price`, or are reduced.
+    """Oracle that reduces the prices of the motion style if their share of the objective is larger than
+    `ImpactProblem.motion_price`.
     """
 
-    most = _TRIES
+    most = _MAX_REDUCTIONS
 
     def missing(self, outcome: Outcome[Transcription]) -> Additions[Transcription] | None:
-        """The program with reduced prices, from where the solution is."""
+        """Program with reduced prices, from the solution."""
         t, allowed = outcome.program, outcome.program.problem.motion_price
         if not t.problem.price_scale:
             return None
-        share, style = t.price_shares(outcome.result.x)
+        share, style = t.price_shares(outcome.result.x)  # of all prices, and of the style's
         if share <= allowed * (1 + _TOLERANCE):
             return None
-        left = max(_BELOW * allowed - (share - style), 0.0) if np.isfinite(share) else 0.0
+        left = max(_AIM * allowed - (share - style), 0.0) if np.isfinite(share) else 0.0
         scale = t.problem.price_scale * left / style if style > 0 else 0.0
 
         def guesses() -> Iterator[Guess[Transcription]]:

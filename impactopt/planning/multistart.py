@@ -1,4 +1,4 @@
-"""Solves from several initial guesses: the problem has local optima, and the best of them is kept."""
+"""Multistart: solves from several initial guesses, of which the best local optimum is kept."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from impactopt.errors import InputError
 from impactopt.planning.budget import Budget, rank_of
-from impactopt.planning.gain_selection import roomy
+from impactopt.planning.gain_selection import with_room_for_gains
 from impactopt.planning.models import climbed
 from impactopt.planning.refinement import Guess, Outcome, Program, Solve
 from impactopt.planning.solution import Solved
@@ -28,29 +28,38 @@ from impactopt.transcription.transcription import block_functions
 __all__ = ["best_of", "best_of_starts", "check_starts", "drawn_guesses"]
 
 AnySolution = TypeVar("AnySolution", bound=Solved)
-# problem, start, budget, numbers of the starts, and before which number to end -> the best solution
+# problem, start, budget, numbers of the starts, and the number that further starts end before -> best
+# solution
 Run = Callable[[ImpactProblem, Any, Budget, range, int], AnySolution]
+# names, and functions that make the guesses
 Guesses = Iterable[tuple[str, Callable[[], Guess[Program]]]]
-MORE = 2  # starts, where all that were asked for end with solutions that are refused
-ALIKE = 0.1  # relative difference of two violations, of refusals in the same words
-SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
+EXTRA_STARTS = 2  # at most, if the solutions of all requested starts are refused
+ALIKE = 0.1  # relative difference of the violations of two refusals with the same message
+# [m/s], [rad] ranges of all starts but the first: speed of the reach, and noise of its posture
+SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)
 
 
 def check_starts(starts: int, seed: int, workers: int, callback: object, *, given: bool) -> None:
-    """InputError if these are no numbers of starts and processes, or no seed; if a given start is to be
-    several, or a callback would have to go to other processes.
+    """Checks arguments of `solve`.
+
+    given : whether the user gives an initial guess.
+
+    Raises
+    ------
+    InputError : numbers that are not whole or too small; several starts from a given guess; a callback with
+        several processes.
     """
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise InputError(f"{name} is {value!r}; give a whole number >= {least}")
     if given and starts > 1:
-        raise InputError(f"starts is {starts}, of one start that is given; leave one of the two out")
+        raise InputError(f"starts is {starts}, but start gives a single one; leave one of the two out")
     if workers > 1 and callback is not None:
-        raise InputError("callback is asked in this process alone: leave it out, or give workers=1")
+        raise InputError("callback is called in this process only: leave it out, or give workers=1")
 
 
 def drawn(starts: int, seed: int) -> list[dict[str, Any]]:
-    """Speed, noise and seed of each start's reach; the first one is the plain reach."""
+    """Speed, noise and seed of each start's reach; the first one is unperturbed."""
     rng = np.random.default_rng(seed)
     others = [
         {
@@ -66,7 +75,7 @@ def drawn(starts: int, seed: int) -> list[dict[str, Any]]:
 def drawn_guesses(
     name: str, make: Callable[[dict[str, Any]], Guess[Program]], which: range, seed: int
 ) -> Guesses[Program]:
-    """Named initial guesses of drawn reaches, each made in its turn."""
+    """Named initial guesses of drawn reaches, each made when it is needed."""
     draws = drawn(which.stop, seed)
     return ((f"{name} {k + 1}", partial(make, draws[k])) for k in which)
 
@@ -80,21 +89,24 @@ def best_of_starts(
     starts: int,
     workers: int,
 ) -> AnySolution:
-    """The best solution from a problem's starts, by the cheapest model of the collision that is good enough.
+    """Best solution from a problem's starts, with the cheapest collision model that is accurate enough.
 
-    one : a problem from some of the starts, in this process.  start : what it is started from.
+    one : solves a problem from some of the starts, in this process.  start : kind of initial guess, or the
+    given one.
     """
     if problem.collision == "auto":
 
         def run(chosen: ImpactProblem, other: AnySolution | None, left: Budget) -> AnySolution:
+            # the second model starts from the first one's solution
             given, count = (start, starts) if other is None else (other, 1)
             return best_of_starts(one, chosen, given, left, starts=count, workers=workers)
 
         return climbed(problem, run, budget)
     if workers > 1 and starts > 1:
-        block_functions(roomy(problem), problem.coordinates, budget.report)  # compiled here, not by each
-        return _best_side_by_side(partial(one, problem, start), budget, starts=starts, workers=workers)
-    return one(problem, start, budget, range(starts), starts + MORE)
+        # compiled here, not by each worker
+        block_functions(with_room_for_gains(problem), problem.coordinates, budget.report)
+        return _best_on_workers(partial(one, problem, start), budget, starts=starts, workers=workers)
+    return one(problem, start, budget, range(starts), starts + EXTRA_STARTS)
 
 
 def best_of(
@@ -103,17 +115,15 @@ def best_of(
     budget: Budget,
     count: int,
 ) -> Outcome[Program]:
-    """The best outcome, with the attempts of all.
+    """Best outcome of several guesses, with the attempts of all.
 
-    guesses : names, and what makes each when its turn comes. More than ``count`` are tried while each ends
-        with a solution that is refused, such as for penetration: where a motion passes bodies on the wrong
-        side, others may not; none more after two that end alike. An interrupted solve is the last one, and so
-        is one after which no time is left.
+    count : number of guesses. More are tried while all solutions are refused, such as for penetration, as
+        another motion may pass a body on another side; but not after two refusals that are alike.
 
-    Of those that meet their constraints the one of least objective is best, else the one of least violation.
+    The search ends after an interrupted solve, and when no time is left. Outcomes are compared by `rank_of`.
     """
     found = list[tuple[str, Outcome[Program]]]()
-    alike = 1  # outcomes that are refused for the same
+    alike = 1  # largest number of outcomes that are refused for the same reason
     for k, (name, make) in enumerate(guesses):
         if k >= count and (alike > 1 or not all(outcome.refused for _, outcome in found)):
             break
@@ -126,33 +136,32 @@ def best_of(
     attempts = [replace(outcome.attempt(name), kept=outcome is best) for name, outcome in found]
     result = best.result
     if best.refused and alike > 1:
-        ended = f"{alike} of {len(found)} starts ended alike."
-        result = replace(result, message=f"{result.message} {ended}")
+        result = replace(result, message=f"{result.message} {alike} of {len(found)} starts ended alike.")
     return replace(best, result=result, attempts=tuple(attempts))
 
 
 def _alike(one: Outcome[Program], other: Outcome[Program]) -> bool:
-    """True if both are refused in the same words, with nearly the same numbers."""
-    words, others = (re.sub(r"[\d.]+", "", outcome.result.message) for outcome in (one, other))
-    worst = (outcome.result.max_violation for outcome in (one, other))
-    return one.refused and other.refused and words == others and math.isclose(*worst, rel_tol=ALIKE)
+    """True if both are refused with the same message but for its numbers, and similar violations."""
+    text, other_text = (re.sub(r"[\d.]+", "", outcome.result.message) for outcome in (one, other))
+    violations = (outcome.result.max_violation for outcome in (one, other))
+    return one.refused and other.refused and text == other_text and math.isclose(*violations, rel_tol=ALIKE)
 
 
-def _best_side_by_side(
+def _best_on_workers(
     run: Callable[[Budget, range, int], AnySolution], budget: Budget, *, starts: int, workers: int
 ) -> AnySolution:
-    """The best of the solutions from each start, with the attempts of all in their order.
+    """Best of the solutions from each start, on worker processes, with the attempts of all in their order.
 
-    run : picklable, and so are its solutions.  budget : of all together; what has not begun when its time is
-    over is left out. Ctrl-C keeps what is there.
+    run : picklable, as are its solutions.  budget : of all together; starts that have not begun when its time
+    is over are left out. Ctrl-C keeps the solutions that are finished.
 
     Raises
     ------
-    InputError : the problem cannot go to other processes, or none of them has come back with a solution.
+    InputError : the problem cannot be pickled, or no worker has returned a solution.
     """
     try:
         pickle.dumps(run)
-    except Exception as error:  # whatever a law or target of the user's own raises
+    except Exception as error:  # a user's own law or target may raise anything
         raise InputError(
             f"the problem cannot go to other processes: {error}; define its own laws, targets and terms in a "
             "module, or give workers=1"
@@ -170,18 +179,19 @@ def _best_side_by_side(
         try:
             for k, solution in jobs:
                 if isinstance(solution, Died):
-                    told = f"start {k + 1} has died (exit code {solution.code})"
+                    message = f"start {k + 1} has died (exit code {solution.code})"
                 elif solution is None:
-                    told = f"start {k + 1} is left out: no time is left"
+                    message = f"start {k + 1} is left out: no time is left"
                 else:
                     found[k] = solution
-                    told = f"start {k + 1}: {solution.attempts[-1].impulse:.2f} N s, {solution.status.value}"
-                budget.say(told)
+                    impulse = solution.attempts[-1].impulse
+                    message = f"start {k + 1}: {impulse:.2f} N s, {solution.status.value}"
+                budget.say(message)
         except KeyboardInterrupt:
             if not found:
                 raise
     if not found:
-        raise InputError("no start has come to an end: give more time, or workers=1 to see why")
+        raise InputError("no start has ended: give more time, or workers=1 to see why")
     best = min(found.values(), key=lambda solution: rank_of(solution.result))
     attempts = [
         replace(attempt, kept=attempt.kept and found[k] is best)
@@ -193,6 +203,10 @@ def _best_side_by_side(
 
 
 def _one(shared: tuple[Callable[..., Any], Budget, float | None], start: int) -> Any:
+    """Solution from one start, in a worker; None if no time is left.
+
+    shared : run, budget, and the time (of the wall clock, as processes share no other) at which it is over.
+    """
     run, budget, ends = shared
     left = None if ends is None else ends - time.time()
     if left is not None and left <= 0:

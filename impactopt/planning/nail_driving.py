@@ -1,4 +1,4 @@
-"""A series of blows on a nail: each is planned where the one before has left it."""
+"""Series of blows on a nail, each planned for the depth that the one before has reached."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["Blow", "Series", "drive_nail"]
 
-ADVANCE = 1e-4  # [m] a blow that drives less is the last
+MIN_ADVANCE = 1e-4  # [m] a blow that drives the nail less is the last
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blow:
-    """One blow of a series: its plan, and how deep the nail is after it [m]."""
+    """One blow of a series: its plan, and the nail's depth [m] after it."""
 
     solution: Solution
     depth: float
@@ -46,8 +46,8 @@ class Series:
         return not self.reason
 
     def describe(self) -> dict[str, Any]:
-        """The series as numbers, for JSON."""
-        rows = [
+        """JSON form of the series."""
+        blows = [
             {
                 "depth_m": blow.depth,
                 "driven_m": blow.driven,
@@ -59,7 +59,7 @@ class Series:
             }
             for blow in self.blows
         ]
-        return {"done": self.done, "reason": self.reason, "blows": rows}
+        return {"done": self.done, "reason": self.reason, "blows": blows}
 
 
 def drive_nail(
@@ -73,15 +73,15 @@ def drive_nail(
     """Blows on the problem's nail until it is ``depth`` [m] deep in the wood.
 
     Each blow is planned for the nail's present depth: its head is at ``point`` plus the driven length along
-    the normal, and the wood has the resistance of that depth. A solve starts from the plan before, and if
-    that fails from a plain reach. Between the blows the robot goes back to its start.
+    the normal, and the wood has the resistance of that depth. Each solve starts from the plan before and, if
+    that fails, from a plain reach. Between the blows the robot returns to its start posture.
 
     most : largest number of blows.  report : called with a line of text for each blow.  options : of
         :func:`impactopt.solve`.
 
     Raises
     ------
-    InputError : the target is no `Nail`, or is deeper already.
+    InputError : the target is not a `Nail`, or is deeper already.
     """
     nail = problem.target
     if not isinstance(nail, Nail):
@@ -101,7 +101,7 @@ def drive_nail(
             target=dataclasses.replace(nail, depth=at),
         )
         solution = solve(here, start=x, report=report, **options)
-        if not isinstance(x, str) and not solution.status.usable:  # from a plain reach, then
+        if not isinstance(x, str) and not solution.status.usable:
             solution = solve(here, start="reach", report=report, **options)
         if not solution.status.usable:
             why = f"blow {len(blows) + 1} has no plan: {solution.result.message}"
@@ -115,6 +115,6 @@ def drive_nail(
                 f"blow {len(blows)}: {1e3 * driven:.1f} mm with {solution.impulse:.2f} N s; "
                 f"{1e3 * at:.1f} mm in all"
             )
-        if driven < ADVANCE and at < depth:
+        if driven < MIN_ADVANCE and at < depth:
             return Series(blows=tuple(blows), reason=f"the nail moves no more at {1e3 * at:.1f} mm")
     return Series(blows=tuple(blows), reason="")

@@ -1,4 +1,4 @@
-"""A problem with other parameters: those that a plan can be bent for."""
+"""Parameters of a problem by name, and problems with changed ones, for re-planning and sensitivities."""
 
 from __future__ import annotations
 
@@ -15,26 +15,28 @@ from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
 
-__all__ = ["Parameter", "changed", "moved_problem", "parameter_of"]
+__all__ = ["Parameter", "changed", "moved_problem", "parameter_of", "with_term"]
 
-# what no term changes but that on the world's bodies, which may be switched off
-_BODIES = ("world", "bodies")
-_KEPT = ("stance_coordinates", "start_posture")  # of a problem on the same robot, stance and start
+# Cached properties of a problem that stay valid with the same robot, stance and start; and those that also
+# need the same terms, or other ones that do not switch the bodies of the world on or off.
+_CACHED = ("stance_coordinates", "start_posture")
+_CACHED_BODIES = ("world", "bodies")
 
 
 def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
-    """`dataclasses.replace`, without computing anew what stays: robot, stance and start are the same, and the
-    posture at contact is looked for from the one known.
+    """`dataclasses.replace` with the cached properties that stay valid, for the same robot, stance and start.
+
+    The posture at contact is searched from the old one.
     """
     new = object.__new__(type(problem))
     new.__dict__.update({f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)} | fields)
-    # before the checks, which need them too
-    same = fields.keys() <= {"terms"} and new.keep_out.enabled == problem.keep_out.enabled
-    kept = (*_KEPT, *_BODIES) if same else _KEPT
-    new.__dict__.update({name: problem.__dict__[name] for name in kept if name in problem.__dict__})
+    # set before the checks (`__post_init__`), which use the cached properties
+    same_bodies = fields.keys() <= {"terms"} and new.keep_out.enabled == problem.keep_out.enabled
+    cached = (*_CACHED, *_CACHED_BODIES) if same_bodies else _CACHED
+    new.__dict__.update({name: problem.__dict__[name] for name in cached if name in problem.__dict__})
     if "contact_posture" in problem.__dict__:
         near, point = problem.contact_posture, fields.get("point", problem.point)
-        with contextlib.suppress(InputError):  # the checks look for one from the start
+        with contextlib.suppress(InputError):  # then the checks search from the start posture
             new.__dict__["contact_posture"] = (
                 near
                 if np.array_equal(point, problem.point)
@@ -56,12 +58,12 @@ def moved_problem(
     damping: float | None = None,
     margin: float | None = None,
 ) -> ImpactProblem:
-    """A problem with another hit point [m], normal, mass of the target [kg], stiffness or damping of the
-    contact (the law's units), or margin of the soles' centres of pressure [m], in contact too.
+    """Problem with another hit point [m], normal, mass of the target [kg], stiffness or damping of the
+    contact (in the law's units), or margin of the soles' centres of pressure [m], during contact too.
 
     Raises
     ------
-    InputError : nothing is changed; target or law have no such number; a value that is none.
+    InputError : nothing is changed; target or law do not have the parameter; a value that is not allowed.
     """
     new: dict[str, Any] = {}
     for name, vector in (("point", point), ("normal", normal)):
@@ -76,7 +78,7 @@ def moved_problem(
     if margin is not None:
         cone = problem.term(ContactWrenchCone)
         both = {"margin": margin} | ({} if cone.collision_margin is None else {"collision_margin": margin})
-        new["terms"] = _with_term(problem, dataclasses.replace(cone, **both))
+        new["terms"] = with_term(problem, dataclasses.replace(cone, **both))
     if not new:
         raise InputError("nothing is moved: give point, normal, mass, stiffness, damping or margin")
     return changed(problem, **new)
@@ -84,20 +86,20 @@ def moved_problem(
 
 def _with(thing: Any, name: str, value: float) -> Any:
     known = [field.name for field in dataclasses.fields(thing)]
-    check_choice(f"{type(thing).__name__} has no number", name, known)
+    check_choice(f"{type(thing).__name__} has no parameter", name, known)
     return dataclasses.replace(thing, **{name: value})
 
 
-def _with_term(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
+def with_term(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
     others = [other for other in problem.terms if type(other) is not type(term)]
     return (*others, term)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """A number of a problem by its name.
+    """Parameter of a problem, by its name.
 
-    typical : a size of it, for steps.
+    typical : magnitude of it, for difference steps.
     """
 
     name: str
@@ -111,7 +113,7 @@ class Parameter:
         return max(abs(self.value), 1e-2)
 
     def at(self, value: float) -> ImpactProblem:
-        """The problem with another value of it."""
+        """Problem with another value of the parameter."""
         if self._field == "point":
             point = np.array(self.problem.point, dtype=float)
             point["xyz".index(self._part)] = value
@@ -119,18 +121,18 @@ class Parameter:
         if self._field == "terms":
             kind, name = self._part
             term = dataclasses.replace(self.problem.term(kind), **{name: value})
-            return changed(self.problem, terms=_with_term(self.problem, term))
+            return changed(self.problem, terms=with_term(self.problem, term))
         part = getattr(self.problem, self._field)
         return changed(self.problem, **{self._field: _with(part, self._part, value)})
 
 
 def parameter_of(problem: ImpactProblem, name: str) -> Parameter:
-    """The number of a name: ``target.mass``, ``contact.stiffness``, ``point.x``, and of a term that the
-    problem has ``terms.contact_wrench_cone.margin``, as problem files call them, without units.
+    """Parameter of a name: ``target.mass``, ``contact.stiffness``, ``point.x``, or of a term of the problem,
+    such as ``terms.contact_wrench_cone.margin``. Names are those of problem files, without units.
 
     Raises
     ------
-    InputError : there is no such number.
+    InputError : there is no such parameter.
     """
     known: dict[str, tuple[str, Any, float]] = {
         f"point.{axis}": ("point", axis, float(problem.point[k])) for k, axis in enumerate("xyz")
@@ -141,11 +143,11 @@ def parameter_of(problem: ImpactProblem, name: str) -> Parameter:
     others = [term for term in DEFAULT_TERMS if not any(isinstance(t, type(term)) for t in problem.terms)]
     for term in (*problem.terms, *others):
         section = snake_case(type(term).__name__)
-        for told in dataclasses.fields(term):
-            value = getattr(term, told.name)
+        for parameter in dataclasses.fields(term):
+            value = getattr(term, parameter.name)
             if isinstance(value, float) and np.isfinite(value):
-                known[f"terms.{section}.{told.name}"] = ("terms", (type(term), told.name), value)
-    check_choice("this problem has no number", name, known)
+                known[f"terms.{section}.{parameter.name}"] = ("terms", (type(term), parameter.name), value)
+    check_choice("this problem has no parameter", name, known)
     field, part, value = known[name]
     return Parameter(
         name=name, problem=problem, value=check_number(name, value), _field=str(field), _part=part

@@ -23,15 +23,14 @@ def program_on(
     shares: Shares,
     report: Callable[[str], None] | None = None,
 ) -> Transcription:
-    """A problem's program on a mesh that is known, without clearance constraints."""
+    """Program of a problem on a given mesh, without clearance constraints."""
     functions = block_functions(problem, problem.coordinates, report, elements)
     return Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
 
 
 def program_of(solution: Solution) -> Transcription:
-    """The program of a solution, without clearance constraints."""
-    s = solution
-    return program_on(s.problem, s.nodes, s.elements, s.shares)
+    """Program of a solution, without clearance constraints."""
+    return program_on(solution.problem, solution.nodes, solution.elements, solution.shares)
 
 
 def solution_of(

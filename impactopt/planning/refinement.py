@@ -1,8 +1,8 @@
-"""Refinement loop: solve, ask oracles what the solution lacks, add it, solve again.
+"""Refinement loop: solve, check the solution by oracles, add what they require, solve again.
 
 An oracle checks one aspect of a solution (clearance, mesh and contact; gear loads and slips; prices of
-motion) and returns what the nonlinear program lacks there. Plans, strikes and re-planning all go through
-`refine`, with oracles of their own.
+motion) and returns the additions to the nonlinear program that this aspect requires. Plans, strikes and
+re-planning all use `refine`, each with its own oracles.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ __all__ = ["Additions", "Attempt", "Evaluation", "Guess", "Oracle", "Outcome", "
 
 Array = NDArray[np.float64]
 Program = TypeVar("Program", Transcription, StrikeTranscription)
-NAMED = 20  # violated constraints at most
+MAX_VIOLATIONS = 20  # that an outcome lists
 
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
     """Result of the solve from one initial guess, or of one round of refinement.
 
-    start : its name; impulse [N s]; seconds: of the solver; kept: it is the one that was best.
+    start : name of the guess or round.  impulse [N s].  seconds : of the solver.  kept : True for the best.
     """
 
     start: str
@@ -83,7 +83,7 @@ class Guess(Generic[Program]):
 
     @property
     def warm(self) -> SolverResult | None:
-        """Result that the solve goes on from; None if its multipliers are those of other constraints."""
+        """Result for a warm start; None if its multipliers are those of other constraints."""
         fits = isinstance(self.start, SolverResult) and len(self.start.multipliers) == self.program.program.m
         return self.start if fits and isinstance(self.start, SolverResult) else None
 
@@ -107,12 +107,12 @@ class Evaluation(Generic[Program]):
 
     @cached_property
     def contact_error(self) -> ContactError | None:
-        """Discretization error of the contact; None of a strike, and of an impact without duration."""
+        """Discretization error of the contact; None for a strike, and for an impact without duration."""
         return contact_error(self.program, self.x) if isinstance(self.program, Transcription) else None
 
     @cached_property
     def contact(self) -> PlannedContact | None:
-        """The planned contact; None while gains are open, as the robot is another one then."""
+        """The planned contact; None while gains are open, as the robot's own are not those of the plan."""
         return None if self.program.problem.gains else planned_contact(self.program, self.x, self.planned)
 
     @property
@@ -125,8 +125,8 @@ class Evaluation(Generic[Program]):
 class Outcome(Generic[Program]):
     """Result of a refinement.
 
-    at : the program that was solved last, at its solution.  result : with the effort of all rounds.
-    origin : the guess that the first round was solved from.  attempts : of all rounds, or all guesses.
+    at : the last program, evaluated at its solution.  result : with the effort of all rounds.
+    origin : initial guess of the first round.  attempts : of all rounds, or all guesses.
     """
 
     at: Evaluation[Program]
@@ -166,7 +166,8 @@ class Outcome(Generic[Program]):
     def violations(self) -> tuple[Violation, ...]:
         """Violated constraints, worst first."""
         x, program = self.result.x, self.program.program
-        return tuple(worst_rows(program, x, program.constraints(x), tolerance=VIOLATED, count=NAMED))
+        g = program.constraints(x)
+        return tuple(worst_rows(program, x, g, tolerance=VIOLATED, count=MAX_VIOLATIONS))
 
     def attempt(self, name: str) -> Attempt:
         r = self.result
@@ -182,20 +183,22 @@ class Outcome(Generic[Program]):
         )
 
     def then(self, new: Outcome[Program], name: str = "") -> Outcome[Program]:
-        """The new outcome with the effort of both, and one attempt more of this name."""
+        """New outcome with the effort and the attempts of both; ``name``: of its attempt."""
         attempts = (*(replace(a, kept=False) for a in self.attempts), new.attempt(name))
         result = one_after_the_other(self.result, new.result)
         return replace(new, result=result, origin=self.origin, attempts=attempts)
 
     def else_then(self, new: Outcome[Program]) -> Outcome[Program]:
-        """The same after a failure; this one if it has failed less far off, with the effort of both."""
+        """New outcome after a failure; this one if the new one has failed with a larger violation. Either has
+        the effort of both.
+        """
         both, ended = self.then(new), new.usable or new.result.status is Status.INTERRUPTED
         if ended or not rank_of(self.result) < rank_of(new.result):
             return both
         return replace(self, result=with_effort_of(self.result, both.result))
 
     def checked(self) -> Outcome[Program]:
-        """The same, solved only if its contact is what it says when followed in full dynamics."""
+        """Outcome with the status that the replay of its contact permits (`contact_replay.checked`)."""
         return replace(self, result=checked(self.result, self.at.replay)) if self.usable else self
 
 
@@ -204,12 +207,13 @@ Solve = Callable[[Guess[Program]], Outcome[Program]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Additions(Generic[Program]):
-    """Additions that a solution calls for.
+    """Additions to a program that a solution requires.
 
     name : for the list of attempts.  why : for the report.
-    guesses : programs that have it, to be solved one after the other until one is; each made in its turn.
-    without : addition to the message of a failed solve, whose solution before it is none. "": then that
-        solution stays.
+    guesses : programs with the additions, each made when it is needed; they are solved in turn until one
+        succeeds.
+    without : the solution before is not valid without the additions: this text is appended to the message of
+        the failed solve. "": if all guesses fail, the solution before stays.
     """
 
     name: str
@@ -219,7 +223,7 @@ class Additions(Generic[Program]):
 
 
 class Oracle(Protocol[Program]):
-    """One aspect that solutions are checked for.
+    """Check of one aspect of a solution.
 
     most : rounds of one refinement.
     """
@@ -227,17 +231,18 @@ class Oracle(Protocol[Program]):
     most: int
 
     def missing(self, outcome: Outcome[Program]) -> Additions[Program] | None:
-        """Additions that a solution calls for; None if it lacks nothing, or nothing that can be added."""
+        """Additions that a solution requires; None if there are none, or none that are possible."""
 
 
 def refine(
     outcome: Outcome[Program], oracles: Sequence[Oracle[Program]], solve: Solve[Program], budget: Budget
 ) -> Outcome[Program]:
-    """Outcome that lacks nothing by all oracles, or the last solution before additions failed.
+    """Outcome that all oracles accept, or the last solution before a program with additions failed.
 
-    Oracles are nested: what one has added is solved and refined by those before it, and then asked again.
+    Oracles are nested: a program with one's additions is solved and refined by those before it, and then
+    checked again.
 
-    outcome : of the initial guess.  solve : one program from one guess.
+    outcome : of the initial guess.  solve : solves one program from one guess.
     """
     if not oracles:
         return outcome
@@ -245,19 +250,20 @@ def refine(
     oracle = oracles[-1]
     outcome = refine(outcome, before, solve, budget)
 
-    # an addition changes the motion, so earlier oracles have to agree to it again before this one is asked
+    # an addition changes the motion, so the oracles before have to accept it again before this one is called
     def refined(guess: Guess[Program]) -> Outcome[Program]:
         return refine(solve(guess), before, solve, budget)
 
     for _ in range(oracle.most):
         lacks = oracle.missing(outcome) if outcome.usable else None
+        # without time left, a solution that is not valid without the additions still has to become a failure
         if lacks is None or (budget.left == 0 and not lacks.without):
             break
         budget.say(lacks.why)
         new = _first_usable(lacks.guesses, refined, budget)
         if not new.usable:
             if not lacks.without:
-                break
+                break  # the solution before the additions stays
             if new.result.status is not Status.INTERRUPTED:
                 message = f"{new.result.message} {lacks.without}"
                 new = replace(new, result=replace(new.result, message=message))
@@ -268,7 +274,7 @@ def refine(
 def _first_usable(
     guesses: Iterable[Guess[Program]], solve: Solve[Program], budget: Budget
 ) -> Outcome[Program]:
-    """The first outcome that is a solution, or the best of all, with the effort of all."""
+    """First outcome that is a solution, or the best of all, with the effort of all."""
     done: Outcome[Program] | None = None
     for guess in guesses:
         new = solve(guess)
@@ -289,7 +295,7 @@ def program_for(
     constraints: Mapping[ClearanceKey, SeparatingDirection] | None = None,
     report: Callable[[str], None] | None = None,
 ) -> Program:
-    """A program with another problem, or on another mesh, or with other clearance constraints."""
+    """Program like ``t`` for another problem, on another mesh, or with other clearance constraints."""
     constraints = t.apart_rows if constraints is None else constraints
     problem = problem or t.problem
     elements = elements or (t.hit.elements if t.hit.guarded else ())
@@ -304,7 +310,7 @@ def program_for(
 
 
 def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> SolverResult:
-    """A program's result mapped to another one, see `carried_over`."""
+    """Result of a program mapped to another one, see `carried_over`."""
     if new is old:
         return result
     x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)

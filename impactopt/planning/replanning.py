@@ -1,4 +1,6 @@
-"""Re-planning for other parameters, by the KKT system of a plan and then by the solver; sensitivities."""
+"""Re-planning for changed parameters, by a plan's KKT system and then by the solver; parametric
+sensitivities.
+"""
 
 from __future__ import annotations
 
@@ -28,19 +30,32 @@ from impactopt.solvers.predictor import ActiveSystem, Change, Offset, Prediction
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.transcription import Transcription, statement_of
 
-__all__ = ["Bent", "Binding", "Sensitivity", "bent_of", "moved_solution", "sensitivity_of"]
+__all__ = [
+    "Binding",
+    "ParametricProgram",
+    "Sensitivity",
+    "moved_solution",
+    "parametric_program",
+    "sensitivity_of",
+]
 
-_MORE, _ASIDE = 1.01, 1e-3  # of law and target; [m]
-_PROXIMAL = 1e-2  # [N s] beside the objective's curvature, per square of a variable of order one
+# changes that show whether a program follows its problem: factor of the parameters of law and target, and
+# shift of the point [m]
+_TRIAL_FACTOR, _TRIAL_SHIFT = 1.01, 1e-3
+# [N s] Curvature added to the objective's for every (scaled) variable, as large steps would otherwise move
+# variables that hardly matter.
+_PROXIMAL = 1e-2
 
 
-class Bent:
-    """A solution's own program, and its KKT system, factored once."""
+class ParametricProgram:
+    """Nonlinear program of a solution as a function of the problem's parameters, and the KKT system at the
+    solution, factored once.
+    """
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
         self.program = self._built(solution.problem)
-        self._moving = self._follows()
+        self._movable = self._movable_program()
 
     def program_for(
         self,
@@ -49,25 +64,30 @@ class Bent:
         *,
         anew: bool = True,
     ) -> Transcription:
-        """The solution's program with the numbers of another problem: the same variables and constraints.
+        """The solution's program with the parameters of another problem: same variables and constraints.
 
-        Where point, contact law and target alone are others it is good until the next one is asked for.
+        If only point, contact law and target differ, all calls return one program, moved to the problem: a
+        result is valid until the next call.
         anew : as of `ContactProgram.move_to`.
 
         Raises
         ------
-        InputError : they are others.
+        InputError : the other problem's program has other variables or constraints.
         """
-        if self._moving is not None and _alike(problem, self.solution.problem):
-            self._moving.move_to(problem, anew=anew)
-            return self._moving
+        if self._movable is not None and _alike(problem, self.solution.problem):
+            self._movable.move_to(problem, anew=anew)
+            return self._movable
         return self._built(problem, report)
 
-    def _follows(self) -> Transcription | None:
-        """A program that follows the problem; None if parts of it do not, such as a term of someone's own."""
+    def _movable_program(self) -> Transcription | None:
+        """A program that `ContactProgram.move_to` moves to other problems; None if parts of it do not follow,
+        such as a user's own term.
+
+        It is built for a slightly different problem and moved back: all its numbers must be the solution's.
+        """
         problem = self.solution.problem
         try:
-            t = self._built(_beside(problem))
+            t = self._built(_slightly_changed(problem))
         except InputError:
             return None
         t.move_to(problem)
@@ -96,8 +116,8 @@ class Bent:
 
     @cached_property
     def steady(self) -> tuple[ActiveSystem, Offset]:
-        """The same for steps that are not small, and leave alone what hardly matters; and what the solver has
-        left, which is no part of what a change does.
+        """KKT system with a proximal term, for steps that are not small; and the KKT residual that the solver
+        left at the solution, which is not an effect of the changed parameters.
         """
         r = self.solution.result
         common = r.x, r.multipliers, r.bound_multipliers
@@ -107,55 +127,56 @@ class Bent:
 
 def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
     """True if the programs of the two problems differ in bounds, constants and parameters only."""
-    changing = {"point", "law", "target", "name"}
+    movable = {"point", "law", "target", "name"}
     pairs = [
-        (getattr(problem, f.name), getattr(other, f.name)) for f in fields(problem) if f.name not in changing
+        (getattr(problem, f.name), getattr(other, f.name)) for f in fields(problem) if f.name not in movable
     ]
-    same = all(
+    same_fields = all(
         one is two or (np.array_equal(one, two) if isinstance(one, np.ndarray) else one == two)
         for one, two in pairs
     )
-    kinds = type(problem.law) is type(other.law) and type(problem.target) is type(other.target)
-    kinds = kinds and problem.target.speed_before() == other.target.speed_before()
-    return same and kinds and (not problem.keeps_apart or same_bodies(problem, other))
+    same_types = type(problem.law) is type(other.law) and type(problem.target) is type(other.target)
+    same_types = same_types and problem.target.speed_before() == other.target.speed_before()
+    return same_fields and same_types and (not problem.keeps_apart or same_bodies(problem, other))
 
 
-def _beside(problem: ImpactProblem) -> ImpactProblem:
-    """A problem with a point, law and target that are a little others."""
+def _slightly_changed(problem: ImpactProblem) -> ImpactProblem:
+    """A problem with a slightly different point, law and target."""
     law, target = (
-        type(part)(**{name: _MORE * value for name, value in part.parameters.items()})
+        type(part)(**{name: _TRIAL_FACTOR * value for name, value in part.parameters.items()})
         for part in (problem.law, problem.target)
     )
-    with contextlib.suppress(InputError):  # an arm in a plane reaches no point beside it
-        return changed(problem, law=law, target=target, point=problem.point + _ASIDE)
-    return changed(problem, law=law, target=target, point=problem.point + _ASIDE * problem.normal)
+    with contextlib.suppress(InputError):  # a planar arm cannot reach a point outside of its plane
+        return changed(problem, law=law, target=target, point=problem.point + _TRIAL_SHIFT)
+    return changed(problem, law=law, target=target, point=problem.point + _TRIAL_SHIFT * problem.normal)
 
 
-_known: WeakKeyDictionary[Solution, Bent] = WeakKeyDictionary()
+_known: WeakKeyDictionary[Solution, ParametricProgram] = WeakKeyDictionary()
 
 
-def bent_of(solution: Solution) -> Bent:
+def parametric_program(solution: Solution) -> ParametricProgram:
     if not solution.status.usable:
         raise InputError(
-            f"this plan is no solution ({solution.status.value}): it has no sensitivities; solve it first"
+            f"this plan is not a solution ({solution.status.value}) and has no sensitivities: solve it first"
         )
     if solution not in _known:
-        _known[solution] = Bent(solution)
+        _known[solution] = ParametricProgram(solution)
     return _known[solution]
 
 
 Array = NDArray[np.float64]
-# of a parameter's size: half of a difference. The least durations of a contact's phases come from a point
-# mass's blow, whose integration leaves 1e-6 of them: a smaller step would see that
-_STEP = 1e-2
-_SMALL = 1e-6  # a shadow price that is nothing
+# Half of a central difference, over the parameter's size. The least durations of a contact's phases come from
+# the impact of a point mass, integrated with a relative error of 1e-6, which dominates with a smaller step.
+_DIFFERENCE_STEP = 1e-2
+_MIN_PRICE = 1e-6  # smaller shadow prices count as zero
 
 
 @dataclass(frozen=True, kw_only=True)
 class Binding:
-    """A constraint that a plan is at, and its shadow price: what the objective gains by its bound, per unit.
+    """Active constraint of a plan, and its shadow price: gain of the objective per unit by which the bound is
+    relaxed.
 
-    row : as messages name it.  price : [objective's unit / unit]; ``unit`` of what the bound is moved by.
+    row : name of the constraint, as in messages.  price : [objective's unit / unit].  unit : of the bound.
     """
 
     row: str
@@ -172,7 +193,7 @@ class Sensitivity:
 
     parameter, value : its name and value.  impulse : d impulse / d parameter [N s / unit].
     objective : d (weighted sum of the objectives, less the prices on motion) / d parameter.
-    binding : constraints and bounds that the plan is at, dearest first.
+    binding : active constraints and bounds, by falling shadow price.
     """
 
     parameter: str
@@ -189,44 +210,48 @@ def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
     """Sensitivity of impulse and objective to a parameter, and the active constraints:
     `Solution.sensitivity`.
 
-    Derivatives of the program by the parameter are central differences at the solution; the solution's own
+    Derivatives of the program by the parameter are central differences at the solution. Those of the solution
     follow from the KKT system.
     """
-    bent = bent_of(solution)
-    number, x = parameter_of(solution.problem, parameter), solution.result.x
-    whole, half = (_slope(bent, number, _STEP * number.typical / k) for k in (1, 2))
-    offset, impulse, objective = (_extrapolated(*pair) for pair in zip(whole, half, strict=True))
+    family = parametric_program(solution)
+    p, x = parameter_of(solution.problem, parameter), solution.result.x
+    whole, half = (_slope(family, p, _DIFFERENCE_STEP * p.typical / k) for k in (1, 2))
+    residual, impulse, objective = (_extrapolated(*pair) for pair in zip(whole, half, strict=True))
     n, m = len(x), len(solution.result.multipliers)
-    # implicit function theorem: the KKT matrix times dz/dp is minus the slope of the KKT residual at fixed z
-    change = bent.system.step(Offset(dual=offset[:n], rows=offset[n : n + m], variables=offset[n + m :]))
-    # impulse and objective may depend on the number at the same motion too
-    program = bent.program
-    slope = float(impulse) + _along(program.impulse, x, change.x)
+    # implicit function theorem: KKT matrix times dz/dp = -(derivative of the KKT residual by p at fixed z)
+    change = family.system.step(
+        Offset(dual=residual[:n], rows=residual[n : n + m], variables=residual[n + m :])
+    )
+    # total derivatives: impulse and objective may also depend on the parameter itself, at the same x
+    program = family.program
+    impulse_slope = float(impulse) + _along(program.impulse, x, change.x)
     cost_slope = float(objective) + float(program.program.gradient(x) @ change.x)
     return Sensitivity(
         parameter=parameter,
-        value=number.value,
-        impulse=slope,
-        objective=-cost_slope,
-        binding=_binding(bent),
+        value=p.value,
+        impulse=impulse_slope,
+        objective=-cost_slope,  # the program minimizes
+        binding=_binding(family),
     )
 
 
-def _slope(bent: Bent, number: Parameter, half: float) -> tuple[Array, Array, Array]:
-    """Central differences by a number at the solution: of KKT conditions, impulse and what is minimized."""
-    x, sides = bent.solution.result.x, []
-    for value in (number.value + half, number.value - half):
-        t = bent.program_for(number.at(value))
-        off = bent.system.offset(t.program)
-        parts = np.concatenate([getattr(off, name) for name in Offset.PARTS])
-        sides.append((parts, np.array(t.impulse(x)), np.array(t.program.objective(x))))
-    parts, impulse, objective = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))
-    return parts, impulse, objective
+def _slope(family: ParametricProgram, parameter: Parameter, half: float) -> tuple[Array, Array, Array]:
+    """Central differences by a parameter, at fixed variables and multipliers: of the KKT residual
+    (n + m + n,), the impulse and the minimized objective.
+    """
+    x, sides = family.solution.result.x, []
+    for value in (parameter.value + half, parameter.value - half):
+        t = family.program_for(parameter.at(value))
+        offset = family.system.offset(t.program)
+        residual = np.concatenate([getattr(offset, name) for name in Offset.PARTS])
+        sides.append((residual, np.array(t.impulse(x)), np.array(t.program.objective(x))))
+    residual, impulse, objective = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))
+    return residual, impulse, objective
 
 
 def _extrapolated(whole: Array, half: Array) -> Array:
     """Richardson extrapolation of central differences with a step and its half."""
-    # both errors are even in the step: four times the half's less the whole's leaves those of fourth order
+    # both errors have even powers of the step only, so the result is of fourth order
     return (4 * half - whole) / 3
 
 
@@ -239,35 +264,39 @@ def _along(function: Callable[[Array], float], x: Array, d: Array) -> float:
     return (function(x + h * d) - function(x - h * d)) / (2 * h)
 
 
-def _binding(bent: Bent) -> tuple[Binding, ...]:
-    """Inequalities and bounds that hold with a price, dearest first."""
-    t, system = bent.program, bent.system
+def _binding(family: ParametricProgram) -> tuple[Binding, ...]:
+    """Active inequalities and bounds with a shadow price, by falling price."""
+    t, system = family.program, family.system
     program, out = t.program, list[Binding]()
-    unequal = program.g_lower < program.g_upper
-    for i in np.flatnonzero(system.rows * unequal):
+    inequality = program.g_lower < program.g_upper
+    for i in np.flatnonzero(system.rows * inequality):
         price, origin = abs(float(system.y[i])), t.rows.origins[int(i)]
         measure = origin.measure
+        # the program's constraints are scaled: ``factor`` leads back to the unit of the bound
         unit, factor = ("1", 1.0) if measure is None else (measure.unit, measure.factor)
         if measure is not None and measure.over is not None:
             factor /= max(float(measure.over.evaluate(system.x)[0]), measure.least)
-        if price > _SMALL:
+        if price > _MIN_PRICE:
             out.append(Binding(row=origin.told(system.x, 0.0)[0], price=price / factor, unit=unit))
-    moves = program.x_lower < program.x_upper
-    for j in np.flatnonzero(system.bounds * moves):
+    free = program.x_lower < program.x_upper
+    for j in np.flatnonzero(system.bounds * free):
         price = abs(float(system.z[j]))
-        if price > _SMALL:
+        if price > _MIN_PRICE:
             group = next(g for g in t.layout.groups.values() if g.offset <= j < g.offset + g.count * g.size)
             scale = float(group.scale[(int(j) - group.offset) % group.size])
             out.append(Binding(row=f"bound of {t.layout.name(int(j))}", price=price / scale, unit="SI unit"))
     return tuple(sorted(out, key=lambda binding: -binding.price))
 
 
-_FIRST_ORDER = 1e-3  # of constraints: a first-order plan that is off by more is none
-_ENOUGH, _CORRECTIONS = 1e-4, 4  # of constraints: no more steps; and so many at most beside the first
-# First barriers of the solver, and most iterations. With the smaller one the solver keeps to bounds that hold
-# no more, and takes a third longer. In one of 50 shifts either of them fails. A plan of first order is a
-# better start for shifts of a millimetre alone, and takes longer than what it saves
-_FROM_PLAN = ((1e-3, 150), (1e-5, None))
+_MAX_VIOLATION = 1e-3  # of the (scaled) constraints: a first-order plan with more is not usable
+# Newton steps with the solution's active set: no more of them below this violation, and at most so many
+# beside the first.
+_SMALL_VIOLATION, _MAX_CORRECTIONS = 1e-4, 4
+# First barrier and most iterations of the solver, from the old plan: in turn, until one succeeds. With the
+# smaller barrier the solver stays at bounds that are no longer active, and takes a third longer. Each of them
+# fails in one of 50 shifts of the point. A first-order plan is a better initial guess for shifts of up to a
+# millimetre only, and takes longer than it saves.
+_BARRIERS = ((1e-3, 150), (1e-5, None))
 
 
 def moved_solution(
@@ -280,26 +309,27 @@ def moved_solution(
     callback: Callback | None = None,
     **changes: Any,
 ) -> Solution:
-    """The plan for a problem with other parameters: `Solution.moved`.
+    """Plan for a problem with changed parameters: `Solution.moved`.
 
     changes : as of `impactopt.planning.parameter_changes.moved_problem`.
     """
     problem = moved_problem(solution.problem, **changes)
-    bent = bent_of(solution)
+    family = parametric_program(solution)
     if not polish:
-        _ = bent.predictor  # what all that is moved shares
+        _ = family.predictor  # made once for all changes, so it is not part of the time of this one
     began = time.perf_counter()
-    t = bent.program_for(problem, anew=polish)
+    t = family.program_for(problem, anew=polish)
     built = time.perf_counter()
     if not polish:
-        first = _first_order(solution, t, bent)
+        first = _first_order(solution, t, family)
         return _solution(solution, Outcome.of(t, first), (built - began, time.perf_counter() - built))
     budget = Budget(solver="ipm", options=options, time_limit=time_limit, callback=callback).started()
     margins = Margins(problem) if problem.keeps_apart else None
     origin = Guess(program=t, start=solution.result)
-    # new constraints are farther off than what a tolerance for small moves makes up for
-    given = {name: value for name, value in (options or {}).items() if not name.endswith("_tolerance")}
-    exact = replace(budget, options=given)
+    # The user's tolerances are for small changes from the old plan. New constraints change it by more, and
+    # are solved with the solver's own tolerances.
+    others = {name: value for name, value in (options or {}).items() if not name.endswith("_tolerance")}
+    exact = replace(budget, options=others)
 
     def refined(outcome: Outcome[Transcription]) -> Outcome[Transcription]:
         return BetweenNodes(budget, margins, mesh=refine).refined(outcome)
@@ -313,9 +343,9 @@ def moved_solution(
 
 
 def _polished(budget: Budget, t: Transcription, old: SolverResult) -> SolverResult:
-    """Solution of the changed program, started from the old one."""
+    """Solution of the changed program, with the old one as warm start."""
     result: SolverResult | None = None
-    for barrier, most in _FROM_PLAN:
+    for barrier, most in _BARRIERS:
         if result and (result.status.usable or result.status is Status.INTERRUPTED or budget.left == 0):
             break
         new = budget.run(t.program, old, barrier, most)
@@ -324,49 +354,50 @@ def _polished(budget: Budget, t: Transcription, old: SolverResult) -> SolverResu
     return result
 
 
-def _first_order(solution: Solution, t: Transcription, bent: Bent) -> SolverResult:
+def _first_order(solution: Solution, t: Transcription, family: ParametricProgram) -> SolverResult:
     """First-order plan by QPs; if those are not solved, by steps with the active set of the solution."""
     began = time.perf_counter()
-    found = bent.predictor.predict(t.program)
+    found = family.predictor.predict(t.program)
     if found is None:
-        return _by_active_set(solution, t, bent)
-    words = f"By {found.steps} QPs of first order: constraints are off by {found.violation:.1g} at most."
-    return _result(solution, t, found, words, began)
+        return _by_active_set(solution, t, family)
+    message = f"By {found.steps} first-order QPs: constraints are violated by {found.violation:.1g} at most."
+    return _result(solution, t, found, message, began)
 
 
-def _by_active_set(solution: Solution, t: Transcription, bent: Bent) -> SolverResult:
-    """Newton steps on the changed program's KKT conditions with the solution's own matrix and active set,
-    clipped to bounds: the first is the plan of first order, more of them while constraints are off and they
-    help.
+def _by_active_set(solution: Solution, t: Transcription, family: ParametricProgram) -> SolverResult:
+    """Newton steps on the changed program's KKT conditions, with the matrix and active set of the solution,
+    clipped to the bounds.
 
-    What the solver had left at the solution is not made up for.
+    The first step gives the first-order plan. More follow while constraints are violated and a step reduces
+    the violation. The residual that the solver left at the solution is subtracted.
     """
     program, began = t.program, time.perf_counter()
-    system, own = bent.steady
+    system, residual_before = family.steady
     at, best, worst = Change(x=system.x, y=system.y, z=system.z), None, np.inf
-    for taken in range(1 + _CORRECTIONS):
-        off = system.offset(program, at)
-        step = system.step(off.less(own))
+    for taken in range(1 + _MAX_CORRECTIONS):
+        residual = system.offset(program, at)
+        step = system.step(residual.less(residual_before))
         x = np.clip(at.x + step.x, program.x_lower, program.x_upper)
         at = Change(x=x, y=at.y + step.y, z=at.z + step.z)
-        found = max_violation(program, x, program.constraints(x))
-        if not found < worst:
+        violation = max_violation(program, x, program.constraints(x))
+        if not violation < worst:
             break
-        best, worst, steps = at, found, taken + 1
-        if worst <= _ENOUGH:
+        best, worst, steps = at, violation, taken + 1
+        if worst <= _SMALL_VIOLATION:
             break
     assert best is not None
-    unequal, moves = program.g_lower < program.g_upper, program.x_lower < program.x_upper
-    gone_y, gone_z = unequal & (system.rows * best.y < 0), moves & (system.bounds * best.z < 0)
-    turned = int(gone_y.sum() + gone_z.sum())
-    words = f"By {steps} steps of first order: constraints are off by {worst:.1g} at most"
-    words += f"; {turned} of those that held should not any more." if turned else "."
-    y, z = np.where(gone_y, 0.0, best.y), np.where(gone_z, 0.0, best.z)
-    return _result(solution, t, Prediction(x=best.x, y=y, z=z, violation=worst, steps=steps), words, began)
+    # a multiplier of the wrong sign: its inequality or bound is no longer active
+    inequality, free = program.g_lower < program.g_upper, program.x_lower < program.x_upper
+    released_y, released_z = inequality & (system.rows * best.y < 0), free & (system.bounds * best.z < 0)
+    released = int(released_y.sum() + released_z.sum())
+    message = f"By {steps} first-order steps: constraints are violated by {worst:.1g} at most"
+    message += f"; {released} active constraints have multipliers of the wrong sign." if released else "."
+    y, z = np.where(released_y, 0.0, best.y), np.where(released_z, 0.0, best.z)
+    return _result(solution, t, Prediction(x=best.x, y=y, z=z, violation=worst, steps=steps), message, began)
 
 
 def _result(
-    solution: Solution, t: Transcription, found: Prediction, words: str, began: float
+    solution: Solution, t: Transcription, found: Prediction, message: str, began: float
 ) -> SolverResult:
     seconds = time.perf_counter() - began
     return replace(
@@ -375,14 +406,14 @@ def _result(
         multipliers=found.y,
         bound_multipliers=found.z,
         objective=t.program.objective(found.x),
-        status=Status.ACCEPTABLE if found.violation <= _FIRST_ORDER else Status.ITERATION_LIMIT,
+        status=Status.ACCEPTABLE if found.violation <= _MAX_VIOLATION else Status.ITERATION_LIMIT,
         iterations=found.steps,
         seconds=seconds,
         seconds_functions=0.0,
         seconds_qp=seconds,
         max_violation=found.violation,
         kkt=float("nan"),
-        message=words,
+        message=message,
         history=(),
     )
 

@@ -1,4 +1,4 @@
-"""Result of a solve, and its record on disk."""
+"""Solutions of planned problems, and their summaries for ``summary.json``."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.planning.causes import Cause
-from impactopt.planning.contact_replay import AGREED, ContactReplay, ModelError, PlannedContact
+from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
-from impactopt.planning.lazy_constraints import gear_caution, rows_on_demand, slide, slide_caution
+from impactopt.planning.lazy_constraints import gear_caution, lazy_terms_of, slide, slide_caution
 from impactopt.planning.refinement import Attempt
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads
@@ -32,20 +32,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Solved:
-    """Result of a solver on a problem's program, solved or stopped.
+    """Result of a solver on a problem's nonlinear program, solved or stopped.
 
-    result : the solver's own record, its history included; of the best start.
+    result : of the solver from the best start, with its history.
     build_seconds : time to compile or load functions and to assemble the program.  solve_seconds : time of
-        the solver, of all starts.
-    violations : constraints that are not met, worst first.
+        the solver, for all starts.
+    violations : violated constraints, worst first.
     objectives : value of each of the problem's objectives, by name, in its own unit.
     attempts : result of each start.
-    apart : constraints of the program between bodies.
-    elements, shares : lengths of the collocation elements of the contact's phases, as fractions of them, if
-        they are finer than the problem asks for; and the share of each phase in the contact's time, where
-        something is frozen during contact. Else ().
-    gains : what is chosen of the gains that the problem left open; `problem` has the robot with these.
-    contact : the planned contact, and what comes of it in full dynamics; None where no usable plan was found.
+    apart : clearance constraints of the program.
+    elements : lengths of the collocation elements of each phase of the contact, as fractions of the phase, if
+        they are finer than the problem's; else ().
+    shares : each phase's fraction of the contact's duration, if the model freezes during contact; else ().
+    gains : chosen values of the gains that the problem left open; `problem` has the robot with these.
+    contact : the planned contact and its replay in full dynamics; None without a usable plan.
     """
 
     problem: ImpactProblem
@@ -63,7 +63,7 @@ class Solved:
     gains: tuple[ChosenGains, ...] = ()
 
     def __repr__(self) -> str:
-        """One line: its arrays would fill pages."""
+        """One line without arrays, which would fill pages."""
         impulse = getattr(self, "impulse", np.nan)
         return (
             f"<{type(self).__name__} of {self.problem.name or self.problem.robot.name!r}: "
@@ -72,13 +72,13 @@ class Solved:
 
     @property
     def model_error(self) -> ModelError | None:
-        """Estimated error of the model of the collision; None where nothing is frozen in it."""
+        """Estimated error of the collision model; None if it freezes nothing."""
         return None if self.contact is None else self.contact.model_error
 
     @property
     def contact_replay(self) -> ContactReplay | None:
-        """The planned contact followed in full dynamics from the plan's state at contact; None of an impact
-        without duration, and where no usable plan was found.
+        """Replay of the planned contact in full dynamics, from the plan's state at contact; None for an
+        impact without duration, and without a usable plan.
         """
         return None if self.contact is None else self.contact.replay
 
@@ -86,16 +86,14 @@ class Solved:
     def caution(self) -> str:
         """Warning about effects that the planned contact leaves out; empty if the replay agrees with it."""
         replay = self.contact_replay
-        return str(replay) if replay is not None and (replay.unforeseen or replay.off > AGREED) else ""
+        return str(replay) if replay is not None and (replay.unforeseen or replay.off > SOLVED_WITHIN) else ""
 
     @property
     def status(self) -> Status:
         return self.result.status
 
     def outcome(self) -> dict[str, Any]:
-        """Outcome of the solve, as in ``summary.json``; known even of a plan whose motion cannot be
-        completed.
-        """
+        """Outcome of the solve, as in ``summary.json``; also for a plan whose motion cannot be completed."""
         return {
             "status": self.status.value,
             "message": self.result.message,
@@ -109,7 +107,7 @@ class Solved:
             "collision_model": self.problem.collision,
             "freezes": self.problem.freezes,
             **({"touches": self.problem.touches} if self.problem.touches is not None else {}),
-            "rows_on_demand": list(rows_on_demand(self.problem)),
+            "rows_on_demand": list(lazy_terms_of(self.problem)),
             "style": self.problem.style,
             "price_scale": self.problem.price_scale,
             "model_error_pct": None if self.model_error is None else self.model_error.impulse_pct,
@@ -123,17 +121,17 @@ class Solved:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Solution(Solved):
-    """A solved (or stopped) impact problem.
+    """Solution of an impact problem, solved or stopped.
 
-    plan : the motion; for a status that is not usable, that of the best iterate.
+    plan : the motion; of the best iterate if the status is not usable.
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
-    contact_error : estimated error of the impulse by the contact's elements; None for an impact without
-        duration, and if no usable plan was found.
+    contact_error : estimated discretization error of the impulse; None for an impact without duration, and
+        without a usable plan.
     statement : names of the program's variables and constraints, as `impactopt.transcription.transcription`
-    writes them.
-    causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
-        cheapest first. Each has the ``problem`` with that value. Empty where none is known to.
-    window : what is to be said of the time that the contact may last; "" if that costs little.
+        writes them.
+    causes : of an infeasible problem, bounds each of which alone, with another value, makes it solvable. Each
+        has the ``problem`` with that value. Empty if none is known.
+    window : warning about a bound on the contact's duration that limits the objective; else "".
     Its other attributes are those of :class:`Solved`.
     """
 
@@ -158,16 +156,16 @@ class Solution(Solved):
 
     @property
     def contact_error_pct(self) -> float | None:
-        """Estimated error of the impulse [%]; None where there is no estimate, as an event is missed."""
+        """Estimated error of the impulse [%]; None without an estimate, as when an event is missed."""
         error = self.contact_error
         return error.pct if error is not None and np.isfinite(error.pct) else None
 
     @property
     def motion_price_pct(self) -> float:
-        """Share of the objective that the prices on motion, sole wrenches and the end posture take [%].
+        """Prices on motion, sole wrenches and end posture, over the objective [%].
 
-        They are there for one optimum among motions that hit as hard: ``ImpactProblem.smoothness``,
-        ``wrench_price`` and ``return_price``.  nan where the objectives are zero, or not known.
+        These, ``ImpactProblem.smoothness``, ``wrench_price`` and ``return_price``, select one optimum among
+        motions with equal objectives.  nan if the objectives are zero, or not known.
         """
         if any(o.name not in self.objectives for o in self.problem.objectives):
             return np.nan
@@ -178,12 +176,12 @@ class Solution(Solved):
 
     @property
     def trajectory(self) -> Trajectory:
-        """The servo's reference, sampled."""
+        """Sampled reference of the servo."""
         return self.plan.reference
 
     @property
     def missed_trajectory(self) -> Trajectory:
-        """The servo's reference if nothing is hit; InputError if the plan has no abort motion."""
+        """Sampled reference of the servo for a missed target; InputError if the plan has no abort motion."""
         return self.plan.missed_reference
 
     @property
@@ -193,8 +191,8 @@ class Solution(Solved):
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
         """Re-simulate the plan in full dynamics; a :class:`impactopt.simulation.Simulation`.
 
-        engine : "pinocchio" holds the soles to the ground; "mujoco" holds nothing, the robot can fall (extra
-        ``validate``).  options : of the engine, such as ``step`` [s], or of "pinocchio"
+        engine : "pinocchio" fixes the soles to the ground; with "mujoco" they are free and the robot can fall
+            (extra ``validate``).  options : of the engine, such as ``step`` [s], or of "pinocchio"
             ``missing=True``: there is no target.
 
         Raises
@@ -208,8 +206,8 @@ class Solution(Solved):
 
     def clearance(self) -> dict[str, Any]:
         """Clearances and unintended contacts in the plan, by exact geometry at 1 ms: the keys
-        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those after a missed blow
-        are among them, marked as such.
+        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``. They include the motion
+        after a missed target, whose contacts are marked.
         """
         least, nearest, touches = self._clearance
         return {"clearance_mm": 1e3 * least, "nearest": nearest, "contacts_besides": [{**t} for t in touches]}
@@ -238,13 +236,14 @@ class Solution(Solved):
 
     @property
     def collision(self) -> PlannedCollision:
-        """The expected one, at more instants than the program's where they are known."""
+        """The expected collision, on the finer mesh of the error estimate if there is one."""
         return self._collisions[0]
 
     @property
     def _collisions(self) -> list[PlannedCollision]:
-        """The expected one and those of the scenarios, at more instants than the program's where they are
-        known: between those torque and ZMP may be worse. What they come to is what the plan says.
+        """The expected collision and those of the scenarios, on the finer mesh of the error estimate if there
+        is one, as torque and ZMP may be worse between the program's points. The outcomes are those of the
+        plan.
         """
         planned = [self.plan.collision, *(scenario.collision for scenario in self.plan.scenarios)]
         if self.contact_error is None or self.contact_error.missed or not self.contact_error.finer:
@@ -253,7 +252,7 @@ class Solution(Solved):
         return [replace(new, outcome=old.outcome) for new, old in finer]
 
     def margins(self) -> dict[str, dict[str, float]]:
-        """ZMP margin [m] and torque demand over limit by phase, as of `Plan.margins`, in `collision`."""
+        """ZMP margin [m] and ratio of torque demand to limit, by phase, as of `Plan.margins`."""
         return self.plan.margins(self.collision)
 
     def sole_margins(self) -> dict[str, Any]:
@@ -261,19 +260,21 @@ class Solution(Solved):
         return self.plan.sole_margins(self.collision)
 
     def _stances(self) -> dict[str, Any]:
-        """Stance phases, and how fast soles touch down, as ``summary.json`` has them."""
+        """Stance phases and landing speeds of soles, as in ``summary.json``."""
         if not self.problem.stances:
             return {}
         return {"stances": self.plan.stances(), "landing_speed_m_s": self.plan.landing_speeds()}
 
     @cached_property
     def loads(self) -> DriveLoads:
-        """Peak loads of gears and motors, as planned with the expected target."""
+        """Peak loads of gears and motors in the plan, with the expected target."""
         return motion_loads(self.problem.robot, self.trajectory, self.collision)
 
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
-        """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
-        plan, way = self.plan, self.slide
+        """Entries of ``summary.json``, with ``simulated``, and ``replayed`` on free soles, if these are
+        given.
+        """
+        plan = self.plan
         expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),
@@ -289,7 +290,7 @@ class Solution(Solved):
             **self.sole_margins(),
             **self.loads.summary(),
             **self.clearance(),
-            "slide_mm": 1e3 * way,
+            "slide_mm": 1e3 * self.slide,
             **motion_measures(self.problem, self.trajectory),
             **first_touch(plan),
             "versions": versions(),
@@ -310,13 +311,13 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way), self.window))):
+        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(self.slide), self.window))):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])
 
 
 def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
-    """Data of a planned impact for ``summary.json``; one without duration has no force."""
+    """Entries of ``summary.json`` for a planned impact; one without duration has no force."""
     duration = hit.compression + hit.restitution
     return {
         "impulse_Ns": hit.impulse,
@@ -328,6 +329,6 @@ def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> di
 
 
 def versions() -> dict[str, str]:
-    """Versions of what made the numbers."""
+    """Versions of the packages that computed the results."""
     names = ("casadi", "pin", "numpy", "scipy", "osqp")
     return {"impactopt": __version__, "python": platform.python_version(), **{n: version(n) for n in names}}

@@ -1,7 +1,7 @@
-"""Solve: from a problem to its solution.
+"""Planner: solution of an impact problem.
 
-`solve` checks what is asked; `_planned` goes from the problem to a nonlinear program (`Transcription`), its
-initial guesses, their refinement (`refine`), a diagnosis where none leads to a solution, and the `Solution`.
+`solve` checks its arguments. `_planned` makes the nonlinear program (`Transcription`) and its initial
+guesses, solves and refines these (`refine`), diagnoses a failure, and makes the `Solution`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,15 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
 from impactopt.planning.causes import Cause, search
-from impactopt.planning.clearance_constraints import Margins, same_bodies, solved_apart
-from impactopt.planning.diagnosis import lacks_rows, second_look, with_reason, with_soles_kept
-from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, rows_on_demand, window_caution, with_rows
+from impactopt.planning.clearance_constraints import Margins, same_bodies, solve_with_clearance
+from impactopt.planning.diagnosis import ended_with_violations, ipopt_retry, with_reason, with_soles_kept
+from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
+from impactopt.planning.lazy_constraints import (
+    LazyTerms,
+    lazy_terms_of,
+    window_caution,
+    with_lazy_constraints,
+)
 from impactopt.planning.models import carried_start, with_touches, with_touches_of
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
@@ -78,31 +83,32 @@ def solve(
         "ipm" is our primal-dual interior-point method; "sqp" our SQP, which solves its QPs to their end, by
         OSQP, for small programs.
     start : str, array_like (n,) or Solution
-        "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such a
-        reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables; or the
-        solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
+        Initial guess. "reach": a plain reach to the target; "strike": the same with the state at contact of
+        the hardest impact near by, which is a program of its own (:func:`impactopt.optimize_strike`); solver
+        variables; or the solution of a similar problem, such as the same with its target moved by a few
+        centimetres.
     starts : int
-        Number of starts. The first one is plain, the others have perturbed postures and other speeds, drawn
-        by `seed`. The best motion is kept; ``Solution.attempts`` has all. Where all end with bodies in each
-        other, up to two more are tried, unless two end alike.
+        Number of initial guesses. All but the first one have perturbed postures and other speeds, drawn by
+        `seed`. The best motion is kept; ``Solution.attempts`` has all. If bodies penetrate each other in all
+        solutions, up to two more guesses are tried, unless two have ended alike.
     seed : int
-        Seed of the starts that are drawn.
+        Seed of the drawn initial guesses.
     options : mapping, optional
-        The solver's own: those of :class:`impactopt.solvers.ipm.IPMOptions`,
+        Options of the solver: those of :class:`impactopt.solvers.ipm.IPMOptions`,
         :class:`impactopt.solvers.sqp.SQPOptions`, or IPOPT's.
     time_limit : float, optional
-        Time [s] of all starts together, without compiling functions.
+        Time [s] for all starts together, without compiling functions.
     workers : int
-        Processes that the starts are solved on, side by side. Then no callback is asked, and no more starts
-        are tried than were asked for.
+        Number of processes that solve the starts. With more than one, `callback` is not allowed, and no
+        starts are added.
     refine : bool
-        Whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin between
-        two nodes, and it is solved again from the solution, at most three times (``Solution.nodes``). The
-        contact gets finer elements while theirs make an error of more than half a per cent of the impulse
+        Refine the mesh. Nodes are added where a motion loses more than half of a margin between two nodes,
+        and the problem is solved again from the solution, at most three times (``Solution.nodes``). The
+        contact gets finer elements while their error is more than half a per cent of the impulse
         (``Solution.elements``, ``Solution.contact_error``).
     report : callable, optional
-        Called with a line of text while functions are built; by default the logger "impactopt", with level
-        INFO, has them.
+        Called with a line of text while functions are built; by default the lines go to the logger
+        "impactopt" with level INFO.
     callback : callable, optional
         Called with every iteration's record; if it returns True, or on Ctrl-C, the solve stops with the best
         iterate.
@@ -110,12 +116,12 @@ def solve(
     Returns
     -------
     Solution
-        The plan, with the solver's result; its status says whether it is solved.
+        Plan with the solver's result and status.
 
     Raises
     ------
     InputError
-        Unknown solver, option or start, a start of the wrong length, several of a given start.
+        An unknown solver, option or start; a start of the wrong length; several starts from a given one.
     """
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback, report=report)
     check_starts(starts, seed, workers, callback, given=not isinstance(start, str))
@@ -141,19 +147,19 @@ def _planned(
     which: range,
     last: int,
 ) -> Solution:
-    """Solution from the given start, or the best from these starts.
+    """Solution from the given initial guess, or the best from the starts of these numbers.
 
-    last : number that further starts end before, if all are refused.
+    last : number that further starts end before, if the solutions of all are refused.
     """
     began = time.perf_counter()
     t, given = _program(problem, start, budget)
     budget = budget.started()
     if isinstance(given, SolverResult) and Outcome.of(t, given).own_violation <= VIOLATED:
-        budget = budget.near_by()  # the start may be the optimum
+        budget = budget.near_by()  # a feasible warm start may be the optimum
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(t.problem) if t.problem.keeps_apart else None
-    # guesses compare only once their solutions are clear of bodies and within gears: each is refined; where
-    # no bodies are kept apart, refining the best one is enough
+    # Solutions of different guesses compare only once they keep their clearances and gear limits, so each is
+    # refined. Without clearance constraints only the best one is.
     solver = PlanSolver(budget=budget, margins=margins, refined=refined and margins is not None)
     if isinstance(start, Solution) and margins is not None and same_bodies(t.problem, start.problem):
         t = t.with_apart(start.apart)
@@ -161,12 +167,12 @@ def _planned(
     outcome = best_of(guesses, solver.from_guess, budget, len(which))
     if refined and margins is None:
         outcome = solver.on(outcome)
-    known = hopeless(t.problem) if lacks_rows(outcome.program, outcome.result) else []
+    known = hopeless(t.problem) if ended_with_violations(outcome.program, outcome.result) else []
     causes: tuple[Cause, ...] = ()
     if not known:
         outcome, causes = _diagnosed(outcome, solver)
-    gains = chosen_of(outcome.program, outcome.result.x)
-    outcome = settled(outcome, gains, budget)
+    gains = chosen_gains(outcome.program, outcome.result.x)
+    outcome = with_gains_fixed(outcome, gains, budget)
     t, solved = outcome.program, time.perf_counter()
     outcome = replace(outcome, result=with_reason(t, outcome.result, causes, known=known)).checked()
     usable = outcome.usable
@@ -186,19 +192,19 @@ def _planned(
 def _program(
     problem: ImpactProblem, start: str | ArrayLike | Solution, budget: Budget
 ) -> tuple[Transcription, str | Array | SolverResult]:
-    """A problem's nonlinear program, on the mesh of a given solution, and the given start on it."""
+    """Nonlinear program of a problem, on the mesh of a given solution, and the initial guess for it."""
     if not isinstance(start, Solution):
         problem = with_touches(problem, budget.say)
-        t = program_on(roomy(problem), NO_MORE, (), (), budget.report)
+        t = program_on(with_room_for_gains(problem), NO_MORE, (), (), budget.report)
         if isinstance(start, str):
             return with_first_scale(t), start
         return t, check_array("start", start, (t.program.n,))
-    # a neighbour is likely to need the same constraints and prices
-    problem = with_rows(problem, rows_on_demand(start.problem))
+    # a similar problem is likely to need the same lazy constraints and prices
+    problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
     if problem.style == start.problem.style:
         problem = replace(problem, price_scale=start.problem.price_scale)
     problem = with_touches_of(start, problem)
-    t = program_on(roomy(problem), start.nodes, start.elements, start.shares, budget.report)
+    t = program_on(with_room_for_gains(problem), start.nodes, start.elements, start.shares, budget.report)
     apart = start.apart if same_bodies(problem, start.problem) else {}
     given = carried_start(t, partial(program_of, start), start, apart)
     check_array("start", given.x, (t.program.n,))
@@ -209,7 +215,8 @@ def _program(
 class PlanSolver:
     """Solves plans from their initial guesses.
 
-    margins : required clearance; None where bodies are not kept apart.  refined : whether each is refined.
+    margins : required clearances; None if there are no clearance constraints.  refined : whether each
+    solution is refined between its nodes.
     """
 
     budget: Budget
@@ -217,55 +224,59 @@ class PlanSolver:
     refined: bool
 
     def from_guess(self, guess: Guess[Transcription]) -> Outcome[Transcription]:
-        """Outcome of an initial guess, with the lazy constraints that it needs and at its price of motion."""
+        """Outcome of an initial guess, with the lazy constraints and the prices of motion that it needs."""
         oracles: list[Oracle[Transcription]] = [LazyTerms(self.budget.report), MotionPrice()]
         return refine(self._solved(guess), oracles, self._solved, self.budget)
 
     def on(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
-        """A solution refined further, where it has not been."""
-        own = replace(self, refined=True)
+        """Solution refined between its nodes, which `from_guess` has not done without clearance
+        constraints.
+        """
+        refining = replace(self, refined=True)
 
         def solve(guess: Guess[Transcription]) -> Outcome[Transcription]:
-            return solved_apart(self.budget, self.margins, guess)
+            return solve_with_clearance(self.budget, self.margins, guess)
 
         outcome = refine(outcome, [BetweenNodes(self.budget, self.margins)], solve, self.budget)
-        return refine(outcome, [LazyTerms(self.budget.report)], own._solved, self.budget)
+        return refine(outcome, [LazyTerms(self.budget.report)], refining._solved, self.budget)
 
     def _solved(self, guess: Guess[Transcription]) -> Outcome[Transcription]:
-        """Outcome of an initial guess, refined between nodes; by a second solver where the first gives up."""
-        outcome = solved_apart(self.budget, self.margins, guess)
+        """Outcome of an initial guess, refined between nodes; by IPOPT if our solver fails without a
+        diagnosis.
+        """
+        outcome = solve_with_clearance(self.budget, self.margins, guess)
         if not self.refined:
-            return outcome if self.margins is not None else self._looked_at(outcome)
+            return outcome if self.margins is not None else self._retried(outcome)
         if self._stuck(outcome.result) and outcome.program.apart_rows and self.budget.left != 0:
             outcome = self._solved_without_clearance(outcome)
         else:
             outcome = self._between(outcome)
-        looked = self._looked_at(outcome)
-        return looked if looked is outcome or not looked.usable else self._between(looked)
+        retried = self._retried(outcome)
+        return retried if retried is outcome or not retried.usable else self._between(retried)
 
     def _between(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
         return BetweenNodes(self.budget, self.margins).refined(outcome)
 
-    def _looked_at(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
-        """Outcome without a diagnosis, with that of another solver from the same guess."""
+    def _retried(self, outcome: Outcome[Transcription]) -> Outcome[Transcription]:
+        """Outcome of IPOPT from the same guess, if the old one has no diagnosis; else the old one."""
         t, old = outcome.program, outcome.result
-        new = second_look(self.budget, t.program, outcome.origin.x, old)
+        new = ipopt_retry(self.budget, t.program, outcome.origin.x, old)
         return outcome if new is old else outcome.then(Outcome.of(t, new))
 
     def _stuck(self, result: SolverResult) -> bool:
-        """True if the solver has ended without a solution, and not at a limit that the caller has set."""
+        """True if the solver has ended without a solution, and not at a limit that the user has set."""
         if result.status is Status.ITERATION_LIMIT:
             return "max_iterations" not in (self.budget.options or {})
         return result.status in _STUCK
 
     def _solved_without_clearance(self, stuck: Outcome[Transcription]) -> Outcome[Transcription]:
-        """Outcome of an initial guess with which the first clearance constraints lead nowhere.
+        """Outcome of an initial guess from which no motion was found with clearance constraints.
 
-        A solver that stops there does not show that there is no motion: the constraints are linearized for
-        the bodies as they are in the guess. So the motion is first found without them and then moved out of
-        penetration; if that fails too, the violated constraints name the obstacle.
+        That does not show that there is none, as the constraints are linearized at the guess. So the program
+        is first solved without them, and its solution moved out of penetration. If that fails too, the
+        violated constraints of the first solve name the obstacle.
         """
-        self.budget.say("no motion was found from there with clearance constraints: first without them")
+        self.budget.say("no motion was found with clearance constraints: solving without them first")
         free = stuck.program.with_apart({})
         found = self._between(Outcome.of(free, self.budget.run(free.program, stuck.origin.x), stuck.origin))
         return stuck.then(found) if found.usable else found.then(stuck)
@@ -274,17 +285,17 @@ class PlanSolver:
 def _diagnosed(
     outcome: Outcome[Transcription], solver: PlanSolver
 ) -> tuple[Outcome[Transcription], tuple[Cause, ...]]:
-    """Diagnosis of a failed solve: the bounds that make it infeasible, or a solution from a feasible point
-    that the diagnosis has found.
+    """Outcome and causes of infeasibility after a failed solve: the outcome is a solution if the diagnosis
+    has found a feasible point and a motion from there.
 
-    A limit that the caller has set is an answer, and stays one.
+    A solve that ended at a limit that the user has set is returned as it is.
     """
     budget, old = solver.budget, outcome.result
     limited = old.status is Status.ITERATION_LIMIT and "max_iterations" in (budget.options or {})
-    if limited or not lacks_rows(outcome.program, old) or budget.left == 0:
+    if limited or not ended_with_violations(outcome.program, old) or budget.left == 0:
         return outcome, ()
     if outcome.origin.program.problem.style_prices != MotionPrices():
-        budget.say("no motion was found from there: again without prices on motion")
+        budget.say("no motion was found: solving again without prices on motion")
         free = unpriced(outcome.origin.program)
         both = outcome.then(
             solver.from_guess(Guess(program=free, start=outcome.origin.x)), "no prices on motion"
@@ -294,11 +305,11 @@ def _diagnosed(
         outcome = replace(outcome, result=with_effort_of(old, both.result))
         if budget.left == 0:
             return outcome, ()
-    budget.say("no motion meets all bounds: which one would have to move?")
+    budget.say("no motion meets all bounds: searching for the bound that would have to change")
     found = search(outcome.program, old, budget)
     if found.met is None or budget.left == 0:
         return outcome, found.causes
-    budget.say("there is a motion that meets all bounds: on from there")
+    budget.say("a motion that meets all bounds was found: solving from it")
     program, x = found.met
     new = solver.from_guess(Guess(program=program, start=x))
     return (outcome.then(new, "a motion within all bounds") if new.usable else outcome), ()
@@ -307,7 +318,9 @@ def _diagnosed(
 def _guesses(
     t: Transcription, start: str | Array | SolverResult, which: range, seed: int, solver: PlanSolver
 ) -> Guesses[Transcription]:
-    """Named initial guesses: the given one, or drawn reaches, or the strikes that these lead to."""
+    """Named initial guesses: the given one, or drawn reaches, or those with the states of optimized
+    strikes.
+    """
     if not isinstance(start, str):
         return [("given", partial(Guess, program=t, start=start))]
     strike = StrikeTranscription(t.problem, t.coordinates, t.functions) if start == "strike" else None

@@ -1,4 +1,4 @@
-"""The hardest blow by itself: the state at contact that no motion need reach."""
+"""Strike optimization: the state at contact with the hardest impact, without a motion that reaches it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
 from impactopt.planning.budget import Budget, touching
-from impactopt.planning.clearance_constraints import Margins, deepest_penetration, solved_apart
+from impactopt.planning.clearance_constraints import Margins, deepest_penetration, solve_with_clearance
 from impactopt.planning.diagnosis import with_reason
-from impactopt.planning.gain_selection import chosen_of, roomy, settled
-from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, rows_on_demand, with_rows
+from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
+from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, lazy_terms_of, with_lazy_constraints
 from impactopt.planning.models import carried_start, with_touches, with_touches_of
 from impactopt.planning.multistart import (
     Guesses,
@@ -36,29 +36,29 @@ from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
-# first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
-# solve that goes on with other constraints
-BARRIER_ARM, BARRIER_ON = 0.03, 1e-2
+# First barriers: of robots without soles, whose solves are faster and succeed more often with it (humanoids'
+# do not); and of a warm start with other constraints.
+BARRIER_ARM, BARRIER_WARM = 0.03, 1e-2
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class StrikeSolution(Solved):
-    """A solved (or stopped) strike.
+    """Solution of a strike program.
 
-    strike : posture and velocity at contact, and the blow; for a status that is not usable, of the best
-    iterate.  Its other attributes are those of :class:`impactopt.planning.solution.Solved`.
+    strike : posture and velocity at contact, and the impact; those of the best iterate if the status is not
+    usable.  Its other attributes are those of :class:`impactopt.planning.solution.Solved`.
     """
 
     strike: PlannedStrike
 
     @property
     def impulse(self) -> float:
-        """Planned impulse to the target [N s]: no motion from this local optimum brings more."""
+        """Planned impulse to the target [N s]: an upper bound for motions near this local optimum."""
         return self.strike.impulse
 
     def summary(self) -> dict[str, Any]:
-        """The numbers of ``summary.json``."""
+        """Entries of ``summary.json``."""
         hit = self.strike
         loads, names = hit.loads(), self.problem.robot.joint_names
         angles = self.problem.robot.joint_positions(hit.posture)
@@ -91,24 +91,24 @@ def optimize_strike(
     report: Callable[[str], None] | None = None,
     callback: Callback | None = None,
 ) -> StrikeSolution:
-    """Find the state at contact that hits hardest within the problem's terms, without a motion that leads to
-    it.
+    """Find the state at contact with the hardest impact within the problem's terms, without a motion that
+    leads to it.
 
-    The motion before and after is free. So near the state at contact of a motion, the impulse of the strike
-    is an upper bound on that of the motion. There are local optima: different postures can differ by a
-    factor. Gears bear what `GearLoad` lets them, by default too.
+    The motions before and after are free. So the impulse of the strike is an upper bound on that of motions
+    whose state at contact is near. There are local optima: the impulses of different postures can differ by a
+    factor. The gear loads stay within `GearLoad`, by default too.
 
-    method : "collocation", the only one: the whole equation of motion while the contact lasts.
+    method : "collocation", the only one: the full equations of motion during contact.
     solver, options, time_limit, report, callback : as of :func:`impactopt.solve`.
-    starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,
-        drawn by ``seed``; the best strike is kept. ``StrikeSolution.attempts`` has all.
-    workers : processes that these starts are solved on, side by side; then no callback is asked.
-    start : to start from instead: solver variables (n,), or the solution of a neighbouring problem.
+    starts : number of initial guesses; all but the first one have perturbed postures and other speeds, drawn
+        by ``seed``. The best strike is kept; ``StrikeSolution.attempts`` has all.
+    workers : number of processes that solve these; with more than one, ``callback`` is not allowed.
+    start : initial guess instead: solver variables (n,), or the solution of a similar problem.
 
     Raises
     ------
-    InputError : an unknown method, solver or option; a start of the wrong length; `starts` beside a given
-        start; objectives of a whole motion only.
+    InputError : an unknown method, solver or option; a start of the wrong length; several `starts` with a
+        given start; objectives of a whole motion only.
     """
     if method != "collocation":
         gone = "is no longer supported" if method == "shooting" else "is unknown"
@@ -117,7 +117,7 @@ def optimize_strike(
     check_starts(starts, seed, workers, callback, given=start is not None)
     if problem.floats:
         raise InputError(
-            f"robot {problem.robot.name!r} floats freely: what it can have at contact hangs on the swing, so "
+            f"robot {problem.robot.name!r} floats freely: its state at contact depends on the swing, so "
             "there is no strike by itself; solve the whole motion, from a reach"
         )
     if all(o.whole_motion for o in problem.objectives):
@@ -134,10 +134,10 @@ def _optimized(
     which: range,
     _last: int,
 ) -> StrikeSolution:
-    """The best strike from these starts, or from the given one."""
-    began, problem = time.perf_counter(), roomy(problem)
+    """Best strike from the starts of these numbers, or from the given initial guess."""
+    began, problem = time.perf_counter(), with_room_for_gains(problem)
     if isinstance(start, StrikeSolution):
-        problem = with_rows(problem, rows_on_demand(start.problem))
+        problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
         problem = with_touches_of(start, problem)
     else:
         problem = with_touches(problem, budget.say)
@@ -146,12 +146,11 @@ def _optimized(
     budget = budget.started()
     t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
-        same = partial(_program_of, start)
-        start = carried_start(t, same, start, start.apart).x
+        start = carried_start(t, partial(_program_of, start), start, start.apart).x
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     solve = partial(_clean_strike, budget, Margins(problem) if problem.keeps_apart else None)
 
-    def bounded(guess: Guess[StrikeTranscription]) -> Outcome[StrikeTranscription]:
+    def with_lazy_terms(guess: Guess[StrikeTranscription]) -> Outcome[StrikeTranscription]:
         return refine(solve(guess), [LazyTerms(budget.report)], solve, budget)
 
     def reach(draw: dict[str, Any]) -> Guess[StrikeTranscription]:
@@ -161,9 +160,9 @@ def _optimized(
     guesses: Guesses[StrikeTranscription] = drawn_guesses("reach", reach, which, seed)
     if start is not None:
         guesses = [("given", partial(Guess, program=t, start=check_array("start", start, (t.program.n,))))]
-    outcome = best_of(guesses, bounded, budget, len(which))
-    gains = chosen_of(outcome.program, outcome.result.x)
-    outcome = settled(outcome, gains, budget)
+    outcome = best_of(guesses, with_lazy_terms, budget, len(which))
+    gains = chosen_gains(outcome.program, outcome.result.x)
+    outcome = with_gains_fixed(outcome, gains, budget)
     t, at, solved = outcome.program, outcome.at, time.perf_counter()
     outcome = replace(outcome, result=with_reason(t, outcome.result)).checked()
     return StrikeSolution(
@@ -185,7 +184,7 @@ def _optimized(
 
 
 def _program_of(solution: StrikeSolution) -> StrikeTranscription:
-    """The program of a solution, without clearance constraints."""
+    """Program of a strike's solution, without clearance constraints."""
     p, elements = solution.problem, solution.elements
     functions = block_functions(p, p.coordinates, None, elements)
     return StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
@@ -194,9 +193,10 @@ def _program_of(solution: StrikeSolution) -> StrikeTranscription:
 def clear_strike(
     budget: Budget, margins: Margins | None, guess: Guess[StrikeTranscription]
 ) -> Outcome[StrikeTranscription]:
-    """A strike whose bodies keep apart.
+    """Strike with clearance constraints, and freezes at the right times.
 
-    guess : if warm, the solve goes on from there, and begins anew only where that fails.
+    guess : a warm start is tried first; if that fails, the solve begins without its multipliers and clearance
+    constraints.
     """
     t = guess.program
     if budget.interior and not t.coordinates.soles:
@@ -204,10 +204,13 @@ def clear_strike(
 
     def solve(guess: Guess[StrikeTranscription]) -> Outcome[StrikeTranscription]:
         return refine(
-            solved_apart(budget, margins, guess), [Freezes()], partial(solved_apart, budget, margins), budget
+            solve_with_clearance(budget, margins, guess),
+            [Freezes()],
+            partial(solve_with_clearance, budget, margins),
+            budget,
         )
 
-    outcome = solve(replace(guess, barrier=BARRIER_ON))
+    outcome = solve(replace(guess, barrier=BARRIER_WARM))
     if guess.warm is not None and outcome.result.status in _STUCK and budget.left != 0:
         outcome = outcome.then(solve(Guess(program=t.with_apart({}), start=guess.x)))
     return outcome
@@ -216,7 +219,7 @@ def clear_strike(
 def _clean_strike(
     budget: Budget, margins: Margins | None, guess: Guess[StrikeTranscription]
 ) -> Outcome[StrikeTranscription]:
-    """Strike without penetration (`clear_strike`); a result that still has some is no solution."""
+    """Strike without penetration (`clear_strike`); a failed outcome if bodies still penetrate."""
     outcome = clear_strike(budget, margins, guess)
     if margins is None or not outcome.usable:
         return outcome
@@ -228,14 +231,14 @@ def _clean_strike(
 
 
 class Freezes:
-    """Oracle for freezes of the model during contact that do not come when they are to, by the time that the
-    contact takes.
+    """Oracle for the instants at which a model freezes during contact: they are fractions of the contact's
+    duration, and change with the durations of its phases.
     """
 
     most = 10
 
     def missing(self, outcome: Outcome[StrikeTranscription]) -> Additions[StrikeTranscription] | None:
-        """The program with freezes at other shares of the contact."""
+        """Program whose phases have the fractions of the contact that the solution has."""
         t, x = outcome.program, outcome.result.x
         shares = t.hit.drifted(x)
         if shares is None:

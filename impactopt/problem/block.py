@@ -1,5 +1,5 @@
-"""Nonlinear functions of variables z and numbers p, symbolic: what constraints and objectives are written
-with.
+"""Blocks: symbolic nonlinear functions of variables z and parameters p, of which constraints and objectives
+are made.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from impactopt.kinematics.stages import Stage
 
 __all__ = ["LANES", "BlockExpression", "BlockRecipe", "JointMotion", "joint_motion", "make_block"]
 
-# Instances that a compiled block takes at once, on any CPU: where its vectors are narrower, the compiler
-# takes several. Fewer, a power of two, for blocks of few instances: lanes that are idle cost as much as the
-# others, in memory between the caches above all.
+# Instances that a compiled block evaluates at once (SIMD). On CPUs with narrower vectors the compiler uses
+# several vectors. Blocks of few instances have fewer lanes, a power of two, as idle lanes cost as much as the
+# others, above all in memory traffic.
 LANES = 8
 
 
 @dataclass(frozen=True)
 class BlockExpression:
-    """z (variables), p (parameters), out: SX columns, and the length of each named slice of ``out``.
+    """Expression of a block: SX columns of the variables z, the parameters p and the output.
 
-    through : numbers that ``out`` is written with, in stages.  lanes : of
-        `impactopt.transcription.simd.in_lanes`, about as many as there are instances.
+    sizes : length of each named slice of ``out``.  through : intermediate quantities of ``out``, in stages.
+    lanes : of `impactopt.transcription.simd.in_lanes`, about the number of instances.
     """
 
     z: Any
@@ -45,10 +45,10 @@ def make_block(
     lanes: int = LANES,
     stages: Sequence[Stage] = (),
 ) -> BlockExpression:
-    """A block from parts of z and of p, and the named slices of its output.
+    """Block from the parts of z and of p, and the named slices of its output.
 
-    through : numbers that it is written with, in place of an expression of z and p each.  stages : more of
-        them, each of z, p and of those before.
+    through : intermediate symbols of ``out``, each with its expression in z and p.  stages : further
+        intermediate quantities, each in z, p and those before.
     """
     first = [Stage(*(ca.vertcat(*parts) for parts in zip(*through, strict=True)))] if through else []
     return BlockExpression(
@@ -63,11 +63,12 @@ def make_block(
 
 @dataclass(frozen=True)
 class BlockRecipe:
-    """A block that is only built where its compiled functions are not in the cache.
+    """Recipe of a block, which is built only if its compiled functions are not in the cache.
 
-    build : makes it; with `of_stages` from the number of collocation points of the expected contact.
-    key : all that shapes it beside robot, stance, striker, that number, and this package's sources. What is
-        written outside the package has to be given as the block itself: its sources are not looked at.
+    build : makes the block; with `of_stages` from the number of collocation points of the expected contact.
+    key : everything that the block depends on beside robot, stance, striker, that number, and this package's
+        sources. A term outside of the package has to give the block itself, as the cache does not know its
+        sources.
     """
 
     build: Callable[..., BlockExpression]
@@ -78,7 +79,7 @@ class BlockRecipe:
 class JointMotion(NamedTuple):
     """Velocities and accelerations of all joints.
 
-    z : what it is a function of, as `ContactProgram.drive_points` has slots for it.  velocity (n) [rad/s],
+    z : their variables, for which `ContactProgram.drive_points` has slots.  velocity (n) [rad/s],
     acceleration (n) [rad/s^2].  through : of `make_block`.
     """
 
@@ -89,7 +90,9 @@ class JointMotion(NamedTuple):
 
 
 def joint_motion(c: StanceCoordinates) -> JointMotion:
-    """z = y0; d1, T1, d, T: y = y0 + T1 d1 + T d; r, r', S: ydot = r/S, yddot = r'/(S T); legs (nl)."""
+    """Motion of all joints, as functions of coordinates y = y0 + T1 d1 + T d, rates ydot = r/S, accelerations
+    yddot = r'/(S T) and legs (nl).
+    """
     names = ("y0", "d1", "d", "r", "r1", "y", "u", "udot")
     y0, d1, d, r, r1, y, u, udot = (ca.SX.sym(name, c.ny) for name in names)
     T1, T, S, legs = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("S"), ca.SX.sym("legs", c.nl)

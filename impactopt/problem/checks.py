@@ -1,4 +1,8 @@
-"""Checks by which an `impactopt.ImpactProblem` refuses parts that do not go together."""
+"""Checks of the parts of an `impactopt.ImpactProblem` against each other.
+
+Each check replaces a field by its normalized value (a tuple, a float) where it has one, and raises
+`InputError`.
+"""
 
 from __future__ import annotations
 
@@ -51,19 +55,20 @@ __all__ = [
     "check_world",
 ]
 
-# models of the collision, cheapest first; those of no duration; "auto": the cheapest that is good enough
-INSTANT = ("rigid", "virtual-mass")
+INSTANT = ("rigid", "virtual-mass")  # collision models without duration
+# collision models, the cheapest first; "auto" is the cheapest that is accurate enough
 COLLISIONS = (*INSTANT, "sdc-paper", "sdc", "full", "auto")
 MOST_FREEZES = 64
 LONGEST_CONTACT = 100.0  # [s]
-MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
+MOST_ELEMENTS = 100  # of compression or restitution: two are accurate to a few per mille
 MOST_TOUCHES = 4
 MANY = 100  # scenarios or obstacles
-STUCK = 1e-12  # mobility along the normal over the largest in any direction, that is none
+# Smaller mobilities along the normal, over the largest in any direction, count as zero.
+MIN_MOBILITY = 1e-12
 
 
 def check_apart(kind: str, names: Sequence[str]) -> None:
-    """InputError if there are too many things of a kind, or two of the same name."""
+    """InputError if there are too many things of a kind, or two with the same name."""
     if len(names) > MANY:
         raise InputError(
             f"there are {len(names)} {kind}s; give at most {MANY}, each of which is part of the program"
@@ -76,7 +81,7 @@ def check_apart(kind: str, names: Sequence[str]) -> None:
 def check_at_rest(
     robot: Robot, coordinates: StanceCoordinates, soles: Sequence[str], posture: NDArray[np.float64]
 ) -> None:
-    """InputError if the posture's centre of mass is not above the fixed soles: it would fall at once."""
+    """InputError if the posture's centre of mass is not above the fixed soles, so that the robot falls."""
     polygon = support_polygon(robot, coordinates)
     if not len(polygon):
         return
@@ -86,12 +91,12 @@ def check_at_rest(
         raise InputError(
             f"the start posture cannot be held at rest: its centre of mass is {-1e3 * inside:.0f} mm "
             f"outside the support polygon of {', '.join(soles)}; start from a posture with its weight on "
-            "what is held, or hold more"
+            "these soles, or stand on more"
         )
 
 
 def check_world(problem: Any) -> None:
-    """InputError for bodies of the world that are none; for a ground that is not where the soles stand."""
+    """InputError for wrong bodies of the world, and for a ground other than that of the soles."""
     if not isinstance(problem.body, TargetBody):
         raise InputError(f"body must be a TargetBody, not {problem.body!r}")
     obstacles, ground = problem.obstacles, problem.ground
@@ -108,15 +113,15 @@ def check_world(problem: Any) -> None:
 
 
 def check_stance(problem: Any) -> None:
-    """InputError for a stance that plans have not: a virtual base, a hand with no arm of its own, soles on a
-    ground that is not level.
+    """InputError for a stance that cannot be planned: with a virtual base, a supporting hand that shares its
+    arm, or soles on a ground that is not level.
     """
     robot, stance = problem.robot, problem.stance
-    pull = np.array(robot.model.gravity.linear)
-    if stance.sole_frames(robot) and not (pull[2] < 0 and not pull[:2].any()):
+    gravity = np.array(robot.model.gravity.linear)
+    if stance.sole_frames(robot) and not (gravity[2] < 0 and not gravity[:2].any()):
         raise InputError(
-            f"gravity is {pull.tolist()} m/s2, and soles that stand need one along -z: turn it, as <option "
-            "gravity> of an MJCF, or bolt the robot to the ground (floating = false)"
+            f"gravity is {gravity.tolist()} m/s2, and soles that stand need one along -z: turn it, as "
+            "<option gravity> of an MJCF, or bolt the robot to the ground (floating = false)"
         )
     if np.any(stance.compliance > 0):
         raise InputError(
@@ -128,7 +133,9 @@ def check_stance(problem: Any) -> None:
 
 
 def check_hands(problem: Any) -> None:
-    """InputError for a hand that holds on where it cannot, or by a grip of no known strength."""
+    """InputError for a supporting hand without a known grip, in a model without it, or on the striking
+    arm.
+    """
     p, robot, grip = problem, problem.robot, problem.extra(Grip)
     hands = p.stance.held_hands(robot)
     if not hands:
@@ -140,7 +147,8 @@ def check_hands(problem: Any) -> None:
         return
     if grip is None:
         raise InputError(
-            f"the hand {hands[0].name!r} holds on: say what its grip bears, by the term Grip(force=, moment=)"
+            f"the hand {hands[0].name!r} holds on: give the limits of its grip, by the term "
+            "Grip(force=, moment=)"
         )
     if p.collision != "full":
         raise InputError(f'a plan whose hand holds on needs collision="full", not {p.collision!r}')
@@ -156,7 +164,9 @@ def check_hands(problem: Any) -> None:
 
 
 def check_gains(problem: Any) -> None:
-    """InputError for gains that no plan can choose: of a joint twice, too fast, in a contact without time."""
+    """InputError for gains that cannot be chosen: two factors for a joint, a servo that is too fast, or a
+    contact without duration.
+    """
     if not isinstance(problem.gains, (list, tuple)) or not all(
         isinstance(gain, GainFactor) for gain in problem.gains
     ):
@@ -183,7 +193,7 @@ def check_moves(problem: Any) -> None:
     c, n = problem.coordinates, problem.normal
     striker = problem.robot.striker(problem.striker).model_frame
     mobility = Held.at(c.model, problem.contact_posture, c.frames, striker).inverse_mass()
-    if n @ mobility @ n <= STUCK * np.linalg.norm(mobility):
+    if n @ mobility @ n <= MIN_MOBILITY * np.linalg.norm(mobility):
         raise InputError(
             f"no joint of {problem.robot.name!r} moves {problem.striker!r} along the normal "
             f"{np.round(n, 6).tolist()} at the point: turn the normal, move the point, or take another robot"
@@ -191,7 +201,7 @@ def check_moves(problem: Any) -> None:
 
 
 def check_collision(problem: Any) -> None:
-    """InputError for a law, a target and a model of the collision that do not go together."""
+    """InputError for a law, target and collision model that do not fit together."""
     for name, kind in (("law", ContactLaw), ("target", Target)):
         thing = getattr(problem, name)
         if not isinstance(thing, kind):
@@ -231,14 +241,14 @@ def check_collision(problem: Any) -> None:
             f"collision={problem.collision!r} knows the targets FreeMass and RigidWall only, not "
             f'{type(problem.target).__name__}; take collision="full"'
         )
-    if not instant:  # refuses what has switches
+    if not instant:
         target = problem.target
-        target.smooth([0.0] * target.n_states, 0.0, 0)
+        target.smooth([0.0] * target.n_states, 0.0, 0)  # raises for switches without a `smooth` of their own
         if not target.turns and law.formula()[0] != law.formula()[1]:
             raise InputError(
                 f"a plan for a {type(target).__name__} needs a law that is the same in compression and "
                 f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
-                "approach and part several times in a blow"
+                "approach and part several times in one blow"
             )
 
 
@@ -253,9 +263,9 @@ def check_touches(problem: Any) -> None:
 
 
 def met_once(problem: Any) -> str:
-    """Reason why a striker meets the target only once in a plan; "" if it may meet it again."""
+    """Reason that a plan has a single touch; "" if it may have several."""
     law, target = problem.law, problem.target
-    if not getattr(target, "met_again", False):  # what is no target is refused elsewhere
+    if not getattr(target, "met_again", False):  # not a target at all: `check_collision` refuses it
         return f"a {type(target).__name__} is met once in a plan"
     if not isinstance(law, ContactLaw) or law.formula()[0] != law.formula()[1]:
         return f"the law {type(law).__name__} is not the same in compression and restitution"
@@ -269,7 +279,7 @@ def met_once(problem: Any) -> str:
 
 
 def check_elements(problem: Any) -> None:
-    """InputError for elements and durations of the contact that are none."""
+    """InputError for invalid collocation elements and durations of the contact."""
     given: Any = problem.collision_elements
     given = given.tolist() if isinstance(given, np.ndarray) else given
     if not isinstance(given, (list, tuple)) or len(given) != 2:
@@ -295,7 +305,7 @@ def check_elements(problem: Any) -> None:
 
 
 def check_prices(problem: Any) -> None:
-    """InputError for prices on motion that are no numbers of 0 or more."""
+    """InputError for an unknown style, and for prices on motion that are not numbers >= 0."""
     check_choice("unknown style", problem.style, STYLES)
     for name in ("smoothness", "wrench_price", "return_price", "motion_price", "price_scale"):
         number = check_number(name, getattr(problem, name))
@@ -305,16 +315,16 @@ def check_prices(problem: Any) -> None:
 
 
 def check_freezes(problem: Any) -> None:
-    """InputError for freezes of a model that has none, and for bounds of "auto" that are not positive."""
+    """InputError for freezes of a model without them, and for tolerances of "auto" that are not positive."""
     freezes = check_whole("freezes", problem.freezes, least=0, most=MOST_FREEZES)
     object.__setattr__(problem, "freezes", freezes)
     if freezes and problem.collision != "sdc":
         raise InputError(f'freezes are for collision="sdc"; with {problem.collision!r} leave them out')
     for name in ("auto_impulse_pct", "auto_zmp_mm"):
-        bound = check_number(name, getattr(problem, name))
-        object.__setattr__(problem, name, bound)
-        if not 0 < bound <= MOST:
-            raise InputError(f"{name} must be a number > 0, at most {MOST:g}, not {bound:g}")
+        tolerance = check_number(name, getattr(problem, name))
+        object.__setattr__(problem, name, tolerance)
+        if not 0 < tolerance <= MOST:
+            raise InputError(f"{name} must be a number > 0, at most {MOST:g}, not {tolerance:g}")
 
 
 def check_names(robot: Robot, term: Term) -> None:

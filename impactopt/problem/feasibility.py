@@ -1,4 +1,4 @@
-"""Plausibility checks: valid problems that cannot be solved, found before anything is planned."""
+"""Feasibility checks without a solve: valid problems for which no plan can exist."""
 
 from __future__ import annotations
 
@@ -22,23 +22,25 @@ if TYPE_CHECKING:
 __all__ = ["hopeless", "sticks_out", "too_weak"]
 
 Array = NDArray[np.float64]
-LEANS = 0.05  # [m] a motion may take the centre of mass so far out of the soles, and back in time
-AHEAD = 2e-3  # [m] that a link may stick out beyond its striking point without a word
-OFF = 0.005  # [m] of a posture that counts as one
-_ROUNDED = 1e-6
-PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers
-DRAWN = 3  # postures that are tried beside the two there are
+# [m] Distance outside the support polygon to which a motion may take the centre of mass for a short time.
+MAX_LEAN = 0.05
+AHEAD = 2e-3  # [m] that a link may stick out beyond its striking point without a warning
+REACHED = 0.005  # [m] distance from the hit point of a posture that reaches it
+_ROUNDING = 1e-6  # of a torque limit, by the linear program
+PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers in a problem file
+DRAWN_POSTURES = 3  # initial guesses of inverse kinematics, beside the postures at start and at contact
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """Reasons why no solve can succeed, most basic first: soles of a giant, a start beyond the target, a
-    point out of balance.
+    """Reasons why no solve can succeed: implausibly large soles; else a start beyond the target, and a hit
+    point that no balanced posture reaches.
     """
     found = list(giant_soles(problem.robot)) or [_beyond(problem), _out_of_balance(problem)]
     return [text for text in found if text]
 
 
 def _beyond(problem: ImpactProblem) -> str:
+    """Message about a start posture whose striking point is beyond the target's plane; else ""."""
     at = striking_point(problem.robot, problem.striker, problem.start_posture)
     past = float(problem.normal @ (at - problem.point))
     if past <= PAST:
@@ -51,35 +53,36 @@ def _beyond(problem: ImpactProblem) -> str:
 
 
 def too_weak(problem: ImpactProblem) -> str:
-    """Message if no wrenches on the constrained frames let the torques hold the robot at rest at its
-    start; "" otherwise. A motion that falls from there at once may be planned all the same.
+    """Message if no wrenches on the constrained frames let the torques hold the robot at rest in its start
+    posture; else "". A motion that falls from there at once may be feasible all the same.
     """
     robot, c, limit = problem.robot, problem.coordinates, problem.term(TorqueLimit).fraction
     q = problem.start_posture
     weight = robot.generalized_gravity(robot.model.createData(), q)
-    held = c.sole_jacobians(q)[0].T if c.legs else np.zeros((robot.nv, 0))
+    # torques are weight - fixed @ wrenches
+    fixed = c.sole_jacobians(q)[0].T if c.legs else np.zeros((robot.nv, 0))
     base = robot.nv - robot.n
     driven = np.flatnonzero(~(robot.passive | robot.hinges))
-    rows, most = base + driven, robot.torque_limit[driven]
-    # the least largest share of a limit: a linear program in the wrenches and that share
-    each = held[rows] / most[:, None]
-    asked = weight[rows] / most
-    ones = np.ones((len(rows), 1))
+    indices, most = base + driven, robot.torque_limit[driven]
+    # linear program in the wrenches w and s: least s with |weight - fixed @ w| / most <= s
+    per_wrench = fixed[indices] / most[:, None]
+    load = weight[indices] / most
+    ones = np.ones((len(indices), 1))
     found = linprog(
-        np.append(np.zeros(held.shape[1]), 1.0),
-        A_ub=np.vstack([np.hstack([-each, -ones]), np.hstack([each, -ones])]),
-        b_ub=np.concatenate([-asked, asked]),
-        A_eq=np.hstack([held[c.undriven], np.zeros((len(c.undriven), 1))]) if len(c.undriven) else None,
+        np.append(np.zeros(fixed.shape[1]), 1.0),
+        A_ub=np.vstack([np.hstack([-per_wrench, -ones]), np.hstack([per_wrench, -ones])]),
+        b_ub=np.concatenate([-load, load]),
+        A_eq=np.hstack([fixed[c.undriven], np.zeros((len(c.undriven), 1))]) if len(c.undriven) else None,
         b_eq=weight[c.undriven] if len(c.undriven) else None,
         bounds=(None, None),
     )
-    if found.status != 0 or found.fun <= limit + _ROUNDED:
+    if found.status != 0 or found.fun <= limit + _ROUNDING:
         return ""
-    share = np.abs(asked - each @ found.x[:-1])
-    joint = robot.joint_names[int(driven[int(share.argmax())])]
+    ratios = np.abs(load - per_wrench @ found.x[:-1])
+    joint = robot.joint_names[int(driven[int(ratios.argmax())])]
     return (
-        f"the torque limits do not hold the robot's own weight: at rest at its start {joint} bears "
-        f"{share.max():.3g} of its limit, and [terms.torque_limit] fraction lets it bear {limit:.3g}; "
+        f"the torque limits do not hold the robot's own weight: at rest at its start {joint} needs "
+        f"{ratios.max():.3g} of its limit, and [terms.torque_limit] fraction allows {limit:.3g}; "
         "raise the limits or the fraction, or start from another posture"
     )
 
@@ -96,12 +99,13 @@ def sticks_out(problem: ImpactProblem) -> list[str]:
 
 
 def _out_of_balance(problem: ImpactProblem) -> str:
+    """Message about a hit point that no posture reaches with the centre of mass above the soles; else ""."""
     c = problem.coordinates
     polygon = support_polygon(problem.robot, c)
     if not len(polygon):
         return ""
     found = _nearest(problem, polygon)
-    if found.off <= OFF:
+    if found.off <= REACHED:
         return ""
     names = ", ".join(sole.name for sole in c.soles)
     return (
@@ -113,18 +117,19 @@ def _out_of_balance(problem: ImpactProblem) -> str:
 
 
 def _nearest(problem: ImpactProblem, polygon: Array) -> Reach:
+    """Balanced posture with the striking point nearest to the hit point, from several initial guesses."""
     c, robot = problem.coordinates, problem.robot
-    held = [(leg.frame, leg.placement) for leg in c.legs]
+    fixed = [(leg.frame, leg.placement) for leg in c.legs]
     rng = np.random.default_rng(0)
     guesses = [problem.contact_posture, problem.start_posture]
-    for _ in range(DRAWN):
+    for _ in range(DRAWN_POSTURES):
         step = np.concatenate([np.zeros(robot.nv - robot.n), 0.3 * rng.standard_normal(robot.n)])
         guesses.append(pin.integrate(robot.model, problem.start_posture, step))
     best = None
     for guess in guesses:
-        found = reach(robot, held, polygon, problem.striker, problem.point, guess, lean=LEANS)
+        found = reach(robot, fixed, polygon, problem.striker, problem.point, guess, lean=MAX_LEAN)
         best = found if best is None or found.off < best.off else best
-        if best.off <= OFF:
+        if best.off <= REACHED:
             break
     assert best is not None
     return best

@@ -1,4 +1,4 @@
-"""A problem as a short hash: the same for the same problem, however it was written down."""
+"""Hash of a problem, which is the same for all ways of writing the same problem."""
 
 from __future__ import annotations
 
@@ -16,50 +16,56 @@ from impactopt.robots.robot import Robot
 
 __all__ = ["problem_hash"]
 
-_UNSHAPED = ("name", "price_scale")  # how far a plan has reduced its prices is the plan's
-DIGITS = 16  # 64 bits: two of a million problems share a hash once in 40 million times
+# Fields that are not hashed: the name, and the factor by which the planner has reduced the prices.
+_NOT_HASHED = ("name", "price_scale")
+DIGITS = 16  # 64 bits: the probability that two of a million problems share a hash is 1 in 40 million
 
 
 def problem_hash(problem: Any) -> str:
-    """Hexadecimal hash of all that shapes an `ImpactProblem`'s solution, the same in every process.
+    """Hexadecimal hash of everything that an `ImpactProblem`'s solution depends on, the same in every
+    process.
 
-    Names of the problem and the robot, the order of terms and objectives, postures that it does not start
-    from, and whether a default was given or left out make no difference. Numbers count to the last digit.
+    It does not depend on the names of problem and robot, the order of terms and objectives, postures other
+    than the start, or on whether a default is given or left out. Numbers count to the last digit.
     """
-    shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name not in _UNSHAPED}
-    second = shape.pop("second")
+    data = {
+        f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name not in _NOT_HASHED
+    }
+    second = data.pop("second")
+    # features that a problem does not use are left out, so that problems without them keep their hashes
     for name in ("stances", "friction"):
-        if not shape[name]:
-            shape.pop(name)
-    shape.pop("ground")
+        if not data[name]:
+            data.pop(name)
+    data.pop("ground")
     if not problem.stands:
-        shape["ground"] = problem.ground_height
-    if gains := shape.pop("gains"):
+        data["ground"] = problem.ground_height
+    if gains := data.pop("gains"):
         each = zip(problem.gain_joints, gains, strict=True)
-        shape["gains"] = sorted((joints, gain.factor) for joints, gain in each)
+        data["gains"] = sorted((joints, gain.factor) for joints, gain in each)
     if second is not None:
         other = problem.robot.striker(second.striker)
-        shape["second"] = (other.frame, other.point, second.point)
-    own = {type(term): term for term in (*DEFAULT_TERMS, *ON_DEMAND_TERMS, *problem.terms)}
-    shape |= {
+        data["second"] = (other.frame, other.point, second.point)
+    terms = {type(term): term for term in (*DEFAULT_TERMS, *ON_DEMAND_TERMS, *problem.terms)}
+    data |= {
         "robot": _robot(problem.robot, problem.striker) | _drives(problem) | _hands(problem),
         "law": _contact(problem.law),
         "target": _contact(problem.target),
         "start": problem.start_posture,
-        "terms": sorted(canonical(_plain(term)) for term in own.values()),
+        "terms": sorted(canonical(_plain(term)) for term in terms.values()),
         "objectives": sorted(canonical(_plain(objective)) for objective in problem.objectives),
     }
-    return hashlib.sha256(canonical(_plain(shape)).encode()).hexdigest()[:DIGITS]
+    return hashlib.sha256(canonical(_plain(data)).encode()).hexdigest()[:DIGITS]
 
 
 def _robot(robot: Robot, striker: str) -> dict[str, Any]:
-    numbers = ("kp", "kd", "torque_limit", "velocity_limit", "lower", "upper")
-    hits = robot.striker(striker)
+    """Data of a robot and one of its strikers."""
+    parameters = ("kp", "kd", "torque_limit", "velocity_limit", "lower", "upper")
+    own = robot.striker(striker)
     return {
         "model": model_hash(robot.model, robot.springs),
-        **{name: getattr(robot, name) for name in numbers},
+        **{name: getattr(robot, name) for name in parameters},
         "soles": [(sole.name, sole.frame, sole.polygon) for sole in robot.soles],
-        "striker": (hits.frame, hits.point),
+        "striker": (own.frame, own.point),
         "disable_collisions": sorted(map(sorted, robot.disable_collisions)),
         **({"passive": robot.passive} if robot.passive.any() else {}),
         **({"tendons": robot.tendons} if robot.tendons else {}),
@@ -67,27 +73,27 @@ def _robot(robot: Robot, striker: str) -> dict[str, Any]:
 
 
 def _drives(problem: Any) -> dict[str, Any]:
-    """Motors and gears, as far as the problem depends on them."""
+    """Motors and gears, if the problem depends on them."""
     if problem.of_drives:
         return {"actuators": problem.robot.actuators}
     return {"gear_limit": problem.robot.gear_limit} if problem.gear_load.active else {}
 
 
 def _hands(problem: Any) -> dict[str, Any]:
-    """The hands that hold on, where one does."""
-    held = problem.stance.held_hands(problem.robot)
-    return {"hands": [(hand.frame, hand.point) for hand in held]} if held else {}
+    """Supporting hands, if there are any."""
+    hands = problem.stance.held_hands(problem.robot)
+    return {"hands": [(hand.frame, hand.point) for hand in hands]} if hands else {}
 
 
 def _contact(thing: Any) -> tuple[Any, ...]:
-    """A law or a target by its kind and numbers; one of a user's own by its formula too."""
+    """Class and parameters of a law or a target; a user's own also by its formula."""
     kind = type(thing)
-    own = isinstance(thing, CustomLaw) or not kind.__module__.startswith("impactopt.contact.")
-    return kind.__name__, thing.parameters, thing.formula() if own else ()
+    users_own = isinstance(thing, CustomLaw) or not kind.__module__.startswith("impactopt.contact.")
+    return kind.__name__, thing.parameters, thing.formula() if users_own else ()
 
 
 def _plain(item: Any) -> Any:
-    """An item in which equal numbers look the same: 5 and 5.0, 0.0 and -0.0, arrays and tuples."""
+    """Item in a form that is the same for equal values: 5 and 5.0, 0.0 and -0.0, arrays and tuples."""
     if isinstance(item, (np.ndarray, np.generic)):
         item = item.tolist()
     if isinstance(item, (bool, str)) or item is None:
@@ -101,6 +107,6 @@ def _plain(item: Any) -> Any:
     if dataclasses.is_dataclass(item):
         fields = {f.name: _plain(getattr(item, f.name)) for f in dataclasses.fields(item)}
         return type(item).__name__, fields
-    if hasattr(item, "__dict__") and not callable(item):  # a stance of a user's own, which is no dataclass
+    if hasattr(item, "__dict__") and not callable(item):  # a user's own stance, which need not be a dataclass
         return type(item).__name__, _plain(vars(item))
     raise TypeError(f"a problem holds {item!r}, which has no hash")

@@ -1,4 +1,4 @@
-"""Motion styles: prices on motion that keep a plan one that a laboratory would run."""
+"""Motion styles: prices on motion, which keep plans smooth and near the start posture."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ __all__ = ["STYLES", "MotionPrices", "idle_joints", "joints_to"]
 
 @dataclass(frozen=True, kw_only=True)
 class MotionPrices:
-    """Prices of a whole motion, each on the integral of a square over swing and follow-through.
+    """Prices of a whole motion. All but ``end`` are on the integral of a square over swing and
+    follow-through.
 
     acceleration [N s per (rad/s^2)^2 s], jerk [N s per (rad/s^3)^2 s] : of all independent coordinates.
-    speed, idle_speed [N s per (rad/s)^2 s] : of all of them, and of idle joints besides.
-    end [N s per rad^2] : of the squared distance between the posture at rest and that of the start.
+    speed, idle_speed [N s per (rad/s)^2 s] : of all independent coordinates, and of idle joints in addition.
+    end [N s per rad^2] : on the squared distance of the end posture from the start posture.
     """
 
     acceleration: float = 0.0
@@ -33,8 +34,8 @@ class MotionPrices:
         return replace(self, **{name: factor * value for name, value in vars(self).items()})
 
 
-# Chosen on `punch` (docs/howto/natural.md has the figures): jerk takes out reversals and peaks, idle speed
-# the travel of limbs that bring nothing, speed the detours of all others.
+# Chosen for `punch` (figures: docs/howto/natural.md). The price on jerk removes reversals and peaks, that on
+# idle speed the motion of limbs that do not contribute, that on speed the detours of all others.
 STYLES: dict[str, MotionPrices] = {
     "natural": MotionPrices(jerk=7e-7, speed=7.5e-3, idle_speed=8e-2, end=2.0),
     "strongest": MotionPrices(),
@@ -42,14 +43,14 @@ STYLES: dict[str, MotionPrices] = {
 
 
 def joints_to(robot: Robot, frames: Iterable[str]) -> set[int]:
-    """Joints of the model that move one of these frames, and 0, the world."""
+    """Joints of the model that move any of these frames, and 0, the world."""
     model = robot.model
     joints = (model.frames[model.getFrameId(name)].parentJoint for name in frames)
     return {int(j) for joint in joints for j in model.supports[joint]}
 
 
 def idle_joints(robot: Robot, frames: Iterable[str]) -> NDArray[np.bool_]:
-    """Mask (n,) of the joints that move none of these frames: those of idle arms, and of the head."""
+    """Mask (n,) of the joints that move none of these frames, such as those of an idle arm or the head."""
     model = robot.model
     first = model.nv - robot.n
     idle = np.ones(robot.n, dtype=bool)

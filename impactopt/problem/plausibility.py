@@ -1,4 +1,4 @@
-"""Plausibility of a robot's numbers: what is sound by itself, and hard to believe."""
+"""Plausibility checks of a robot's parameters: each is valid by itself, but missing or hard to believe."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from impactopt.robots.robot import Robot
 
 __all__ = ["doubts", "giant_soles", "shape_doubts"]
 
-GIANT = 3.0  # of a leg's length: no sole is so long
-ALIKE = 0.2  # of a sole's length or width, by which left and right may differ
+GIANT = 3.0  # length of a sole over that of its leg: no sole is so long
+ALIKE = 0.2  # relative difference of left and right soles in length or width that is no doubt
 
 
 def doubts(robot: Robot) -> list[str]:
-    """Numbers of a robot that a plan depends on and that are missing, or hard to believe."""
+    """Messages about parameters of a robot that are missing, or hard to believe, and that plans depend on."""
     return [*_without_armature(robot), *_armatures(robot), *_sides(robot), *shape_doubts(robot)]
 
 
 def giant_soles(robot: Robot) -> Iterator[str]:
-    """Soles that are longer than any leg could carry, as of millimetres taken for metres."""
+    """Messages about soles far longer than their legs, as when millimetres are taken for metres."""
     for sole in robot.soles:
         size = float(np.ptp(sole.polygon, axis=0).max())
         chain = robot.model.supports[_parent(robot, sole.frame)]
+        # without the world and the base's joint
         leg = sum(float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in list(chain)[2:])
         leg = max(leg, 1e-3)
         if size > GIANT * leg:
@@ -38,6 +39,7 @@ def giant_soles(robot: Robot) -> Iterator[str]:
 
 
 def _without_armature(robot: Robot) -> Iterator[str]:
+    """Message about driven joints without armature."""
     driven = zip(robot.joint_names, robot.armature, robot.passive, strict=True)
     without = [joint for joint, a, passive in driven if a == 0 and not passive]
     if without:
@@ -45,17 +47,17 @@ def _without_armature(robot: Robot) -> Iterator[str]:
         which = "no joint has" if every else f"{', '.join(without)}: no"
         yield (
             f"{which} armature: without the rotors' inertia (x gear ratio^2) a geared robot is planned too "
-            "light and hits too softly, and what its gears bear is not known; give `[robot] armature_kg_m2`, "
-            "by joint"
+            "light and hits too softly, and its gear loads are not known; give `[robot] armature_kg_m2`, by "
+            "joint"
         )
 
 
 def _armatures(robot: Robot) -> Iterator[str]:
-    """Armatures that belong to no motor of such a torque."""
-    share = robot.armature / robot.torque_limit
+    """Messages about armatures that are too small or too large for the joint's torque limit."""
+    ratio = robot.armature / robot.torque_limit
     for wrong, bound, what, end in (
-        ((share > 0) & (share < LIGHTEST_ROTOR), LIGHTEST_ROTOR, "small", "least"),
-        (share > HEAVIEST_ROTOR, HEAVIEST_ROTOR, "large", "most"),
+        ((ratio > 0) & (ratio < LIGHTEST_ROTOR), LIGHTEST_ROTOR, "small", "least"),
+        (ratio > HEAVIEST_ROTOR, HEAVIEST_ROTOR, "large", "most"),
     ):
         names = [
             name for name, doubtful in zip(robot.joint_names, wrong & ~robot.passive, strict=True) if doubtful
@@ -71,7 +73,7 @@ def _armatures(robot: Robot) -> Iterator[str]:
 
 
 def _sides(robot: Robot) -> Iterator[str]:
-    """Soles on the other side than their names say, and soles of a pair that are not alike."""
+    """Messages about soles on the opposite side of their names, and about a pair of different sizes."""
     names = {sole.name.lower(): sole for sole in robot.soles}
     left = next((sole for name, sole in names.items() if "left" in name), None)
     right = next((sole for name, sole in names.items() if "right" in name), None)
@@ -91,26 +93,27 @@ def _sides(robot: Robot) -> Iterator[str]:
 
 
 def shape_doubts(robot: Robot) -> Iterator[str]:
-    """Shapes far from the link that has them, or too large for it, and striking links without any."""
+    """Messages about shapes far from their link or larger than the robot, and striking links without
+    shapes.
+    """
     bodies = bodies_of(robot)
     for piece in bodies.too_large:
         yield (
             f"a shape of link {piece.link!r} is {size_of(piece):.2g} m large, more than the whole robot: "
             "scale it, as from millimetres; a box of the link's inertia takes its place"
         )
-    pieces, shown = bodies.pieces, bodies.of_joint
     for striker in robot.strikers.values():
-        if _parent(robot, striker.frame) not in shown:
+        if _parent(robot, striker.frame) not in bodies.of_joint:
             yield (
-                f"the link of striker {striker.name!r} has no shapes: nothing keeps it off other bodies, and "
-                "what of it touches first is not known; give it a <collision>"
+                f"the link of striker {striker.name!r} has no shapes: it may pass through other bodies, and "
+                "which part of it touches first is not known; give it a <collision>"
             )
-    for piece in pieces:
-        beside = [other for other in pieces if other.joint == piece.joint]
-        if is_far(robot.model, piece, beside):
+    for piece in bodies.pieces:
+        same_link = [other for other in bodies.pieces if other.joint == piece.joint]
+        if is_far(robot.model, piece, same_link):
             yield (
                 f"a shape of link {piece.link!r}, {size_of(piece):.2g} m large, is "
-                f"{distance_to_link(robot.model, piece, beside):.2g} m away from the link's joint, mass "
+                f"{distance_to_link(robot.model, piece, same_link):.2g} m away from the link's joint, mass "
                 "and frames: correct its <origin>"
             )
 

@@ -1,4 +1,4 @@
-"""The declarative problem: which robot hits what, where, and what it must respect meanwhile."""
+"""Declarative impact problem: robot, striker, target and contact law, terms, objectives and scenarios."""
 
 from __future__ import annotations
 
@@ -90,58 +90,58 @@ AnyTerm = TypeVar("AnyTerm", bound=Term)
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ImpactProblem:
-    """Maximize what ``robot`` does to ``target`` with ``striker``: by default the impulse.
+    """Problem of an impact: maximize the objectives, by default the impulse to the target, within the terms.
 
     Attributes
     ----------
-    robot, striker : the robot, and the name of the one of its strikers that hits.
-    point (3,) [m] : where the striking point meets the target, in the world frame: that of a fixed base, or
-        with z = 0 at the ground on which the soles stand, and the soles of the start posture centred on the
-        origin.
+    robot, striker : robot, and name of its striker that hits the target.
+    point (3,) [m] : where the striking point meets the target, in the world frame. That is the frame of a
+        fixed base; otherwise z = 0 is the ground on which the soles stand, and the origin is in the middle of
+        the soles in the start posture.
     normal (3,) : unit vector in the world frame, along which the target is pushed.
-    friction : of the striking points on the target, which does not move sideways; None: there is none.
-    second : another striker that hits the same target at the same time, at a point of its own.
+    friction : between the striking points and the target, which does not move sideways; None: no friction.
+    second : another striker that hits the same target at the same time, at its own point.
     law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
-        once and stands again before the striker leaves it.
-    stance : which soles are held, and which hands hold on: to where they are in the start posture.
-    stances : the motion as a sequence of phases, each with the soles that stand in it; (): `stance` from the
-        first to the last instant. With phases `stance` is that of the one with the blow.
-    start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
-        configuration (nq,).
-    swing, follow : wind-up and strike; follow-through to rest.
-    contact_duration : (shortest, longest) [s], of compression (of a nail: until it stands) and of restitution
-        alike. A phase that an event splits in two, as a board's break does, may be shorter than this. With 0
-        as the shortest, law and masses decide.
-    collision_elements : lengths of the collocation elements of compression, and of restitution, each as
-        fractions that sum to 1. With a `Nail` or a `Board` those of compression are used before and after the
-        event, and every element is cut in two halves.
-    collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
-    touches : how many times the striker meets the target in the blow: more than once a `Board` that breaks in
-        the last touch. None: as many times as point masses in place of robot and target do.
-    collision : the model of the impact. "full": the whole equation of motion while the contact lasts. "sdc":
-        H, J and bias are frozen at contact, and ``freezes`` times during it, as in :class:`impactopt.SDC`.
-        "sdc-paper": likewise, with the effects of `SDC.paper`. "auto": "sdc" where it is good enough, else
-        "full", where full dynamics at the plan's state at contact would change the impulse by more than
-        ``auto_impulse_pct`` or the ZMP by more than ``auto_zmp_mm``. Two impacts without duration are there
-        to compare with; they know nothing of torque, ZMP and servo meanwhile: "virtual-mass", with the
-        restitution of two masses under the contact law, and "rigid", with ``coefficient_of_restitution``
-        (speed of separation over speed of approach).
-    scenarios : other targets, or none, that the robot has to survive with the same swing.
-    body : the target's shape, which all of the robot but the striking point keeps off.
-    obstacles : bodies in the world that the robot keeps off.
-    ground : the floor below a robot on a fixed base, or one that floats freely; None: there is none. Soles
-        stand on the ground z = 0.
-    terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
-        `GearLoad`, whose constraints a program gets once a plan without them goes beyond it.
+        once and stops before the striker leaves it.
+    stance : fixed soles and supporting hands, which stay where they are in the start posture.
+    stances : stance phases of the motion, each with the soles that stand in it; (): one stance throughout.
+        With phases, `stance` is that of the phase with the impact.
+    start : posture at the start of the motion, at rest: a name of ``robot.postures`` or a pin configuration
+        (nq,).
+    swing, follow : phases from rest to contact, and from contact to rest (follow-through).
+    contact_duration : (shortest, longest) [s], of each of compression (of a nail: until it stops) and
+        restitution. A phase that ends by an event, such as a board's break, may be shorter. If the shortest
+        is 0, it follows from law and masses.
+    collision_elements : lengths of the collocation elements of compression, and of restitution, as fractions
+        that sum to 1. With a `Nail` or a `Board` those of compression are used before and after the event,
+        and every element is halved.
+    collision_stages : Radau IIA stages of an element, 2 or 3 (order 3 or 5).
+    touches : number of contacts in the impact; more than one for a `Board` that breaks in the last one. None:
+        the number for point masses in place of robot and target.
+    collision : model of the collision. "full": the equations of motion, at every instant. "sdc": H, J and
+        bias are frozen at contact, and ``freezes`` times during it, as in :class:`impactopt.SDC`.
+        "sdc-paper": the same with the effects of `SDC.paper`. "auto": "sdc", or "full" if full dynamics at
+        the plan's state at contact would change the impulse by more than ``auto_impulse_pct`` or the ZMP by
+        more than ``auto_zmp_mm``. Two models without duration, and so without torque, ZMP and servo, are for
+        comparison: "virtual-mass", with the restitution of two masses under the contact law, and "rigid",
+        with ``coefficient_of_restitution`` (speed of separation over speed of approach).
+    scenarios : other targets, or a missing one, that the robot has to survive with the same swing.
+    body : shape of the target, which no part of the robot but the striking link may touch.
+    obstacles : bodies in the world that the robot must not touch.
+    ground : floor below a robot that does not stand on soles; None: no floor. Soles stand on the ground
+        z = 0.
+    terms : constraints. Terms of DEFAULT_TERMS that are not given have their defaults, and so have the lazy
+        ones of ON_DEMAND_TERMS, whose constraints enter once a plan violates them.
     objectives : their weighted sum is maximized.
-    style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending
-        away from the start posture (`impactopt.problem.motion_style`); or "strongest", with none.
-    motion_price : largest share of the objective that prices on motion may take; those of the style are
-        reduced until they take no more.  price_scale : factor on these; 1: a plan chooses it.
+    style : "natural", with prices on jerk, on the motion of joints, above all of idle ones, and on the
+        distance of the end posture from the start (`impactopt.problem.motion_style`); or "strongest", without
+        prices.
+    motion_price : largest share of all prices on motion in the objective; those of the style are reduced to
+        it.  price_scale : factor on these; 1: the planner chooses it.
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
-        return_price : price of ending away from the start posture [N s per rad^2]. These three are small;
-        they make the optimum unique, and bring the robot back to its start.
-    gains : factors on gains of servos and of springs of soft grips, which the plan chooses.
+        return_price : price of the end posture's distance from the start [N s per rad^2]. These three are
+        small; they make the optimum unique.
+    gains : factors of the gains of servos, and of the springs of soft grips, which the planner chooses.
 
     Raises
     ------
@@ -191,34 +191,38 @@ class ImpactProblem:
         return f"<ImpactProblem {self.name!r}: {self.striker} of {self.robot.name} on {self.target!r}>"
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but its coordinates, whose symbols CasADi does not pickle: they are made anew when needed."""
+        """State without the cached coordinates, whose symbols CasADi does not pickle."""
         return {name: value for name, value in vars(self).items() if name != "stance_coordinates"}
 
     def __post_init__(self) -> None:
-        found = Mistakes()
-        found.attempt(lambda: check_name("the problem", self.name, empty=True))
-        hits = found.attempt(lambda: self.robot.striker(self.striker))
-        aimed = found.attempt(self._check_aim)
-        stands = found.attempt(partial(check_stances, self)) and found.attempt(partial(check_stance, self))
-        stands = stands and found.attempt(self._check_start)
+        # `attempt` collects the error of a check and returns False. A check that needs parts which have
+        # failed is skipped, so that the message has independent mistakes only.
+        mistakes = Mistakes()
+        mistakes.attempt(lambda: check_name("the problem", self.name, empty=True))
+        striker = mistakes.attempt(lambda: self.robot.striker(self.striker))
+        aim = mistakes.attempt(self._check_aim)
+        stance = mistakes.attempt(partial(check_stances, self)) and mistakes.attempt(
+            partial(check_stance, self)
+        )
+        stance = stance and mistakes.attempt(self._check_start)
         for check in (check_elements, check_prices, check_collision, check_touches):
-            found.attempt(partial(check, self))
-        if found.attempt(self._check_scenarios):
+            mistakes.attempt(partial(check, self))
+        if mistakes.attempt(self._check_scenarios):
             for scenario in self.scenarios:
-                found.attempt(partial(scenario.numbers, self.law, self.target))
-        found.attempt(partial(check_world, self))
-        found.attempt(partial(check_gains, self))
-        termed = found.attempt(self._check_terms)
-        if termed:
+                mistakes.attempt(partial(scenario.numbers, self.law, self.target))
+        mistakes.attempt(partial(check_world, self))
+        mistakes.attempt(partial(check_gains, self))
+        terms = mistakes.attempt(self._check_terms)
+        if terms:
             for term in self.terms:
-                found.attempt(partial(check_names, self.robot, term))
-        found.attempt(self._check_objectives)
-        sound = hits and stands and termed and found.attempt(partial(check_second, self))
+                mistakes.attempt(partial(check_names, self.robot, term))
+        mistakes.attempt(self._check_objectives)
+        sound = striker and stance and terms and mistakes.attempt(partial(check_second, self))
         if sound:
-            found.attempt(partial(check_hands, self))
-        if sound and aimed and found.attempt(lambda: self.contact_posture):
-            found.attempt(partial(check_moves, self))
-        found.raise_if_any("the problem")
+            mistakes.attempt(partial(check_hands, self))
+        if sound and aim and mistakes.attempt(lambda: self.contact_posture):
+            mistakes.attempt(partial(check_moves, self))
+        mistakes.raise_if_any("the problem")
 
     def _check_aim(self) -> None:
         object.__setattr__(self, "point", check_array("point [m]", self.point, (3,), most=FARTHEST))
@@ -271,19 +275,19 @@ class ImpactProblem:
 
     @property
     def style_prices(self) -> MotionPrices:
-        """The prices of its style, as far as they are reduced."""
+        """Prices of the problem's style, scaled by `price_scale`."""
         return STYLES[self.style].scaled(self.price_scale)
 
     @cached_property
     def idle_joints(self) -> NDArray[np.bool_]:
-        """Mask (n,) of the joints that move no striker, no sole on the ground and no hand that holds on."""
+        """Mask (n,) of the joints that move no striker, no sole on the ground and no supporting hand."""
         strikers = [self.robot.striker(name).model_frame for name in self.strikers]
-        held = [*(leg.frame for leg in self.coordinates.legs), *(sole.frame for sole in self.soles)]
-        return idle_joints(self.robot, [*strikers, *held])
+        fixed = [*(leg.frame for leg in self.coordinates.legs), *(sole.frame for sole in self.soles)]
+        return idle_joints(self.robot, [*strikers, *fixed])
 
     @property
     def planned_touches(self) -> int:
-        """Touches of the target in a plan: one where their number is open."""
+        """Number of touches in a plan; 1 if it is left open."""
         return self.touches or 1
 
     @property
@@ -293,46 +297,46 @@ class ImpactProblem:
 
     @property
     def lasts(self) -> bool:
-        """True if the model of the collision gives the contact a duration."""
+        """True if the contact has a duration in the collision model."""
         return self.collision not in INSTANT
 
     @property
     def frozen(self) -> Effects | None:
-        """The effects of a model of the collision with frozen dynamics; None of the others."""
+        """Effects of a collision model with frozen dynamics; None for other models."""
         return {"sdc": Effects(), "sdc-paper": Effects.paper()}.get(self.collision)
 
     @property
     def gain_joints(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the joints of each of its `gains`."""
+        """Indices of the joints of each `GainFactor` in `gains`."""
         return tuple(gain.indices(self.robot) for gain in self.gains)
 
     @property
     def of_drives(self) -> bool:
-        """True if a term is about motors or gears."""
+        """True if a term bounds motors or gears."""
         return any(term.of_drives for term in self.active_terms)
 
     @property
     def first_instant(self) -> bool:
-        """True if a term needs the first instant of a contact whose force begins with a jump."""
-        wanted = self.lasts and any(term.first_instant for term in self.active_terms)
-        return wanted and float(self.law.branch(0.0, 1.0, True)) != 0.0
+        """True if a term has constraints at the first instant of contact, and the law's force jumps there."""
+        required = self.lasts and any(term.first_instant for term in self.active_terms)
+        return required and float(self.law.branch(0.0, 1.0, True)) != 0.0
 
     @property
     def abort_after(self) -> float | None:
-        """Time after the planned contact at which the motion is aborted if nothing is hit [s]; None:
+        """Time [s] after the planned contact at which the motion is aborted if nothing is hit; None:
         never.
         """
         return next((s.abort_after for s in self.scenarios if s.abort_after is not None), None)
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
-        """The term of a kind: the problem's own, or the default."""
+        """Term of a kind: the problem's own, or the default."""
         for t in (*self.terms, *DEFAULT_TERMS, *ON_DEMAND_TERMS):
             if isinstance(t, kind):
                 return t
         raise InputError(f"unknown kind of term {kind.__name__}")
 
     def extra(self, kind: type[AnyTerm]) -> AnyTerm | None:
-        """The problem's own term of a kind that has no default; None if it has none."""
+        """The problem's own term of a kind; None if it has none."""
         return next((t for t in self.terms if isinstance(t, kind)), None)
 
     @cached_property
@@ -342,81 +346,83 @@ class ImpactProblem:
 
     @cached_property
     def start_posture(self) -> Array:
-        """pin configuration (nq,) of the start."""
+        """Start posture, a pin configuration (nq,)."""
         if isinstance(self.start, str):
             return np.array(self.robot.posture(self.start))
         return self.robot.check_configuration(self.start, name="the start posture")
 
     @property
     def coordinates(self) -> StanceCoordinates:
-        """Independent coordinates of the stance with the blow, in which hands hold on, too."""
+        """Independent coordinates of the stance at the impact, with supporting hands."""
         return self.stance_coordinates[self.blow]
 
     @cached_property
     def stance_coordinates(self) -> tuple[StanceCoordinates, ...]:
-        """Independent coordinates of each of its stance phases; of its one stance if it has none."""
+        """Independent coordinates of each stance phase, or of the single stance."""
         robot, start = self.robot, self.start_posture
         if not self.stances:
             hands = self.stance.held_hands(robot)
             return (StanceCoordinates(robot, self.stance.soles(robot), start, hands),)
+        # by the names of the soles: where they stand at the start; by names and steps: after these
         known: dict[Any, StanceCoordinates] = {}
         out = []
-        for places in places_of_soles(self.stances, [sole.name for sole in robot.soles]):
-            soles = tuple(robot.sole(name) for name in places)
-            names, key = tuple(places), tuple((name, *at) for name, at in places.items())
+        for steps in places_of_soles(self.stances, [sole.name for sole in robot.soles]):
+            soles = tuple(robot.sole(name) for name in steps)
+            names, key = tuple(steps), tuple((name, *step) for name, step in steps.items())
             if names not in known:
                 known[names] = StanceCoordinates(robot, soles, start)
             if key not in known:
                 c = known[names]
-                if any(at.any() for at in places.values()):
-                    c = StanceCoordinates(robot, soles, stepped_posture(c, places))
+                if any(step.any() for step in steps.values()):
+                    c = StanceCoordinates(robot, soles, stepped_posture(c, steps))
                 known[key] = c
             out.append(known[key])
         return tuple(out)
 
     @property
     def blow(self) -> int:
-        """Index of the stance phase with the blow."""
+        """Index of the stance phase with the impact."""
         return next((k for k, stance in enumerate(self.stances) if stance.phase is None), 0)
 
     def change_posture(self, k: int) -> Array:
-        """Some posture (nq,) between stance phases k and k + 1: that of the heavier one, with the centre of
-        mass above the soles that stand in both. That of the stance before the first and after the last one.
+        """Guess of the posture (nq,) between stance phases k and k + 1: all soles of both in place, and the
+        centre of mass above those that stand in both. Before the first phase and after the last one, that of
+        the phase.
         """
         if not 0 <= k < len(self.stances) - 1:
             return self.stance_coordinates[min(max(k, 0), len(self.stances) - 1)].posture
         one, other = self.stance_coordinates[k : k + 2]
-        heavy, light = (one, other) if len(one.legs) > len(other.legs) else (other, one)
-        middle = support_polygon(self.robot, light).mean(axis=0)
-        y, legs, data = heavy.start.copy(), heavy.start_legs, self.robot.model.createData()
+        more, fewer = (one, other) if len(one.legs) > len(other.legs) else (other, one)
+        middle = support_polygon(self.robot, fewer).mean(axis=0)
+        y, legs, data = more.start.copy(), more.start_legs, self.robot.model.createData()
         for _ in range(20):
-            y[:2] += middle - np.array(pin.centerOfMass(self.robot.model, data, heavy.join(y, legs)))[:2]
+            y[:2] += middle - np.array(pin.centerOfMass(self.robot.model, data, more.join(y, legs)))[:2]
             try:
-                legs = heavy.solve_legs(y, legs)
+                legs = more.solve_legs(y, legs)
             except InputError:
-                y[2] -= 0.02  # the legs do not reach: lower
-        return heavy.join(y, legs)
+                y[2] -= 0.02  # the legs do not reach from so high
+        return more.join(y, legs)
 
     @property
     def standing(self) -> NDArray[np.bool_]:
-        """Mask (phases, soles) of its `soles` that stand in each stance phase."""
+        """Mask (phases, soles) of the `soles` that stand in each stance phase."""
         names = [sole.name for sole in self.soles]
-        found = [[name in stance.soles for name in names] for stance in self.stances]
-        return np.array(found or [[True] * len(names)], dtype=bool)
+        stand = [[name in stance.soles for name in names] for stance in self.stances]
+        return np.array(stand or [[True] * len(names)], dtype=bool)
 
     @property
     def floats(self) -> bool:
-        """True if nothing holds the robot."""
+        """True if the robot floats freely: no sole, hand or base is fixed."""
         return isinstance(self.stance, Free)
 
     @property
     def stands(self) -> bool:
-        """True if soles bear the robot: it neither floats freely, nor is its base fixed."""
+        """True if the robot stands on soles: it neither floats freely, nor has a fixed base."""
         return self.robot.floating and not self.floats
 
     @property
     def soles(self) -> tuple[Sole, ...]:
-        """The soles that stand at some time, in the robot's order."""
+        """Soles that stand in any phase, in the robot's order."""
         if not self.stances:
             return self.stance.soles(self.robot)
         names = {name for stance in self.stances for name in stance.soles}
@@ -424,11 +430,13 @@ class ImpactProblem:
 
     @cached_property
     def contact_posture(self) -> Array:
-        """Some posture (nq,) with the striking point at ``point`` and the soles in place.
+        """Posture (nq,) with the striking point at ``point`` and the soles in place, by inverse kinematics.
 
-        The hand has the orientation that is asked for, as nearly as may be.
+        The hand has the orientation of `HandOrientation` if that is possible.
 
-        Raises InputError if none is found: the point is out of reach.
+        Raises
+        ------
+        InputError : the point is out of reach.
         """
         given = self.coordinates, self.striker, self.point, self.change_posture(self.blow - 1)
         also = self.contacts[1:]
@@ -440,65 +448,67 @@ class ImpactProblem:
 
     @property
     def active_terms(self) -> tuple[Term, ...]:
-        """Its own terms, and those by default that bring constraints of their own; none that is off."""
-        mine = {type(term) for term in self.terms}
-        own = [t for t in DEFAULT_TERMS if type(t).add_rows is not Term.add_rows and type(t) not in mine]
-        return tuple(term for term in (*self.terms, *own) if term.active)
+        """The problem's own terms, and default terms with an `add_rows`; without those that are switched
+        off.
+        """
+        given = {type(term) for term in self.terms}
+        defaults = [
+            t for t in DEFAULT_TERMS if type(t).add_rows is not Term.add_rows and type(t) not in given
+        ]
+        return tuple(term for term in (*self.terms, *defaults) if term.active)
 
     @property
     def on_demand(self) -> tuple[Term, ...]:
-        """Lazy terms (ON_DEMAND_TERMS) that hold: they are not switched off, and about one striker."""
+        """Lazy terms (ON_DEMAND_TERMS) that hold: all that are not switched off; none with two strikers."""
         terms = tuple(self.term(type(term)) for term in ON_DEMAND_TERMS)
         return tuple(term for term in terms if term.active and self.second is None)
 
     @property
     def gear_load(self) -> GearLoad:
-        """Its term on its gears."""
+        """Term that limits gear loads."""
         return self.term(GearLoad)
 
     @property
     def self_collision(self) -> SelfCollision:
-        """Its term on its own links."""
+        """Term that requires clearance between the robot's links."""
         return self.term(SelfCollision)
 
     @property
     def keep_out(self) -> KeepOut:
-        """Its term on the world."""
+        """Term that requires clearance from the bodies of the world."""
         return self.term(KeepOut)
 
     @property
     def keeps_apart(self) -> bool:
-        """True if any two bodies must not touch."""
+        """True if clearance is required between any two bodies."""
         return self.self_collision.enabled or self.keep_out.enabled
 
     @property
     def middle(self) -> Array:
-        """(3,) [m] of the target's face: the point, or what is between the two."""
+        """Middle (3,) [m] of the target's face: the hit point, or the mean of the two."""
         return self.point if self.second is None else (self.point + self.second.point) / 2
 
     @property
     def strikers(self) -> tuple[str, ...]:
-        """Names of all that hit."""
+        """Names of the strikers that hit."""
         return tuple(striker for striker, _ in self.contacts)
 
     @property
     def contacts(self) -> tuple[tuple[str, Array], ...]:
-        """Strikers, each with the point [m] that it meets."""
-        mine = (self.striker, self.point)
-        return (mine,) if self.second is None else (mine, (self.second.striker, self.second.point))
+        """Strikers, each with its hit point [m]."""
+        first = (self.striker, self.point)
+        return (first,) if self.second is None else (first, (self.second.striker, self.second.point))
 
     @property
     def ground_height(self) -> float | None:
-        """[m] of the floor; None: there is none."""
+        """Height [m] of the floor; None if there is none."""
         if self.stands:
             return 0.0
         return None if self.ground is None else self.ground.height
 
     @cached_property
     def world(self) -> tuple[WorldBody, ...]:
-        """The bodies that are not the robot's: the ground if there is one, the target and what holds it, the
-        obstacles.
-        """
+        """Bodies of the world: the ground if there is one, the target and its supports, the obstacles."""
         return (
             *([] if self.ground_height is None else [ground_body(self.ground_height)]),
             *target_bodies(self.body, self.target, self.middle, self.normal),
@@ -507,28 +517,28 @@ class ImpactProblem:
 
     @cached_property
     def bodies(self) -> Bodies:
-        """All that can touch something: the robot's links and the world, and which pairs are not to.
+        """The robot's links and the bodies of the world, and the pairs of them that must not touch.
 
         Raises
         ------
-        InputError : the start posture is in the target, in what holds it, or in an obstacle.
+        InputError : the start posture penetrates the target, its supports, or an obstacle.
         """
         robot, model = self.robot, self.robot.model
-        hits = [robot.striker(name).model_frame for name in self.strikers]
-        frames = [*hits, *(s.frame for s in self.soles)]
+        strikers = [robot.striker(name).model_frame for name in self.strikers]
+        frames = [*strikers, *(s.frame for s in self.soles)]
         joints = [int(model.frames[model.getFrameId(name)].parentJoint) for name in frames]
         return Bodies(
             self.robot,
             self.world,
             self.start_posture,
             normal=self.normal,
-            striking=tuple(joints[: len(hits)]),
+            striking=tuple(joints[: len(strikers)]),
             strict=self.keep_out.enabled,
-            standing=tuple(joints[len(hits) :]),
+            standing=tuple(joints[len(strikers) :]),
         )
 
     def describe(self) -> dict[str, Any]:
-        """The problem in a few plain words and numbers, for reports."""
+        """Short description of the problem, as JSON data for reports."""
         out: dict[str, Any] = {
             "name": self.name,
             "robot": self.robot.name,

@@ -1,4 +1,4 @@
-"""Phases of a motion, scenarios that the robot has to survive, and a second striker."""
+"""Phases of a motion, scenarios of other targets, and a second striker."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SecondStriker:
-    """Another hand that meets the target, at a point of its own.
+    """Another striker that hits the target at its own point.
 
-    Both hands touch at the same instant, are deepest in at the same instant, and leave at the same instant.
-    Each has the contact law to itself. The target feels the sum of both forces. It moves along the normal and
-    does not turn: a door on rails, a box that is guided, or one that the two forces leave straight.
+    Both strikers touch, reach their deepest penetration, and separate at the same instants. Each has its own
+    contact with the problem's law. The sum of both forces acts on the target, which moves along the normal
+    and does not turn: a door on rails, a guided box, or one that the two forces do not turn.
 
     Attributes
     ----------
     striker : name of the robot's striker.
-    point (3,) [m] : where it meets the target, in the world frame.
+    point (3,) [m] : hit point in the world frame.
 
     Raises
     ------
@@ -68,14 +68,15 @@ class SecondStriker:
 
 
 def check_second(problem: Any) -> None:
-    """InputError for a second striker that does not go with the rest of a problem."""
+    """InputError for a second striker that does not fit the rest of a problem."""
     p, robot, second = problem, problem.robot, problem.second
     if second is None:
         return
     if not isinstance(second, SecondStriker):
         raise InputError(f"second must be a SecondStriker, not {second!r}")
-    mine, its = (set(robot.limb(robot.striker(s).model_frame)) for s in (p.striker, second.striker))
-    if not (mine - its and its - mine):
+    # each needs a joint that does not move the other
+    one, other = (set(robot.limb(robot.striker(s).model_frame)) for s in (p.striker, second.striker))
+    if not (one - other and other - one):
         raise InputError(
             f"the second striker {second.striker!r} moves with {p.striker!r}: give one on a limb of its own"
         )
@@ -89,21 +90,22 @@ def check_second(problem: Any) -> None:
         if isinstance(thing, (HitCone, HitRegion, Slide, PeakForce, Penetration)) or (
             getattr(thing, "first_instant", False)
         ):
-            raise InputError(f"{type(thing).__name__} is about one striker: leave it out, or the second one")
+            raise InputError(f"{type(thing).__name__} is for one striker: leave it out, or the second one")
 
 
-SHORTEST, LONGEST = 1e-3, 1e3  # [s] of a phase: no servo is faster, and no blow is prepared for longer
-FINEST = 2000  # intervals of a phase: nodes of a swing of 1 s come as often as a servo of 4 kHz samples
+SHORTEST, LONGEST = 1e-3, 1e3  # [s] of a phase: no servo is faster, and no impact is prepared for longer
+# intervals of a phase: with the middles of the intervals, a swing of 1 s has nodes at 4 kHz, as a fast servo
+FINEST = 2000
 STEEPEST = 1e3  # grading
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """A phase of the motion: its duration and its spline.
+    """Phase of the motion: duration and spline.
 
-    ``duration`` [s] : (shortest, longest), or one number.  ``intervals`` : how many the spline has.
-    ``grading`` : longest over shortest interval; the short ones are at the contact. The program's nodes are
-    the ends and the middles of the intervals.
+    ``duration`` [s] : (shortest, longest), or one number.  ``intervals`` : number of the spline's intervals.
+    ``grading`` : longest interval over the shortest one; the short ones are at the contact. The program's
+    nodes are the ends and the middles of the intervals.
     """
 
     duration: tuple[float, float]
@@ -136,11 +138,11 @@ class Phase:
 class Scenario(Described):
     """Another target than the expected one, or none, that the robot has to survive with the same swing.
 
-    Objectives are those of the blow on the expected target. In a scenario the collision's rows (torque,
-    wrench cones) and the balance after it hold too, with margins of their own, under the same reference and
-    servo. If there is nothing to hit, no impulse slows the robot down: the margin of balance is then taken at
-    contact. With `abort_after` the robot goes on to an abort motion, which brings it to rest and is planned
-    with the swing; without, it follows the follow-through of the blow.
+    The objectives are those of the expected target. In a scenario the constraints on the collision (torque,
+    wrench cones) and on the balance after it hold too, with their own margins, under the same reference and
+    servo. If the target is missing, no impulse slows the robot down, and balance is required at contact. With
+    `abort_after` an abort motion follows, which brings the robot to rest and is planned with the swing;
+    without it, the follow-through.
     """
 
     name: str = field(metadata=about("what reports call it"))
@@ -180,11 +182,11 @@ class Scenario(Described):
     def __post_init__(self) -> None:
         check_name("a scenario", self.name)
         where = f"scenario {self.name!r}"
-        for f, told in list(abouts(type(self)))[1:]:
+        for f, description in list(abouts(type(self)))[1:]:
             value = getattr(self, f.name)
             if value is None and f.default is None:
                 continue
-            told.checked(f"{where}: {f.name}", value)
+            description.checked(f"{where}: {f.name}", value)
         changed = [f.name for f in fields(self)[1:] if getattr(self, f.name) != f.default]
         unused = [name for name in changed if name not in ("missing", "abort_after", "capture_margin")]
         if self.missing and unused:
@@ -195,11 +197,11 @@ class Scenario(Described):
             raise InputError(f"{where}: abort_after is for a missing target; drop it, or give missing=True")
 
     def numbers(self, law: ContactLaw, target: Target) -> tuple[dict[str, float], dict[str, float]]:
-        """The contact law's and the target's numbers by name, with the scenario's factors.
+        """Parameters of the contact law and the target by name, with the scenario's factors.
 
         Raises
         ------
-        InputError : a factor of a number that they do not have.
+        InputError : a factor of a parameter that they do not have.
         """
         return scaled_numbers(
             f"scenario {self.name!r}",

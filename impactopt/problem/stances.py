@@ -1,4 +1,4 @@
-"""Stance phases of a motion: which soles stand when."""
+"""Stance phases of a motion: the soles that stand in each, and their steps."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from impactopt.robots.robot import Robot
 
 __all__ = ["StancePhase", "check_stances", "names_of", "places_of_soles", "stepped_posture"]
 
-_LOWER = np.arange(0.0, 0.21, 0.02)  # [m] that the base goes down for legs that do not reach
-_LONGEST = 2.0  # [m] of a step: what is farther is a mistake of units
+_DESCENTS = np.arange(0.0, 0.21, 0.02)  # [m] of the base that are tried, in turn, for legs that do not reach
+_MAX_STEP = 2.0  # [m]: a longer step is a mistake of units
 
 
 @dataclass(frozen=True, kw_only=True)
 class StancePhase:
-    """A phase of the motion in which the same soles stand.
+    """Phase of the motion in which the same soles stand.
 
-    Between two phases soles lift off, or touch down: where they stood before, or a step from there.
+    Between two phases soles lift off or touch down, where they stood before or a step away.
 
-    soles : names of those that stand.
-    phase : its duration and its spline. None: the blow falls in it, and its times are those of the problem's
+    soles : names of the soles that stand.
+    phase : duration and spline. None: the impact is in this phase, whose durations are those of the problem's
         swing and follow-through.
-    steps : by name of a sole that touches down as the phase begins: forward and to the left [m], world axes,
-        from where it stood before.
+    steps : by name of a sole that touches down at the phase's beginning: displacement [m] along the world's x
+        and y from where it stood before.
     """
 
     soles: tuple[str, ...]
@@ -58,14 +58,14 @@ class StancePhase:
         if not isinstance(self.steps, Mapping):
             raise InputError(f"a stance phase's steps are a table by sole's name, not {self.steps!r}")
         steps = {
-            name: check_array(f"the step of sole {name!r} [m]", step, (2,), most=_LONGEST)
+            name: check_array(f"the step of sole {name!r} [m]", step, (2,), most=_MAX_STEP)
             for name, step in self.steps.items()
         }
         object.__setattr__(self, "steps", {name: tuple(step.tolist()) for name, step in steps.items()})
 
 
 def names_of(stances: Sequence[StancePhase]) -> str:
-    """Soles and steps of each phase in words."""
+    """Text with the soles and steps of each phase."""
     return ", then ".join(
         " and ".join(stance.soles)
         + "".join(f" ({name} steps {x:g} m ahead, {y:g} m left)" for name, (x, y) in stance.steps.items())
@@ -74,7 +74,12 @@ def names_of(stances: Sequence[StancePhase]) -> str:
 
 
 def check_stances(problem: Any) -> None:
-    """InputError for stance phases that are no schedule; takes the stance of the one with the blow."""
+    """Checks the sequence of stance phases, and sets the problem's stance to that of the impact.
+
+    Raises
+    ------
+    InputError : phases that are not a possible sequence, or that the problem's other parts exclude.
+    """
     given: Any = problem.stances
     if not isinstance(given, (list, tuple)) or not all(isinstance(s, StancePhase) for s in given):
         raise InputError(f"stances must be a tuple of StancePhase, not {given!r}")
@@ -87,15 +92,16 @@ def check_stances(problem: Any) -> None:
     for stance in stances:
         for name in stance.soles:
             robot.sole(name)
-    of_blow = [stance for stance in stances if stance.phase is None]
-    if len(of_blow) != 1:
-        found = "none" if not of_blow else str(len(of_blow))
+    of_impact = [stance for stance in stances if stance.phase is None]
+    if len(of_impact) != 1:
+        found = "none" if not of_impact else str(len(of_impact))
         raise InputError(
-            f"stances: the blow falls in one phase, which has no duration of its own, and {found} of "
-            f"{names_of(stances)} is like that: give all others a duration"
+            f"stances: the impact is in one phase, which has no duration of its own, but {found} of "
+            f"{names_of(stances)} have none: give all other phases a duration"
         )
     if len(stances) == 1:
-        raise InputError("stances: one phase is no schedule: give `stance` in its place")
+        raise InputError("stances: a single phase is no sequence: give `stance` in its place")
+    # soles either lift off or touch down between two phases, so that some soles stand in both
     for one, other in pairwise(stances):
         a, b = set(one.soles), set(other.soles)
         if not (a < b or b < a):
@@ -108,7 +114,7 @@ def check_stances(problem: Any) -> None:
         raise InputError("stances: a hand that holds on goes with one stance: leave one of them out")
     if robot.sprung.any():
         raise InputError(f"stances: robot {robot.name!r} has soft grips, which go with one stance")
-    object.__setattr__(problem, "stance", _stance(robot, of_blow[0].soles))
+    object.__setattr__(problem, "stance", _stance(robot, of_impact[0].soles))
 
 
 def _check_steps(stances: Sequence[StancePhase]) -> None:
@@ -117,10 +123,10 @@ def _check_steps(stances: Sequence[StancePhase]) -> None:
         landing = set(stance.soles) - set(stances[k - 1].soles if k else stance.soles)
         for name in stance.steps:
             if name not in landing:
-                there = " or ".join(sorted(landing)) or "no sole"
+                names = " or ".join(sorted(landing)) or "no sole"
                 raise InputError(
                     f"stances: sole {name!r} has a step in phase {k + 1}, on {' and '.join(stance.soles)}, "
-                    f"where {there} touches down: give the step to the phase in which it lands"
+                    f"where {names} touches down: give the step to the phase in which it lands"
                 )
 
 
@@ -129,7 +135,7 @@ def places_of_soles(
 ) -> Iterator[dict[str, NDArray[np.float64]]]:
     """Displacements (2,) [m] of each phase's soles from where they stood at the start, by name.
 
-    names : of the robot's soles, in its order, which is kept.
+    names : of all soles, in the order of the result.
     """
     moved: dict[str, NDArray[np.float64]] = {}
     for stance in stances:
@@ -140,11 +146,11 @@ def places_of_soles(
 def stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
     """Posture (nq,) of a stance with its soles displaced by ``moved`` (2,) [m].
 
-    That of the stance, with the base above the soles as there, and lower where the legs do not reach.
+    The base is displaced by the mean of the soles, and lowered if the legs do not reach.
 
     Raises
     ------
-    InputError : the legs do not reach, or beyond their joints' limits only; soles overlap.
+    InputError : the legs do not reach within their joints' limits; soles overlap.
     """
     limbs, corners = [], {}
     for leg in c.legs:
@@ -160,8 +166,8 @@ def stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64
     closing = LegClosure(c.model, c.data, limbs, base=c.base, independent=c.base + c.independent, join=c.join)
     mean = np.mean([moved.get(leg.name, np.zeros(2)) for leg in c.legs], axis=0)
     lower, upper = c.robot.lower[c.dependent], c.robot.upper[c.dependent]
-    for down in _LOWER:
-        y = c.start + np.concatenate([mean, [-down], np.zeros(c.ny - 3)])
+    for descent in _DESCENTS:
+        y = c.start + np.concatenate([mean, [-descent], np.zeros(c.ny - 3)])
         try:
             legs = closing.legs(y, c.start_legs)
         except InputError:

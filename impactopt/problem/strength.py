@@ -1,4 +1,4 @@
-"""Estimates of how hard a robot on a fixed base hits, in many postures: where it is strong."""
+"""Estimates of the impulse with which a robot on a fixed base hits a target, in many postures."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ if TYPE_CHECKING:
 __all__ = ["Blow", "Strength", "best_share", "drawn_blows"]
 
 Array = NDArray[np.float64]
-SWING = 1.2  # [rad], [m] of a joint's way from rest to contact at most
-INSIDE = 0.05  # of a joint's range that a posture at contact keeps off its limits
-DRAWN, REFUSED = 600, 6000  # postures in which blows are estimated, and that are drawn for them at most
-TRIED = 8  # postures at the point of a problem
+MAX_SWING = 1.2  # [rad], [m] travel of a joint from rest to contact
+LIMIT_MARGIN = 0.05  # of a joint's range, between a posture at contact and the joint's limits
+# postures with estimated impacts, and postures that are drawn for them at most, as most may not face a normal
+POSTURES, MAX_DRAWN = 600, 6000
+POINT_POSTURES = 8  # postures at the hit point of a problem
 NEARBY = 0.4  # [m] from a problem's point
-AHEAD = 0.25  # of the reach: a target stands so far ahead of the base at least
+MIN_AHEAD = 0.25  # of the reach: a target is at least so far ahead of the base
 DOWN = np.array([0.0, 0.0, -1.0])
 NORMALS = (*map(np.array, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0))), DOWN)
-ASLANT = float(np.cos(np.radians(30)))  # least cosine between a single joint's line and a normal
-PRESSED = 1e-3  # [m] at which a law's stiffness is read
+MIN_COSINE = float(np.cos(np.radians(30)))  # between a normal and the line along which a single joint strikes
+STIFFNESS_DEPTH = 1e-3  # [m] penetration at which the secant stiffness of a law is taken
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blow:
-    """An estimated blow: configuration q (nq,) and velocity v (nv,) at contact, point (3,) [m], normal (3,),
+    """Estimated impact: configuration q (nq,) and velocity v (nv,) at contact, point (3,) [m], normal (3,),
     and impulse [N s].
     """
 
@@ -53,7 +54,7 @@ class Blow:
 
 @dataclass(frozen=True, kw_only=True)
 class Strength:
-    """A striker of a robot on a fixed base, and what it hits."""
+    """Estimator of impacts of a striker, on a robot with a fixed base, with a law and a target."""
 
     robot: Robot
     striker: str
@@ -61,12 +62,13 @@ class Strength:
     target: Target
 
     def at(self, q: Array, normals: Sequence[Array]) -> list[Blow]:
-        """Blows in a configuration (nq,), one along each normal (3,) that the striking point can move along.
+        """Impacts in a configuration (nq,), one along each normal (3,) along which the striking point can
+        move.
 
-        The impulse is mu s: mu is the reduced mass of target and effective mass, and s the largest speed,
-        without any across the normal, that these leave: joint speeds; torques that accelerate all joints
-        evenly over the room behind them; and gears, which bear their rotors' deceleration under the peak
-        force.
+        The impulse is mu s. mu is the reduced mass of target and effective mass. s is the largest speed along
+        the normal, without speed across it, within three limits: of the joints' velocities; of the torques,
+        which accelerate all joints evenly from their limits of position; and of the gear loads, from the
+        rotors' deceleration under the peak force.
         """
         robot = self.robot
         model, data = robot.model, robot.model.createData()
@@ -77,115 +79,130 @@ class Strength:
         )[:3]
         weight = np.abs(robot.generalized_gravity(data, q))
         point = np.array(data.oMf[frame].translation)
-        spread = np.linalg.solve(inertia, jac.T)
-        mobility = jac @ spread
+        response = np.linalg.solve(inertia, jac.T)  # (nv, 3) velocities by unit impulses at the point
+        mobility = jac @ response
         angles = robot.joint_positions(q)
-        room = [np.clip(angles - robot.lower, 0.0, SWING), np.clip(robot.upper - angles, 0.0, SWING)]
-        fast = jac * robot.velocity_limit**2
+        # largest travel of each joint before contact, in positive and in negative direction
+        travel = [
+            np.clip(angles - robot.lower, 0.0, MAX_SWING),
+            np.clip(robot.upper - angles, 0.0, MAX_SWING),
+        ]
+        weighted = jac * robot.velocity_limit**2
         out = []
         for n in normals:
-            inverse = float(n @ mobility @ n)
-            if inverse <= 1e-9 * np.trace(mobility):  # it cannot move along the normal
+            inverse_mass = float(n @ mobility @ n)
+            if inverse_mass <= 1e-9 * np.trace(mobility):  # it cannot move along the normal
                 continue
-            best = max(
-                (self._speed(way, n, jac, inertia, weight, room), k, way)
-                for k, way in enumerate((spread @ _solved(mobility, n), fast.T @ _solved(fast @ jac.T, n)))
+            # velocities (nv,) for 1 m/s along n: of least kinetic energy, and of least squares over the
+            # limits
+            candidates = (
+                response @ _least_squares(mobility, n),
+                weighted.T @ _least_squares(weighted @ jac.T, n),
             )
-            speed, way = best[0], best[2]
-            mass = 1.0 / (inverse + self._yield())
-            speed = min(speed, self._bearable(spread @ n, mass))
-            blow = Blow(q=q, v=speed * way, point=point, normal=n, impulse=mass * speed)
-            out.append(blow)
+            best = max(
+                (self._swing_speed(v, n, jac, inertia, weight, travel), k, v)
+                for k, v in enumerate(candidates)
+            )
+            speed, direction = best[0], best[2]
+            mass = 1.0 / (inverse_mass + self._target_inverse_mass())
+            speed = min(speed, self._gear_speed(response @ n, mass))
+            out.append(Blow(q=q, v=speed * direction, point=point, normal=n, impulse=mass * speed))
         return out
 
-    def _yield(self) -> float:
-        """[1/kg] of the target."""
+    def _target_inverse_mass(self) -> float:
+        """Inverse mass [1/kg] of the target."""
         return 1.0 / self.target.mass if isinstance(self.target, FreeMass) else 0.0
 
-    def _speed(
-        self, way: Array, n: Array, jac: Array, inertia: Array, weight: Array, room: list[Array]
+    def _swing_speed(
+        self, direction: Array, n: Array, jac: Array, inertia: Array, weight: Array, travel: list[Array]
     ) -> float:
-        """[m/s] that a swing reaches: velocities (nv,) are `way` at 1 m/s."""
+        """Largest speed [m/s] of a swing whose velocities (nv,) at 1 m/s are ``direction``; 0 if these do not
+        move the point along n.
+        """
         robot = self.robot
-        if np.linalg.norm(jac @ way - n) > 1e-6:
+        if np.linalg.norm(jac @ direction - n) > 1e-6:
             return 0.0
-        size = np.maximum(np.abs(way), 1e-9)
-        behind = np.where(way > 0, room[0], room[1])
-        free = np.maximum(TorqueLimit().fraction * robot.torque_limit - weight, 0.0)
-        travel = float((behind / size).min())
-        push = float((free / np.maximum(np.abs(inertia @ way), 1e-9)).min())
-        return min(float((robot.velocity_limit / size).min()), float(np.sqrt(2.0 * travel * push)))
+        size = np.maximum(np.abs(direction), 1e-9)
+        joint_travel = np.where(direction > 0, travel[0], travel[1])
+        torque = np.maximum(TorqueLimit().fraction * robot.torque_limit - weight, 0.0)
+        # distance and constant acceleration of the point, by the joint that limits each: v^2 = 2 a s
+        distance = float((joint_travel / size).min())
+        acceleration = float((torque / np.maximum(np.abs(inertia @ direction), 1e-9)).min())
+        return min(float((robot.velocity_limit / size).min()), float(np.sqrt(2.0 * distance * acceleration)))
 
-    def _bearable(self, jump: Array, mass: float) -> float:
-        """[m/s] at which gears carry a blow; jump (nv,) : of velocities by an impulse of 1 N s."""
+    def _gear_speed(self, jump: Array, mass: float) -> float:
+        """Largest speed [m/s] at which the gears carry the impact; jump (nv,) : velocities by 1 N s."""
         robot = self.robot
-        stiffness = float(self.law.force(PRESSED, 0.0)) / PRESSED
-        damping = float(self.law.force(PRESSED, 1.0)) - float(self.law.force(PRESSED, 0.0))
-        force = max(np.sqrt(stiffness * mass), damping)  # [N] at 1 m/s
+        stiffness = float(self.law.force(STIFFNESS_DEPTH, 0.0)) / STIFFNESS_DEPTH
+        damping = float(self.law.force(STIFFNESS_DEPTH, 1.0)) - float(self.law.force(STIFFNESS_DEPTH, 0.0))
+        force = max(
+            np.sqrt(stiffness * mass), damping
+        )  # [N] peak at 1 m/s, of the spring or the damper alone
         size = np.maximum(np.abs(jump), 1e-12)
         gears = robot.gear_limit * robot.torque_limit / np.maximum(robot.armature * size, 1e-12)
         return float(gears.min()) / force
 
 
-def _solved(matrix: Array, n: Array) -> Array:
+def _least_squares(matrix: Array, n: Array) -> Array:
     return np.asarray(np.linalg.lstsq(matrix, n, rcond=1e-9)[0])
 
 
 def drawn_blows(
     strength: Strength, q: Array, normals: Sequence[Array] = NORMALS, *, with_face: bool = True
 ) -> list[Blow]:
-    """Estimated blows ahead of the base, the hardest first: in `DRAWN` postures, along each normal.
+    """Estimated impacts ahead of the base, the hardest first: in `POSTURES` postures, along each normal.
 
-    The joints that move the striker are anywhere inside their limits, and the others as in q (nq,). A single
-    joint strikes along its circle or line, within `ASLANT` of a normal. A striker
-    whose face is known meets the target with it, as `FirstTouch` asks by default; not if not `with_face`.
+    The joints that move the striker are drawn within their limits; the others are as in q (nq,). A single
+    joint strikes along its circle or line, if that is within 30 degrees of a normal.
+    with_face : a striker meets the target with its face if that is known, as `FirstTouch` requires by
+    default.
     """
     robot = strength.robot
     model, data = robot.model, robot.model.createData()
     frame = model.getFrameId(robot.striker(strength.striker).model_frame)
     face = striker_face(robot, strength.striker) if with_face else None
-    square = float(np.cos(FirstTouch().angle))
+    min_face_cosine = float(np.cos(FirstTouch().angle))
     rng, limb = np.random.default_rng(0), np.array(robot.limb(robot.striker(strength.striker).model_frame))
     low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
-    low, high = low + INSIDE * (high - low), high - INSIDE * (high - low)
+    low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
     own, blows = robot.joint_positions(q)[limb], list[Blow]()
-    met = 0
-    for _ in range(REFUSED):
+    count = 0
+    for _ in range(MAX_DRAWN):
         step = np.zeros(robot.nv)
         step[robot.nv - robot.n + limb] = rng.uniform(low, high) - own
-        posture, ways = np.array(pin.integrate(model, q, step)), normals
+        posture, directions = np.array(pin.integrate(model, q, step)), normals
         if len(limb) == 1:
             jac = pin.computeFrameJacobian(model, data, posture, frame, pin.LOCAL_WORLD_ALIGNED)
-            way = np.reshape(jac, (6, robot.nv))[:3, robot.nv - robot.n + limb[0]]
-            both = np.outer([1.0, -1.0], way / max(float(np.linalg.norm(way)), 1e-9))
-            ways = [line for line in both if max(n @ line for n in normals) > ASLANT]
+            tangent = np.reshape(jac, (6, robot.nv))[:3, robot.nv - robot.n + limb[0]]
+            both = np.outer([1.0, -1.0], tangent / max(float(np.linalg.norm(tangent)), 1e-9))
+            directions = [line for line in both if max(n @ line for n in normals) > MIN_COSINE]
         if face is not None:
             pin.framesForwardKinematics(model, data, posture)
-            ahead = data.oMf[frame].rotation @ face.normal
-            ways = [n for n in ways if n @ ahead >= square]
-        if ways:
-            blows += strength.at(posture, ways)
-            met += 1
-        if met == DRAWN:
+            face_normal = data.oMf[frame].rotation @ face.normal
+            directions = [n for n in directions if n @ face_normal >= min_face_cosine]
+        if directions:
+            blows += strength.at(posture, directions)
+            count += 1
+        if count == POSTURES:
             break
     reach = max((float(np.linalg.norm(blow.point[:2])) for blow in blows), default=0.0)
-    front = [b for b in blows if b.point[0] > AHEAD * reach and b.impulse > 0]
+    front = [b for b in blows if b.point[0] > MIN_AHEAD * reach and b.impulse > 0]
     return sorted(front, key=lambda blow: -blow.impulse)
 
 
 def best_share(problem: ImpactProblem) -> tuple[float, Blow] | None:
-    """Impulse of a problem's blow over that of the hardest one nearby, by estimates of both, and that one.
+    """Estimated impulse of a problem over that of the hardest impact nearby, and that impact.
 
-    Nearby are points within `NEARBY`, hit along the problem's normal, to the front, to a side or down. A
-    rough number: postures are drawn, and estimates know nothing of bodies. None: of a robot on soles, whose
-    balance decides, and of targets that are no free mass.
+    Nearby are points within 0.4 m, hit along the problem's normal, to the front, to a side or down. The
+    result is rough: postures are drawn, and clearance is ignored. None for a robot on soles, whose balance
+    limits the impulse, and for targets other than a free mass.
     """
     p = problem
     if p.robot.floating or p.second is not None or not isinstance(p.target, FreeMass):
         return None
     strength = Strength(robot=p.robot, striker=p.striker, law=p.law, target=p.target)
     rng, postures = np.random.default_rng(0), [p.contact_posture]
-    for _ in range(TRIED):
+    for _ in range(POINT_POSTURES):
         guess = pin.integrate(p.robot.model, p.contact_posture, rng.standard_normal(p.robot.nv))
         with suppress(InputError):
             postures.append(inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1))

@@ -1,4 +1,4 @@
-"""Readable description of a violated constraint: its place in the motion, and the amount."""
+"""Description of a violated constraint in messages: its place in the motion, and the amount."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Expression(Protocol):
 class Place:
     """Place in the motion at which a constraint holds.
 
-    name : in the program, where no other place has it: "swing, 93 %".
-    text : to a reader; ``{s}`` and ``{ms}`` stand for the time [s] and [ms].
-    time : [s], an expression in the program's variables; None if the text has none.
+    name : unique name in the program, such as "swing, 93 %".
+    text : for messages; ``{s}`` and ``{ms}`` stand for the time in [s] and [ms].
+    time [s] : expression in the program's variables; None if the text has no time.
     """
 
     name: str
@@ -34,20 +34,20 @@ class Place:
 
     @classmethod
     def plain(cls, name: str) -> Place:
-        """A place without a time."""
+        """Place without a time, whose text is its name."""
         return cls(name, name.replace("{", "{{").replace("}", "}}"))
 
     def told(self, x: Array) -> str:
-        """The text, with the time that solver variables (n,) say."""
+        """Text with the time at solver variables (n,)."""
         t = float(self.time.evaluate(x)[0]) if self.time is not None else np.nan
         return self.text.format(s=f"{t:.2f} s", ms=f"{1e3 * t:.0f} ms")
 
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """Amount of a violation in words: the amount x ``factor`` in ``unit``, and a ``phrase``.
+    """Text for the amount of a violation: the amount x ``factor`` in ``unit``, and a ``phrase``.
 
-    over : what the amount is divided by first, such as a sole's normal force; at least ``least``.
+    over : divisor of the amount, such as a sole's normal force; at least ``least``.
     """
 
     unit: str
@@ -57,7 +57,7 @@ class Measure:
     least: float = 1e-3
 
     def told(self, x: Array, amount: float) -> str:
-        """The amount in words, for solver variables (n,)."""
+        """Text for an amount, at solver variables (n,)."""
         by = max(float(self.over.evaluate(x)[0]), self.least) if self.over is not None else 1.0
         value = abs(amount * self.factor / by)
         number = f"{value:.0f}" if 9.5 <= value < np.inf else f"{value:.2g}"
@@ -75,5 +75,5 @@ def degrees(phrase: str) -> Measure:
 
 
 def percent(phrase: str, *, of: float = 1.0) -> Measure:
-    """Measure of constraints relative to a whole ``of``."""
+    """Measure of constraints in per cent of a value ``of``."""
     return Measure("%", 100 / of if of > 0 else 100.0, phrase)

@@ -1,4 +1,4 @@
-"""The units of a sweep on a Dask cluster: the same units, on whatever machines its workers are."""
+"""Evaluation of a sweep's units on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -17,33 +17,34 @@ from impactopt.sweeps.evaluate import evaluate
 
 __all__ = ["connected", "on_cluster"]
 
-AHEAD = 3  # units a worker's thread that are handed to the scheduler at once
-LOOK = 5.0  # [s] between looks at how many workers there are
-PATIENCE = 10.0  # [s] for a scheduler to answer
+UNITS_PER_THREAD = 3  # that the scheduler has at once, for each thread of its workers
+COUNT_INTERVAL = 5.0  # [s] between counts of the workers' threads
+CONNECT_TIMEOUT = 10.0  # [s]
 
 
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """A client of the scheduler at an address, tcp://host:port.
+    """Client of the scheduler at an address, tcp://host:port.
 
     Raises
     ------
-    InputError : Dask is not installed; nothing answers there.
+    InputError : Dask is not installed; nothing answers at the address.
     """
     distributed = _distributed()
-    # of a scheduler that is lost `_found` says all in one sentence, Dask on many pages
+    # If the scheduler is lost, `_found` raises one sentence. Dask would log many pages.
     loggers = [logging.getLogger(f"distributed.{name}") for name in ("client", "utils")]
     before = [logger.level for logger in loggers]
     try:
         for logger in loggers:
             logger.setLevel(logging.CRITICAL)
         try:
-            with ThreadPoolExecutor(1) as apart:  # a notebook has a loop of its own
-                apart.submit(asyncio.run, _greet(address)).result()
-            client = distributed.Client(address, timeout=PATIENCE)
+            # in another thread, as a notebook's runs an event loop already
+            with ThreadPoolExecutor(1) as thread:
+                thread.submit(asyncio.run, _check_scheduler(address)).result()
+            client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
         except (OSError, ValueError, TypeError, asyncio.TimeoutError) as error:
             raise InputError(
-                f"no Dask scheduler answers at {address}: {str(error) or f'nothing in {PATIENCE:g} s'}"
+                f"no Dask scheduler answers at {address}: {str(error) or f'nothing in {CONNECT_TIMEOUT:g} s'}"
             ) from error
         with client:
             yield client
@@ -52,42 +53,43 @@ def connected(address: str) -> Iterator[Any]:
             logger.setLevel(level)
 
 
-async def _greet(address: str) -> None:
-    """OSError or TimeoutError where no scheduler answers.
+async def _check_scheduler(address: str) -> None:
+    """Raise OSError or TimeoutError if no scheduler answers.
 
-    A `Client` waits for ever for what takes its connection and is none.
+    A `Client` would wait for ever for another server that accepts its connection.
     """
     distributed = _distributed()
-    given = distributed.Security().get_connection_args("client")
-    comm = await asyncio.wait_for(distributed.comm.connect(address, timeout=PATIENCE, **given), PATIENCE)
+    security = distributed.Security().get_connection_args("client")
+    connection = distributed.comm.connect(address, timeout=CONNECT_TIMEOUT, **security)
+    comm = await asyncio.wait_for(connection, CONNECT_TIMEOUT)
     comm.abort()
 
 
 def on_cluster(
-    work: Work, units: Iterable[Unit], client: Any, tell: Callable[[str], None]
+    work: Work, units: Iterable[Unit], client: Any, report: Callable[[str], None]
 ) -> Generator[tuple[Unit, Found], None, None]:
     """Results of units on a cluster, in the order in which they are finished.
 
-    client : a `distributed.Client`. A unit whose worker dies is given to another one by the scheduler, as
-        often as `distributed.scheduler.allowed-failures` says; then its rows say so. Workers come and go.
-    tell : told if there are no workers to begin with.
+    client : a `distributed.Client`. Workers may come and go. If a worker dies, the scheduler gives its unit
+        to another one, as often as `distributed.scheduler.allowed-failures` says; then the unit's cases fail.
+    report : called with a message if there are no workers at first.
 
-    Closing the generator cancels what is not finished.
+    Closing the generator cancels the units that are not finished.
 
     Raises
     ------
-    InputError : the workers are threads of this process; a worker has another impactopt; the scheduler is
-        lost.
+    InputError : the workers are threads of this process; a worker has another version of impactopt; the
+        scheduler is lost.
     """
     distributed = _distributed()
-    pool = _Pool(client, tell)
+    pool = _Pool(client, report)
     name, source = uuid.uuid4().hex[:8], iter(units)
     pending: dict[Any, Unit] = {}
     done = distributed.as_completed()
 
     def submit() -> None:
-        while len(pending) < AHEAD * pool.threads and (unit := next(source, None)) is not None:
-            # a unit is worth more than its arguments: a new task each, none that depends on another's data
+        while len(pending) < UNITS_PER_THREAD * pool.threads and (unit := next(source, None)) is not None:
+            # A key of its own makes each unit a new task. Dask would else identify tasks by their arguments.
             key = f"impactopt-{name}-{unit.index}"
             future = client.submit(evaluate, work, unit, key=key, pure=False)
             pending[future] = unit
@@ -103,33 +105,34 @@ def on_cluster(
             future.release()
     finally:
         if pending:
-            with contextlib.suppress(Exception):  # of a scheduler that is gone
+            with contextlib.suppress(Exception):  # the scheduler may be lost
                 client.cancel([*pending], force=True)
 
 
 class _Pool:
-    """Number of threads that the workers have at present."""
+    """Present number of the workers' threads."""
 
-    def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
+    def __init__(self, client: Any, report: Callable[[str], None]) -> None:
         self._client, self._next, self._threads = client, 0.0, 1
         workers = client.scheduler_info(n_workers=-1)["workers"]
         if any(str(address).startswith("inproc") for address in workers):
             raise InputError(
                 "the workers of this Dask cluster are threads of this process, which a case that crashes "
-                "would take along; give LocalCluster(processes=True, threads_per_worker=1)"
+                "would end; give LocalCluster(processes=True, threads_per_worker=1)"
             )
         if not workers:
-            tell("no worker has come to the scheduler yet; waiting for one")
+            report("the scheduler has no worker yet; waiting for one")
 
     @property
     def threads(self) -> int:
         if time.monotonic() >= self._next:
             self._threads = max(sum(self._client.nthreads().values()), 1)
-            self._next = time.monotonic() + LOOK
+            self._next = time.monotonic() + COUNT_INTERVAL
         return self._threads
 
 
 def _found(unit: Unit, future: Any) -> Found:
+    """Result of a finished task; InputError if the sweep cannot go on."""
     if future.status == "finished":
         found: Found = future.result()
         return found
@@ -143,8 +146,8 @@ def _found(unit: Unit, future: Any) -> Found:
         what = f"{type(error).__name__}: {error}"
         raise InputError(f"the workers cannot do it ({what}); do they have the same impactopt?")
     raise InputError(
-        "the Dask scheduler is lost, or has been told to forget these tasks; what was finished before is "
-        "kept, and the same command goes on from there"
+        "the Dask scheduler is lost, or has forgotten these tasks; finished cases are kept, and the same "
+        "command resumes the sweep"
     )
 
 

@@ -1,7 +1,7 @@
-"""Sweeps of collisions: their keys, and batches of them in one compiled call.
+"""Many collisions of a problem: which keys they may vary in, and their evaluation in compiled batches.
 
-What a row shares with others is made once: a robot and a model for each combination of keys that change the
-structure, a posture for each hit point. All else are inputs of the compiled functions.
+A robot and a model are made once for each combination of structural keys, and a posture once for each hit
+point. All other values are inputs of the compiled functions.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from impactopt.files.problem_file.toml import Place, plain_value
 
 __all__ = [
     "SERVO",
-    "AlikeCollisions",
+    "CollisionBatch",
     "Collisions",
     "Role",
     "collide_many",
@@ -48,9 +48,11 @@ __all__ = [
     "sweep_place",
 ]
 
-# a number of its own in each row; one that makes another posture; one that makes another model
+# Role of a key: "number", an input of the compiled functions; "point", which changes the posture;
+# "structure", which changes the robot or the model.
 Role = Literal["number", "point", "structure"]
 
+# settings of the servo, by the places of their values and of factors on them
 SERVO = {
     ("robot", "kp_N_m_rad"): "kp",
     ("robot", "kd_N_m_s_rad"): "kd",
@@ -59,7 +61,7 @@ SERVO = {
     ("at_contact", "kd_scale"): "kd",
     ("at_contact", "torque_limit_scale"): "torque_limit",
 }
-_KINDS = {"target": "kind", "contact": "law"}
+_TYPE_KEYS = {"target": "kind", "contact": "law"}  # keys that select the class of the target or law
 _STATE = (("at_contact", "speed_m_s"), ("at_contact", "joints_rad"))
 
 
@@ -68,7 +70,7 @@ def sweep_place(data: Mapping[str, Any], key: str) -> Place:
 
     Raises
     ------
-    InputError : there is no such key, or one that no collision depends on.
+    InputError : there is no such key, or no collision depends on it.
     """
     if key.partition(".")[0] != "at_contact":
         place = key_place(data, key)
@@ -81,8 +83,8 @@ def sweep_place(data: Mapping[str, Any], key: str) -> Place:
 def role_of(place: Place) -> Role:
     """Role of a key at this place in a collision; InputError if it has none."""
     table, *rest = place
-    if table in _KINDS:
-        return "structure" if rest == [_KINDS[str(table)]] else "number"
+    if table in _TYPE_KEYS:
+        return "structure" if rest == [_TYPE_KEYS[str(table)]] else "number"
     if place[:2] in SERVO or place[:2] in _STATE:
         return "number"
     if place[:2] == ("problem", "point_m"):
@@ -99,7 +101,7 @@ def role_of(place: Place) -> Role:
 
 
 def setting_of(place: Place, content: Any) -> str:
-    """Name of a collision's setting (`Settings`) that a number of [target] or [contact] is."""
+    """Name in `Settings` of a number of [target] or [contact]."""
     table, key = str(place[0]), str(place[1])
     section = getattr(content, table)
     fields = {info.alias or name: name for name, info in type(section).model_fields.items()}
@@ -124,23 +126,25 @@ def _in_section(key: str) -> tuple[str, ...]:
 
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
-Numbers = Mapping[Place, Array]  # columns of numbers, by their keys' places
+Index = NDArray[np.intp]
+Numbers = Mapping[Place, Array]  # values (count, ...) of the keys with the role "number" or "point"
 
-_ROWS, _WITH_HISTORIES = 8192, 512  # rows at a time: histories are large
+# collisions in one call of a compiled batch, without and with histories, which are large
+_MAX_BATCH, _MAX_BATCH_HISTORIES = 8192, 512
+# reasons that a collision has no result
 NO_NUMBER = (
-    "the collision has no finite numbers: its steps are unstable here, or what holds the robot cannot be "
-    "told apart"
+    "the collision has no finite numbers: its steps are unstable here, or the constraints that fix the robot "
+    "are linearly dependent"
 )
 TOO_STIFF = "the contact is too stiff for the steps of its law: {:.1g} of the impulse would be left out"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class AlikeCollisions:
-    """Batch of collisions that differ in numbers and hit points only.
+class CollisionBatch:
+    """Collisions with one robot and one model, which differ in numbers and hit points only.
 
-    file, section : problem and [at_contact], with the values of keys that make the structure.
-    model, states, measures : what collides, from where, and what of it is asked for.
+    file, section : problem and [at_contact], with the values of the structural keys.
+    model : of the collision.  states : makes the states at contact.  measures : outputs by name.
     """
 
     file: ProblemFile
@@ -150,8 +154,8 @@ class AlikeCollisions:
     measures: Mapping[str, Measure]
 
     def posture(self, point: tuple[float, ...] | None = None) -> Posture | str:
-        """The posture that rows with this hit point (3,) [m] start from, None being the problem's own; or why
-        there is none.
+        """Posture at contact for a hit point (3,) [m], by default the problem's; or the reason that there is
+        none.
 
         Raises
         ------
@@ -161,23 +165,25 @@ class AlikeCollisions:
         return self.states.posture(self.section.posture, self.section.result, at)
 
     def __call__(self, numbers: Numbers, count: int, threads: int | None) -> dict[str, NDArray[Any]]:
-        """Columns of `count` rows by measure, and ``reason``."""
+        """Values (count,) of each measure, nan where there is no result, and the ``reason`` (count,) for
+        it.
+        """
         out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.measures}
         out["reason"] = np.full(count, "", dtype=object)
-        for point, rows in self._points(numbers, count):
+        for point, indices in self._by_point(numbers, count):
             posture = self.posture(point)
             if isinstance(posture, str):
-                out["reason"][rows] = posture
+                out["reason"][indices] = posture
                 continue
-            for begin in range(0, len(rows), self._together):
-                some = rows[begin : begin + self._together]
+            for begin in range(0, len(indices), self._max_batch):
+                some = indices[begin : begin + self._max_batch]
                 own = {place: x[some] for place, x in numbers.items() if not _is_point(place)}
                 for name, values in self._collide(posture, own, len(some), threads).items():
                     out[name][some] = values
         return out
 
-    def _points(self, numbers: Numbers, count: int) -> Iterator[tuple[tuple[float, ...], Rows]]:
-        """Hit points, and the rows that have them."""
+    def _by_point(self, numbers: Numbers, count: int) -> Iterator[tuple[tuple[float, ...], Index]]:
+        """Hit points, each with the indices of its collisions."""
         own = self.file.content.problem.point
         given = {place: x for place, x in numbers.items() if _is_point(place)}
         if not given:
@@ -185,22 +191,24 @@ class AlikeCollisions:
             return
         point = np.repeat(np.array(own, dtype=float)[None], count, axis=0)
         for place, values in given.items():
+            # the key is problem.point, or one coordinate of it
             point[:, slice(None) if len(place) == 2 else int(place[2])] = values
-        kept, back = np.unique(point, axis=0, return_inverse=True)
-        for k, one in enumerate(kept):
-            yield tuple(one.tolist()), np.flatnonzero(back.ravel() == k)
+        distinct, inverse = np.unique(point, axis=0, return_inverse=True)
+        for k, one in enumerate(distinct):
+            yield tuple(one.tolist()), np.flatnonzero(inverse.ravel() == k)
 
     @cached_property
     def _outputs(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for m in self.measures.values() for name in m.outputs))
 
     @cached_property
-    def _together(self) -> int:
-        return _WITH_HISTORIES if {*self._outputs} & {*HISTORIES} else _ROWS
+    def _max_batch(self) -> int:
+        return _MAX_BATCH_HISTORIES if {*self._outputs} & {*HISTORIES} else _MAX_BATCH
 
     def _collide(
         self, posture: Posture, numbers: Numbers, count: int, threads: int | None
     ) -> dict[str, NDArray[Any]]:
+        """Values as of `__call__`, for collisions in one posture and in one call of the model."""
         section, model = self.section, self.model
         joints = {name: np.full(count, angle) for name, angle in section.joints.items()}
         joints |= {str(at[2]): x for at, x in numbers.items() if at[:2] == ("at_contact", "joints_rad")}
@@ -209,6 +217,7 @@ class AlikeCollisions:
             speed = np.full(count, section.speed)
         normal = np.asarray(model.normal)
         states = self.states.rows(posture, joints, speed, normal, count, velocity=section.velocity)
+        # collisions whose state at contact is impossible stay nan, with its reason
         out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.measures}
         out["reason"] = states.reason
         good = np.flatnonzero(states.reason == "")
@@ -239,7 +248,7 @@ class AlikeCollisions:
         return out
 
     def _settings(self, numbers: Numbers, count: int) -> dict[str, Array]:
-        """Numbers of law, target and servo by the names of `Settings`, (count, ...) or (1, ...)."""
+        """Parameters of law, target and servo by their names in `Settings`, (count, ...) or (1, ...)."""
         section, robot = self.section, self.model.robot
         out = {"kp": robot.kp[None], "kd": robot.kd[None], "torque_limit": robot.torque_limit[None]}
         scales: dict[str, Any] = {"kp": section.kp_scale, "kd": section.kd_scale}
@@ -269,7 +278,10 @@ def batch(
     settings: Mapping[str, Array],
     threads: int | None,
 ) -> tuple[dict[str, Array], NDArray[np.object_]]:
-    """Outputs by name, and why a row has none."""
+    """Outputs (count, ...) of a compiled model by name, and for each collision the reason that it has
+    none.
+    """
+    # the batch takes a setting that all collisions share without the axis of collisions
     single: dict[str, Any] = {
         name: x[0] if x.ndim == 2 and len(x) == 1 else x for name, x in settings.items()
     }
@@ -277,39 +289,39 @@ def batch(
     reason = np.where(found["separated"], "", NOT_ENDED).astype(object)
     finite = np.ones(len(reason), dtype=bool)
     for name in outputs:
-        if name == FREEZE_ERROR:  # may be infinite, and says so
+        if name == FREEZE_ERROR:  # infinity is a result: with other freezes the contact does not end
             continue
         finite &= np.isfinite(found[name]).reshape(len(reason), -1).all(axis=1)
     reason[~finite] = NO_NUMBER
     if "step_error" in found:
         error = found["step_error"]
-        for row in np.flatnonzero(np.isfinite(error) & too_large(model.stepping, error)):
-            reason[row] = TOO_STIFF.format(error[row])
+        for k in np.flatnonzero(np.isfinite(error) & too_large(model.stepping, error)):
+            reason[k] = TOO_STIFF.format(error[k])
     return found, reason
 
 
 def one_by_one(
     model: Any, outputs: tuple[str, ...], states: States, settings: Mapping[str, Array]
 ) -> tuple[dict[str, Array], NDArray[np.object_]]:
-    """Likewise, of models that have no batch."""
+    """Outputs and reasons as of `batch`, for a model without compiled batches."""
     count = len(states.q)
-    rows: list[Collision | None] = []
+    collisions: list[Collision | None] = []
     reason = np.full(count, "", dtype=object)
     for i in range(count):
         own = {name: x[0 if len(x) == 1 else i] for name, x in settings.items()}
         try:
             result = one_collision(model, states.q[i], states.v[i], states.torque[i], **own)
         except InputError as error:
-            rows.append(None)
+            collisions.append(None)
             reason[i] = str(error)
             continue
-        rows.append(result)
+        collisions.append(result)
         if not result.separated:
             reason[i] = NOT_ENDED
-    return {name: _stacked([_of(row, name) for row in rows]) for name in outputs}, reason
+    return {name: _stacked([_output(one, name) for one in collisions]) for name in outputs}, reason
 
 
-def _of(collision: Collision | None, name: str) -> Any:
+def _output(collision: Collision | None, name: str) -> Any:
     if collision is None:
         return None
     value = getattr(collision, name)
@@ -317,16 +329,16 @@ def _of(collision: Collision | None, name: str) -> Any:
 
 
 def _stacked(values: list[Any]) -> Array:
-    """Rows of equal shape: histories repeat their last instant, and what there is not is nan."""
+    """Values in one array; a missing one is nan, and shorter histories repeat their last instant."""
     arrays = [None if x is None else np.asarray(x, dtype=float) for x in values]
-    there = [x for x in arrays if x is not None]
-    if not there:
+    known = [x for x in arrays if x is not None]
+    if not known:
         return np.full((len(values), 1, 1), np.nan)
-    length = max((len(x) for x in there if x.ndim), default=0)
+    length = max((len(x) for x in known if x.ndim), default=0)
     out = []
     for x in arrays:
         if x is None:
-            x = np.full(there[0].shape, np.nan)
+            x = np.full(known[0].shape, np.nan)
         out.append(np.concatenate([x, np.repeat(x[-1:], length - len(x), axis=0)]) if x.ndim else x)
     return np.stack(out)
 
@@ -339,30 +351,31 @@ def collide_many(
     at_contact: Mapping[str, Any] | None = None,
     threads: int | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Collisions of a problem's robot with its target, one a row, in compiled code.
+    """Evaluate N collisions of a problem's robot with its target, in compiled code.
 
     Parameters
     ----------
     problem : a problem file, its path, or its name.
-    columns : by key path (N) values: numbers of the problem file's [target], [contact] and servo
-        (robot.kp, robot.kd, robot.torque_limit, of all joints or of one), of [at_contact], and problem.point;
-        names and numbers that make another robot or model, as those of [friction] do, are in few
-        combinations. Of one value: for all.
-    outputs : names of columns; see docs/sweeps.md. Only what they need is computed: where a million rows are
-        asked for, leave out freeze_error_pct, which takes some six times as long as the impulse.
+    columns : values (N,), or a single one for all collisions, by key path: numbers of the problem file's
+        [target], [contact] and servo (robot.kp, robot.kd, robot.torque_limit, for all joints or one), of
+        [at_contact], and problem.point. Each combination of other values, such as those of [friction], makes
+        a robot or model: these should be few.
+    outputs : names of columns; see docs/sweeps.md. Only what they need is computed. For a million collisions
+        leave out freeze_error_pct, which takes some six times as long as the impulse.
     at_contact : the keys of [at_contact] that no column gives; see docs/sweeps.md.
     threads : cores to use; None: all.
 
     Returns
     -------
-    By output (N) numbers, nan in rows that are impossible; and ``reason`` (N), why a row is, else "".
+    Numbers (N,) by output, nan for collisions that are impossible; and ``reason`` (N,), why a collision is
+    impossible, else "".
 
     Raises
     ------
     InputError : unknown keys or outputs; columns of different lengths; values that the problem file refuses.
     """
     file = problem if isinstance(problem, ProblemFile) else read_problem_file(problem)
-    whole = Collisions(file, at_contact or {}, outputs, keys=tuple(columns))
+    collisions = Collisions(file, at_contact or {}, outputs, keys=tuple(columns))
     given = {key: np.atleast_1d(raw_array(key, values)) for key, values in columns.items()}
     count = max((len(x) for x in given.values()), default=1)
     for key, values in given.items():
@@ -371,19 +384,19 @@ def collide_many(
         if len(values) not in (1, count):
             raise InputError(f"{key}: has {len(values)} values and other columns {count}; give as many")
     given = {key: np.repeat(x, count, axis=0) if len(x) != count else x for key, x in given.items()}
-    whole.check(given)
-    return whole(given, threads=threads)
+    collisions.check(given)
+    return collisions(given, threads=threads)
 
 
 class Collisions:
-    """Evaluates rows of a sweep of collisions; keeps what rows share from one call to the next.
+    """Evaluates collisions with varied keys; robots, models and postures are kept from one call to the next.
 
     file, at_contact, outputs : as of `collide_many`.  keys : key paths of the columns.  folder : where a
     relative path of [at_contact] result begins.
 
     Raises
     ------
-    InputError : as of `collide_many`; what does not depend on the columns' values.
+    InputError : as of `collide_many`, for mistakes that do not depend on the columns' values.
     """
 
     def __init__(
@@ -400,33 +413,38 @@ class Collisions:
         self.places = {key: sweep_place(file.data, key) for key in keys}
         if len({*self.places.values()}) < len(self.places):
             raise InputError(f"two columns are of one key: {', '.join(keys)}")
-        self._alike: dict[tuple[Any, ...], AlikeCollisions] = {}
-        self._bodies: dict[str, ContactStates] = {}
+        self._batches: dict[tuple[Any, ...], CollisionBatch] = {}  # by the values of the structural keys
+        self._states: dict[str, ContactStates] = {}  # by robot and stance
 
     # ------------------------------------------------------------ checks
     def check(self, columns: Mapping[str, Any]) -> None:
-        """InputError for values that the problem file, [at_contact] or a robot refuses, before work starts.
+        """Checks values before work starts.
 
-        columns : by key all values, or what bounds them: ranges of numbers are intervals.
+        columns : all values by key, or their bounds.
+
+        Raises
+        ------
+        InputError : values that the problem file, [at_contact] or a robot refuses.
         """
-        for structure, rows in self._groups(columns):
+        for structure, indices in self._groups(columns):
             for key, place in self.places.items():
                 if role_of(place) == "structure":
                     continue
-                values = np.asarray(columns[key])[rows]
-                numbers = values.dtype.kind in "fiu"  # NaN is among their least and their largest
+                values = np.asarray(columns[key])[indices]
+                # allowed numbers are intervals, so the extremes are enough; a NaN is both of them
+                numbers = values.dtype.kind in "fiu"
                 for value in (values.min(axis=0), values.max(axis=0)) if numbers else values:
                     self._with({**structure, key: plain_value(value)})
-            alike = self._alike_of(structure)
+            one = self._batch(structure)
             for place in self.places.values():
                 if place[:2] == ("at_contact", "joints_rad"):
-                    alike.states.check_joint(str(place[2]))
-            for name in alike.section.joints:
-                alike.states.check_joint(name)
-            alike.posture()
+                    one.states.check_joint(str(place[2]))
+            for name in one.section.joints:
+                one.states.check_joint(name)
+            one.posture()
 
     def _with(self, values: Mapping[str, Any]) -> tuple[ProblemFile, AtContact]:
-        """Problem and section with other values by key."""
+        """Problem and [at_contact] with other values by key."""
         section = dict(self.at_contact)
         changes = {}
         for key, value in values.items():
@@ -439,25 +457,25 @@ class Collisions:
                 section["joints_rad"] = {**section.get("joints_rad", {}), str(place[2]): value}
         for key, place in self.places.items():
             if place == ("at_contact", "speed_m_s") and key not in values:
-                section.setdefault("speed_m_s", 1.0)  # each row has its own
+                section.setdefault("speed_m_s", 1.0)  # any value: each collision has its own
         file = self.file.changed(changes)
         return file, check_at_contact(section)
 
-    # ------------------------------------------------------------ rows
+    # ------------------------------------------------------------ evaluation
     def __call__(self, columns: Mapping[str, Any], *, threads: int | None = None) -> dict[str, NDArray[Any]]:
-        """Outputs as of `collide_many`; columns (N) of all keys."""
+        """Outputs as of `collide_many`; columns (N,) of all keys."""
         count = len(next(iter(columns.values()))) if columns else 1
         out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.outputs}
         out["reason"] = np.full(count, "", dtype=object)
         numbers = {p: np.asarray(columns[key]) for key, p in self.places.items() if role_of(p) != "structure"}
-        for structure, rows in self._groups(columns):
-            own = {place: x[rows] for place, x in numbers.items()}
-            for name, values in self._alike_of(structure)(own, len(rows), threads).items():
-                out[name][rows] = values
+        for structure, indices in self._groups(columns):
+            own = {place: x[indices] for place, x in numbers.items()}
+            for name, values in self._batch(structure)(own, len(indices), threads).items():
+                out[name][indices] = values
         return out
 
     def _groups(self, columns: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], NDArray[np.intp]]]:
-        """Values of the keys that make the structure, and the rows that have them."""
+        """Combinations of values of the structural keys, each with the indices of its collisions."""
         count = len(next(iter(columns.values()))) if columns else 1
         keys = [key for key, place in self.places.items() if role_of(place) == "structure"]
         if not keys:
@@ -465,16 +483,16 @@ class Collisions:
             return
         groups: dict[str, tuple[dict[str, Any], list[int]]] = {}
         lists = [plain_value(columns[key]) for key in keys]
-        for row, values in enumerate(zip(*lists, strict=True)):
-            groups.setdefault(repr(values), (dict(zip(keys, values, strict=True)), []))[1].append(row)
-        for structure, rows in groups.values():
-            yield structure, np.array(rows, dtype=np.intp)
+        for k, values in enumerate(zip(*lists, strict=True)):
+            groups.setdefault(repr(values), (dict(zip(keys, values, strict=True)), []))[1].append(k)
+        for structure, indices in groups.values():
+            yield structure, np.array(indices, dtype=np.intp)
 
-    def _alike_of(self, structure: Mapping[str, Any]) -> AlikeCollisions:
+    def _batch(self, structure: Mapping[str, Any]) -> CollisionBatch:
         key = tuple(repr(structure[name]) for name in sorted(structure))
-        if key not in self._alike:
+        if key not in self._batches:
             file, section = self._with(structure)
-            states = self._body(file)
+            states = self._contact_states(file)
             model = collision_model(file.content, states.robot, states.stance, section)
             measures = chosen(self.outputs, model.target)
             needed = [name for m in measures.values() for name in m.outputs if name != FREEZE_ERROR]
@@ -482,23 +500,23 @@ class Collisions:
                 model._check_outputs(tuple(needed), 1)
             elif isinstance(model, RigidImpact) and (unknown := [x for x in needed if x in OF_SERVO]):
                 raise InputError(f"output {unknown[0]!r}: a rigid impact knows nothing of it; leave it out")
-            self._alike[key] = AlikeCollisions(
+            self._batches[key] = CollisionBatch(
                 file=file, section=section, model=model, states=states, measures=measures
             )
-        return self._alike[key]
+        return self._batches[key]
 
-    def _body(self, file: ProblemFile) -> ContactStates:
-        """Contact states of a robot on its stance, which models share."""
+    def _contact_states(self, file: ProblemFile) -> ContactStates:
+        """Contact states of a robot on its stance, which several models share."""
         problem, content = file.data["problem"], file.content
         names = [problem.get(name) for name in ("robot", "striker", "start")]
         key = repr([*names, file.data.get("robot"), file.data.get("stance")])
-        if key not in self._bodies:
+        if key not in self._states:
             robot = content.make_robot(file.path.parent)
-            self._bodies[key] = ContactStates(
+            self._states[key] = ContactStates(
                 robot=robot,
                 striker=content.problem.striker,
                 stance=content.make_stance(robot),
                 start=content.make_start(robot),
                 folder=self.folder,
             )
-        return self._bodies[key]
+        return self._states[key]

@@ -1,4 +1,4 @@
-"""Sweep files: which problem, which of its keys vary, and what is done with each case."""
+"""Sweep files: the problem, the keys of it that vary, and the kind of case."""
 
 from __future__ import annotations
 
@@ -32,40 +32,46 @@ from impactopt.sweeps.collisions import Collisions, sweep_place
 from impactopt.sweeps.design import Axis, Column, Design, Draws, Span, column
 from impactopt.sweeps.sections import CaseKind, Figure, SpanSection, SweepFile, flat, of_other_kinds, put
 
-__all__ = ["Sweep", "VariedKeys", "parse_sweep", "read_sweep_file", "sweep_from_data", "telling"]
+__all__ = ["Sweep", "VariedKeys", "parse_sweep", "read_sweep_file", "sweep_from_data"]
 
 
 class VariedKeys:
-    """Reads the varied keys, and gathers what is wrong with them."""
+    """Reader of the varied keys, which adds what is wrong with them to a list of mistakes.
+
+    base : the problem file whose keys vary.  place : place of a key path in the file's data.
+    """
 
     def __init__(
         self, base: ProblemFile, mistakes: list[Mistake], place: Callable[[Mapping[str, Any], str], Place]
     ) -> None:
         self._base, self._mistakes, self._place = base, mistakes, place
-        self._seen: dict[Place, Place] = {}  # by the problem's key, where it is in the sweep's file
+        self._seen: dict[Place, Place] = {}  # place in the sweep file, by place in the problem file
 
     def name(self, table: tuple[str, ...], key: str) -> str | None:
-        """The full name of a key of the problem's; None if it has none such, or if it is there twice."""
+        """Full name of a key of the problem file; None, and a mistake, if there is none or it varies
+        twice.
+        """
         at = (*table, *key.split("."))
         try:
             place = self._place(self._base.data, key)
         except InputError as error:
             self._wrong(at, str(error))
             return None
-        for other, there in self._seen.items():
+        for other, other_at in self._seen.items():
+            # a key and a part of it, such as a point and one of its coordinates, exclude each other
             if place[: len(other)] == other or other[: len(place)] == place:
-                self._wrong(at, f"is also given by {'.'.join(map(str, there))}")
+                self._wrong(at, f"is also given by {'.'.join(map(str, other_at))}")
                 return None
         self._seen[place] = at
         return ".".join(map(str, place))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Full names of the keys so far."""
+        """Full names of the keys read so far."""
         return tuple(".".join(map(str, place)) for place in self._seen)
 
     def full_name(self, key: str) -> str:
-        """The full name of a key that varies; what is none, such as a column of results, as it is."""
+        """Full name of a varied key; another name, such as that of an output column, as it is."""
         try:
             name = ".".join(map(str, self._place(self._base.data, key)))
         except InputError:
@@ -73,6 +79,10 @@ class VariedKeys:
         return name if name in self.names else key
 
     def axis(self, table: str, key: str, what: Any) -> Axis | None:
+        """Axis of a key of [grid] or [list]; None, and a mistake, if it is wrong.
+
+        what : the file's value, which should be a list or a table with from, to and count.
+        """
         name, at = self.name((table,), key), (table, *key.split("."))
         if isinstance(what, Mapping):
             section = self._span(at, what)
@@ -90,6 +100,7 @@ class VariedKeys:
         return None if name is None else Axis(key=name, values=values)
 
     def drawn(self, key: str, what: Any) -> Span | Column | None:
+        """Range or list of a key of [draw.over]; None, and a mistake, if it is wrong."""
         at = ("draw", "over", *key.split("."))
         if isinstance(what, Sequence) and not isinstance(what, str) and what:
             return column(what)
@@ -102,55 +113,55 @@ class VariedKeys:
             return None
         return None if section is None else _span_of(section)
 
-    def check_lengths(self, rows: Sequence[Axis]) -> None:
-        for one, two in combinations(rows, 2):
+    def check_lengths(self, listed: Sequence[Axis]) -> None:
+        """Checks that all keys of [list] have as many values."""
+        for one, two in combinations(listed, 2):
             if len(one.values) != len(two.values):
-                text = f"{len(two.values)} values, but {one.key} has {len(one.values)}; they go side by side"
+                text = f"{len(two.values)} values, but {one.key} has {len(one.values)}; give as many"
                 self._wrong(("list", *two.key.split(".")), text)
                 return
 
     def check_values(
-        self, grid: Sequence[Axis], rows: Sequence[Axis], over: Mapping[str, Span | Column]
+        self, grid: Sequence[Axis], listed: Sequence[Axis], over: Mapping[str, Span | Column]
     ) -> None:
-        """Checks values by the problem's file; each value with the first ones of the other keys."""
-        alone = {axis.key: telling(axis.values) for axis in grid}
-        alone |= {
-            k: [what.first, what.last] if isinstance(what, Span) else telling(what)
+        """Checks values by the problem file: each value of a key with the first ones of the others."""
+        tested = {axis.key: _test_values(axis.values) for axis in grid}
+        tested |= {
+            k: [what.first, what.last] if isinstance(what, Span) else _test_values(what)
             for k, what in over.items()
         }
-        first = {key: values[0] for key, values in alone.items()}
-        first |= {axis.key: axis.values[0] for axis in rows}
-        if not self._base_takes(first):
-            # which of them it is shows alone, or else it is how they go together
-            alone_accepted = [self._accepted({key: value}, key) for key, value in first.items()]
-            if all(alone_accepted):
+        first = {key: values[0] for key, values in tested.items()}
+        first |= {axis.key: axis.values[0] for axis in listed}
+        if self._refusal(first) is not None:
+            # either some values are refused alone, or their combination is
+            accepted_alone = [self._accepted({key: value}, key) for key, value in first.items()]
+            if all(accepted_alone):
                 self._accepted(first, next(iter(first)))
             return
-        for key, values in alone.items():
+        for key, values in tested.items():
             for value in values[1:]:
                 if not self._accepted({**first, key: value}, key):
                     break
-        for k in _telling_rows(rows):
-            if not self._accepted({**first, **{axis.key: axis.values[k] for axis in rows}}, rows[0].key):
+        for k in _test_indices(listed):
+            if not self._accepted({**first, **{axis.key: axis.values[k] for axis in listed}}, listed[0].key):
                 break
 
     def _accepted(self, settings: Mapping[str, Any], key: str) -> bool:
-        """True if the problem's file takes these values; if not, that is the mistake of one of the keys."""
+        """True if the problem file accepts these values; if not, the mistake is added at the key."""
+        refusal = self._refusal(settings)
+        if refusal is not None:
+            reason = refusal.removeprefix(f"{self._base.path}, as set, ")
+            places = {".".join(map(str, place)): at for place, at in self._seen.items()}
+            self._wrong(places[key], f"with {key} = {settings[key]}: {reason}")
+        return refusal is None
+
+    def _refusal(self, settings: Mapping[str, Any]) -> str | None:
+        """Message of the problem file's error with these values; None if it accepts them."""
         try:
             self._base.changed(settings)
         except InputError as error:
-            reason = str(error).removeprefix(f"{self._base.path}, as set, ")
-            places = {".".join(map(str, place)): at for place, at in self._seen.items()}
-            self._wrong(places[key], f"with {key} = {settings[key]}: {reason}")
-            return False
-        return True
-
-    def _base_takes(self, settings: Mapping[str, Any]) -> bool:
-        try:
-            self._base.changed(settings)
-        except InputError:
-            return False
-        return True
+            return str(error)
+        return None
 
     def _span(self, at: Place, what: Mapping[str, Any]) -> SpanSection | None:
         try:
@@ -172,36 +183,35 @@ def _span_of(section: SpanSection) -> Span:
     return Span(first=section.first, last=section.last, scale=section.scale)
 
 
-def telling(values: Column) -> list[Any]:
-    """Test values: of numbers the first, the least and the largest, as ranges are intervals; else all
-    values.
+def _test_values(values: Column) -> list[Any]:
+    """Values to test: the first, the smallest and the largest number, as allowed numbers are intervals; or
+    all values that are not numbers.
     """
     if isinstance(values, np.ndarray):
         return [values[0].item(), values.min().item(), values.max().item()]
     return list(values)
 
 
-def _telling_rows(rows: Sequence[Axis]) -> list[int]:
-    """Rows of the list to test, as of `telling`."""
-    if not all(isinstance(axis.values, np.ndarray) for axis in rows):
-        return list(range(len(rows[0].values)))
-    numbers = [np.asarray(axis.values) for axis in rows]
+def _test_indices(listed: Sequence[Axis]) -> list[int]:
+    """Indices of the values of [list] to test, by the same rule as `_test_values`."""
+    if not all(isinstance(axis.values, np.ndarray) for axis in listed):
+        return list(range(len(listed[0].values)))
+    numbers = [np.asarray(axis.values) for axis in listed]
     return sorted({int(k) for x in numbers for k in (x.argmin(), x.argmax())})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sweep:
-    """A sweep whose file is sound.
+    """Checked contents of a sweep file.
 
-    path, text : where it was read, and what it said.  content : the same as tables, but for [figure], which
-        no row depends on.
-    problem : the problem's file with the sweep's [set], which every case changes.
-    case_kind : what a case is: "solve" (a whole motion), "strike" or "collision".
-    design : the values of the cases.  name : for people.
+    path, text : of the file.  content : its data but for [figure], which no result depends on.
+    problem : the problem file with the sweep's [set]; every case changes it.
+    design : the values of the cases.  name : for reports.
+    case_kind : kind of case: "solve" (a whole motion), "strike" or "collision".
     seed, start, starts : of a case's solves, as of :func:`impactopt.solve`.
-    time_limit [s] : of a case; None for none.  trajectories : whether each case's result is kept whole.
+    time_limit [s] : of a case; None: no limit.  trajectories : whether each case's full result is kept.
     at_contact, outputs : of collisions, as of :func:`impactopt.collide_many`.
-    figure : of the table, with full names of the keys; None for none.
+    figure : of the table, with full names of the keys; None: no figure.
     """
 
     path: Path
@@ -222,22 +232,22 @@ class Sweep:
 
     @property
     def hash(self) -> str:
-        """Hexadecimal hash of the sweep's file and its problem's, by their data: comments do not count."""
+        """Hexadecimal hash of the data of the sweep file and its problem file; comments do not count."""
         both = json.dumps([self.content, self.problem.data], sort_keys=True)
-        # the values too: another SciPy might draw others
+        # with all values, as another version of SciPy might draw other ones
         return hashlib.sha256(both.encode() + self.design.content()).hexdigest()[:16]
 
 
 def read_sweep_file(
     path: str | os.PathLike[str], settings: Mapping[str, Any] = MappingProxyType({})
 ) -> Sweep:
-    """The sweep of a file, or by name one that comes with the package.
+    """Sweep of a file, or of the package by name.
 
-    settings : other values, by key paths of the sweep's file, such as "draw.count".
+    settings : other values, by key paths of the sweep file, such as "draw.count".
 
     Raises
     ------
-    InputError : an unknown name; the file cannot be read, or is wrong; one message with all mistakes and
+    InputError : an unknown name; the file cannot be read, or is wrong. One message has all mistakes, with
         their lines.
     """
     path = sweep_file(path)
@@ -250,8 +260,8 @@ def read_sweep_file(
 
 
 def parse_sweep(text: str, path: Path, settings: Mapping[str, Any] = MappingProxyType({})) -> Sweep:
-    """The sweep of a file's text, with settings as of `read_sweep_file`; the problem's file is named relative
-    to the folder of `path`.
+    """Sweep of a file's text, with settings as of `read_sweep_file`. The problem file is relative to the
+    folder of `path`.
     """
     try:
         data = read_toml(text)
@@ -263,7 +273,7 @@ def parse_sweep(text: str, path: Path, settings: Mapping[str, Any] = MappingProx
 
 
 def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = "sweep") -> Sweep:
-    """The sweep that the data of a file describe; see `parse_sweep`."""
+    """Sweep of a file's data; see `parse_sweep`."""
     try:
         check_plain(data)
     except TOMLError as error:
@@ -273,8 +283,8 @@ def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = 
 
 
 def _written(data: Mapping[str, Any]) -> str:
-    """Text of the file. Varied keys are written by key paths: their order counts, and TOML has tables
-    last.
+    """Text of a sweep file. Varied keys are written as key paths, as their order matters, and TOML writes
+    tables last.
     """
 
     def with_flat(table: Any, *names: str) -> Any:
@@ -288,10 +298,12 @@ def _written(data: Mapping[str, Any]) -> str:
 
 
 def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
+    """Sweep of a file's data; InputError with all mistakes of one stage of the checks."""
     if found := text_with_control(data):
         raise InputError(f"{path}: the text {shortened(repr(found))} has control characters; take them out")
     lines, mistakes = key_lines(text), list[Mistake]()
 
+    # called after each stage: a later stage needs a file that has passed the earlier ones
     def raise_if_any() -> None:
         if mistakes:
             raise InputError(report_mistakes(str(path), lines, mistakes))
@@ -303,11 +315,12 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
     raise_if_any()
     given = content.sweep
     mistakes += of_other_kinds(content)
+    # every case is this problem with the values of its varied keys
     base = read_problem_file(_near(given.problem, path)).changed(dict(flat(content.set)))
     reader = VariedKeys(base, mistakes, sweep_place if given.case_kind == "collision" else key_place)
     grid = [a for key, what in flat(content.grid) if (a := reader.axis("grid", key, what)) is not None]
-    rows = [a for key, what in flat(content.list) if (a := reader.axis("list", key, what)) is not None]
-    reader.check_lengths(rows)
+    listed = [a for key, what in flat(content.list) if (a := reader.axis("list", key, what)) is not None]
+    reader.check_lengths(listed)
     over = {}
     for key, what in flat(content.draw.over if content.draw else {}):
         name, drawn = reader.name(("draw", "over"), key), reader.drawn(key, what)
@@ -319,11 +332,11 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
     draws = None
     if content.draw:
         draws = Draws(method=content.draw.method, count=content.draw.count, seed=given.seed, over=over)
-    design = Design(grid=grid, rows=rows, draws=draws)
+    design = Design(grid=grid, listed=listed, draws=draws)
     if given.case_kind == "collision":
         _check_collisions(path, base, content, design)
     else:
-        reader.check_values(grid, rows, over)
+        reader.check_values(grid, listed, over)
     if content.figure is not None and given.case_kind == "collision":
         known = [*reader.names, *given.outputs]
         for name in content.figure.renamed(reader.full_name).columns:
@@ -351,10 +364,10 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
 
 
 def _check_collisions(path: Path, base: ProblemFile, content: SweepFile, design: Design) -> None:
-    """InputError for what collisions of the first values, and of the bounds of numbers, refuse."""
-    bounds = {axis.key: telling(axis.values) for axis in design.axes}
-    longest = max(map(len, bounds.values()), default=1)
-    columns = {key: column([*islice(cycle(values), longest)]) for key, values in bounds.items()}
+    """Checks the test values of all keys by `Collisions.check`; InputError with the file's name."""
+    tested = {axis.key: _test_values(axis.values) for axis in design.axes}
+    longest = max(map(len, tested.values()), default=1)
+    columns = {key: column([*islice(cycle(values), longest)]) for key, values in tested.items()}
     try:
         Collisions(
             base, content.at_contact, content.sweep.outputs, keys=[*columns], folder=path.parent
@@ -364,6 +377,6 @@ def _check_collisions(path: Path, base: ProblemFile, content: SweepFile, design:
 
 
 def _near(problem: str, path: Path) -> Path:
-    """The problem's file: by name, or relative to the sweep's."""
+    """Problem file relative to the sweep file, or by name."""
     beside = path.parent / problem
     return beside if is_plain_file(beside) else problem_file(problem)

@@ -1,6 +1,7 @@
-"""Design of a sweep: grids, lists and draws, and the units of work that its cases are.
+"""Design of a sweep: grids, lists and draws; units of work, and their results.
 
-Cases are never written out all at once: a million of them are a formula and the draws.
+The values of cases are computed for a few cases at a time, from the axes and the draws, as there may be a
+million.
 """
 
 from __future__ import annotations
@@ -38,21 +39,24 @@ Column = Sequence[Any] | NDArray[Any]
 
 
 def column(values: Sequence[Any]) -> Column:
-    """Values of one key, as an array where they are numbers."""
+    """Values of one key, as an array if all are numbers."""
     kinds = {type(value) for value in values}
     return np.array(values) if kinds and kinds <= {int, float} else list(values)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Span:
-    """Numbers from `first` to `last`, both included; in equal steps, or with "log" by equal factors."""
+    """Range from `first` to `last`, both included.
+
+    scale : "linear" for equal steps, "log" for equal factors.
+    """
 
     first: float
     last: float
     scale: str = "linear"
 
     def at(self, u: Array) -> Array:
-        """The numbers at shares u of the way, 0 to 1; rounding does not leave the range."""
+        """Numbers at fractions u of the range, 0 to 1; clipped, as rounding might leave it."""
         if self.scale == "log":
             x = self.first * (self.last / self.first) ** u
         else:
@@ -60,13 +64,13 @@ class Span:
         return np.asarray(np.clip(x, min(self.first, self.last), max(self.first, self.last)))
 
     def spread(self, count: int) -> Array:
-        """So many numbers, evenly; of one, the first."""
+        """Evenly spaced numbers (count,); the first one if count is 1."""
         return self.at(np.linspace(0.0, 1.0, count))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """A key and its values, one after the other."""
+    """Key and its values, in their order."""
 
     key: str
     values: Column
@@ -79,13 +83,10 @@ class Axis:
 
 @dataclass(frozen=True, kw_only=True)
 class Draws:
-    """So many points drawn over the unit cube, and what each of its sides stands for.
+    """Points drawn in the unit cube by `scipy.stats.qmc`, and the key of each dimension.
 
-    method : "random" (independent), "sobol" (scrambled: the first so many of the sequence) or "latin
-        hypercube".
-    over : by key, a `Span`, or a list of values of which one is drawn.
-
-    The points are those of `scipy.stats.qmc`.
+    method : "random" (independent), "sobol" (the first points of a scrambled sequence) or "latin hypercube".
+    over : by key a range, or a list of values of which one is drawn.
     """
 
     method: str
@@ -94,7 +95,7 @@ class Draws:
     over: dict[str, Span | Column]
 
     def columns(self) -> tuple[Axis, ...]:
-        """The drawn values, (count,) by key."""
+        """Drawn values (count,) of each key."""
         cube = self._cube()
         return tuple(
             Axis(key=key, values=self._values(what, u))
@@ -102,37 +103,38 @@ class Draws:
         )
 
     def _cube(self) -> Array:
-        from scipy.stats import qmc  # as long to import as all else, and workers do not draw
+        from scipy.stats import qmc  # slow to import, and workers do not draw
 
-        rng, sides = np.random.default_rng(self.seed), len(self.over)
+        rng, dimensions = np.random.default_rng(self.seed), len(self.over)
         if self.method == "sobol":
-            # SciPy warns of counts that are no powers of two; the first points of the sequence are asked for
-            points = qmc.Sobol(sides, seed=rng).random_base2(ceil(log2(self.count)))
+            # drawn up to a power of two, as SciPy warns of other counts
+            points = qmc.Sobol(dimensions, seed=rng).random_base2(ceil(log2(self.count)))
             return np.asarray(points[: self.count])
         if self.method == "latin hypercube":
-            return np.asarray(qmc.LatinHypercube(sides, seed=rng).random(self.count))
-        return rng.random((self.count, sides))
+            return np.asarray(qmc.LatinHypercube(dimensions, seed=rng).random(self.count))
+        return rng.random((self.count, dimensions))
 
     @staticmethod
     def _values(what: Span | Column, u: Array) -> Column:
         if isinstance(what, Span):
             return what.at(u)
-        chosen = np.minimum((u * len(what)).astype(np.int64), len(what) - 1)
-        return Axis(key="", values=what).take(chosen)
+        indices = np.minimum((u * len(what)).astype(np.int64), len(what) - 1)
+        return Axis(key="", values=what).take(indices)
 
 
 class Design:
-    """Every combination of the grid's values, the list's rows and the draws; the draws go fastest.
+    """All combinations of grid, list and draws; the draws vary fastest.
 
-    grid : axes that are combined.  rows : axes of one length that are read side by side.
+    grid : axes of which all combinations of values are taken.  listed : axes of equal length; values of the
+    same index are taken together.
     """
 
     def __init__(
-        self, *, grid: Sequence[Axis] = (), rows: Sequence[Axis] = (), draws: Draws | None = None
+        self, *, grid: Sequence[Axis] = (), listed: Sequence[Axis] = (), draws: Draws | None = None
     ) -> None:
         drawn = () if draws is None else draws.columns()
-        # groups of axes that go together, the fastest last
-        self._groups = [(axis,) for axis in grid] + [group for group in (tuple(rows), drawn) if group]
+        # groups of axes that share an index, the fastest last
+        self._groups = [(axis,) for axis in grid] + [group for group in (tuple(listed), drawn) if group]
         self._lengths = [len(group[0].values) for group in self._groups]
 
     @property
@@ -141,11 +143,11 @@ class Design:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """All that is varied."""
+        """Axes of all keys, the drawn ones included."""
         return tuple(axis for group in self._groups for axis in group)
 
     def content(self) -> bytes:
-        """All values, the drawn ones too, for hashes."""
+        """All values, the drawn ones included, as bytes for a hash."""
         parts = []
         for axis in self.axes:
             array = isinstance(axis.values, np.ndarray)
@@ -155,14 +157,15 @@ class Design:
 
     def columns(self, first: int, last: int) -> dict[str, Column]:
         """Values by key of the cases first, ..., last - 1."""
-        where = np.unravel_index(np.arange(first, last), self._lengths) if self._lengths else ()
+        by_group = np.unravel_index(np.arange(first, last), self._lengths) if self._lengths else ()
         out: dict[str, Column] = {}
-        for group, indices in zip(self._groups, where, strict=True):
+        for group, indices in zip(self._groups, by_group, strict=True):
             out |= {axis.key: axis.take(indices) for axis in group}
         return out
 
 
-GRACE = 60.0  # [s]: a case that says nothing for so long after its time is killed
+# [s] A case without an iteration for so long after its time limit is killed.
+GRACE = 60.0
 
 Columns = Mapping[str, Sequence[Any] | NDArray[Any]]
 
@@ -171,11 +174,11 @@ Columns = Mapping[str, Sequence[Any] | NDArray[Any]]
 class Work:
     """Data that all units of a sweep share.
 
-    data, path : of the problem's file with the sweep's [set].  folder : of the sweep's file.
+    data, path : of the problem file with the sweep's [set].  folder : of the sweep file.
     case_kind, seed, start, starts, time_limit [s], trajectories, at_contact, outputs : as of `Sweep`.
-    grace [s] : after the time limit, until the worker is killed.
-    solved : where cases are kept that others start from; None: none do.
-    version : of impactopt, which workers have to have too.
+    grace [s] : time after the time limit until the worker is killed.
+    solved : folder of the solved cases that others start from; None: cases do not start from others.
+    version : of impactopt, which the workers must have.
     """
 
     data: Mapping[str, Any]
@@ -196,7 +199,10 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class Unit:
-    """Cases that are done together: `count` of them from case `first` on, with their values by key."""
+    """Cases that a worker evaluates together: `count` of them from case `first` on.
+
+    columns : values (count,) by key.
+    """
 
     index: int
     first: int
@@ -206,10 +212,12 @@ class Unit:
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """Result of a unit: columns of `count` values each, and whole results by case, where they are kept.
+    """Result of a unit.
 
-    Every row has a `status`, and a `reason` where it has no usable result, else "".
-    peak_mb : the most memory that the worker has had so far [MB].
+    columns : values (count,) of the table's columns by name. ``reason`` says why a case has no usable result,
+        and is "" if it has one; cases that are solves have a ``status``.
+    records : full results by case, if they are kept.
+    peak_mb [MB] : peak memory of the worker so far.
     """
 
     columns: Columns
@@ -218,5 +226,5 @@ class Found:
 
 
 def failed_columns(count: int, status: str, reason: str) -> Columns:
-    """Rows of cases that have no result."""
+    """Columns of cases that have no result."""
     return {"status": [status] * count, "reason": [reason] * count}

@@ -1,4 +1,4 @@
-"""Evaluation of a sweep's units, by kind of case, in this process or on local ones."""
+"""Evaluation of a sweep's units by kind of case, in this process or in local worker processes."""
 
 from __future__ import annotations
 
@@ -30,16 +30,17 @@ from impactopt.sweeps.progress import START
 
 __all__ = ["CASE_KINDS", "ENDED_BY_WATCHDOG", "TRIES", "Watchdog", "evaluate", "on_processes"]
 
-ENDED_BY_WATCHDOG = -int(signal.SIGALRM)  # exit code of a process that it ended
-BUILDING = 900.0  # [s]: the longest that one step of building functions may take
+ENDED_BY_WATCHDOG = -int(signal.SIGALRM)  # exit code of a process that the watchdog has ended
+MAX_BUILD_STEP = 900.0  # [s] for one step of building functions
 
 
 class Watchdog:
-    """Ends this process where a case takes much longer than its time; news from the case put it off.
+    """Timer that ends this process if a case takes much longer than its time limit; each iteration restarts
+    it.
 
-    The kernel does, by SIGALRM: nothing else stops compiled code.
+    The kernel sends SIGALRM, as nothing else stops compiled code.
 
-    limit [s] : None for none.  grace [s] : how much longer.
+    limit [s] : None: no limit.  grace [s] : time beyond the limit.
     """
 
     def __init__(self, limit: float | None, grace: float) -> None:
@@ -47,24 +48,25 @@ class Watchdog:
         self._set(self._seconds)
 
     def building(self, line: str) -> None:
-        """A solve's `report`: functions may be compiled, which is no part of a case's time."""
-        self._set(max(BUILDING, self._seconds))
+        """`report` of a solve: functions may be compiled, which is not part of a case's time."""
+        self._set(max(MAX_BUILD_STEP, self._seconds))
 
     def iteration(self, record: Any) -> None:
-        """A solve's `callback`."""
+        """`callback` of a solve."""
         self._set(self._seconds)
 
     def off(self) -> None:
         self._set(0.0)
 
     def _set(self, seconds: float) -> None:
-        if self._seconds:  # without a limit a timer of the caller's own is left alone
+        if self._seconds:  # without a limit, a timer that the caller has set stays
             signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
-Rows = tuple[Columns, Mapping[int, Record]]
+Evaluated = tuple[Columns, Mapping[int, Record]]
 
-_PLAIN = (
+# entries of a summary that are columns of the same name
+_COPIED = (
     START,
     "impulse_Ns",
     "peak_force_N",
@@ -80,8 +82,10 @@ _PLAIN = (
 _UNITS = {"N s": "_Ns", "N": "_N", "J": "_J", "m": "_m", "s": "_s", "(N m s)^2": "_N2m2s2"}
 
 
-def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
-    file = _file(work, unit)
+def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
+    """Columns and record of a solve or a strike, which is a unit by itself."""
+    settings = {key: values[0] for key, values in unit.columns.items()}
+    file = problem_file_from_data(work.data, where=work.path).changed(settings)
     problem = file.build()
     options = {
         "starts": work.starts,
@@ -91,7 +95,7 @@ def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
         **_arguments(file, work),
     }
     solution: Solution | StrikeSolution
-    started: dict[str, str] = {}
+    started: dict[str, str] = {}  # the column of the case that this one starts from
     if work.case_kind == "strike":
         solution = optimize_strike(problem, **options)
     elif work.solved is not None:
@@ -102,52 +106,50 @@ def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
     else:
         solution = solve(problem, start=work.start, **options)
     if not work.trajectories:
-        return _row({**summary_of(solution), **started}, problem), {}
+        return _columns({**summary_of(solution), **started}, problem), {}
     from_file: Any = {"problem": file.text, "problem_path": file.path}
     if isinstance(solution, StrikeSolution):
         record = record_of_strike(solution, **from_file)
     else:
         record = record_of(solution, **from_file)
-    return _row({**record.summary, **started}, problem), {unit.first: record}
+    return _columns({**record.summary, **started}, problem), {unit.first: record}
 
 
-def _collide(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
+def _collide(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
+    """Columns of a unit of collisions."""
     global _kept
-    if _kept is None or _kept[0] != work:  # what rows share is made once a worker
+    if _kept is None or _kept[0] != work:
         file = problem_file_from_data(work.data, where=work.path)
         keys, folder = tuple(unit.columns), work.folder
         _kept = work, Collisions(file, work.at_contact, work.outputs, keys=keys, folder=folder)
-    rows = _kept[1](unit.columns, threads=1)
-    return {"reason": rows.pop("reason").tolist(), **rows}, {}
+    columns = _kept[1](unit.columns, threads=1)
+    return {"reason": columns.pop("reason").tolist(), **columns}, {}
 
 
+# robots, models and postures of a sweep of collisions, made once in each worker
 _kept: tuple[Work, Collisions] | None = None
-CASE_KINDS: dict[str, Callable[[Work, Unit, Watchdog], Rows]] = {
+CASE_KINDS: dict[str, Callable[[Work, Unit, Watchdog], Evaluated]] = {
     "solve": _plan,
     "strike": _plan,
     "collision": _collide,
 }
 
 
-def _file(work: Work, unit: Unit) -> ProblemFile:
-    settings = {key: values[0] for key, values in unit.columns.items()}
-    return problem_file_from_data(work.data, where=work.path).changed(settings)
-
-
 def _arguments(file: ProblemFile, work: Work) -> dict[str, Any]:
+    """Arguments of `solve` in the problem file, with the shorter time limit of file and sweep."""
     own = file.solver.time_limit
     limits = [seconds for seconds in (own, work.time_limit) if seconds is not None]
     return file.solver.arguments(time_limit=min(limits, default=None))
 
 
-def _row(summary: Mapping[str, Any], problem: ImpactProblem) -> Columns:
-    """The numbers of a summary as columns, each named with its unit."""
+def _columns(summary: Mapping[str, Any], problem: ImpactProblem) -> Columns:
+    """Numbers of a summary as columns of one row, with units in their names."""
     usable = summary["status"] in ("solved", "acceptable") and "note" not in summary
     row = {
         "status": summary["status"],
         "reason": "" if usable else " ".join(filter(None, (summary["message"], summary.get("note")))),
     }
-    row |= {name: summary[name] for name in _PLAIN if name in summary}
+    row |= {name: summary[name] for name in _COPIED if name in summary}
     row |= {f"target_{name}": value for name, value in (summary.get("target") or {}).items()}
     row |= {f"torque_ratio_{phase}": x for phase, x in summary.get("torque_ratio", {}).items()}
     row |= {f"zmp_margin_{phase}_m": x for phase, x in summary.get("zmp_margin_m", {}).items()}
@@ -160,21 +162,22 @@ def _row(summary: Mapping[str, Any], problem: ImpactProblem) -> Columns:
     return {name: [value] for name, value in plain(row).items()}
 
 
-_ONE_AT_A_TIME = threading.Lock()  # in a Dask worker of several threads: the watchdog is the process's
+# A process evaluates one unit at a time, in a Dask worker with several threads too, as it has one timer.
+_LOCK = threading.Lock()
 
 
 def evaluate(work: Work, unit: Unit) -> Found:
-    """The rows of a unit; what goes wrong in a case is the reason in its row.
+    """Result of a unit; an error in a case is the reason that its row has no result.
 
     BLAS gets one thread, as the other cores are for other workers.
 
     Raises
     ------
-    InputError : this is not the version of impactopt that the sweep was begun with.
+    InputError : the sweep was begun with another version of impactopt.
     """
     if work.version != __version__:
         raise InputError(f"a worker has impactopt {__version__}, the sweep {work.version}; install the same")
-    with _ONE_AT_A_TIME, threadpool_limits(1):
+    with _LOCK, threadpool_limits(1):
         return _evaluate(work, unit)
 
 
@@ -185,35 +188,35 @@ def _evaluate(work: Work, unit: Unit) -> Found:
         columns, records = CASE_KINDS[work.case_kind](work, unit, watchdog)
     except InputError as error:
         columns = failed_columns(unit.count, "refused", str(error))
-    except Exception as error:  # of whatever kind: it is this unit's alone
+    except Exception as error:  # the other units go on
         columns = failed_columns(unit.count, "error", f"{type(error).__name__}: {error}")
     finally:
         watchdog.off()
-        gc.collect()  # a solve leaves cycles, which would make a worker of a long night ever larger
+        gc.collect()  # solves leave reference cycles, with which the worker's memory would grow
     if work.case_kind != "collision":
         columns = {**columns, "seconds": [time.perf_counter() - began]}
     return Found(columns=columns, records=records, peak_mb=_peak_memory())
 
 
 def _peak_memory() -> float:
-    """The most that this process has had in memory [MB]."""
-    if sys.platform.startswith("linux"):  # getrusage counts what the parent had when it started this process
+    """Peak memory of this process [MB]."""
+    if sys.platform.startswith("linux"):  # getrusage includes the parent's memory at the fork
         for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
             if line.startswith("VmHWM:"):
                 return float(line.split()[1]) / 1024
-    unit = 1 if sys.platform == "darwin" else 1024
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes of ru_maxrss
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
-TRIES = 3  # so many processes may die of a unit; one of them might have been killed for another's memory
+TRIES = 3  # of a unit whose process dies: it may have been killed for the memory of another one
 
 
 def on_processes(
     work: Work, units: Iterable[Unit], *, workers: int
 ) -> Generator[tuple[Unit, Found], None, None]:
-    """Results of units, in the order in which they are finished.
+    """Results of units on local processes, in the order in which they are finished.
 
-    A unit whose process died is tried again, then its rows say so; one that took too long is not.
+    A unit whose process died is tried again, `TRIES` times in all, unless it took too long.
     """
     given: dict[int, Unit] = {}
 
@@ -235,6 +238,7 @@ def on_processes(
 
 
 def _lost(work: Work, unit: Unit, died: Died) -> Found:
+    """Result of a unit whose process died: its rows have the reason."""
     if died.code == ENDED_BY_WATCHDOG:
         columns = failed_columns(
             unit.count, "time_limit", f"it took longer than {work.time_limit:g} s and did not stop by itself"

@@ -18,21 +18,23 @@ from impactopt.errors import printable
 from impactopt.sweeps.design import Columns
 from impactopt.sweeps.table import merge_kinds
 
-__all__ = ["START", "ProgressCounter", "SweepConsole", "SweepProgress", "told", "words_for_time"]
+__all__ = ["START", "ProgressCounter", "SweepConsole", "SweepProgress", "receivers", "words_for_time"]
 
 BEST = "impulse_Ns"
-START = "started_from"  # a case; "": none
-OF_LATE = 30.0  # [s]
+START = "started_from"  # column with the solved case that a solve started from; "": none
+RATE_WINDOW = 30.0  # [s] over which the present rate is measured
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepProgress:
-    """Cases of the sweep, done, failed among these, and resumed from runs before.
+    """Progress of a sweep.
 
-    seconds : since this run began.  rate : its cases a second, of late: workers take a while to start.
+    cases : of the sweep.  done : finished ones.  failed : those of them without a usable result.  resumed :
+    those of them from earlier runs.
+    seconds : since this run began.  rate [1/s] : of recent cases, as workers take a while to start.
     remaining [s] : at this rate; nan at first.
-    best [N s], best_case : the largest impulse of usable rows; None if there is none.
+    best [N s], best_case : largest impulse of the usable results, and its case; None if there is none.
     """
 
     cases: int
@@ -47,9 +49,10 @@ class SweepProgress:
 
 
 class ProgressCounter:
-    """Counts rows as they come.
+    """Counter of a sweep's finished cases.
 
-    kinds : of the columns' values, for the table.  reasons : how often each came, numbers left out.
+    kinds : of the columns' values, for the table.  reasons : number of failed cases by reason, without
+    numbers.
     """
 
     def __init__(self, cases: int) -> None:
@@ -65,16 +68,16 @@ class ProgressCounter:
 
     @property
     def seconds(self) -> float:
-        """Since this run began."""
+        """Time [s] since this run began."""
         return time.perf_counter() - self._began
 
     def begin(self) -> None:
-        """Begins this run; cases counted so far are of earlier runs."""
+        """Begin this run; cases counted so far are of earlier runs."""
         self.resumed, self._began = self.done, time.perf_counter()
         self._recent = deque([(self._began, self.done)])
 
     def add(self, first: int, columns: Columns, peak_mb: float) -> None:
-        """Count rows: of cases from `first` on."""
+        """Count the cases of a unit, from `first` on."""
         good = np.array([reason == "" for reason in columns["reason"]])
         self.done += len(good)
         self.failed += int((~good).sum())
@@ -97,13 +100,15 @@ class ProgressCounter:
 
     @property
     def iterations(self) -> dict[str, float]:
-        """Mean of usable rows that say what they started from, by that."""
+        """Mean iterations of usable solves by their start, "neighbour" or "reach"; empty if it is not
+        known.
+        """
         return {name: float(np.mean(found)) for name, found in sorted(self._iterations.items())}
 
     def progress(self) -> SweepProgress:
         """Present progress."""
         now = time.perf_counter()
-        while len(self._recent) > 2 and now - self._recent[0][0] > OF_LATE:
+        while len(self._recent) > 2 and now - self._recent[0][0] > RATE_WINDOW:
             self._recent.popleft()
         since, before = self._recent[0]
         self._recent.append((now, self.done))
@@ -125,7 +130,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-BETWEEN = 2.0  # seconds between lines about progress where lines cannot be rewritten
+LINE_INTERVAL = 2.0  # [s] between lines about progress, if there is no live bar
 
 _log = logging.getLogger("impactopt")
 
@@ -134,14 +139,14 @@ Progress = Callable[[SweepProgress], None]
 
 
 class SweepConsole:
-    """Lines about what is going on, and a live bar; where there is no terminal, a line now and then.
+    """Messages of a sweep and a live progress bar on a terminal; elsewhere, a line now and then.
 
-    quiet : nothing at all.  verbose : a line after every unit.
+    quiet : print nothing.  verbose : print a line after every unit.
     """
 
     def __init__(self, console: Console, *, quiet: bool = False, verbose: bool = False) -> None:
-        self._console, self._quiet, self._last = console, quiet, -BETWEEN
-        self._between = 0.0 if verbose else BETWEEN
+        self._console, self._quiet, self._last = console, quiet, -LINE_INTERVAL
+        self._interval = 0.0 if verbose else LINE_INTERVAL
         self._live = None
         if console.is_terminal and not (quiet or verbose):
             from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
@@ -161,12 +166,12 @@ class SweepConsole:
             self._live.stop()
 
     def say(self, text: str) -> None:
-        """One more thing is done or begun."""
+        """Print a message."""
         if not self._quiet:
             self._console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
     def progress(self, now: SweepProgress) -> None:
-        """Updates the bar's text."""
+        """Update the bar, or print a line if the last one was long enough ago."""
         text = f"{now.rate:.3g} a second, {words_for_time(now.remaining)} left"
         if now.failed:
             text += f", {now.failed} failed"
@@ -174,13 +179,13 @@ class SweepConsole:
             text += f", best {now.best:.2f} N s (case {now.best_case})"
         if self._live is not None:
             self._live.update(self._task, completed=now.done, total=now.cases, description=text)
-        elif time.perf_counter() - self._last >= self._between:
+        elif time.perf_counter() - self._last >= self._interval:
             self._last = time.perf_counter()
             self.say(f"{now.done} of {now.cases}, {text}")
 
 
 @contextlib.contextmanager
-def told(report: Say | None, progress: Progress | bool | None) -> Iterator[tuple[Say, Progress]]:
+def receivers(report: Say | None, progress: Progress | bool | None) -> Iterator[tuple[Say, Progress]]:
     """Receivers of messages and of the progress; arguments as of :func:`impactopt.sweep`."""
     console = None
     if progress is True or (progress is None and report is None):
@@ -193,7 +198,7 @@ def told(report: Say | None, progress: Progress | bool | None) -> Iterator[tuple
 
 
 def words_for_time(seconds: float) -> str:
-    """A time in words, as 12.3 s or 3 min 20 s; nan is "?"."""
+    """Text for a time, such as "12.3 s" or "3 min 20 s"; "?" for nan."""
     if not seconds < float("inf"):
         return "?"
     hours, rest = divmod(round(seconds), 3600)
@@ -203,11 +208,11 @@ def words_for_time(seconds: float) -> str:
 
 
 def _console(*, always: bool) -> Console | None:
-    """A terminal's or a notebook's, where someone looks; None elsewhere, unless `always`."""
+    """Console of a terminal or a notebook; None elsewhere, unless `always`."""
     from rich.console import Console
 
     terminal = Console(stderr=True)
-    if Console().is_jupyter:  # plain lines: a live display would need a package more
+    if Console().is_jupyter:  # plain lines, as a live display would need one more package
         return Console(force_jupyter=False, force_terminal=False)
     return terminal if terminal.is_terminal or always else None
 

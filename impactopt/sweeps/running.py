@@ -1,4 +1,4 @@
-"""A sweep from its file to its table."""
+"""Run of a sweep: evaluates the cases that are not finished, and writes the table."""
 
 from __future__ import annotations
 
@@ -17,30 +17,31 @@ from impactopt.sweeps.cluster import connected, on_cluster
 from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
 from impactopt.sweeps.design import Found, Unit, Work
 from impactopt.sweeps.evaluate import evaluate, on_processes
-from impactopt.sweeps.progress import ProgressCounter, SweepProgress, told
+from impactopt.sweeps.progress import ProgressCounter, SweepProgress, receivers
 from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
 from impactopt.transcription.transcription import block_functions
 
 __all__ = ["SweepResult", "sweep"]
 
-ACCIDENTS = {"crashed", "error", "time_limit"}  # what another run may do better
+RETRIED = {"crashed", "error", "time_limit"}  # statuses of cases that may succeed in another run
 Engine = Generator[tuple[Unit, Found], None, None]
-TOGETHER = {"collision": 16384}  # the most cases in a unit; one of the other kinds
-UNITS = 64  # at least, where there are cases for them, so that workers end together
+MAX_UNIT = {"collision": 16384}  # cases in a unit by kind; 1 for other kinds
+MIN_UNITS = 64  # of a sweep, if it has so many cases, so that all workers finish at about the same time
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepResult:
     """Result of a sweep.
 
-    cases : of the sweep.  done : rows in the table; failed : of these, without a usable result.  resumed :
-    of these, from runs before this one.  seconds : of this run, and rate_per_second : its cases.
-    peak_worker_mb : the most memory that a worker had, in any run [MB].  table : the Parquet file.
-    best, best_case : the largest impulse [N s] of usable rows, and where; None if there is none.
-    reasons : why rows have no usable result, and how often, most often first; numbers in them are left out.
-    iterations : mean of usable rows, by what they started from: "neighbour" and "reach", of a sweep whose
-        cases start from their neighbours.
+    cases : of the sweep.  done : rows in the table.  failed : rows without a usable result.  resumed : rows
+    from earlier runs.  seconds, rate_per_second : duration of this run, and its cases per second.
+    peak_worker_mb [MB] : peak memory of a worker, in any run.  table : the Parquet file.
+    best [N s], best_case : largest impulse of the usable rows, and its case; None if there is none.
+    reasons : number of rows without a usable result by reason, the most frequent first; numbers are left out
+        of the reasons.
+    iterations : mean iterations of usable rows by their start, "neighbour" or "reach", in a sweep whose cases
+        start from their neighbours.
     """
 
     cases: int
@@ -74,26 +75,28 @@ def sweep(
     report: Callable[[str], None] | None = None,
     progress: Callable[[SweepProgress], None] | bool | None = None,
 ) -> SweepResult:
-    """Do every case of a sweep and write one table. If it is called again, it resumes what was not finished.
+    """Evaluate all cases of a sweep and write them to one table. Called again, it resumes an unfinished
+    sweep.
 
-    source : a sweep file, its data as tables, or what :func:`impactopt.sweeps.read_sweep_file` gave.
+    source : a sweep file, its data, or a result of :func:`impactopt.sweeps.read_sweep_file`.
     out : directory of the results: see `impactopt.sweeps.store`. Every finished case is on disk at once.
-    workers : processes; None: as many as there are cores. A script needs `if __name__ == "__main__":`.
-    scheduler : address of a Dask scheduler, tcp://host:port, whose workers do the cases; client : or a
-        `distributed.Client`. Workers need this version of impactopt, one thread each, and to see the files
-        that the problem's file names.
-    again : do cases once more that crashed, met an error of ours or ran out of time in an earlier run.
-    report : told in words what is going on.  progress : told after every unit; True: both are shown, False:
-        not; None: where a person looks, on a terminal or in a notebook, unless `report` is given.
-        Messages without a receiver go to the logger "impactopt".
+    workers : number of processes; None: as many as cores. A script needs `if __name__ == "__main__":`.
+    scheduler, client : address of a Dask scheduler, tcp://host:port, or a `distributed.Client`, whose workers
+        evaluate the cases. They need this version of impactopt, one thread each, and access to the files that
+        the problem file names.
+    again : repeat cases that crashed, raised an internal error or exceeded their time limit in an earlier
+    run.
+    report : called with messages.  progress : called after every unit. With True messages and progress are
+        printed, with False they are not, with None on a terminal or in a notebook, unless `report` is given.
+        Other messages go to the logger "impactopt".
 
-    A case that fails is a row with its reason. Ctrl-C ends the processes, writes the table of what is
-    finished, and is raised.
+    A case that fails has a row with the reason. Ctrl-C ends the processes, writes the table of the finished
+    cases, and raises KeyboardInterrupt.
 
     Raises
     ------
-    InputError : the sweep or its problem is wrong; another process is at work in the directory, or it holds
-        another sweep; the disk is full; pyarrow is not installed.
+    InputError : the sweep or its problem is wrong; another process uses the directory, or it holds another
+        sweep; the disk is full; pyarrow is not installed.
     """
     if sum(x is not None for x in (workers, scheduler, client)) > 1:
         raise InputError("give one of workers, scheduler and client: a cluster brings its own workers")
@@ -105,16 +108,16 @@ def sweep(
     store = Store(chosen, Path(out))
     try:
         with (
-            told(report, progress) as (tell, count),
+            receivers(report, progress) as (say, count),
             contextlib.nullcontext(client) if scheduler is None else connected(scheduler) as cluster,
         ):
 
             def engine(work: Work, units: Iterator[Unit]) -> Engine:
                 if cluster is not None:
-                    return on_cluster(work, units, cluster, tell)
+                    return on_cluster(work, units, cluster, say)
                 return on_processes(work, units, workers=_cores() if workers is None else workers)
 
-            return _run(chosen, problem, store, engine, again, tell, count)
+            return _run(chosen, problem, store, engine, again, say, count)
     finally:
         store.close()
 
@@ -125,26 +128,27 @@ def _run(
     store: Store,
     engine: Callable[[Work, Iterator[Unit]], Engine],
     again: bool,
-    tell: Callable[[str], None],
+    say: Callable[[str], None],
     progress: Callable[[SweepProgress], None],
 ) -> SweepResult:
     journal = store.journal
-    together = min(TOGETHER.get(chosen.case_kind, 1), -(-chosen.design.cases // UNITS))
+    # the same in every run, as units are numbered
+    unit_size = min(MAX_UNIT.get(chosen.case_kind, 1), -(-chosen.design.cases // MIN_UNITS))
     if journal.damaged:
-        tell(f"{journal.damaged} units in {journal.path} are damaged; they are done again")
+        say(f"{journal.damaged} units in {journal.path} are damaged, and evaluated again")
     counter, finished = ProgressCounter(chosen.design.cases), set[int]()
     for entry in journal.read():
-        if again and not ACCIDENTS.isdisjoint(entry.columns.get("status", ())):
+        if again and not RETRIED.isdisjoint(entry.columns.get("status", ())):
             continue
         finished.add(entry.unit)
-        counter.add(entry.unit * together, entry.columns, entry.peak_mb)
+        counter.add(entry.unit * unit_size, entry.columns, entry.peak_mb)
     counter.begin()
     if counter.resumed:
-        tell(f"{counter.resumed} of {counter.cases} cases are there from before")
+        say(f"{counter.resumed} of {counter.cases} cases are finished already")
     work = _work(chosen, store)
     if counter.done < counter.cases:
-        _compile(chosen, problem, work, tell)
-    left = _units(chosen, together, finished)
+        _compile(chosen, problem, work, say)
+    left = _units(chosen, unit_size, finished)
     with contextlib.closing(engine(work, left)) as found:
         try:
             for unit, result in found:
@@ -153,9 +157,9 @@ def _run(
                 progress(counter.progress())
         except KeyboardInterrupt:
             found.close()
-            _write(chosen, problem, store, together, counter)
+            _write(chosen, problem, store, unit_size, counter)
             raise
-    _write(chosen, problem, store, together, counter)
+    _write(chosen, problem, store, unit_size, counter)
     seconds = counter.seconds
     return SweepResult(
         cases=counter.cases,
@@ -179,13 +183,13 @@ def _read(source: Sweep | Mapping[str, Any] | str | os.PathLike[str]) -> Sweep:
     return sweep_from_data(source) if isinstance(source, Mapping) else read_sweep_file(source)
 
 
-def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, tell: Callable[[str], None]) -> None:
-    """Build functions here, so that it is done once, and said; workers find them on disk."""
+def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, say: Callable[[str], None]) -> None:
+    """Compile functions once, in this process; workers load them from disk."""
     if chosen.case_kind == "collision":
-        tell("building the collision (compiles the first time)")
+        say("building the collision (compiles the first time)")
         evaluate(work, Unit(index=0, first=0, count=1, columns=chosen.design.columns(0, 1)))
     else:
-        block_functions(problem, problem.coordinates, tell)
+        block_functions(problem, problem.coordinates, say)
 
 
 def _work(chosen: Sweep, store: Store) -> Work:
@@ -205,24 +209,24 @@ def _work(chosen: Sweep, store: Store) -> Work:
     )
 
 
-def _units(chosen: Sweep, together: int, finished: set[int]) -> Iterator[Unit]:
-    """Units that are left, in their order."""
+def _units(chosen: Sweep, unit_size: int, finished: set[int]) -> Iterator[Unit]:
+    """Units that are not finished, in their order."""
     cases = chosen.design.cases
-    for index in range(-(-cases // together)):
+    for index in range(-(-cases // unit_size)):
         if index not in finished:
-            first, last = index * together, min((index + 1) * together, cases)
+            first, last = index * unit_size, min((index + 1) * unit_size, cases)
             columns = chosen.design.columns(first, last)
             yield Unit(index=index, first=first, count=last - first, columns=columns)
 
 
 def _write(
-    chosen: Sweep, problem: ImpactProblem, store: Store, together: int, counter: ProgressCounter
+    chosen: Sweep, problem: ImpactProblem, store: Store, unit_size: int, counter: ProgressCounter
 ) -> None:
-    """The table of all that is finished."""
+    """Write the table of all finished cases."""
 
     def parts() -> Iterator[Part]:
         for entry in store.journal.read():
-            first = entry.unit * together
+            first = entry.unit * unit_size
             count = len(entry.columns["reason"])
             yield first, {**chosen.design.columns(first, first + count), **entry.columns}
 

@@ -1,4 +1,4 @@
-"""The sections of a sweep file."""
+"""Sections of a sweep file, with their defaults and checks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["CaseKind", "Figure", "SpanSection", "SweepFile", "flat", "of_other_k
 
 
 def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Key paths and what they hold; TOML's own dots make tables in tables."""
+    """Key paths and their values; TOML reads dots in keys as nested tables."""
     for key, what in table.items():
         if isinstance(what, Mapping) and not what.keys() & {"from", "to"}:
             yield from flat(what, f"{above}{key}.")
@@ -23,9 +23,9 @@ def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]
 
 
 def put(table: dict[str, Any], key: str, value: Any) -> None:
-    """Write a value in place of what a key path holds, in tables that are made where there are none."""
+    """Set the value of a key path; missing tables are made."""
     name, _, below = key.partition(".")
-    if key in table or not below:  # a key of the table may have dots in quotes
+    if key in table or not below:  # a quoted key of the table may have dots
         table[key] = value
         return
     inner = table.get(name)
@@ -51,12 +51,14 @@ class Figure(Section):
     y: Names = required("column on the vertical axis; with lines one or several, each in a panel")
     colour: Names = Field(
         default_factory=list,
-        description="of heatmaps one or several, each in a panel; of lines what tells them apart",
+        description="of heatmaps one or several columns, each in a panel; of lines the columns that "
+        "distinguish them",
     )
     panel: str | None = optional("of lines and scatters: a panel for each of its values")
     against: Named = Field(
         default_factory=dict,
-        description="of lines: by key the value of the rows that the others are held against, in per cent",
+        description="of lines: by key the value of the reference rows, which the others are compared with in "
+        "per cent",
     )
     contour: Levels = Field(
         default_factory=dict, description="of heatmaps: by column the level at which a line is drawn"
@@ -65,18 +67,18 @@ class Figure(Section):
         default_factory=list, description="columns with logarithmic scales"
     )
     labels: Texts = Field(
-        default_factory=dict, description="by name, or by what a line is called, other words for it"
+        default_factory=dict, description="by the name of a column or line, the text in its place"
     )
     title: str = Field(default="", description="title above the picture")
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """All that it names."""
+        """Names of all columns in the figure."""
         panel = [] if self.panel is None else [self.panel]
         return tuple(dict.fromkeys([self.x, *self.y, *self.colour, *panel, *self.against, *self.contour]))
 
     def renamed(self, name: Callable[[str], str]) -> Figure:
-        """The same with other names for the columns."""
+        """Figure with other names for the columns."""
 
         def keys(table: Mapping[str, Any]) -> dict[str, Any]:
             return {name(key): value for key, value in table.items()}
@@ -104,19 +106,19 @@ class SweepSection(Section):
     problem: str = required("a problem's name, or a file beside this one")
     name: str = Field(default="", description="what reports call the sweep")
     case_kind: CaseKind = Field(
-        default="solve", description="a whole motion, the blow alone, or one collision"
+        default="solve", description="a whole motion, the strike alone, or one collision"
     )
     seed: Seed = Field(default=0, description="seed of what is drawn, and of solves from several starts")
     start: Literal["reach", "strike", "neighbour"] = Field(
         default="reach",
-        description="what a solve starts from: a plain reach, the strike alone, or the nearest case solved "
-        "so far (a plain reach where there is none)",
+        description="initial guess of a solve: a plain reach, the strike alone, or the nearest case solved "
+        "so far (a plain reach if there is none)",
     )
     starts: AtLeastOne = Field(
-        default=1, description="starts of each solve or strike, of which the best is kept"
+        default=1, description="initial guesses of each solve or strike, of which the best is kept"
     )
-    time_limit: Positive = optional("longest time of the solver in each case [s]", "time_limit_s")
-    trajectories: bool = Field(default=False, description="keep the result of each case whole")
+    time_limit: Positive = optional("time limit of the solver in each case [s]", "time_limit_s")
+    trajectories: bool = Field(default=False, description="keep the full result of each case")
     outputs: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         default=("impulse_Ns", "peak_force_N", "freeze_error_pct"),
         description="columns of the table, of collisions",
@@ -124,11 +126,11 @@ class SweepSection(Section):
 
 
 class SpanSection(Section):
-    """Numbers from one to another."""
+    """Range of numbers."""
 
     first: float = required("the first", "from")
     last: float = required("the last, included", "to")
-    count: AtLeastOne | None = optional("how many; left out where they are drawn")
+    count: AtLeastOne | None = optional("number of values; not for drawn ones")
     scale: Literal["linear", "log"] = Field(
         default="linear", description="equal steps (linear) or equal factors (log)"
     )
@@ -138,9 +140,9 @@ class DrawSection(Section):
     """Points drawn over ranges."""
 
     method: Literal["random", "sobol", "latin hypercube"] = Field(
-        default="sobol", description="how points are drawn"
+        default="sobol", description="method of drawing"
     )
-    count: AtLeastOne = required("how many points")
+    count: AtLeastOne = required("number of points")
     over: dict[str, Any] = required("by key path, a range or a list to choose from")
 
 
@@ -154,14 +156,14 @@ class SweepFile(Section):
         default_factory=dict, description="values of which every combination is a case"
     )
     list: dict[str, Any] = Field(
-        default_factory=dict, description="values of which those at the same place of each list are a case"
+        default_factory=dict, description="lists of equal length, whose values at the same index are a case"
     )
-    draw: DrawSection = optional("what is drawn")
-    figure: Figure | None = optional("the picture of the table")
+    draw: DrawSection = optional("drawn values")
+    figure: Figure | None = optional("picture of the table")
 
 
 def of_other_kinds(content: SweepFile) -> list[Mistake]:
-    """Settings in the file that the sweep's kind of case has no use for."""
+    """Mistakes: settings in the file that do not apply to the sweep's kind of case."""
     given, found = content.sweep, list[Mistake]()
     collisions = given.case_kind == "collision"
     for name in sorted(given.model_fields_set):

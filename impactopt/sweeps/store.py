@@ -1,15 +1,16 @@
-"""The directory of a sweep: what it holds, that only one sweep writes there, and that it is the same sweep.
+"""Directory of a sweep: its journal of finished units, and its lock. It belongs to one sweep, and one process
+writes to it at a time.
 
-SQLite sees to kills and full disks: a row is there whole or not at all, and on disk when `add` returns. Rows
-carry a checksum, so that a unit whose numbers the disk has changed is done again. A file that is no journal,
-or whose pages are damaged, is refused, and nothing in it is changed.
+SQLite handles kills and full disks: a record is there as a whole or not at all, and is on disk when
+`Journal.add` returns. Records have a checksum: a unit whose record is damaged is evaluated again. A file that
+is not a journal, or whose pages are damaged, is refused, and nothing in it is changed.
 
-* sweep.json      which sweep this is: its file's and its problem's data, and the versions that make its rows
-* sweep.toml      the sweep's file as it was
-* units.sqlite    every finished unit (`impactopt.sweeps.store`)
-* solved/N/       a plan that others start from, where cases start from their neighbours
-* cases/N/        the whole result of case N, as of `impactopt solve`, where trajectories are kept
-* table.parquet   the rows of all finished cases; made from the journal at the end of every run
+* sweep.json      data of the sweep file and the problem file, and the versions that compute the results
+* sweep.toml      the sweep file
+* units.sqlite    every finished unit (`Journal`)
+* solved/N/       plans that others start from, if cases start from their neighbours
+* cases/N/        the full result of case N, as of `impactopt solve`, if trajectories are kept
+* table.parquet   one row for each finished case; made from the journal at the end of every run
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from impactopt.sweeps.design import Columns, Found
 
 __all__ = ["Entry", "Journal", "Store"]
 
-MAGIC = b"SQLite format 3\x00"  # what such a file begins with
+MAGIC = b"SQLite format 3\x00"  # first bytes of an SQLite file
 APPLICATION = 0x696D7061  # SQLite's application_id of these files: "impa"
-MEND = "put back a copy of it, or give another --out"
+FIX = "put back a copy of it, or give another --out"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,21 +51,24 @@ class Entry:
 
 
 class Journal:
-    """An open journal; the file is made if it is not there.
+    """Journal of finished units, open; the file is made if there is none.
 
-    units : those that are finished.  damaged : rows that are not as they were written, and do not count.
+    units : numbers of the finished units.  damaged : number of records that fail their checksum, which do not
+    count.
 
     Raises
     ------
-    InputError : the file is no journal, its pages are damaged, or it cannot be opened, read or written.
+    InputError : the file is not a journal, its pages are damaged, or it cannot be opened, read or written.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self.damaged, self.units = path, 0, set[int]()
         try:
-            with open(path, "rb", opener=_made) as file:  # no link, pipe or directory
+            # as a plain file, not through a link, and made if it does not exist
+            with open(path, "rb", opener=lambda name, flags: open_own(name, flags | os.O_CREAT)) as file:
                 head = file.read(len(MAGIC))
-            # SQLite takes a few bytes for an empty file; after a kill it may have its head to fix
+            # SQLite would overwrite a short file of another kind. After a kill it may have to repair the
+            # first bytes from its own journal.
             if head not in (b"", MAGIC) and not path.with_name(f"{path.name}-journal").exists():
                 raise InputError(f"{path} is no journal of a sweep; move it away, or give another --out")
             self._file = sqlite3.connect(path, isolation_level=None)  # each statement is a transaction
@@ -72,7 +76,7 @@ class Journal:
             raise InputError(f"cannot open {path}: {getattr(error, 'strerror', None) or error}") from error
         try:
             self._claim()
-            for unit, crc, content in self._rows():
+            for unit, crc, content in self._records():
                 if isinstance(content, bytes) and zlib.crc32(content) == crc and _unit(content) == unit:
                     self.units.add(unit)
                 else:
@@ -80,38 +84,38 @@ class Journal:
         except BaseException as error:
             self._file.close()
             if isinstance(error, sqlite3.Error):
-                raise InputError(f"cannot read {path}: {error}; {MEND}") from error
+                raise InputError(f"cannot read {path}: {error}; {FIX}") from error
             raise
 
     def close(self) -> None:
         self._file.close()
 
     def add(self, entry: Entry) -> None:
-        """Put a unit on disk; when this returns, it is there.
+        """Write a unit; it is on disk when this returns.
 
         Raises
         ------
-        InputError : the disk is full, or fails; what was there before still is.
+        InputError : the disk is full, or fails; earlier units stay.
         """
         content = _pack(entry)
-        row = (entry.unit, zlib.crc32(content), content)
+        record = (entry.unit, zlib.crc32(content), content)
         try:
-            self._file.execute("INSERT OR REPLACE INTO units VALUES (?, ?, ?)", row)
+            self._file.execute("INSERT OR REPLACE INTO units VALUES (?, ?, ?)", record)
         except sqlite3.Error as error:
             raise InputError(
-                f"cannot write {self.path}: {error}; what was finished before is kept, and the same command "
-                "goes on from there when the disk can be written and has room"
+                f"cannot write {self.path}: {error}; finished cases are kept, and the same command resumes "
+                "the sweep when the disk can be written and has room"
             ) from error
         self.units.add(entry.unit)
 
     def read(self) -> Iterator[Entry]:
         """All finished units in their order, one by one."""
-        for unit, _, content in self._rows():
+        for unit, _, content in self._records():
             if unit in self.units:
                 yield _unpack(content)
 
     def _claim(self) -> None:
-        """Make a new file a journal; refuse a file that is none."""
+        """Make a new file a journal; InputError for a file of another kind."""
         (kind,) = self._file.execute("PRAGMA application_id").fetchone()
         (tables,) = self._file.execute("SELECT count(*) FROM sqlite_master").fetchone()
         if kind != APPLICATION and (kind or tables):
@@ -126,22 +130,17 @@ class Journal:
             )
         (found,) = self._file.execute("PRAGMA quick_check(1)").fetchone()
         if found != "ok":
-            raise InputError(f"{self.path} is damaged ({' '.join(found.split())}); {MEND}")
+            raise InputError(f"{self.path} is damaged ({' '.join(found.split())}); {FIX}")
 
-    def _rows(self) -> Iterator[tuple[Any, Any, Any]]:
+    def _records(self) -> Iterator[tuple[Any, Any, Any]]:
         try:
             yield from self._file.execute("SELECT unit, crc, content FROM units ORDER BY unit")
         except sqlite3.Error as error:
-            raise InputError(f"cannot read {self.path}: {error}; {MEND}") from error
-
-
-def _made(path: str, flags: int) -> int:
-    """A handle of the file, which is made if it is not there."""
-    return open_own(path, flags | os.O_CREAT)
+            raise InputError(f"cannot read {self.path}: {error}; {FIX}") from error
 
 
 def _pack(entry: Entry) -> bytes:
-    """A line of JSON, then the numbers of the arrays one after the other; lists stay in the line."""
+    """Record of a unit: a line of JSON with its lists, then the bytes of its arrays, one after the other."""
     arrays = {name: np.ascontiguousarray(x) for name, x in entry.columns.items() if isinstance(x, np.ndarray)}
     line = {
         "unit": entry.unit,
@@ -154,7 +153,7 @@ def _pack(entry: Entry) -> bytes:
 
 
 def _unit(content: bytes) -> int | None:
-    """The unit of a record's content; None where it is none that `_pack` writes, whatever its checksum."""
+    """Unit number of a record; None if `_pack` cannot have written it."""
     try:
         return _unpack(content).unit
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
@@ -184,19 +183,19 @@ def _unpack(content: bytes) -> Entry:
 
 
 FORMAT = 2  # of sweep.json and the journal
-UNITS, BEFORE = "units.sqlite", "units.journal"  # the second until format 1
-SAID = 5  # so many changes are named
+UNITS, UNITS_OLD = "units.sqlite", "units.journal"  # names of the journal: now, and in format 1
+MAX_NAMED = 5  # changes in a message
 
 
 class Store:
-    """A sweep's directory, open for this process alone; `close` gives it free.
+    """Directory of a sweep, locked for this process until `close`.
 
-    journal : its finished units.
+    journal : of the finished units.
 
     Raises
     ------
-    InputError : another process has it; it holds another sweep, or rows of other versions; it cannot be
-        written.
+    InputError : another process has locked it; it holds another sweep, or results of other versions; it
+        cannot be written.
     """
 
     def __init__(self, sweep: Sweep, out: Path) -> None:
@@ -218,7 +217,7 @@ class Store:
         return self.path / "solved"
 
     def keep(self, unit: int, found: Found) -> None:
-        """Put a unit on disk: whole results first, then the rows that say that they are there."""
+        """Write a unit's result: full results first, so that every unit in the journal has them."""
         for case, record in found.records.items():
             save_record(record, self.path / "cases" / f"{case:06d}")
         self.journal.add(Entry(unit=unit, peak_mb=found.peak_mb, columns=found.columns))
@@ -228,6 +227,7 @@ class Store:
         os.close(self._lock)
 
     def _claim(self, sweep: Sweep) -> None:
+        """Write sweep.json in a new directory; InputError if it is there and of another sweep or version."""
         place = self.path / "sweep.json"
         now: dict[str, Any] = {
             "format": FORMAT,
@@ -237,42 +237,42 @@ class Store:
             "problem": sweep.problem.data,
         }
         try:
-            there = json.loads(place.read_text(encoding="utf-8"))
+            before = json.loads(place.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            if any((self.path / name).exists() for name in (UNITS, BEFORE)):
+            if any((self.path / name).exists() for name in (UNITS, UNITS_OLD)):
                 raise InputError(
-                    f"{self.path} holds rows of a sweep, but {place.name}, which says of which, is gone; put "
-                    "it back, or give another directory"
+                    f"{self.path} holds rows of a sweep, but {place.name}, which identifies it, is missing; "
+                    "put it back, or give another directory"
                 ) from None
             write_file(self.path / "sweep.toml", lambda file: file.write(sweep.text.encode()))
             write_file(place, lambda file: file.write(json.dumps(now, indent=1).encode()))
             return
         except (OSError, ValueError) as error:
             raise InputError(f"{place} cannot be read ({error}); give another directory") from error
-        if not isinstance(there, dict) or there.get("format") != FORMAT:
+        if not isinstance(before, dict) or before.get("format") != FORMAT:
             raise InputError(
                 f"{self.path} keeps its finished cases as another version of impactopt does; end this "
                 "sweep with the version that began it, or give another --out (its table.parquet can be read "
                 "as before)"
             )
-        if there.get("hash") != now["hash"]:
+        if before.get("hash") != now["hash"]:
             raise InputError(
-                f"{self.path} holds another sweep{_changes(there, now)}; give another --out, or change the "
-                "sweep back to go on with it"
+                f"{self.path} holds another sweep{_changes(before, now)}; give another --out, or change the "
+                "sweep back to resume it"
             )
-        if there["versions"] != now["versions"]:
-            names = [n for n, v in now["versions"].items() if there["versions"].get(n) != v]
+        if before["versions"] != now["versions"]:
+            names = [n for n, v in now["versions"].items() if before["versions"].get(n) != v]
             old, new = (
-                ", ".join(f"{n} {of[n]}" for n in names) for of in (there["versions"], now["versions"])
+                ", ".join(f"{n} {of[n]}" for n in names) for of in (before["versions"], now["versions"])
             )
             raise InputError(
-                f"the rows in {self.path} were made with {old}, and this is {new}; rows of both would mix: "
-                "install the same again, or give another --out"
+                f"the rows in {self.path} were computed with {old}, and this is {new}; rows of both would "
+                "mix: install the same again, or give another --out"
             )
 
 
 def _lock(path: Path) -> int:
-    """A lock on the directory; it is free when the process ends, in whatever way."""
+    """Handle of a lock on the directory; the system releases it however the process ends."""
     import fcntl  # POSIX only
 
     try:
@@ -286,30 +286,31 @@ def _lock(path: Path) -> int:
     except OSError as error:
         os.close(handle)
         raise InputError(
-            f"another process is at work on {path}; wait for it, or give another --out"
+            f"another process is working on {path}; wait for it, or give another --out"
         ) from error
     return handle
 
 
-def _changes(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Differences in words; settings that only one of them has included."""
-    before, after = (
-        {**_flat(of.get("sweep", {})), **_flat(of.get("problem", {}), "problem file: ")}
-        for of in (there, now)
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Message with the settings that differ between two sweep.json, or that only one of them has."""
+    old, new = (
+        {**_flat(data.get("sweep", {})), **_flat(data.get("problem", {}), "problem file: ")}
+        for data in (before, now)
     )
     none = "not given"
     changed = [
-        f"{key} was {before.get(key, none)}, is {after.get(key, none)}"
-        for key in {**before, **after}
-        if before.get(key, none) != after.get(key, none)
+        f"{key} was {old.get(key, none)}, is {new.get(key, none)}"
+        for key in {**old, **new}
+        if old.get(key, none) != new.get(key, none)
     ]
     if not changed:
         return ""
-    more = f", and {len(changed) - SAID} more" if len(changed) > SAID else ""
-    return ": " + "; ".join(changed[:SAID]) + more
+    more = f", and {len(changed) - MAX_NAMED} more" if len(changed) > MAX_NAMED else ""
+    return ": " + "; ".join(changed[:MAX_NAMED]) + more
 
 
 def _flat(data: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Values by key path."""
     out: dict[str, Any] = {}
     for key, value in data.items():
         out |= _flat(value, f"{above}{key}.") if isinstance(value, Mapping) else {f"{above}{key}": value}

@@ -1,4 +1,4 @@
-"""The result of a sweep: one row a case in a Parquet file, which pandas, polars and DuckDB read."""
+"""Table of a sweep's results: a Parquet file with one row for each case, for pandas, polars or DuckDB."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from impactopt.sweeps.design import Columns
 
 __all__ = ["merge_kinds", "pyarrow", "read_columns", "unit_of", "without_unit", "write_table"]
 
-Part = tuple[int, Columns]  # the first case, and columns of it and those after it
+Part = tuple[int, Columns]  # number of the first case, and columns of consecutive cases from it on
 
-ROWS = 1 << 16  # in a group of rows, at least; small units are put together
-# how a column's name ends, and its unit; `_N_m` is a stiffness's where it is one
+MIN_GROUP = 1 << 16  # rows in one of the file's row groups, but for the last; small units are joined
+# Units by the endings of columns' names. `_N_m` is N/m for stiffness and hardening (`unit_of`).
 _UNITS = {
     "_N_m_rad": "N m/rad",
     "_N_m_s_rad": "N m s/rad",
@@ -46,11 +46,11 @@ _UNITS = {
 
 
 def pyarrow() -> Any:
-    """The module that writes Parquet.
+    """Module pyarrow, with its parquet.
 
     Raises
     ------
-    InputError : it is not installed.
+    InputError : pyarrow is not installed.
     """
     try:
         import pyarrow.parquet
@@ -60,10 +60,10 @@ def pyarrow() -> Any:
 
 
 def unit_of(name: str) -> str:
-    """The unit that a column's name has, "" for none: impulse_Ns is in N s."""
+    """Unit in a column's name, "" for none: impulse_Ns is in N s."""
     if name.endswith("seconds"):
         return "s"
-    # the last part that ends with one: others name a joint, or an entry of a list
+    # the last part of the key path with a unit: those after it name a joint, or an index of a list
     for part in reversed(name.split(".")):
         ends = [end for end in _UNITS if part.endswith(end)]
         if ends:
@@ -73,7 +73,7 @@ def unit_of(name: str) -> str:
 
 
 def without_unit(name: str) -> str:
-    """A column's name without its unit: target.mass_kg is target.mass."""
+    """Name of a column without its unit: target.mass for target.mass_kg."""
     parts = name.split(".")
     for k in reversed(range(len(parts))):
         ends = [end for end in _UNITS if parts[k].endswith(end)]
@@ -84,17 +84,17 @@ def without_unit(name: str) -> str:
 
 
 def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Columns of a table: numbers, nan where there is none, or texts.
+    """Columns of a table: numbers, nan for a null, or texts.
 
     Raises
     ------
-    InputError : it has no such column; it cannot be read.
+    InputError : there is no such column; the table cannot be read.
     """
     arrow = pyarrow()
     try:
-        there = arrow.parquet.read_schema(path).names
+        known = arrow.parquet.read_schema(path).names
         for name in names:
-            check_choice(f"{path} has no column", name, there)
+            check_choice(f"{path} has no column", name, known)
         table = arrow.parquet.read_table(path, columns=list(names))
     except (OSError, arrow.ArrowException) as error:
         raise InputError(f"cannot read {path}: {error}") from error
@@ -104,15 +104,16 @@ def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
 def write_table(
     path: Path, parts: Iterable[Part], kinds: Mapping[str, str], metadata: Mapping[str, str]
 ) -> None:
-    """Write rows in their order; the file takes the place of the one before in one step.
+    """Write a table, with rows in the order of the parts; it replaces an old file atomically.
 
-    parts : first case and columns of each; a column that a part does not have is null there.
-    kinds : by column what it holds, "float", "int", "bool", "text" or "json" (`merge_kinds`).
-    metadata : text by name, under `impactopt.<name>`; units are each column's own, and all under `units`.
+    parts : a column that a part does not have is null there.
+    kinds : type of each column, "float", "int", "bool", "text" or "json" (`merge_kinds`).
+    metadata : text by name, under `impactopt.<name>`. Each column has its unit, and `impactopt.units` has
+    all.
 
     Raises
     ------
-    InputError : it cannot be written.
+    InputError : the file cannot be written.
     """
     arrow = pyarrow()
     types = {
@@ -127,8 +128,8 @@ def write_table(
     for name, kind in kinds.items():
         own = {"unit": units[name]} if name in units else None
         fields.append(arrow.field(name, types[kind], metadata=own))
-    said = {**metadata, "units": json.dumps(units)}
-    schema = arrow.schema(fields, metadata={f"impactopt.{name}": text for name, text in said.items()})
+    texts = {**metadata, "units": json.dumps(units)}
+    schema = arrow.schema(fields, metadata={f"impactopt.{name}": text for name, text in texts.items()})
 
     def write(file: Any) -> None:
         with arrow.parquet.ParquetWriter(file, schema) as writer:
@@ -141,7 +142,7 @@ def write_table(
 
 
 def merge_kinds(kinds: dict[str, str], columns: Columns) -> None:
-    """Add to the kinds of columns what more of their values say."""
+    """Update the kinds of columns by more of their values; "json" if values are of different kinds."""
     for name, values in columns.items():
         kind = _kind(values)
         before = kinds.get(name, "")
@@ -151,7 +152,7 @@ def merge_kinds(kinds: dict[str, str], columns: Columns) -> None:
 
 
 def _kind(values: Sequence[Any] | NDArray[Any]) -> str:
-    """Type of values; "" for nothing but None."""
+    """Kind of values; "" if all are None."""
     if isinstance(values, np.ndarray) and values.dtype.kind in "fiub":
         return {"f": "float", "b": "bool"}.get(values.dtype.kind, "int")
     names = {bool: "bool", int: "int", float: "float", str: "text"}
@@ -161,35 +162,36 @@ def _kind(values: Sequence[Any] | NDArray[Any]) -> str:
     return found.pop() if len(found) == 1 else "json" if found else ""
 
 
-def _array(arrow: Any, values: Any, kind: str, of: Any) -> Any:
+def _array(arrow: Any, values: Any, kind: str, arrow_type: Any) -> Any:
+    """Values of a column as a pyarrow array."""
     if kind == "json":
         values = [None if value is None else json.dumps(value) for value in values]
     elif kind == "float":
-        # no number is nan in an array, None in a list; both are null in the table
-        values = np.array(
-            [np.nan if x is None else x for x in values] if isinstance(values, list) else values
-        )
-        return arrow.array(values.astype(np.float64), of, mask=np.isnan(values.astype(np.float64)))
-    return arrow.array(values, of)
+        # a missing number is nan in an array, None in a list, and null in the table
+        numbers = [np.nan if x is None else x for x in values] if isinstance(values, list) else values
+        floats = np.array(numbers).astype(np.float64)
+        return arrow.array(floats, arrow_type, mask=np.isnan(floats))
+    return arrow.array(values, arrow_type)
 
 
 def _groups(
     parts: Iterable[Part], names: Sequence[str]
 ) -> Iterator[tuple[NDArray[np.int64], dict[str, Any]]]:
-    """Parts put together, so that a file of many small ones is read as fast as one of a few."""
-    held: list[Part] = []
+    """Case numbers and columns of row groups: parts are joined, as many small groups are slow to read."""
+    group: list[Part] = []
     rows = 0
     for first, columns in parts:
-        held.append((first, columns))
+        group.append((first, columns))
         rows += _length(columns)
-        if rows >= ROWS:
-            yield _joined(held, names)
-            held, rows = [], 0
-    if held:
-        yield _joined(held, names)
+        if rows >= MIN_GROUP:
+            yield _joined(group, names)
+            group, rows = [], 0
+    if group:
+        yield _joined(group, names)
 
 
 def _joined(parts: Sequence[Part], names: Sequence[str]) -> tuple[NDArray[np.int64], dict[str, Any]]:
+    """Case numbers (k,) and columns of several parts; a column that a part does not have is None there."""
     cases = np.concatenate([first + np.arange(_length(columns)) for first, columns in parts])
     out: dict[str, Any] = {}
     for name in names:

@@ -19,7 +19,7 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
-from impactopt.planning.contact_replay import AGREED
+from impactopt.planning.contact_replay import SOLVED_WITHIN
 from impactopt.planning.solve import solve
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem
@@ -149,6 +149,6 @@ def _row(number: int, seed: int, say: Say) -> dict[str, Any]:
         abs(out.get(f"{engine}_pct", 0.0)) - out.get(f"{engine}_steps_pct", 0.0)
         for engine in ("pinocchio", "mujoco")
     )
-    out["false"] = solution.status is Status.SOLVED and worst > AGREED and not solution.caution
+    out["false"] = solution.status is Status.SOLVED and worst > SOLVED_WITHIN and not solution.caution
     say(", ".join(f"{key} {out.get(key)}" for _, key, _ in COLUMNS[:-1] if key) + f", {out['false']}")
     return out

@@ -263,7 +263,7 @@ def test_a_compiler_whose_children_hang_is_given_up(tmp_path: Path, monkeypatch:
 def test_a_port_that_takes_connections_and_never_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     from impactopt.sweeps import cluster
 
-    monkeypatch.setattr(cluster, "PATIENCE", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
     with socket.socket() as port:
         port.bind(("127.0.0.1", 0))
         port.listen()

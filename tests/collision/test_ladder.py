@@ -235,7 +235,7 @@ def test_held_hands_are_checked():
         models(robot, stance=BothSoles(hands=("right_hand",)))
     with pytest.raises(InputError, match="no hand is held"):
         models(robot)["repaired"].function(("hand_wrench",))
-    with pytest.raises(InputError, match="say what its grip bears"):
+    with pytest.raises(InputError, match="give the limits of its grip"):
         ImpactProblem(
             robot=robot,
             striker="right_hand",

@@ -11,51 +11,51 @@ import pytest
 from impactopt import SDC, load_problem
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
-from impactopt.live.collision_page import LiveBlow
+from impactopt.live.collision_page import CollisionPage
 
 FILE = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
 LONG = 60.0  # [s]
 
 
 @pytest.fixture(scope="module")
-def look() -> Iterator[LiveBlow]:
-    with LiveBlow(load_problem(FILE)) as made:
+def look() -> Iterator[CollisionPage]:
+    with CollisionPage(load_problem(FILE)) as made:
         assert made.wait(LONG)
         yield made
 
 
-def test_at_first_the_hand_is_at_the_target_and_hits(look: LiveBlow) -> None:
-    p, hit = look.problem, look.blow.collision
-    assert look.blow.q == pytest.approx(p.contact_posture)
+def test_at_first_the_hand_is_at_the_target_and_hits(look: CollisionPage) -> None:
+    p, hit = look.problem, look.shown.collision
+    assert look.shown.q == pytest.approx(p.contact_posture)
     q = p.contact_posture
     v = striking_velocity(p.robot, q, p.striker, p.normal, float(look.speed.value), stance=p.stance)
     names = ("robot", "striker", "normal", "law", "target", "stance")
     model = SDC(**{name: getattr(p, name) for name in names}, freezes=4)
     assert hit is not None
     assert hit.impulse == model.collide(q, v, holding_torque(p.robot, q, v, stance=p.stance)).impulse
-    assert f"**{hit.impulse:.3g} N s**" in look.told.content
+    assert f"**{hit.impulse:.3g} N s**" in look.text.content
 
 
-def test_a_slider_of_posture_or_speed_makes_another_collision(look: LiveBlow) -> None:
-    assert look.blow.collision is not None
-    before, q = look.blow.collision.impulse, look.blow.q
+def test_a_slider_of_posture_or_speed_makes_another_collision(look: CollisionPage) -> None:
+    assert look.shown.collision is not None
+    before, q = look.shown.collision.impulse, look.shown.q
     look.speed.value = 2.0
     assert look.wait(LONG)
-    faster = look.blow.collision
+    faster = look.shown.collision
     assert faster is not None
     assert faster.impulse > before
     name = next(reversed(look.joints))
     look.joints[name].value = look.joints[name].value - 0.2
     assert look.wait(LONG)
-    assert look.blow.q is not None
+    assert look.shown.q is not None
     assert q is not None
-    assert np.abs(look.blow.q - q).max() == pytest.approx(0.2)
-    assert look.blow.collision is not None
-    assert look.blow.collision.impulse != faster.impulse
+    assert np.abs(look.shown.q - q).max() == pytest.approx(0.2)
+    assert look.shown.collision is not None
+    assert look.shown.collision.impulse != faster.impulse
 
 
 def test_where_there_is_no_collision_the_page_says_why(
-    look: LiveBlow, monkeypatch: pytest.MonkeyPatch
+    look: CollisionPage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stuck(*_: object, **__: object) -> None:
         raise InputError("the hand cannot move along the normal")
@@ -63,5 +63,5 @@ def test_where_there_is_no_collision_the_page_says_why(
     monkeypatch.setattr("impactopt.live.collision_page.striking_velocity", stuck)
     look.speed.value = 3.0
     assert look.wait(LONG)
-    assert look.blow.collision is None
-    assert look.told.content == "**No collision.** the hand cannot move along the normal"
+    assert look.shown.collision is None
+    assert look.text.content == "**No collision.** the hand cannot move along the normal"

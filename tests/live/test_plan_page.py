@@ -34,9 +34,9 @@ from impactopt.files.output import load_record, record_of, save_record
 from impactopt.files.replay import problem_of, resumed
 from impactopt.live import plan_page as look_module
 from impactopt.live.drawing import moment_of
-from impactopt.live.plan_page import LiveLook
+from impactopt.live.plan_page import PlanPage
 from impactopt.live.replanning import Replanning
-from impactopt.live.requests import PlanRequest, numbers_of, request_of
+from impactopt.live.requests import PlanRequest, request_of, slider_parameters
 from impactopt.report.tracks import planned_track, tracks_of
 from impactopt.solvers.program import SolverResult, Status
 
@@ -50,8 +50,8 @@ def arm() -> Solution:
 
 
 @pytest.fixture
-def look(arm: Solution) -> Iterator[LiveLook]:
-    with LiveLook(arm) as made:
+def look(arm: Solution) -> Iterator[PlanPage]:
+    with PlanPage(arm) as made:
         yield made
 
 
@@ -70,13 +70,13 @@ def test_a_standing_robots_answer_has_the_impulse_of_its_optimum() -> None:
     biped = solve(biped_problem(), refine=False)
     mass = 1.1 * biped.problem.target.parameters["mass"]
     own = request_of(biped.problem)
-    numbers = tuple((name, mass if name == "mass" else value) for name, value in own.numbers)
-    answer = Replanning(biped)(dataclasses.replace(own, numbers=numbers), lambda: False)
+    numbers = tuple((name, mass if name == "mass" else value) for name, value in own.parameters)
+    answer = Replanning(biped)(dataclasses.replace(own, parameters=numbers), lambda: False)
     assert answer.solution is not None
     assert answer.solution.impulse == pytest.approx(biped.moved(mass=mass).impulse, rel=2e-3)
 
 
-def test_a_slider_makes_a_new_plan(look: LiveLook, arm: Solution) -> None:
+def test_a_slider_makes_a_new_plan(look: PlanPage, arm: Solution) -> None:
     mass = 1.2 * arm.problem.target.mass
     look.sliders["mass"].value = mass
     assert look.wait(LONG)
@@ -85,12 +85,12 @@ def test_a_slider_makes_a_new_plan(look: LiveLook, arm: Solution) -> None:
     assert look.answer.solution.problem.target.mass == mass
     assert look.answer.solution.impulse == pytest.approx(wanted.impulse, rel=1e-3)
     assert look.answer.solution.impulse != arm.impulse
-    assert f"**{look.answer.solution.impulse:.2f} N s**" in look.told.content
-    assert "All constraints are met." in look.told.content
+    assert f"**{look.answer.solution.impulse:.2f} N s**" in look.text.content
+    assert "All constraints are met." in look.text.content
     assert look.status.content == ""
 
 
-def test_a_dragged_hit_point_is_hit_where_it_is(look: LiveLook, arm: Solution) -> None:
+def test_a_dragged_hit_point_is_hit_where_it_is(look: PlanPage, arm: Solution) -> None:
     point = arm.problem.point + np.array([0.01, 0.0, -0.01])
     look.hit.position = point
     look.changed()
@@ -102,7 +102,7 @@ def test_a_dragged_hit_point_is_hit_where_it_is(look: LiveLook, arm: Solution) -
     assert hand[0] == pytest.approx(point[0], abs=2e-3)
 
 
-def test_what_cannot_be_hit_leaves_the_old_plan_and_says_why(look: LiveLook, arm: Solution) -> None:
+def test_what_cannot_be_hit_leaves_the_old_plan_and_says_why(look: PlanPage, arm: Solution) -> None:
     look.hit.position = arm.problem.point + np.array([0.0, 0.5, 0.0])  # out of the arm's plane
     look.changed()
     assert look.wait(LONG)
@@ -115,7 +115,7 @@ def test_what_cannot_be_hit_leaves_the_old_plan_and_says_why(look: LiveLook, arm
 
 
 def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
-    look: LiveLook, arm: Solution, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    look: PlanPage, arm: Solution, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def broken(*_: object, **__: object) -> Solution:
         raise ZeroDivisionError("by nothing")
@@ -131,11 +131,13 @@ def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
 def test_a_stale_request_stops_the_solver(arm: Solution) -> None:
     replanning = Replanning(arm)
     request = request_of(arm.problem)
-    heavy = dataclasses.replace(request, numbers=(("mass", 3 * arm.problem.target.mass), request.numbers[1]))
+    heavy = dataclasses.replace(
+        request, parameters=(("mass", 3 * arm.problem.target.mass), request.parameters[1])
+    )
     answer = replanning(heavy, lambda: True)
     assert answer.solution is None
     assert Status.INTERRUPTED.message.split(";")[0] in answer.why
-    assert replanning.last is arm
+    assert replanning.latest is arm
 
 
 def test_a_plan_of_another_program_is_solved_from_the_last(
@@ -147,12 +149,12 @@ def test_a_plan_of_another_program_is_solved_from_the_last(
     monkeypatch.setattr(Solution, "moved", refused)
     request = request_of(arm.problem)
     mass = 1.1 * arm.problem.target.mass
-    answer = Replanning(arm)(dataclasses.replace(request, numbers=(("mass", mass),)), lambda: False)
+    answer = Replanning(arm)(dataclasses.replace(request, parameters=(("mass", mass),)), lambda: False)
     assert answer.solution is not None
     assert answer.solution.problem.target.mass == mass
 
 
-def test_the_motion_plays_and_begins_again(look: LiveLook) -> None:
+def test_the_motion_plays_and_begins_again(look: PlanPage) -> None:
     assert look.answer.track is not None
     end = float(look.answer.track.time[-1])
     look.speed.value = "1"
@@ -167,15 +169,15 @@ def test_the_motion_plays_and_begins_again(look: LiveLook) -> None:
 
 
 def test_a_legged_robot_has_a_margin_and_a_wall_no_mass(arm: Solution) -> None:
-    assert [n.name for n in numbers_of(arm.problem)] == ["mass", "stiffness"]
+    assert [n.name for n in slider_parameters(arm.problem)] == ["mass", "stiffness"]
     biped = biped_problem()
-    assert [n.name for n in numbers_of(biped)] == ["mass", "stiffness", "margin"]
+    assert [n.name for n in slider_parameters(biped)] == ["mass", "stiffness", "margin"]
     wall = dataclasses.replace(biped, target=RigidWall())
-    assert [n.name for n in numbers_of(wall)] == ["stiffness", "margin"]
-    for number in numbers_of(biped):
+    assert [n.name for n in slider_parameters(wall)] == ["stiffness", "margin"]
+    for number in slider_parameters(biped):
         assert number.least < number.value < number.most
     assert request_of(biped).changes(biped) == {}
-    other = PlanRequest(point=(0.0, 0.0, 1.0), numbers=(("mass", 3.0), ("margin", 0.01)))
+    other = PlanRequest(point=(0.0, 0.0, 1.0), parameters=(("mass", 3.0), ("margin", 0.01)))
     assert list(other.changes(biped)) == ["point", "margin"]
 
 
@@ -234,10 +236,10 @@ def test_a_result_that_does_not_say_its_program_is_solved_again(
 # ---- the page
 
 
-def test_a_port_that_is_taken_is_refused(look: LiveLook, arm: Solution) -> None:
+def test_a_port_that_is_taken_is_refused(look: PlanPage, arm: Solution) -> None:
     port = urlsplit(look.address).port
     with pytest.raises(InputError, match=rf"cannot serve a page at 127\.0\.0\.1:{port}.*another --port"):
-        LiveLook(arm, port=port)
+        PlanPage(arm, port=port)
 
 
 def _opened(address: str, origin: str | None) -> int:
@@ -252,7 +254,7 @@ def _opened(address: str, origin: str | None) -> int:
         return error.response.status_code
 
 
-def test_pages_of_other_origins_and_those_without_the_address_drive_nothing(look: LiveLook) -> None:
+def test_pages_of_other_origins_and_those_without_the_address_drive_nothing(look: PlanPage) -> None:
     there, token = look.address.rsplit("/", 1)
     own, host = there.replace("http", "ws"), urlsplit(look.address).netloc
     assert len(token) == 32
@@ -282,19 +284,19 @@ def test_a_viser_that_lets_no_request_be_checked_is_refused(
         ),
     )
     with pytest.raises(InputError, match="lets no request be checked"):
-        LiveLook(arm)
+        PlanPage(arm)
 
 
 def test_viser_that_is_missing_is_named(arm: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r"a live look needs the package viser.*\[live\]"):
-        look_module.LiveLook(arm)
+        look_module.PlanPage(arm)
 
 
 def test_a_plan_that_is_none_is_refused(arm: Solution) -> None:
     failed = dataclasses.replace(arm, result=dataclasses.replace(arm.result, status=Status.FAILED))
-    with pytest.raises(InputError, match="no solution"):
-        LiveLook(failed)
+    with pytest.raises(InputError, match="not a solution"):
+        PlanPage(failed)
 
 
 # the mass's is the second one, after the time's
@@ -306,7 +308,7 @@ SLIDE = """(() => {
 })()"""
 
 
-def test_the_page_opens_in_a_browser_and_its_slider_plans(look: LiveLook, arm: Solution) -> None:
+def test_the_page_opens_in_a_browser_and_its_slider_plans(look: PlanPage, arm: Solution) -> None:
     first = f"{arm.result.iterations} iterations"
     there = f"(document.body?.innerText ?? '').includes({first!r})"
     ready = f"{there} && document.querySelector('canvas') !== null"

@@ -100,7 +100,7 @@ def test_of_a_robot_on_two_soles(biped_transcription: Transcription) -> None:
 
 def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> None:
     t = changed(biped_transcription)
-    rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).rows(0.15)
+    rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).constraints(0.15)
     assert len(rows) > 100
     check_rows(t.with_apart(rows))
 
@@ -267,7 +267,7 @@ def test_of_soles_that_change(name: str) -> None:
     """Before and after the blow, and where nothing is hit."""
     problem = load_problem(PROBLEMS / f"{name}.toml")
     t = _drawn(problem)
-    rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).rows(0.05)
+    rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).constraints(0.05)
     assert any(row.place.startswith("on ") for row in rows)
     check_rows(t.with_apart(rows))
 

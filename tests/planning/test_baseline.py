@@ -12,7 +12,7 @@ from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.kinematics.stance import FixedBase
-from impactopt.planning.minimum_jerk import _holds, _profile, _wrenches_exist, minimum_jerk_baseline
+from impactopt.planning.minimum_jerk import _keeps_limits, _profile, _wrenches_exist, minimum_jerk_baseline
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 
@@ -57,8 +57,8 @@ def test_it_is_inside_the_limits_and_a_little_faster_is_not() -> None:
     assert found.impulse > 0
     assert found.summary["hand_speed_m_s"] == pytest.approx(found.speed, rel=0.03)
     assert max(found.summary["torque_ratio"].values()) <= 1.0
-    assert _holds(problem, found.duration, found.speed)
-    assert not _holds(problem, found.duration, 20 * found.speed)
+    assert _keeps_limits(problem, found.duration, found.speed)
+    assert not _keeps_limits(problem, found.duration, 20 * found.speed)
     assert found.describe()["impulse_Ns"] == found.impulse
 
 

@@ -57,7 +57,7 @@ def test_the_bound_that_is_named_is_the_one_that_has_to_move(arm: ImpactProblem,
     solution = unsolved(problem)
     assert solution.causes
     cause = solution.causes[0]
-    assert cause.first == first
+    assert cause.kind == first
     assert solution.result.message.startswith(f"Infeasible: {first}. {cause.text} would do")
     assert cause.problem is not None
     assert solve(cause.problem).status.usable
@@ -92,7 +92,7 @@ def test_a_window_that_takes_nearly_all_is_told(arm: ImpactProblem) -> None:
     problem = dataclasses.replace(arm, target=FreeMass(mass=1.0), law=law, objectives=(Impulse(),))
     narrow = solve(dataclasses.replace(problem, contact_duration=(0.0, 0.015)))
     assert narrow.status.usable
-    assert "[collision] duration_s leaves it, 15 ms" in narrow.window
+    assert "[collision] duration_s allows, 15 ms" in narrow.window
     assert narrow.window in narrow.summary()["caution"]
     wide = solve(dataclasses.replace(problem, contact_duration=(0.0, 0.2)))
     assert wide.window == ""

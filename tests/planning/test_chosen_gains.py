@@ -30,7 +30,7 @@ from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import parse_problem_file
 from impactopt.files.replay import problem_of, resumed
 from impactopt.files.verify import verify
-from impactopt.planning.gain_selection import roomy
+from impactopt.planning.gain_selection import with_room_for_gains
 from impactopt.planning.models import carried_start
 from impactopt.planning.reconstruction import program_of
 from impactopt.report.result_rows import result_columns, result_rows
@@ -200,7 +200,7 @@ def test_two_factors_are_chosen_each_in_its_bounds_and_noisy_starts_draw_them() 
 
 def test_a_plan_goes_on_from_one_that_has_chosen(chosen: Solution) -> None:
     """Gains begin where that one has them, with all rows met."""
-    problem = roomy(replace(_soft(), gains=_open(HAND)))
+    problem = with_room_for_gains(replace(_soft(), gains=_open(HAND)))
     t = _program(problem)
     start = carried_start(t, partial(program_of, chosen), chosen, {})
     np.testing.assert_allclose(np.exp(t.hit.contact.gains.read(start.x)), [[chosen.gains[0].factor]])

@@ -26,7 +26,12 @@ from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file.writing import write_problem
 from impactopt.files.replay import load_planned, resumed
-from impactopt.planning.lazy_constraints import gear_caution, gears_beyond, rows_on_demand, with_rows
+from impactopt.planning.lazy_constraints import (
+    gear_caution,
+    gears_beyond,
+    lazy_terms_of,
+    with_lazy_constraints,
+)
 from impactopt.report.report import report_of
 from impactopt.simulation import Perturbation
 from impactopt.solvers.program import IterationRecord
@@ -50,7 +55,7 @@ def _free(weak: bool) -> Solution:
 
 
 def _on_gears(problem: ImpactProblem) -> bool:
-    return "gear_load" in rows_on_demand(problem)
+    return "gear_load" in lazy_terms_of(problem)
 
 
 def _with(problem: ImpactProblem, term: GearLoad) -> ImpactProblem:
@@ -185,7 +190,7 @@ def test_what_gears_bear_at_most_is_part_of_the_problem() -> None:
     strong, weak = load_problem("arm_planar"), _weak()
     assert strong.hash != weak.hash
     assert _with(strong, OFF).hash == _with(weak, OFF).hash
-    assert with_rows(_with(weak, OFF), ["gear_load"]).gear_load == OFF
+    assert with_lazy_constraints(_with(weak, OFF), ["gear_load"]).gear_load == OFF
 
 
 def test_a_replay_that_goes_beyond_is_told(bounded: Solution) -> None:

@@ -92,7 +92,7 @@ def test_an_interrupt_keeps_what_is_there(
 
 def test_without_any_solution_it_says_so(arm: ImpactProblem, monkeypatch: pytest.MonkeyPatch) -> None:
     given(monkeypatch, Died(code=-9, tries=1), None)
-    with pytest.raises(InputError, match="no start has come to an end"):
+    with pytest.raises(InputError, match="no start has ended"):
         optimize_strike(arm, starts=2, workers=2)
 
 

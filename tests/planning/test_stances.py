@@ -224,9 +224,9 @@ def test_what_is_said_of_each_phase(plan: Plan) -> None:
 @pytest.mark.parametrize(
     ("stances", "message"),
     [
-        ((BOTH, StancePhase(soles=("left",), phase=Phase(duration=0.5))), "the blow falls in one phase"),
-        ((BOTH, StancePhase(soles=("left",)), StancePhase(soles=("left", "right"))), "and 2 of"),
-        ((StancePhase(soles=("left",)),), "no schedule"),
+        ((BOTH, StancePhase(soles=("left",), phase=Phase(duration=0.5))), "the impact is in one phase"),
+        ((BOTH, StancePhase(soles=("left",)), StancePhase(soles=("left", "right"))), "but 2 of"),
+        ((StancePhase(soles=("left",)),), "no sequence"),
         ((BOTH, StancePhase(soles=("left", "right"))), "lift off or to touch down"),
         (
             (StancePhase(soles=("left",), phase=Phase(duration=0.5)), StancePhase(soles=("right",))),
@@ -333,7 +333,7 @@ def test_a_problem_file_has_the_phases() -> None:
         assert again.hash == problem.hash and again.stances == problem.stances
     data = problem_data(problem)
     for stances, message in (
-        ([{"soles": ["left"], "duration_s": 1.0}], "the blow falls in one phase"),
+        ([{"soles": ["left"], "duration_s": 1.0}], "the impact is in one phase"),
         ([{"soles": []}, *data["stances"]], "no soles"),
         ([{"soles": ["left"], "intervals": 8}, *data["stances"]], "no duration_s"),
         ([*data["stances"], {"soles": ["up"], "duration_s": 1.0}], "no sole 'up'"),

@@ -108,6 +108,6 @@ def test_with_rows_on_demand_it_goes_on_from_the_solution_without_them(strike: S
     guess = Guess(program=strike, start=solved)
     result = strikes.clear_strike(budget, Margins(strike.problem), guess).result
     _, on, anew = budget.asked
-    assert np.array_equal(on["given"].x, solved.x) and on["from"] == strikes.BARRIER_ON
+    assert np.array_equal(on["given"].x, solved.x) and on["from"] == strikes.BARRIER_WARM
     assert anew["given"] is None, "where that leads nowhere"
     assert result.status is Status.SOLVED and result.iterations == 2 * ITERATIONS

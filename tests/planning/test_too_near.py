@@ -15,7 +15,7 @@ from impactopt import Obstacle, Solution, load_problem, solve
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget
-from impactopt.planning.clearance_constraints import Margins, Watch, clearance_violations, spots_of
+from impactopt.planning.clearance_constraints import Margins, Watch, clearance_violations, node_placements
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.solve import PlanSolver
 from impactopt.problem.problem import ImpactProblem
@@ -69,14 +69,14 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
         violated = clearance_violations(t, free.result.x, margins)
         assert violated is not None and violated.depth > 0
         if violated.nodes == t.nodes:
-            rows = {**Watch(t, margins, free.result.x).rows(), **violated.rows}
+            rows = {**Watch(t, margins, free.result.x).constraints(), **violated.constraints}
             assert violation(t.with_apart(rows), free.result.x) > 1e-3
         else:
             functions = block_functions(problem, problem.coordinates)
             finer = Transcription(problem, problem.coordinates, functions, violated.nodes)
             there, _, _ = carried_over(finer, t, free.result.x, np.zeros(t.program.m), np.zeros(t.layout.n))
-            rows = Watch(finer, margins, there).rows()
-            known = set(spots_of(t, free.result.x).names)
+            rows = Watch(finer, margins, there).constraints()
+            known = set(node_placements(t, free.result.x).names)
             assert any(row.place not in known for row in rows)
             assert violation(finer.with_apart(rows), there) > 1e-3
         looked += 1
@@ -89,15 +89,15 @@ def test_rounds_end_with_bodies_that_are_apart(free: Solution, monkeypatch: pyte
     """
     nodes = free.plan.swing_nodes * free.plan.swing.duration
     x, _, z = hammer(free, (nodes[10] + nodes[11]) / 2)
-    problem, began, solved = with_peg(free.problem, x, z), list[float](), between_nodes.solved_apart
+    problem, began, solved = with_peg(free.problem, x, z), list[float](), between_nodes.solve_with_clearance
 
     def watched(budget: Budget, margins: Margins, guess: Guess[Transcription]) -> Outcome[Transcription]:
         t = guess.program
-        rows = {**Watch(t, margins, guess.x).rows(), **t.apart_rows}
+        rows = {**Watch(t, margins, guess.x).constraints(), **t.apart_rows}
         began.append(violation(t.with_apart(rows), guess.x))
         return solved(budget, margins, guess)
 
-    monkeypatch.setattr(between_nodes, "solved_apart", watched)
+    monkeypatch.setattr(between_nodes, "solve_with_clearance", watched)
     solution = solve(problem)
     assert solution.status is Status.SOLVED and solution.nodes.total > 0
     assert solution.clearance()["clearance_mm"] > 0 and not solution.clearance()["contacts_besides"]

@@ -158,7 +158,7 @@ def test_a_plan_starts_from_a_neighbour(chopped: Solution) -> None:
 def test_a_start_with_other_touches_is_refused(chopped: Solution) -> None:
     ball = stiff(target=FreeMass(mass=1.0))
     for problem in (stiff(touches=1), stiff(touches=3), ball):
-        with pytest.raises(InputError, match="start: the solution meets its target 2 times"):
+        with pytest.raises(InputError, match="start: the solution touches its target 2 times"):
             solve(problem, start=chopped)
 
 

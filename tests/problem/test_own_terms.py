@@ -131,7 +131,7 @@ def test_a_plan_obeys_a_term_of_ones_own(arm_transcription: Transcription) -> No
     assert result.status is Status.INFEASIBLE
     assert "ceiling, " in result.message and " mm too high" in result.message
     (bound,) = (bound for bound in bounds_of(low) if bound.name == "ceiling")
-    (cause,) = bound.told(result.x)
+    (cause,) = bound.causes(result.x)
     assert "(Ceiling.height; " in cause.text, "no section of a file has it"
 
 

@@ -116,7 +116,7 @@ def test_of_a_robot_on_soles_with_its_margins() -> None:
         target=FreeMass(mass=5.0),
     )
     whole = Collisions(standin_file(), {"posture": "half_sitting", "speed_m_s": 1.0}, outputs)
-    polygon = whole._alike_of({}).posture()
+    polygon = whole._batch({}).posture()
     assert isinstance(polygon, Posture)
     for i, mass in enumerate(columns["target.mass"]):
         v = striking_velocity(robot, q, "right_hand", np.array([1.0, 0, 0]), columns["at_contact.speed"][i])
@@ -252,7 +252,7 @@ def test_the_state_of_a_result(tmp_path: Path) -> None:
 
 def test_a_reach_hits_where_it_is_told() -> None:
     whole = Collisions(arm_file(), {"speed_m_s": 1.0}, ("impulse_Ns",))
-    alike = whole._alike_of({})
+    alike = whole._batch({})
     robot = alike.model.robot
     for point in ((0.7, 0.0, 0.75), (0.6, 0.0, 0.8)):
         posture = alike.posture(point)

@@ -98,7 +98,7 @@ def test_workers_of_another_version_are_refused(client: Any) -> None:
 
 
 def test_what_cannot_be_used_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("impactopt.sweeps.cluster.PATIENCE", 0.5)
+    monkeypatch.setattr("impactopt.sweeps.cluster.CONNECT_TIMEOUT", 0.5)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         sweep(SWEEP, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
     with pytest.raises(InputError, match="one of workers, scheduler and client"):

@@ -23,7 +23,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
 
 
 def test_by_default_a_person_sees_words_and_progress(screen: io.StringIO) -> None:
-    with console.told(None, None) as (tell, count):
+    with console.receivers(None, None) as (tell, count):
         tell("building")
         count(NOW)
     assert screen.getvalue().splitlines() == [
@@ -34,13 +34,13 @@ def test_by_default_a_person_sees_words_and_progress(screen: io.StringIO) -> Non
 
 def test_false_and_functions_of_ones_own_leave_the_screen_alone(screen: io.StringIO) -> None:
     said, counted = list[str](), list[SweepProgress]()
-    with console.told(None, False) as (tell, count):
+    with console.receivers(None, False) as (tell, count):
         tell("building")
         count(NOW)
-    with console.told(said.append, counted.append) as (tell, count):
+    with console.receivers(said.append, counted.append) as (tell, count):
         tell("building")
         count(NOW)
-    with console.told(said.append, None) as (tell, count):
+    with console.receivers(said.append, None) as (tell, count):
         count(NOW)
     assert screen.getvalue() == "" and said == ["building"] and counted == [NOW]
 

@@ -176,7 +176,7 @@ def test_a_full_disk_is_said_and_what_was_there_is_kept(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, hard))
     try:
-        with pytest.raises(InputError, match=r"cannot write .*; what was finished before is kept"):
+        with pytest.raises(InputError, match=r"cannot write .*; finished cases are kept"):
             journal.add(entry(1, count=3000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -211,7 +211,7 @@ def test_rows_of_other_versions_are_not_mixed_in(tmp_path: Path, monkeypatch: py
     from impactopt.planning.solution import versions
 
     monkeypatch.setattr("impactopt.sweeps.store.versions", lambda: {**versions(), "casadi": "9.9"})
-    with pytest.raises(InputError, match=r"were made with casadi 3.*this is casadi 9\.9"):
+    with pytest.raises(InputError, match=r"were computed with casadi 3.*this is casadi 9\.9"):
         Store(sweep(), tmp_path)
 
 
@@ -232,7 +232,7 @@ def test_a_lost_or_damaged_name_plate_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"sweep\.json cannot be read"):
         Store(sweep(), tmp_path)
     plate.unlink()
-    with pytest.raises(InputError, match="which says of which, is gone"):
+    with pytest.raises(InputError, match="which identifies it, is missing"):
         Store(sweep(), tmp_path)
 
 
@@ -244,7 +244,7 @@ def test_two_processes_do_not_share_a_directory(tmp_path: Path) -> None:
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
         assert other.stdout is not None and other.stdout.readline() == b"held\n"
-        with pytest.raises(InputError, match="another process is at work"):
+        with pytest.raises(InputError, match="another process is working"):
             Store(sweep(), tmp_path)
         other.kill()
     Store(sweep(), tmp_path).close()  # a killed process holds nothing

@@ -28,7 +28,7 @@ from impactopt.sweeps import SweepProgress, sweep, sweep_from_data
 from impactopt.sweeps.collisions import collide_many
 from impactopt.sweeps.design import Found, Unit, Work
 from impactopt.sweeps.evaluate import ENDED_BY_WATCHDOG, evaluate, on_processes
-from impactopt.sweeps.running import TOGETHER
+from impactopt.sweeps.running import MAX_UNIT
 from impactopt.sweeps.store import Entry, Journal
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")  # which no two runs share
@@ -138,7 +138,7 @@ def test_a_parent_that_is_killed_leaves_no_orphans_and_its_rows(
     assert (summary["cases"], summary["done"], again.exit_code) == (4, 4, 0)
     assert summary["failed"] == failures(undisturbed)
     assert 1 <= summary["resumed"] < 4
-    assert "are there from before" in again.stderr
+    assert "are finished already" in again.stderr
     assert rows(Path(summary["table"])) == undisturbed
 
 
@@ -212,7 +212,7 @@ def test_a_bad_sweep_file_is_exit_code_2(tmp_path: Path) -> None:
 def test_collisions_go_in_chunks_and_are_the_same_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(TOGETHER, "collision", 64)
+    monkeypatch.setitem(MAX_UNIT, "collision", 64)
     over = {
         "target.mass": {"from": 0.05, "to": 1.0},
         "contact.stiffness": {"from": 1e5, "to": 1e6, "scale": "log"},

@@ -25,8 +25,8 @@ from impactopt.planning.clearance_constraints import (
     Watch,
     clearance_violations,
     deepest_penetration,
-    solved_apart,
-    spots_of,
+    node_placements,
+    solve_with_clearance,
 )
 from impactopt.planning.parameter_changes import parameter_of
 from impactopt.planning.reconstruction import program_on
@@ -155,7 +155,7 @@ def programs(
     for name, shared in (("arm", arm_transcription), ("biped", biped_transcription)):
         bare = changed(shared)
         x, rng = first_iterate(bare), np.random.default_rng(0)
-        rows = Watch(bare, margins_of(bare), x).rows(0.2)
+        rows = Watch(bare, margins_of(bare), x).constraints(0.2)
         t = bare.with_apart(rows)
         out[name] = t, x + 0.02 * rng.standard_normal(t.program.n)
     return out
@@ -174,7 +174,7 @@ def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any,
     """By coal, whose distance theirs is less by what is rounded; where bodies are in each other, at most."""
     t, x = programs[name]
     names = [t.program.row_name(i) for i in range(t.program.m)]
-    g, spots, bodies = t.program.constraints(x), spots_of(t, x), t.problem.bodies
+    g, spots, bodies = t.program.constraints(x), node_placements(t, x), t.problem.bodies
     for row, held in t.apart_rows.items():
         k = spots.names.index(row.place)
         one, two = pieces(bodies, row)
@@ -210,7 +210,7 @@ def test_a_program_stays_as_it_is_when_one_with_more_rows_is_made_of_it(
 ) -> None:
     t = changed(arm_transcription)
     x = first_iterate(t)
-    more = t.with_apart(Watch(t, margins_of(t), x).rows(0.2))
+    more = t.with_apart(Watch(t, margins_of(t), x).constraints(0.2))
     assert more.program.m > t.program.m
     for program in (more.program, t.program):
         check_derivatives(program, x + 0.01)
@@ -220,7 +220,7 @@ def test_a_program_with_such_rows_takes_the_numbers_of_another_problem(
     arm_transcription: Transcription,
 ) -> None:
     bare = changed(arm_transcription)
-    rows = Watch(bare, margins_of(bare), first_iterate(bare)).rows(0.2)
+    rows = Watch(bare, margins_of(bare), first_iterate(bare)).constraints(0.2)
     problem = bare.problem
     other = parameter_of(problem, "contact.stiffness").at(1.3 * problem.law.parameters["stiffness"])
     moving, whole = (
@@ -259,7 +259,7 @@ def test_constraints_are_met_at_the_start(biped_transcription: Transcription) ->
     margins, pair = margins_of(t), (root, -1 - [body.name for body in t.problem.world].index("wall"))
     assert 0 < margins.bodies.exact(at, 0, pair) < 3e-3
     x = first_iterate(t)
-    rows = Watch(t, margins, x).rows()
+    rows = Watch(t, margins, x).constraints()
     assert any(row[1:3] == pair for row in rows)
     shapes = margins.bodies.shapes
     gaps = shapes.look(margins.bodies.placed(at), 1.0, np.zeros((1, len(shapes), 3)), margins.wanted).gaps[0]
@@ -278,7 +278,7 @@ def test_only_what_is_switched_off_is_not_kept_apart(biped_transcription: Transc
     ):
         problem = dataclasses.replace(biped_transcription.problem, terms=terms)
         assert problem.keeps_apart == (own or world)
-        rows = Watch(biped_transcription, Margins(problem), x).rows(1.0)
+        rows = Watch(biped_transcription, Margins(problem), x).constraints(1.0)
         assert any(row.other < 0 for row in rows) == world
         assert any(row.other >= 0 for row in rows) == own
 
@@ -370,7 +370,7 @@ def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, ba
     depth, pairs = deepest_penetration(t, x, margins)
     assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}
     budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
-    fixed = solved_apart(budget, margins, Guess(program=t, start=free.result))
+    fixed = solve_with_clearance(budget, margins, Guess(program=t, start=free.result))
     assert fixed.result.status is Status.SOLVED
     assert deepest_penetration(fixed.program, fixed.result.x, margins)[0] <= 0
 
@@ -390,5 +390,5 @@ def test_constraints_enter_before_bodies_can_touch(free: Solution) -> None:
     there = x + part * step
     assert watch.lacks(there)
     assert deepest_penetration(t, there, margins)[0] <= 0 < deepest_penetration(t, free.result.x, margins)[0]
-    rows = watch.rows()
+    rows = watch.constraints()
     assert bar in {row.other for row in rows} and not watch.lacks(there)

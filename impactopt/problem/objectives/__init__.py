@@ -1,6 +1,7 @@
-"""Objectives of a plan: a weighted sum of quantities, one a file; the impulse by default.
+"""Objectives of a plan: quantities whose weighted sum is maximized; the impulse by default.
 
-`base` says what an objective has. A new one is a file here, and its lines below.
+`base` has the interface of an objective, and each other file one objective. A new one is a file here, and is
+listed below.
 """
 
 from impactopt.problem.objectives.angular_momentum import AngularMomentum
@@ -12,7 +13,7 @@ from impactopt.problem.objectives.penetration import Penetration
 from impactopt.problem.objectives.target_energy import TargetEnergy
 
 DEFAULT_OBJECTIVES: tuple[Objective, ...] = (Impulse(),)
-# all that problem files know, in their order
+# all objectives of problem files, in their order
 OBJECTIVES: tuple[type[Objective], ...] = (
     Impulse,
     PeakForce,

@@ -13,8 +13,7 @@ from impactopt.problem.objectives.base import WEIGHT, Objective
 class AngularMomentum(Objective):
     """Cost: angular momentum after contact, squared.
 
-    |angular momentum|^2 about the centre of mass [(N m s)^2]. A robot on a fixed base has no
-    balance, and no such objective.
+    |angular momentum|^2 about the centre of mass [(N m s)^2]. It is for robots that stand on soles.
     """
 
     name: ClassVar[str] = "angular momentum after contact, squared"

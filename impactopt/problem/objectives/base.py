@@ -1,7 +1,7 @@
 """Base class of objectives, and checks of their parameters.
 
-A weight turns a quantity's unit into N s, so that weights compare: TargetEnergy(weight=0.5) beside Impulse()
-gives up half a newton second for a joule more in the target.
+A weight converts a quantity's unit to N s, so that objectives compare: with TargetEnergy(weight=0.5) beside
+Impulse(), one more joule in the target counts as half a newton second.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ WEIGHT = about("value of one unit", unit="N s", key="weight")
 
 @dataclass(frozen=True, kw_only=True)
 class Objective(Described):
-    """Base of all objectives: ``name`` is what reports call it, ``unit`` is that of its quantity.
+    """Base of all objectives. ``name`` stands in reports; ``unit`` is that of the quantity.
 
-    An objective has :meth:`quantity`, and :meth:`blocks` if that is not linear; ``whole_motion`` and
+    An objective has :meth:`quantity`, and :meth:`blocks` if the quantity is not linear. ``whole_motion`` and
     ``needs_torques`` are as in :class:`impactopt.problem.terms.Term`.
 
-    A weight is not zero; that of a cost is its price, and positive.
+    The weight is not zero; that of a cost is positive, as a price.
     """
 
     name: ClassVar[str] = ""
@@ -51,31 +51,31 @@ class Objective(Described):
         return {}
 
     def quantity(self, program: Any) -> Any:
-        """Weighed quantity: an affine expression of a program's variables, or with squares of variables a
-        :class:`impactopt.transcription.objective.Quantity`, as `program.squares` gives it.
+        """The quantity, before its weight: an affine expression of a program's variables, or with their
+        squares a :class:`impactopt.transcription.objective.Quantity`, as by `program.squares`.
 
         program : under construction, :class:`impactopt.transcription.contact_program.ContactProgram`.
         """
         raise NotImplementedError
 
     def check_fits(self, *, turns: bool, balance: bool) -> None:
-        """InputError if a problem has no such quantity.
+        """InputError if a problem does not have the quantity.
 
-        turns : its compression has one end.  balance : the robot has one to keep.
+        turns : the compression ends once in the impact.  balance : the robot stands on soles.
         """
 
 
 def check_objectives(
     objectives: object, *, contact: bool, turns: bool, balance: bool
 ) -> tuple[Objective, ...]:
-    """The objectives as a tuple.
+    """Objectives as a tuple, checked.
 
-    ``contact``: it lasts; ``turns``: its compression has one end; ``balance``: the robot has one to keep.
+    contact : the contact has a duration.  turns, balance : as of `Objective.check_fits`.
 
     Raises
     ------
-    InputError : none, something else, two of a kind, one that the problem has no quantity for, one of a
-        user's own that says not what it is.
+    InputError : no objectives, other objects, two of a kind or name, a quantity that the problem does not
+        have, or a user's own objective without `quantity` or name.
     """
     if not isinstance(objectives, (list, tuple)) or not all(isinstance(o, Objective) for o in objectives):
         raise InputError(

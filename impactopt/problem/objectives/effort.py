@@ -17,7 +17,7 @@ from impactopt.problem.objectives.base import WEIGHT, Objective
 class Effort(Objective):
     """Cost: integral of (torque / limit)^2 over swing and follow-through, summed over joints.
 
-    In s, by the trapezoidal rule on the nodes. A side objective: give it a small weight.
+    In s, by the trapezoidal rule on the nodes. It is meant as a secondary objective with a small weight.
     """
 
     name: ClassVar[str] = "effort"
@@ -31,21 +31,26 @@ class Effort(Objective):
         return {"effort": BlockRecipe(lambda: effort(coordinates.robot.n))}
 
     def quantity(self, program: Any) -> Any:
-        """T sum(tau^2) at each node is a variable; their sum is the trapezoidal rule's."""
+        """Trapezoidal sum of T sum(tau^2), which is a lifted variable at each node."""
         swing, follow = program.torque_courses()[:2]
         slots = [[tau, swing.T] for tau in swing.torques[1:]] + [[tau, follow.T] for tau in follow.torques]
         at = program.add_block("effort", slots, np.zeros(0))
         places = [*map(swing.place_at, swing.nodes[1:]), *map(follow.place_at, follow.nodes)]
-        labels = [place.name for place in places]  # by which a program with more nodes finds them again
+        labels = [
+            place.name for place in places
+        ]  # by these names a program with more nodes maps the variables
         of_node = program.lift("effort of a node", at + np.arange(len(slots)), labels=labels)[0]
         first, *of_swing = trapezoid(swing.nodes)
         weights = np.array([*of_swing, *trapezoid(follow.nodes)])
-        at_start = first * float(np.sum(swing.torques[0].const ** 2))  # where the torque is given
+        at_start = first * float(np.sum(swing.torques[0].const ** 2))  # the torque at the start is constant
         return of_node.apply(weights[None]) + swing.T * at_start
 
 
 def effort(n: int) -> BlockExpression:
-    """z = torques over limits (n), T [s];  out = T x the sum of their squares [s]."""
+    """Integrand of the effort.
+
+    z = torques over limits (n), T [s];  out = T x sum of their squares [s].
+    """
     torque, T = ca.SX.sym("torque", n), ca.SX.sym("T")
     return make_block([torque, T], [], {"effort": T * ca.sumsqr(torque)})
 

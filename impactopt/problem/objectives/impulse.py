@@ -1,4 +1,4 @@
-"""The impulse."""
+"""Impulse to the target."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The largest force."""
+"""Peak contact force."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import casadi as ca
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.objectives.base import WEIGHT, Objective
 
-TYPICAL = 100.0  # [N]
+TYPICAL = 100.0  # [N] by which forces are scaled
 
 
 @dataclass(frozen=True, kw_only=True)
 class PeakForce(Objective):
     """The largest contact force; a weight below zero keeps it small.
 
-    In N, of the forces at collocation points, as the smooth maximum sum f^9 / sum f^8 (Lehmer's mean). This
-    is never above the largest, and equal to it if the others are zero or as large; for a half sine it is
-    some 2 % below. The jump of force at first touch, of a law with damping, is not at a collocation point.
+    In N, of the forces at collocation points, as the smooth maximum sum f^9 / sum f^8 (Lehmer mean). This is
+    at most the largest force, and equal to it if the others are zero or as large; for a half sine it is some
+    2 % less. The force's jump at first touch, with a damped law, is not at a collocation point.
     """
 
     name: ClassVar[str] = "peak force"
@@ -35,11 +35,11 @@ class PeakForce(Objective):
 
 
 def peak(stages: int) -> BlockExpression:
-    """Lehmer's mean of the contact forces, a smooth maximum.
+    """Lehmer mean of the contact forces, a smooth maximum.
 
     z = f [N] at each stage;  out = peak / 100 N.
     """
     f = ca.SX.sym("f", stages)
     g = f / TYPICAL
-    # even powers: the sum below is never zero, whatever the signs on the way
+    # with an even power the divisor is positive, though iterates may have negative forces
     return make_block([f], [], {"peak": ca.sum1(g**9) / (ca.sum1(g**8) + 1e-12)}, lanes=2)

@@ -1,4 +1,4 @@
-"""The deepest penetration."""
+"""Deepest penetration."""
 
 from __future__ import annotations
 

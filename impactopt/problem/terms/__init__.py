@@ -1,10 +1,10 @@
-"""Requirements of a plan as named terms with units, one a file; a problem holds one of each kind at most.
+"""Terms: constraints of a plan with a name and a unit. A problem has at most one of each kind.
 
-`base` says what a term has. DEFAULT_TERMS hold in every problem; the constraints of most of them are in the
-transcription, and all other terms bring their own. ON_DEMAND_TERMS hold in every problem too, but a program
-has their constraints only if they are given, or once a plan without them has broken them
-(`impactopt.planning.lazy_constraints`). The rest hold where they are given. A new one is a file here, and
-its lines below.
+`base` has the interface of a term, and each other file one term. DEFAULT_TERMS hold in every problem; the
+transcription adds the constraints of most of them, and all other terms add their own. ON_DEMAND_TERMS hold in
+every problem, too, but a program has their constraints only if the term is given, or once a plan has violated
+it (`impactopt.planning.lazy_constraints`). All other terms hold only if they are given. A new term is a file
+here, and is listed below.
 """
 
 from impactopt.problem.terms.balance import Balance
@@ -48,7 +48,7 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     FirstTouch(),
 )
 ON_DEMAND_TERMS: tuple[Term, ...] = (GearLoad(), Slide(), ReferenceRange())
-# all that problem files know, in their order
+# all terms of problem files, in their order
 TERMS: tuple[type[Term], ...] = (
     *map(type, DEFAULT_TERMS),
     TorqueRate,

@@ -20,19 +20,20 @@ if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
 Array = NDArray[np.float64]
-SINCE = 0.12  # [s] before contact: earlier than that the striking point alone keeps off the target's plane
-NAMES = ("first_touch", "second_first_touch")  # of the blocks, striker by striker
+# [s] The constraints hold in this time before contact. Earlier, only the striking point stays behind the
+# target's plane.
+SINCE = 0.12
+NAMES = ("first_touch", "second_first_touch")  # names of the blocks, one for each striker
 
 
 @dataclass(frozen=True, kw_only=True)
 class FirstTouch(Term):
     """The striking link touches the target with its striking point, not with another part before it.
 
-    Up to contact no corner of the link's hull is farther than `depth` beyond the target's plane, besides what
-    it sticks out beyond the striking point, and at contact the link's face looks along the normal. The face
-    is the one about the striking point, or the one that `HandOrientation` turns to the target. Links without
-    a known shape have such constraints only with `assumed`. There are none where bodies may pass through the
-    world.
+    Until contact no corner of the link's hull is farther than `depth` beyond the target's plane, beside what
+    it sticks out beyond the striking point. At contact the link's face is turned along the normal. The face
+    is the one with the striking point, or the one that `HandOrientation` turns to the target. Links without a
+    known shape have these constraints only with `assumed`. There are none if `KeepOut` is off.
     """
 
     name: ClassVar[str] = "first touch"
@@ -68,21 +69,22 @@ class FirstTouch(Term):
             face = face_of(p, striker)
             if face is None:
                 continue
-            ways = np.vstack([face.corners, face.normal / np.sin(self.angle)])
-            moved = np.append(np.ones(len(face.corners)), 0.0)  # a direction has no place
-            each = [ways, moved[:, None]]
+            # outputs of the block at a node: the corners' distances, and the cosine of the face's direction
+            vectors = np.vstack([face.corners, face.normal / np.sin(self.angle)])
+            is_point = np.append(np.ones(len(face.corners)), 0.0)
+            each = [vectors, is_point[:, None]]
 
             def numbers(b: Any, each: Any = each, number: int = number) -> Array:
                 plane = np.append(b.problem.normal, b.problem.contacts[number][1])
                 return np.tile(np.hstack([np.tile(plane, (len(each[0]), 1)), *each]), (len(spots), 1))
 
-            slots = [[slots[0]] for _, slots in spots for _ in ways]
+            slots = [[slots[0]] for _, slots in spots for _ in vectors]
             at = program.add_block(name, slots, numbers(program.builder))
             program.builder.follow(
                 lambda b, name=name, numbers=numbers: b.block(name).take_parameters(numbers(b))
             )
             for k, (place, _) in enumerate(spots):
-                outputs = at + k * len(ways) + np.arange(len(ways))
+                outputs = at + k * len(vectors) + np.arange(len(vectors))
                 program.rows.add(
                     term=self.name,
                     place=place,
@@ -103,7 +105,7 @@ class FirstTouch(Term):
 
 
 def face_of(problem: Any, striker: str) -> StrikerFace | None:
-    """Face of a striker that is to meet the target; None without a shape, or where bodies may pass."""
+    """Face of a striker that touches the target; None without a shape, or if `KeepOut` is off."""
     if not problem.keep_out.enabled:
         return None
     turned = problem.extra(HandOrientation) if striker == problem.striker else None
@@ -112,21 +114,24 @@ def face_of(problem: Any, striker: str) -> StrikerFace | None:
 
 
 def late_spots(program: Any) -> list[Any]:
-    """Places of the swing's end with their slots: the last 0.12 s, or contact alone if the target comes."""
+    """Places of the last 0.12 s of the swing, with their slots; contact alone if the target moves before
+    it.
+    """
     p = program.problem
     since = max(0.0, 1 - SINCE / float(np.mean(p.swing.duration)))
     return list(program.swing_spots(1.0 if p.target.speed_before() else since))
 
 
 def ahead(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """Distance of a point of the striking link beyond the target's plane, or cosine of a direction of it.
+    """Distance of a point of the striking link beyond the target's plane, or cosine of a direction to the
+    normal.
 
-    z = y;  p = normal (3), hit point (3) [m], point from the striking point on [m] or direction (3), 1 for a
-    point and 0 for a direction;  out = distance [m] or cosine.
+    z = y;  p = normal (3), hit point (3) [m], vector (3) in the striker's frame: point [m] or direction, 1
+    for a point and 0 for a direction;  out = distance [m] or cosine.
     """
     y, normal, hit = ca.SX.sym("y", c.ny), ca.SX.sym("n", 3), ca.SX.sym("hit", 3)
-    way, point = ca.SX.sym("d", 3), ca.SX.sym("point")
-    still = ca.SX.zeros(c.ny)
-    rotation, origin = c.rb_frame(f"striker:{striker}", c.upper_motion(y, still, still)[0])
-    out = ca.dot(normal, point * (origin - hit) + ca.mtimes(rotation, way))
-    return make_block([y], [normal, hit, way, point], {"along": out})
+    vector, is_point = ca.SX.sym("d", 3), ca.SX.sym("point")
+    zero = ca.SX.zeros(c.ny)
+    rotation, origin = c.rb_frame(f"striker:{striker}", c.upper_motion(y, zero, zero)[0])
+    out = ca.dot(normal, is_point * (origin - hit) + ca.mtimes(rotation, vector))
+    return make_block([y], [normal, hit, vector, is_point], {"along": out})

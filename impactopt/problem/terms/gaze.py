@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Gaze(Term):
-    """A frame, such as the head's, looks at the hit point in the swing.
+    """An axis of a frame, such as the head's, points at the hit point during the swing.
 
-    It holds at the nodes of the swing after a fraction of it, and at contact, from the frame's origin to the
-    problem's point.
+    The angle is between the axis and the line from the frame's origin to the problem's point. It is bounded
+    at the nodes of the swing after a fraction of it, and at contact.
     """
 
     name: ClassVar[str] = "gaze"
@@ -70,10 +70,15 @@ class Gaze(Term):
 
 
 def gaze(c: StanceCoordinates, frame: str) -> BlockExpression:
-    """z = y, legs;  p = axis (3), point (3), sine of the angle;  out = cosine of the angle over that sine."""
+    """Cosine of the angle between gaze and hit point.
+
+    z = y, legs;  p = axis (3), point (3), sine of the largest angle;  out = cosine over that sine. So the
+    constraint's slope in the angle is 1 at the bound.
+    """
     y, legs, sine = ca.SX.sym("y", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("sin")
     axis, point = ca.SX.sym("axis", 3), ca.SX.sym("point", 3)
     rotation, origin = c.rb_frame(frame, c.configuration(y, legs))
-    way = point - origin
-    out = ca.dot(way, ca.mtimes(rotation, axis)) / ca.sqrt(ca.sumsqr(way) + 1e-8) / sine
+    line = point - origin
+    # 1e-8 m^2 keeps the root smooth where the origin is at the point
+    out = ca.dot(line, ca.mtimes(rotation, axis)) / ca.sqrt(ca.sumsqr(line) + 1e-8) / sine
     return make_block([y, legs], [axis, point, sine], {"cosine": out})

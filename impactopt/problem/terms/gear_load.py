@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class GearLoad(Term):
-    """|torque through the gear| is bounded: the servo's torque less what its rotor takes to accelerate.
+    """|torque through the gear| is bounded: servo torque - armature x joint acceleration.
 
-    That is servo torque - armature x joint acceleration. It holds at the nodes of all motions, at the
-    collocation points of all contacts, and in their first instant, where the force of a damped contact jumps.
-    If the limit is given by joint, joints that are not named have no bound.
+    The bound holds at the nodes of all motions, at the collocation points of all contacts, and in their first
+    instant, at which the force of a damped contact jumps. If the limit is given by joint, other joints have
+    no bound.
 
-    It holds with its defaults where a problem does not have it. Rows are then added once a plan without them
-    goes beyond; where it is given they are there from the start.
+    The term holds with its defaults in every problem. Its constraints are added once a plan violates them, or
+    from the start if the problem gives the term.
     """
 
     name: ClassVar[str] = "gear load"
@@ -45,13 +45,13 @@ class GearLoad(Term):
             by_joint=True,
         ),
     )
-    enabled: bool = field(default=True, metadata=about("false: gears bear what they have to"))
+    enabled: bool = field(default=True, metadata=about("false: gear loads are not bounded"))
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"rotors": BlockRecipe(lambda: rotors(coordinates))}
 
     def most(self, robot: Robot) -> Any:
-        """(n,) largest loads over the torque limits; inf: no bound."""
+        """Largest loads (n,) over the torque limits; inf: no bound."""
         if self.limit is None:
             return robot.gear_limit
         return np.where(robot.passive, np.inf, of_joints(self.limit, robot.joint_names))
@@ -60,6 +60,8 @@ class GearLoad(Term):
         robot, names = program.robot, program.robot.joint_names
         most = self.most(robot)
         points, first = program.drive_points(), program.first_instants()
+        # of each place: torque over its limit (affine) + output of the block, -armature x acceleration over
+        # it
         outputs = [output for _, output in first]
         if points:
             at = program.add_block("rotors", [p.slots for p in points], robot.armature / robot.torque_limit)
@@ -80,6 +82,9 @@ class GearLoad(Term):
 
 
 def rotors(c: StanceCoordinates) -> BlockExpression:
-    """z of `joint_motion`;  p = armature over torque limit (n);  out = -p x acceleration (n)."""
+    """Torques that the rotors take.
+
+    z of `joint_motion`;  p = armature over torque limit (n);  out = -p x acceleration (n).
+    """
     motion, inertia = joint_motion(c), ca.SX.sym("inertia", c.robot.n)
     return make_block(motion.z, [inertia], {"rotors": -inertia * motion.acceleration}, motion.through)

@@ -14,10 +14,10 @@ from impactopt.problem.violation import Measure
 
 @dataclass(frozen=True, kw_only=True)
 class Grip(Term):
-    """Each component of the wrench on a hand that holds on is bounded, in the axes of the hand's link.
+    """Each component of the wrench on a supporting hand is bounded, in the axes of the hand's link.
 
-    The hand is held in all six directions, and can pull as well as push. The bounds hold at the nodes of the
-    motion, and in contact with all targets. Moments are about the hand's striking point, where it is held.
+    The hand is fixed in all six directions, and can pull as well as push. The bounds hold at the nodes of the
+    motion, and during contact with all targets. Moments are about the hand's striking point, which is fixed.
     """
 
     name: ClassVar[str] = "grip"

@@ -15,11 +15,12 @@ from impactopt.robots.loads import fading
 
 @dataclass(frozen=True, kw_only=True)
 class GroundForce(Term):
-    """The soles stay loaded, one by one and in all, and the robot does not land hard.
+    """The normal forces of the soles, of each and in all, are bounded, so that they stay loaded and the robot
+    does not land hard.
 
-    The shares hold at the nodes of the motion, and in contact with all targets. They come beside the contact
-    wrench cone, which has no scale: near free fall it is satisfied by a sole that a soft floor no longer
-    holds.
+    The bounds hold at the nodes of the motion, and during contact with all targets. The contact wrench cone
+    does not contain them, as it has no scale: near free fall a wrench within it may be too small for a sole
+    to stay in place on a soft floor.
     """
 
     name: ClassVar[str] = "ground force"
@@ -45,12 +46,14 @@ class GroundForce(Term):
         if not soles:
             return
         p = program.problem
+        # soles that touch down or lift off at an end of the phase are unloaded there
         fades = {s.name for s, on in zip(p.soles, fading(p.standing)[p.blow], strict=True) if on}
         each = [k for k in soles if len(soles) > 1 and legs[k].name not in fades]
         sets = [("all soles", soles), *((legs[k].end, [k]) for k in each)]
+        # sums of normal forces over the weight, one row for each set of soles
         normal = np.zeros((len(sets), 6 * len(legs)))
-        for row, (_, chosen) in zip(normal, sets, strict=True):
-            row[6 * np.array(chosen) + 2] = 1 / weight
+        for row, (_, indices) in zip(normal, sets, strict=True):
+            row[6 * np.array(indices) + 2] = 1 / weight
         alone = len(sets) - 1
         for place, wrench in program.wrenches():
             program.rows.add(

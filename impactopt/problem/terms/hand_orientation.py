@@ -56,9 +56,13 @@ class HandOrientation(Term):
 
 
 def hand_orientation(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """z = y;  p = axis (3), direction (3), sine of the angle;  out = cosine between them over that sine."""
+    """Cosine of the angle between the hand's axis and its direction.
+
+    z = y;  p = axis (3), direction (3), sine of the largest angle;  out = cosine over that sine. So the
+    constraint's slope in the angle is 1 at the bound.
+    """
     y, axis, direction, sine = ca.SX.sym("y", c.ny), *(ca.SX.sym(s, 3) for s in "ad"), ca.SX.sym("sin")
-    still = ca.SX.zeros(c.ny)
-    rotation, _ = c.rb_frame(f"striker:{striker}", c.upper_motion(y, still, still)[0])
+    zero = ca.SX.zeros(c.ny)
+    rotation, _ = c.rb_frame(f"striker:{striker}", c.upper_motion(y, zero, zero)[0])
     out = ca.dot(direction, ca.mtimes(rotation, axis)) / sine
     return make_block([y], [axis, direction, sine], {"cosine": out})

@@ -1,4 +1,4 @@
-"""Cone of free directions of the impact."""
+"""Cone of allowed directions of the impact."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
 
-TYPICAL = 1.0  # [m/s] of a strike
+TYPICAL = 1.0  # [m/s] speed of a strike, by which the constraint is scaled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,16 +54,18 @@ class HitCone(Term):
 
 
 def hit_cone(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """z = y, y', T;  p = axes of the face (9, by rows), tangent of the angle.
+    """Margin of the striking point's velocity in its cone.
 
-    out = ((tangent x speed along the normal)^2 - (speed across it)^2) / (2 tangent x 1 m/s) [m/s]: smooth,
-    also where there is no speed across. That the speed along the normal is one of approach is a constraint
-    anyway.
+    z = y, y', T;  p = axes of the face (9, row by row), tangent of the angle;
+    out = ((tangent x speed along the normal)^2 - (speed across it)^2) / (2 tangent x 1 m/s) [m/s].
+
+    The squares keep it smooth where there is no speed across the normal. Another constraint requires that the
+    speed along the normal is one of approach.
     """
     y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
-    rows, tangent = ca.SX.sym("axes", 9), ca.SX.sym("tan")
+    axes, tangent = ca.SX.sym("axes", 9), ca.SX.sym("tan")
     q, v, _ = c.upper_motion(y, y1 / T, ca.SX.zeros(c.ny))
-    speed = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[1]
-    along, *across = ca.vertsplit(ca.mtimes(ca.reshape(rows, 3, 3).T, speed))
+    velocity = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[1]
+    along, *across = ca.vertsplit(ca.mtimes(ca.reshape(axes, 3, 3).T, velocity))
     room = ((tangent * along) ** 2 - ca.sumsqr(ca.vertcat(*across))) / (2 * tangent * TYPICAL)
-    return make_block([y, y1, T], [rows, tangent], {"room": room}, lanes=2)
+    return make_block([y, y1, T], [axes, tangent], {"room": room}, lanes=2)

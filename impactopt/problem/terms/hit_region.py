@@ -1,4 +1,4 @@
-"""Region of free hit points."""
+"""Region of allowed hit points."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
 
-REACH = 0.2  # [m] further off the replays' target has ended
+REACH = 0.2  # [m] from the hit point to the edge of the target's face in replays
 
 
 @dataclass(frozen=True, kw_only=True)
 class HitRegion(Term):
     """The hit point may be anywhere in a disc or a rectangle about `point_m`; give one of the two keys.
 
-    In the plane of the normal: see :func:`impactopt.bodies.world.face_axes`. It reaches no further than
-    0.2 m, where the replays' target ends.
+    The region is in the plane across the normal, with the axes of :func:`impactopt.bodies.world.face_axes`.
+    It reaches no farther than 0.2 m, as the target in replays.
     """
 
     name: ClassVar[str] = "hit region"
@@ -58,7 +58,7 @@ class HitRegion(Term):
         return {"hit_region": BlockRecipe(lambda: hit_region(coordinates, problem.striker, disc), (disc,))}
 
     def add_rows(self, program: Any) -> None:
-        """Adds constraints that replace those of the hit point."""
+        """Add the constraints, which replace those of a fixed hit point."""
 
         def numbers(problem: Any) -> Any:
             size = [] if self.radius is None else [self.radius]
@@ -66,8 +66,8 @@ class HitRegion(Term):
 
         at = program.add_block("hit_region", [[program.contact_state[0]]], numbers(program.problem))
         program.builder.follow(lambda b: b.block("hit_region").take_parameters(numbers(b.problem)))
-        away = millimetres("away")
-        program.equal("hit point", Place("contact", ""), ["along the normal"], np.array([at]), away)
+        off_plane = millimetres("away")
+        program.equal("hit point", Place("contact", ""), ["along the normal"], np.array([at]), off_plane)
         names = ["disc"] if self.size is None else ["across", "up"]
         most = np.zeros(1) if self.size is None else np.array(self.size) / 2
         program.rows.add(
@@ -82,15 +82,16 @@ class HitRegion(Term):
 
 
 def hit_region(c: StanceCoordinates, striker: str, disc: bool) -> BlockExpression:
-    """z = y;  p = point (3), axes of the face (9, by rows), radius if it is a disc.
+    """Offset of the striking point from the hit point.
 
-    out = of the striking point, distance before the face [m]; and across and up [m], or for a disc
-    (r^2 - radius^2) / (2 radius) [m].
+    z = y;  p = point (3), axes of the face (9, row by row), radius of a disc;
+    out = offset along the normal [m]; and offsets across and up [m], or for a disc
+    (r^2 - radius^2) / (2 radius) [m] with r the offset in the plane.
     """
-    y, point, rows = ca.SX.sym("y", c.ny), ca.SX.sym("point", 3), ca.SX.sym("axes", 9)
-    radius, still = ca.SX.sym("radius", int(disc)), ca.SX.zeros(c.ny)
-    q, v, _ = c.upper_motion(y, still, still)
+    y, point, axes = ca.SX.sym("y", c.ny), ca.SX.sym("point", 3), ca.SX.sym("axes", 9)
+    radius, zero = ca.SX.sym("radius", int(disc)), ca.SX.zeros(c.ny)
+    q, v, _ = c.upper_motion(y, zero, zero)
     at = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[0]
-    way = ca.mtimes(ca.reshape(rows, 3, 3).T, at - point)
-    side = (ca.sumsqr(way[1:]) - radius**2) / (2 * radius) if disc else way[1:]
-    return make_block([y], [point, rows, radius], {"depth": way[0], "side": side}, lanes=2)
+    offset = ca.mtimes(ca.reshape(axes, 3, 3).T, at - point)
+    side = (ca.sumsqr(offset[1:]) - radius**2) / (2 * radius) if disc else offset[1:]
+    return make_block([y], [point, axes, radius], {"depth": offset[0], "side": side}, lanes=2)

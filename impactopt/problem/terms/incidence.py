@@ -1,4 +1,4 @@
-"""No glancing blows."""
+"""Limit on the striking point's speed across the normal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class Incidence(Term):
-    """No glancing blow: the striking point's speed across the normal at contact is bounded.
+    """The striking point's speed across the normal at contact is bounded, so that it does not glance off.
 
     :class:`impactopt.HitCone` replaces it.
     """

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class JointAcceleration(Term):
-    """|joint acceleration| is bounded in the swing.
+    """|joint acceleration| is bounded during the swing, at its nodes.
 
-    It holds at the nodes of the swing. Accelerations of joints outside the legs are linear between nodes, so
-    they are bounded everywhere. If the limit is given by joint, joints that are not named have no bound.
+    Accelerations of joints outside the legs are linear between nodes, so they are bounded everywhere. If the
+    limit is given by joint, other joints have no bound.
     """
 
     name: ClassVar[str] = "joint acceleration"
@@ -53,11 +53,14 @@ class JointAcceleration(Term):
             )
 
 
-TYPICAL = 100.0  # [rad/s^2] of a strike
+TYPICAL = 100.0  # [rad/s^2] of a strike, by which the constraints are scaled
 
 
 def joint_acceleration(c: StanceCoordinates) -> BlockExpression:
-    """z = y, y', y'' (ny each), legs (nl), T [s];  out = joint accelerations over 100 rad/s^2 (n)."""
+    """Accelerations of all joints.
+
+    z = y, y', y'' (ny each), legs (nl), T [s];  out = joint accelerations over 100 rad/s^2 (n).
+    """
     y, y1, y2, u, udot = (ca.SX.sym(s, c.ny) for s in ("y", "y1", "y2", "u", "udot"))
     legs, T = ca.SX.sym("legs", c.nl), ca.SX.sym("T")
     _, a = c.motion(y, legs, u, udot)

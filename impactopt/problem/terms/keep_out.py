@@ -11,9 +11,10 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class KeepOut(Term):
-    """The robot keeps off target, ground and obstacles; the link that strikes may touch the target.
+    """The robot has clearance from target, ground and obstacles; the striking link may touch the target's
+    face.
 
-    It may touch it at the face that it strikes. Held soles stand on the ground.
+    Fixed soles stand on the ground.
     """
 
     name: ClassVar[str] = "keep out"

@@ -11,12 +11,12 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class LegExtension(Term):
-    """Held legs stay away from a straight knee.
+    """The knees of standing legs stay bent.
 
-    At the nodes of swing and follow-through the determinant of the leg's Jacobian (joints to sole) over its
-    value in the start posture is no less than a minimum. Near a straight knee the joint rates that keep the
-    sole in place grow without bound, and the leg could become too short between two nodes: at 0.35 TALOS has
-    7 mm left.
+    At the nodes of swing and follow-through, the determinant of the leg's Jacobian (from joints to sole) over
+    its value in the start posture has a lower bound. Near a straight knee the joint rates that keep the sole
+    in place grow without bound, and the leg could become too short between two nodes: at 0.35 TALOS has 7 mm
+    left.
     """
 
     name: ClassVar[str] = "leg extension"

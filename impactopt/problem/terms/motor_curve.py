@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class MotorCurve(Term):
-    """|torque| / stall torque + |speed| / no-load speed is at most a fraction, of motors whose line is known.
+    """|torque| / stall torque + |speed| / no-load speed is at most a fraction, for motors with known curves.
 
-    It holds at the nodes of all motions and at the collocation points of all contacts. Friction adds to the
-    torque as if it always opposed the motor, so this is on the safe side where the motor brakes.
+    The bound holds at the nodes of all motions and at the collocation points of all contacts. Friction adds
+    to the torque as if it always opposed the motor, which is conservative if the motor brakes.
     """
 
     name: ClassVar[str] = "motor curve"
@@ -71,9 +71,10 @@ class MotorCurve(Term):
 
 
 def motor_speed(c: StanceCoordinates) -> BlockExpression:
-    """z of `joint_motion`;  p = what a speed takes of the line [s/rad] (n).
+    """Part of the motor curve that each joint's speed takes.
 
-    out = that of each joint's speed (n), twice: one output a constraint.
+    z of `joint_motion`;  p = part for each unit of speed [s/rad] (n);  out = p x speed (n), twice, as each
+    constraint has its own output.
     """
     motion, per_speed = joint_motion(c), ca.SX.sym("per_speed", c.robot.n)
     speed = per_speed * motion.velocity

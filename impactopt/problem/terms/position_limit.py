@@ -17,8 +17,9 @@ from impactopt.robots.tools import inside
 class PositionLimit(Term):
     """Joints stay inside their limits of position.
 
-    Everywhere: it holds on the spline's control points; for the legs at the nodes, and so for tendons. Hinges
-    of soles and tendons, whose range may be small, keep a quarter of it at most.
+    The bounds are on the spline's control points, so they hold everywhere; those of legs and tendons are at
+    the nodes. The margin of tendons and of hinges of soles, whose range may be small, is at most a quarter of
+    it.
     """
 
     name: ClassVar[str] = "position limit"
@@ -26,11 +27,12 @@ class PositionLimit(Term):
     margin: float = field(default=0.02, metadata=about("distance from each limit", unit="rad", least=0))
 
     def add_rows(self, program: Any) -> None:
-        """Constraints of the tendons; the joints' are bounds of variables."""
+        """Add the constraints of the tendons; joints have bounds of variables."""
         c, own = program.coordinates, program.robot.ranges
         lower, upper = (limit[program.robot.n :] for limit in inside(program.robot, self.margin))
         if not lower.size:
             return
+        # tendon lengths are of_y @ y + (matrix of the legs) @ legs
         of_y = np.pad(own.matrix[:, c.independent], ((0, 0), (c.base, 0)))
         for place, (y, legs) in program.body_spots():
             program.rows.add(

@@ -19,15 +19,17 @@ from impactopt.robots.actuators import numbers_of
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
-SIGNS = tuple(product((1.0, -1.0), repeat=2))  # of the servo's power, and of that of friction
+# Signs of the servo's power and of the power of Coulomb friction: as neither |torque x speed| nor |speed| is
+# smooth, each combination is a constraint.
+SIGNS = tuple(product((1.0, -1.0), repeat=2))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerLimit(Term):
     """The mechanical power of each motor is bounded, whether it drives or brakes.
 
-    It holds at the nodes of all motions and at the collocation points of all contacts. Friction counts as if
-    it always opposed the motor. If the limit is given by joint, joints that are not named have no bound.
+    The bound holds at the nodes of all motions and at the collocation points of all contacts. Friction counts
+    as if it always opposed the motor. If the limit is given by joint, other joints have no bound.
     """
 
     name: ClassVar[str] = "power limit"
@@ -62,11 +64,11 @@ class PowerLimit(Term):
         numbers = np.concatenate([robot.torque_limit, viscous, coulomb, per_power])
         at = program.add_block("motor_power", [[p.torque, *p.slots] for p in points], numbers)
         signs = SIGNS if coulomb.any() else SIGNS[::2]
-        for (k, point), (j, (way, against)) in product(enumerate(points), enumerate(SIGNS)):
-            if (way, against) not in signs:
+        for (k, point), (j, (servo, friction)) in product(enumerate(points), enumerate(SIGNS)):
+            if (servo, friction) not in signs:
                 continue
-            word = "giving" if way > 0 else "taking"
-            word += ("" if against > 0 else ", backwards") if coulomb.any() else ""
+            word = "giving" if servo > 0 else "taking"
+            word += ("" if friction > 0 else ", backwards") if coulomb.any() else ""
             program.rows.add(
                 term=self.name,
                 place=point.place,
@@ -78,15 +80,17 @@ class PowerLimit(Term):
 
 
 def motor_power(c: StanceCoordinates) -> BlockExpression:
-    """z = servo torque over limit (n), z of `joint_motion`;  p = torque limits, viscous and Coulomb friction,
-    1 over the power limit (n each).  out = power over limit, with each of the signs (n each).
+    """Mechanical power of each motor.
+
+    z = servo torque over limit (n), z of `joint_motion`;  p = torque limits, viscous and Coulomb friction,
+    1 over the power limit (n each);  out = power over limit, for each of `SIGNS` (n each).
     """
     n, motion = c.robot.n, joint_motion(c)
     torque = ca.SX.sym("torque", n)
     p = limit, viscous, coulomb, per_power = [ca.SX.sym(s, n) for s in ("limit", "viscous", "coulomb", "per")]
     v = motion.velocity
     out = {
-        f"power{k}": (way * limit * torque * v + against * coulomb * v + viscous * v**2) * per_power
-        for k, (way, against) in enumerate(SIGNS)
+        f"power{k}": (servo * limit * torque * v + friction * coulomb * v + viscous * v**2) * per_power
+        for k, (servo, friction) in enumerate(SIGNS)
     }
     return make_block([torque, *motion.z], list(p), out, motion.through)

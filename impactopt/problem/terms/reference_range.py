@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 class ReferenceRange(Term):
     """The servo's reference stays inside the joints' position limits until contact ends.
 
-    It coasts at the rates at contact, while the target brakes the robot. So in a long contact it goes farther
-    than the joints do, to where a robot's controller cuts it off. Hinges of soles follow no reference.
+    During contact the reference coasts at the rates at contact, while the target brakes the robot. So in a
+    long contact it moves farther than the joints, and a robot's controller would clip it. Hinges of soles
+    have no reference.
 
-    It holds with its defaults where a problem does not have it. Rows are then added once a motion without
-    them goes beyond; where it is given they are there from the start, and in strikes.
+    The term holds with its defaults in every problem. Its constraints are added once a plan violates them, or
+    from the start if the problem gives the term, also in strikes.
     """
 
     name: ClassVar[str] = "reference range"
@@ -33,12 +34,12 @@ class ReferenceRange(Term):
     margin: float = field(
         default=0.0, metadata=about("distance from each limit as contact ends", unit="rad", least=0)
     )
-    enabled: bool = field(default=True, metadata=about("false: it goes as far as it goes"))
+    enabled: bool = field(default=True, metadata=about("false: the reference is not bounded"))
 
     def limits(self, robot: Any) -> tuple[Any, Any]:
-        """(n,) Least and largest angles of the reference [rad], infinite for hinges."""
-        less = np.where(robot.hinges, -np.inf, self.margin)
-        return robot.lower + less, robot.upper - less
+        """Least and largest angles (n,) of the reference [rad], infinite for hinges."""
+        margin = np.where(robot.hinges, -np.inf, self.margin)
+        return robot.lower + margin, robot.upper - margin
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         phases = len(problem.contact_phases)
@@ -63,7 +64,7 @@ class ReferenceRange(Term):
             upper=upper[c.independent],
             **bounds,
         )
-        if c.legs:
+        if c.legs:  # their angles at the end of contact are variables already
             program.rows.add(
                 components=c.leg_labels,
                 affine=hit.coast_legs[hit.coast_legs.count - 1],
@@ -74,6 +75,9 @@ class ReferenceRange(Term):
 
 
 def coasted(c: StanceCoordinates, phases: int) -> BlockExpression:
-    """z = y, ydot at contact, duration [s] of each phase of the contact;  out = joints at its end [rad]."""
+    """Reference at the end of contact.
+
+    z = y, ydot at contact, duration [s] of each phase of the contact;  out = joints at its end [rad].
+    """
     y, rate, times = ca.SX.sym("y", c.ny), ca.SX.sym("rate", c.ny), ca.SX.sym("T", phases)
     return make_block([y, rate, times], [], {"joints": (y + rate * ca.sum1(times))[c.base :]}, lanes=1)

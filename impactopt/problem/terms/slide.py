@@ -18,36 +18,36 @@ from impactopt.problem.violation import millimetres
 class Slide(Term):
     """The striking point stays near the hit point until contact ends.
 
-    Bounded along each of two tangents, with the expected target. With little friction at the hit, or none, a
-    long push at an angle may slide off what it pushes: in replays a target's face ends 0.2 m from the hit
-    point.
+    Its offset along each of two tangents is bounded, with the expected target. With little friction or none,
+    a long push at an angle may slide off the target, whose face ends 0.2 m from the hit point in replays.
 
-    It holds with its defaults where a problem does not have it. Rows are then added once a motion without
-    them goes beyond; where it is given they are there from the start, and in strikes.
+    The term holds with its defaults in every problem. Its constraints are added once a plan violates them, or
+    from the start if the problem gives the term, also in strikes.
     """
 
     name: ClassVar[str] = "slide"
     unit: ClassVar[str] = "m"
-    most: float = field(default=0.1, metadata=about("largest way along each tangent", unit="m", above=0))
-    enabled: bool = field(default=True, metadata=about("false: it goes as far as it goes"))
+    most: float = field(default=0.1, metadata=about("largest offset along each tangent", unit="m", above=0))
+    enabled: bool = field(default=True, metadata=about("false: the offset is not bounded"))
 
     def add_rows(self, program: Any) -> None:
         problem = program.problem
         after = program.follow_spots()[0][1][0]
         for k, tangent in enumerate(across(problem.normal), start=1):
-            place = float(tangent @ problem.point)
-            row = len(program.rows.lower)
-            program.builder.follow(partial(self._follow, row=row, tangent=tangent))
+            hit = float(tangent @ problem.point)
+            index = len(program.rows.lower)
+            program.builder.follow(partial(self._follow, index=index, tangent=tangent))
             program.rows.add(
                 term=self.name,
                 place="after contact",
                 components=[f"tangent {k}"],
                 outputs=np.array([program.add_block("approach", [[after]], tangent)]),
-                lower=place - self.most,
-                upper=place + self.most,
+                lower=hit - self.most,
+                upper=hit + self.most,
                 measure=millimetres("too far"),
             )
 
-    def _follow(self, b: Any, row: int, tangent: Any) -> None:
-        place = float(tangent @ b.problem.point)
-        b.rows.bound(row, place - self.most, place + self.most)
+    def _follow(self, b: Any, index: int, tangent: Any) -> None:
+        """Move the bounds of a constraint to another hit point."""
+        hit = float(tangent @ b.problem.point)
+        b.rows.bound(index, hit - self.most, hit + self.most)

@@ -20,8 +20,8 @@ from impactopt.problem.violation import Measure
 class TargetSpeed(Term):
     """The target's speed at separation is bounded.
 
-    Along the normal: what comes towards the striker has one below zero. Zero at both ends is a catch. As it
-    may be slow then, the striker keeps behind it after contact.
+    The speed is along the normal, so that of a target that moves towards the striker is negative. With both
+    bounds at zero the target is caught. As it may be slow after contact, the striker then stays behind it.
     """
 
     name: ClassVar[str] = "target speed"
@@ -62,13 +62,19 @@ class TargetSpeed(Term):
 
 
 def speed(target: Target) -> BlockExpression:
-    """z = the target's state;  p = its numbers;  out = speed of its surface along the normal [m/s]."""
+    """Speed of the target's surface.
+
+    z = target's state;  p = target's parameters;  out = speed along the normal [m/s].
+    """
     state, numbers, found = _speed(target)
     return make_block([state], [numbers], {"speed": found}, lanes=2)
 
 
 def way(target: Target) -> BlockExpression:
-    """z = the target's state, T [s];  p = its numbers;  out = how far its surface goes in T [m]."""
+    """Travel of the target's surface at constant speed.
+
+    z = target's state, T [s];  p = target's parameters;  out = travel in T [m].
+    """
     state, numbers, found = _speed(target)
     T = ca.SX.sym("T")
     return make_block([state, T], [numbers], {"way": T * found}, lanes=2)

@@ -11,7 +11,7 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueLimit(Term):
-    """|torque| is at most a fraction of each joint's limit; the rest is left to the servo."""
+    """|torque| is at most a fraction of each joint's limit; the servo has the rest for its feedback."""
 
     name: ClassVar[str] = "torque limit"
     unit: ClassVar[str] = "of limit"

@@ -16,9 +16,9 @@ from impactopt.problem.violation import Measure
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueRate(Term):
-    """|d torque/dt| is bounded, from node to node of swing and follow-through.
+    """|d torque/dt| is bounded, between successive nodes of swing and follow-through.
 
-    If the limit is given by joint, joints that are not named have no bound.
+    If the limit is given by joint, other joints have no bound.
     """
 
     name: ClassVar[str] = "torque rate"
@@ -30,7 +30,7 @@ class TorqueRate(Term):
     )
 
     def add_rows(self, program: Any) -> None:
-        """The torques are variables, so these constraints are linear, of a duration that is one too."""
+        """Add the constraints, which are linear in torques and duration, both variables."""
         names = program.robot.joint_names
         limit = of_joints(self.limit, names)
         joints = np.flatnonzero(np.isfinite(limit))
@@ -42,11 +42,11 @@ class TorqueRate(Term):
                 step, most = (two - one)[joints], course.T.apply(np.ones((len(joints), 1))) * (rate * (b - a))
                 place = course.place_at((a + b) / 2)
                 place = replace(place, name=f"{place.name}, from {100 * a:.1f} %")
-                for way, sign in (("rising", 1.0), ("falling", -1.0)):
+                for word, sign in (("rising", 1.0), ("falling", -1.0)):
                     program.rows.add(
                         term=self.name,
                         place=place,
-                        components=[f"{label} {way}" for label in labels],
+                        components=[f"{label} {word}" for label in labels],
                         affine=step * sign - most,
                         upper=0,
                         measure=[Measure("%", 100 / r, "over its limit", course.T * (b - a)) for r in rate],

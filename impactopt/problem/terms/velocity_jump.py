@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class VelocityJump(Term):
     """|joint speed after contact - before it| is bounded, with all targets.
 
-    If the limit is given by joint, joints that are not named have no bound.
+    If the limit is given by joint, other joints have no bound.
     """
 
     name: ClassVar[str] = "velocity jump"
@@ -37,7 +37,7 @@ class VelocityJump(Term):
         return {"leg_jump": BlockRecipe(lambda: leg_jump(coordinates))}
 
     def add_rows(self, program: Any) -> None:
-        """Linear in the rates of the independent joints; those of the legs follow from them."""
+        """Add the constraints: linear ones in the rates of independent joints, and a block's for the legs."""
         c = program.coordinates
         robot = program.robot
         most = np.where(robot.passive, np.inf, of_joints(self.limit, robot.joint_names))
@@ -68,7 +68,10 @@ class VelocityJump(Term):
 
 
 def leg_jump(c: StanceCoordinates) -> BlockExpression:
-    """z = z of `joint_motion` before contact, and after it;  out = change of the legs' rates [rad/s] (nl)."""
+    """Jump of the legs' rates.
+
+    z = z of `joint_motion` before contact, and after it;  out = change of the legs' rates [rad/s] (nl).
+    """
     before, after = joint_motion(c), joint_motion(c)
     legs = [int(j) for j in c.dependent]
     change = ca.vertcat(*[after.velocity[j] - before.velocity[j] for j in legs])

@@ -14,7 +14,8 @@ from impactopt.robots.robot import Robot
 class VelocityLimit(Term):
     """|joint velocity| is at most a fraction of each joint's limit.
 
-    Everywhere: it holds on the spline's velocity control points; for the legs at the nodes.
+    The bounds are on the spline's velocity control points, so they hold everywhere; those of the legs are at
+    the nodes.
     """
 
     name: ClassVar[str] = "velocity limit"
@@ -22,5 +23,5 @@ class VelocityLimit(Term):
     fraction: float = field(default=0.95, metadata=about("share of the limit", above=0, most=1))
 
     def most(self, robot: Robot) -> Any:
-        """The largest magnitude (n,) of each joint's velocity [rad/s] or [m/s]."""
+        """Largest magnitude (n,) of each joint's velocity [rad/s] or [m/s]."""
         return self.fraction * robot.velocity_limit

@@ -260,8 +260,8 @@ class _Replay(MujocoRobot):
         times = self.servo.time
         row = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
         since = row
-        if self.wbc is not None and self.wbc.target.recovers(t):
-            since = min(int(np.searchsorted(times, self.wbc.target.contact[1])), row)
+        if self.wbc is not None and self.wbc.tracking.recovers(t):
+            since = min(int(np.searchsorted(times, self.wbc.tracking.contact[1])), row)
         lean = float(self.base_errors(slice(since, row + 1)).min())
         height, planned = self.data.qpos[2], float(self.reference_q[since : row + 1, 2].min())
         if lean > FALLEN_TILT:

@@ -13,7 +13,7 @@ from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, check_choice
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
-from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, Touched
+from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, UnintendedContact
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
@@ -95,7 +95,8 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
     touched = simulation.touched
     if simulation.fall is None or not problem.keeps_apart:  # this replay's robot has no solids
         touched = tuple(
-            Touched(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth) for t in found.touches
+            UnintendedContact(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth)
+            for t in found.touches
         )
     return replace(
         simulation,

@@ -16,7 +16,7 @@ from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.robots.loads import DriveLoads, cop_margin, least_margins
 from impactopt.robots.robot import Robot
-from impactopt.simulation.collision_geometry import Solids, Touched
+from impactopt.simulation.collision_geometry import Solids, UnintendedContact
 from impactopt.simulation.motors import MotorCut
 
 Array = NDArray[np.float64]
@@ -165,7 +165,7 @@ class Simulation:
     posture_error: float
     fall: str | None
     beyond_range: tuple[str, float] = ("", 0.0)
-    touched: tuple[Touched, ...] = ()
+    touched: tuple[UnintendedContact, ...] = ()
     clearance: float = np.nan
     nearest: tuple[str, ...] = ()
     missed: bool = False

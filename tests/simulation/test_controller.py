@@ -350,7 +350,7 @@ def test_links_are_as_far_apart_as_their_hulls(monkeypatch: pytest.MonkeyPatch) 
         pin.forwardKinematics(model, data, posture)
         expected.append(np.linalg.norm(data.oMi[joints[0]].translation - data.oMi[joints[1]].translation))
     monkeypatch.setattr(collision_geometry, "NEAR", 10.0)  # [m]: feet are near each other
-    np.testing.assert_allclose(feet.apart(model, np.array([q, turned])), expected, atol=5e-5)
+    np.testing.assert_allclose(feet.least_distance(model, np.array([q, turned])), expected, atol=5e-5)
 
 
 def test_only_links_that_a_shift_brings_nearer_are_looked_at() -> None:

@@ -117,10 +117,10 @@ def _clear_fraction(model: Any, reference: Any, scene: Scene, shift: Array) -> f
     if distance_inside(scene.polygon, np.array(capture)).min() < MIN_CAPTURE_MARGIN:
         return 1.0
     links = scene.solids.links_between(model, shift)
-    required = np.minimum(links.apart(model, q), LINK_CLEARANCE)
+    required = np.minimum(links.least_distance(model, q), LINK_CLEARANCE)
     for fraction in SHIFT_FRACTIONS:
         shifted = np.array([pin.integrate(model, posture, fraction * shift) for posture in q])
-        if np.all(links.apart(model, shifted) >= required):
+        if np.all(links.least_distance(model, shifted) >= required):
             return fraction
     return 0.0
 

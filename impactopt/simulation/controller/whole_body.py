@@ -292,7 +292,7 @@ class StanceProblem:
     def __init__(
         self, robot: Robot, scene: Scene, standing: NDArray[np.intp], settings: ControllerSettings, q0: Array
     ) -> None:
-        """standing : indices of the scene's soles that stand.  q0 (nq,) : configuration with them in place."""
+        """standing : indices of the scene's soles that stand.  q0 (nq,) : configuration with them placed."""
         self.frames = tuple(scene.soles[k] for k in standing)
         self.swing_feet = [robot.model.getFrameId(name) for name in scene.soles if name not in self.frames]
         self.dynamics = ConstrainedDynamics(

@@ -105,7 +105,7 @@ def contact_scales(body: Body, forces: Forces, rate: float, horizon: float) -> S
     at_rest = np.zeros(forces.target.n_states)
     torque = np.zeros(body.n)
     pushed = body.accelerate(torque, 0.0) - body.accelerate(torque, 1.0)
-    mobility, large = float((body.rows @ pushed)[0]), 1e9  # [N] that any target gives way to
+    mobility, large = float((body.normal_jacobian @ pushed)[0]), 1e9  # [N] that any target gives way to
 
     def speed_by(force: float) -> float:
         rates = np.array(forces.target_rates(at_rest, force), dtype=float)
@@ -288,7 +288,7 @@ class Motion:
         self._looks = self._looks + 1
         nv, n = self._nv, self._n
         u, v = y[:nv], y[nv : 2 * nv]
-        speed = self.body.look(pin.integrate(self.body.model, self._q, u), v)
+        speed = self.body.update(pin.integrate(self.body.model, self._q, u), v)
         rate = speed - self.forces.target_speed(y[2 * nv + 1 : -1])
         return _State(time, y, speed, rate, self.forces.demand(time, u[-n:], v[-n:]))
 
@@ -363,7 +363,7 @@ class Motion:
             torque,
             demand,
             wrench,
-            self.body.places(),
+            self.body.origins(),
         )
 
     def peak(self, run: Run) -> float:

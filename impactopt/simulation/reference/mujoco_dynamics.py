@@ -75,7 +75,7 @@ class MujocoDynamics(ReferenceModel):
         self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
     ) -> tuple[Collision, float]:
         body = DenseBody(*self._held, normal, self.contact_friction)
-        rate = body.look(q, v) - forces.target_speed(np.zeros(forces.target.n_states))
+        rate = body.update(q, v) - forces.target_speed(np.zeros(forces.target.n_states))
         scales = contact_scales(body, forces, rate, self.horizon)
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
@@ -175,13 +175,13 @@ def march(
     instants: list[Instant] = []
     impulse = travel = peak = 0.0
     target = np.zeros(forces.target.n_states)
-    angles = data.qpos[world.place].copy()
+    angles = data.qpos[world.qpos_index].copy()
     k = 0
     while True:
         world.mujoco.mj_step1(world.world, data)
         speed = float(world.speeds_along(normal)[0])
         if k == 0:
-            start = float(normal @ world.places()[0])
+            start = float(normal @ world.striking_points()[0])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
             raise InputError(f"step [s]: {step:g} is unstable here; give MujocoDynamics a shorter one")
         if k > _MOST_STEPS:
@@ -193,8 +193,8 @@ def march(
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)
         rate = speed - target_speed
-        depth = float(normal @ world.places()[0]) - start - travel
-        demand = forces.demand(time, data.qpos[world.place] - angles, velocity)
+        depth = float(normal @ world.striking_points()[0]) - start - travel
+        demand = forces.demand(time, data.qpos[world.qpos_index] - angles, velocity)
         phase: Phase = forces.phase(demand, velocity, depth, rate, target)
         force = forces.contact(depth, rate, phase.compressing) if phase.touching else 0.0
         if scales is not None and phase.touching:

@@ -178,7 +178,7 @@ def comparison_tables(found: Comparison) -> list[Table]:
     tables = [values]
     for what, differences in (("problems", found.problem), ("versions", found.versions)):
         if differences:
-            table = _empty_comparison(f"differences of the {what}", found.records)
+            table = _empty_comparison(f"{what}: differences", found.records)
             for difference in differences:
                 table.add_row(_plain(difference.key), *map(_plain, difference.values))
             tables.append(table)

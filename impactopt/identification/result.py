@@ -186,8 +186,8 @@ class Identification:
         ):
             out.append(
                 f"the residual force of {best.name}, {best.force_left_pct:.2g} % of the peak, is not white "
-                f"noise (correlation of neighbouring samples: {best.correlation:.2f}): the law is another one, "
-                "or the log is filtered; intervals are too narrow then"
+                f"noise (correlation of neighbouring samples: {best.correlation:.2f}): another law holds, or "
+                "the log is filtered; intervals are too narrow then"
             )
         elif len(self.fits) > 1:
             out.append("the best of these laws need not be the true one")

@@ -93,9 +93,8 @@ def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
         )
     normal = a["replayed_sole_ground"][:, :, 2]
     for k in range(normal.shape[1]):
-        loaded = normal[:, k] >= BEARS * np.median(
-            normal.sum(axis=1)
-        )  # the median is the weight: most of the motion is slow
+        # the median is the weight, because most of the motion is slow
+        loaded = normal[:, k] >= BEARS * np.median(normal.sum(axis=1))
         for which, colour in enumerate(PHASE_COLOURS):
             keep = loaded & (phase == which)
             points: Array = zmp(a["replayed_sole_ground"][keep, k])

@@ -207,8 +207,8 @@ def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
 
 def identified_table(found: Mapping[str, Any]) -> Table:
     """Table of contact laws and their parameters, best law first; `found` as in `identify --json`."""
-    blows = "one blow" if found["blows"] == 1 else f"{found['blows']} blows"
-    table = Table(title=_plain(f"{found['log']}: {blows}"), title_justify="left")
+    impacts = "one impact" if found["blows"] == 1 else f"{found['blows']} impacts"
+    table = Table(title=_plain(f"{found['log']}: {impacts}"), title_justify="left")
     for name in ("", "value", f"{100 * found['level']:g} % interval"):
         table.add_column(name, justify="right" if name else "left")
     for law in found["laws"]:

@@ -68,7 +68,7 @@ class Servo:
         """Torque demand (n,) [N m], and the demand after saturation."""
         target, n = self.target(t), self.n
         error = target[:n] - angles
-        if self.continuous.size:
+        if self.continuous.size:  # the shorter way round
             error[self.continuous] = np.remainder(error[self.continuous] + np.pi, 2 * np.pi) - np.pi
         demand = target[2 * n :] + self.kp * error + self.kd * (target[n : 2 * n] - rates)
         return demand, np.clip(demand, -self.limit, self.limit)
@@ -153,6 +153,8 @@ class Motors:
         """Torque (n,) [N m], clipped to the motors' lines at joint rates (n,)."""
         if not self.lines:
             return torque
+        # back-EMF and viscous friction are linear in the rate; all of them shift both limits against the
+        # motion
         lost = self._slope * rates + self._coulomb * np.sign(rates)
         return np.clip(torque, -self._stall - lost, self._stall - lost)
 
@@ -164,13 +166,13 @@ class Motors:
         """Torque (n,) [N m] a time [s] later, for a constant wanted torque (n,)."""
         if not self._slow:
             return wanted
-        return wanted + np.exp(-self._rate * time) * (torque - wanted)
+        return wanted + np.exp(-self._rate * time) * (torque - wanted)  # first-order lag
 
     def mean(self, torque: Array, wanted: Array, time: float) -> Array:
         """Mean torque (n,) [N m] during a time [s], for a constant wanted torque (n,)."""
         if not self._slow:
             return wanted
-        decay = self._rate * time
+        decay = self._rate * time  # integral of the exponential in `after`, over the time
         return wanted - np.expm1(-decay) / decay * (torque - wanted)
 
 
@@ -187,6 +189,7 @@ class Delay:
         """Stores the commanded values (..., n) of a time [s], later than all before."""
         if not self._longest:
             return
+        # the oldest needed instant is the last one before the longest delay
         while len(self._kept) > 1 and self._kept[1][0] <= t - self._longest:
             self._kept.popleft()
         self._kept.append((t, values))

@@ -169,6 +169,7 @@ def _solids(
             shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": f"solid {k}"}
         else:
             shape = primitive(mujoco, solid)
+        # no general collisions: only the explicit pairs below collide
         body.add_geom(name=f"solid {k}", contype=0, conaffinity=0, mass=0.0, **shape)
     for one, other in near:
         spec.add_pair(
@@ -271,6 +272,7 @@ def _add_joint(mujoco: Any, spec: Any, body: Any, robot: Robot, j: int, at: Any)
         type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=at.rotation @ (subspace[3:] if turns else subspace[:3]),
         pos=at.translation,
+        # a follower's armature is already in that of its leader
         armature=0.0 if coupling else float(model.armature[model.joints[j].idx_v]),
         **spring,
     )

@@ -80,6 +80,7 @@ class Body(ABC):
         """Largest rate [1/s] at which joint damping (n, n) alone slows the joints, in the current state."""
         no_force = np.zeros(len(self.strikers))
         without = self.accelerate(np.zeros(self.n), no_force)
+        # columns of d a / d tau; times the damping, they give the rates at which velocities decay
         by_torque = [(self.accelerate(unit, no_force) - without)[-self.n :] for unit in np.eye(self.n)]
         return float(np.abs(np.linalg.eigvals(np.column_stack(by_torque) @ damping)).max())
 
@@ -135,6 +136,7 @@ class DenseBody(Body):
 
     def update(self, q: Array, v: Array) -> float:
         model, data, nv = self.model, self.data, self.nv
+        # with zero acceleration, a frame's classical acceleration is its drift dJ/dt v
         pin.forwardKinematics(model, data, q, v, self._zero)
         pin.computeJointJacobians(model, data)
         for k, i in enumerate(self.frames):
@@ -145,7 +147,7 @@ class DenseBody(Body):
             self._right[rows] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
         self._update_contact(q, v)
         self._matrix[:nv, :nv] = mass_matrix(model, data, q)
-        self._bias = pin.nonLinearEffects(model, data, q, v)
+        self._bias = pin.nonLinearEffects(model, data, q, v)  # springs are in `_generalized_forces`
         return float(self.normal_jacobian[0] @ v)
 
     def accelerate(self, torque: Array, force: float | Array) -> Array:
@@ -180,6 +182,7 @@ class PinocchioBody(Body):
         self._constraint_data = pin.StdVec_RigidConstraintData()
         for i in self.frames:
             frame = model.frames[i]
+            # between the frame and the universe, joint 0
             constraint = pin.RigidConstraintModel(
                 pin.ContactType.CONTACT_6D,
                 model,
@@ -218,6 +221,7 @@ class PinocchioBody(Body):
 
     def after_touchdown(self, v: Array) -> Array:
         """Velocity (nv,) after an inelastic impact that stops the fixed frames, in the current state."""
+        # v - H^-1 J' (J H^-1 J')^-1 J v: the impulse at the frames that makes J v zero
         J = np.vstack([self._jacobian(frame) for frame in self.frames])
         H = mass_matrix(self.model, self._dynamics, self._state[0])
         response = np.linalg.solve(H, J.T)
@@ -228,7 +232,7 @@ class PinocchioBody(Body):
             return self._dense.wrenches()
         out = np.empty((len(self.frames), 6))
         for k, placement in enumerate(self.placements()):
-            local = self._constraint_data[k].contact_force
+            local = self._constraint_data[k].contact_force  # in the frame's axes
             out[k, :3] = placement.rotation @ local.linear
             out[k, 3:] = placement.rotation @ local.angular
         return out

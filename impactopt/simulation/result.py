@@ -255,6 +255,7 @@ class Simulation:
         if not hit and self.fall is None and not self.missed:
             raise InputError("the simulated motion never touched the target")
         known = bool(np.isfinite(self.clearance))
+        # without contact, the motion is divided at the planned one
         phase = self.phase() if hit else (self.time >= self.expected).astype(int)
         names = PHASES if hit else PHASES_OF_MISS
         out: dict[str, Any] = {
@@ -571,7 +572,7 @@ def simulation_of(
     """
     if not recorded:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
-    columns = [np.array(c) for c in zip(*recorded, strict=True)]
+    columns = [np.array(c) for c in zip(*recorded, strict=True)]  # one array for each quantity
     time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, corners, gear, stance = columns
     stance = stance if scene.standing.size else stance[:0]
     slip, lift = slip_and_lift(scene, corners, stance)
@@ -615,7 +616,7 @@ def simulation_of(
 
 def _jump(time: Array, rates: Array, start: float, end: float) -> Array:
     """Change (n,) of the joints' rates (k, n) from before the contact to after it; nan without contact."""
-    if not (np.isfinite(start) and end <= time[-1]):
+    if not (np.isfinite(start) and end <= time[-1]):  # no contact, or it has not ended
         return np.full(rates.shape[1], np.nan)
     before = max(int(np.searchsorted(time, start, side="right")) - 1, 0)
     return np.asarray(rates[int(np.searchsorted(time, end))] - rates[before])

@@ -97,6 +97,7 @@ def draw_perturbations(n: int, seed: int = 0, ranges: PerturbationRanges | None 
     unit = np.random.default_rng(seed).random((n, len(bounds)))
     columns, planned = {}, Perturbation(period=chosen.period)
     for (name, (low, high)), u in zip(bounds.items(), unit.T, strict=True):
+        # log-uniform, or uniform
         value = low * (high / low) ** u if name in LOGARITHMIC else low + (high - low) * u
         columns[name] = np.clip(value, low, high)  # against rounding
     return [_changed(planned, {name: float(value[k]) for name, value in columns.items()}) for k in range(n)]

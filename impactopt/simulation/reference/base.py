@@ -131,12 +131,14 @@ class Forces:
     def margins(self, phase: Phase, demand: Array, velocity: Array, penetration: float, rate: float) -> Array:
         """Event functions of servo, friction and contact: none is negative during `phase`."""
         saturated, sliding = phase.saturated, phase.sliding
+        # distance of each joint's demand from its limit, on its side of it; likewise of the transition band
         out = [np.where(saturated == 0, self.limit - np.abs(demand), saturated * demand - self.limit)]
         if self.coulomb.any():
             band = self.transition
             out.append(np.where(sliding == 0, band - np.abs(velocity), sliding * velocity - band))
-        if phase.compressing:
+        if phase.compressing:  # ends when the rate changes its sign
             return np.concatenate([*out, [rate]])
+        # restitution ends when the force vanishes, or the two approach again
         force = self.contact(penetration, rate, False)
         if force <= 0:
             # Beyond separation a law may be constant at zero. A negative value makes it an event all the

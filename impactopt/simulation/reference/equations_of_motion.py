@@ -127,6 +127,7 @@ def contact_scales(body: Body, forces: Forces, rate: float, horizon: float) -> S
     stopped = [forces.contact(x, closing, True) * inverse_mass * x > closing**2 for x in depths]
     time = float(depths[stopped.index(True) if True in stopped else -1]) / closing
     impulse = closing / inverse_mass
+    # change of the target's states by the larger of their rates at rest and after this time
     first = np.array(forces.target_rates(at_rest, impulse / time), dtype=float)
     second = np.array(forces.target_rates(first * time, impulse / time), dtype=float)
     typical = np.array(forces.target.typical or np.ones(at_rest.size))
@@ -270,7 +271,7 @@ class Motion:
             state.y,
             until,
             rtol=tolerance,
-            atol=0.1 * tolerance * sizes,
+            atol=0.1 * tolerance * sizes,  # for states that pass through zero
             first_step=min(first, until - state.time),
         )
 
@@ -362,7 +363,7 @@ class Motion:
         a = self.body.accelerate(torque - forces.friction(velocity, phase), force)
         slope = np.empty_like(y)
         slope[:nv] = y[nv : 2 * nv]
-        if self._floating:
+        if self._floating:  # du/dt = J_log(u) v; the other joints' coordinates are Euclidean
             slope[:6] = pin.Jlog6(pin.exp6(y[:6])) @ y[nv : nv + 6]
         slope[nv : 2 * nv] = a
         slope[2 * nv], slope[-1] = rate, force

@@ -79,6 +79,7 @@ class MujocoDynamics(ReferenceModel):
         scales = contact_scales(body, forces, rate, self.horizon)
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
+        # steps that resolve servo and friction; halved until they resolve the contact too
         step = min(self.step, 1 / fastest) if fastest > 0 else self.step
         first = None
         while first is None:
@@ -186,7 +187,9 @@ def march(
     angles = data.qpos[world.qpos_index].copy()
     k = 0
     while True:
-        world.mujoco.mj_step1(world.world, data)
+        world.mujoco.mj_step1(
+            world.world, data
+        )  # positions and velocities; forces may be set before mj_step2
         speed = float(world.speeds_along(normal)[0])
         if k == 0:
             start = float(normal @ world.striking_points()[0])
@@ -205,6 +208,7 @@ def march(
         demand = forces.demand(time, data.qpos[world.qpos_index] - angles, velocity)
         phase: Phase = forces.phase(demand, velocity, depth, rate, target)
         force = forces.contact(depth, rate, phase.compressing) if phase.touching else 0.0
+        # the steps have to resolve the contact's fastest mode, with a factor of two of tolerance
         if scales is not None and phase.touching:
             fastest = _fastest(forces, depth, rate, phase.compressing, scales)
             if fastest * step > 2 * _RESOLUTION:
@@ -225,6 +229,7 @@ def march(
         if ends:
             return collision_from(instants, *end, impulse, peak, target, soles, forces, not phase.touching)
         impulse += step * force
+        # semi-implicit Euler as in MuJoCo: the travel follows from the new speed
         target = target + step * np.array(forces.target_rates(target, force), dtype=float)
         travel += step * forces.target_speed(target)
         k += 1

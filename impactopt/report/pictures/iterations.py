@@ -34,9 +34,8 @@ def draw_iterations(figure: FigureBase, record: Record) -> None:
     top.plot(count, gain, color=BLUE)
     # the objective of the first, very infeasible iterates is meaningless
     top.set_ylim(*_middle_of(gain))
-    several = "objectives" in record.summary.get(
-        "problem", {}
-    )  # other than the impulse, in units of their own
+    # objectives other than the impulse have units of their own
+    several = "objectives" in record.summary.get("problem", {})
     top.set(ylabel="maximized [-]" if several else "maximized [N s]")
     for key, label, style, colour in (
         ("max_violation", "largest violation", "-", VERMILION),

@@ -187,9 +187,7 @@ def march(
     angles = data.qpos[world.qpos_index].copy()
     k = 0
     while True:
-        world.mujoco.mj_step1(
-            world.world, data
-        )  # positions and velocities; forces may be set before mj_step2
+        world.mujoco.mj_step1(world.world, data)  # up to velocities; forces are set before mj_step2
         speed = float(world.speeds_along(normal)[0])
         if k == 0:
             start = float(normal @ world.striking_points()[0])

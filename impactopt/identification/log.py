@@ -242,12 +242,12 @@ _MAX_DURATION, _MAX_SPEED, _MIN_MASS, _MAX_MASS = 1.0, 50.0, 1e-3, 1e4  # s, m/s
 class MeasuredImpact:
     """Samples (k,) of one impact, with first estimates.
 
-    time, force        : [s], [N]
-    motion, travels    : travel [m] if travels, else speed [m/s]
-    clipped            : samples whose force was beyond the sensor's range
-    touch              : index of the first sample in contact
+    time, force : [s], [N]
+    motion, travels : travel [m] if travels, else speed [m/s]
+    clipped : samples whose force was beyond the sensor's range
+    touch : index of the first sample in contact
     duration, speed, mass : first estimates of contact time [s], speed at contact [m/s], and mass [kg]
-    model_mass [kg]    : effective mass by the robot's model, at the touch; nan if unknown
+    model_mass [kg] : effective mass by the robot's model, at the touch; nan if unknown
     """
 
     time: Array

@@ -47,18 +47,17 @@ class Estimate:
 class LawFit:
     """Fit of one law to all impacts of a log together.
 
-    law                  : with the fitted parameters
-    estimates            : of its parameters and of `effective_mass`, by name
-    speeds, touches      : speed [m/s] of each impact at the touch, and instant [s] of the touch
-    held                 : fixed parameters, by name
-    force_left [N]       : root mean square of the force's residuals
-    force_left_pct       : the same, in % of the largest force
-    motion_left          : root mean square of the motion's residuals [m/s], or [m] for joint positions
-    correlation          : of the force's residuals at neighbouring samples; about 0 for white noise, closer
-        to
-                           1 the less the law fits
-    aic                  : Akaike's information criterion, with unknown noise of force and motion; only
-                           differences between laws are meaningful
+    law : with the fitted parameters
+    estimates : of its parameters and of `effective_mass`, by name
+    speeds, touches : speed [m/s] of each impact at the touch, and instant [s] of the touch
+    held : fixed parameters, by name
+    force_left [N] : root mean square of the force's residuals
+    force_left_pct : the same, in % of the largest force
+    motion_left : root mean square of the motion's residuals [m/s], or [m] for joint positions
+    correlation : of the force's residuals at neighbouring samples; about 0 for white noise, closer
+        to 1 the less the law fits
+    aic : Akaike's information criterion, with unknown noise of force and motion; only differences between
+        laws are meaningful
     """
 
     law: ContactLaw
@@ -129,13 +128,13 @@ class LawFit:
 class Identification:
     """Contact laws fitted to a log.
 
-    log              : its name
-    fits             : of each law, the best first
-    samples          : number of fitted samples
-    level            : of the intervals
+    log : its name
+    fits : of each law, the best first
+    samples : number of fitted samples
+    level : of the intervals
     target_mass [kg] : infinite for a fixed target
     clipped, top [N] : number of samples of each impact whose force was cut off at `top`, and is not fitted
-    model_mass [kg]  : effective mass of each impact by the robot's model; nan if unknown
+    model_mass [kg] : effective mass of each impact by the robot's model; nan if unknown
     """
 
     log: str

@@ -39,14 +39,14 @@ class Track:
     """One motion at k instants.
 
     time (k,) [s]
-    places (k, joints, 7)           : position [m] and quaternion x, y, z, w of each joint of the model in the
-                                      world, the universe first
-    hand, mass (k, 3) [m]           : striking point, centre of mass
-    force (k,) [N]                  : on the target along its normal
-    travel (k,) [m]                 : of the target along its normal, at most FAR
+    places (k, joints, 7) : position [m] and quaternion x, y, z, w of each joint of the model in the world,
+        the universe first
+    hand, mass (k, 3) [m] : striking point, centre of mass
+    force (k,) [N] : on the target along its normal
+    travel (k,) [m] : of the target along its normal, at most FAR
     zmp (k, 2) [m], ground (k, 3) [N] : ZMP, and force of the ground on the robot; nan if unknown
-    contact_start, contact_end [s]  : nan without contact
-    missing                         : whether there is no target
+    contact_start, contact_end [s] : nan without contact
+    missing : whether there is no target
     """
 
     name: str

@@ -346,13 +346,12 @@ def quaternion(rotation: Any) -> list[float]:
 class MujocoRobot:
     """A robot in a compiled MuJoCo model, with contact forces at striking points.
 
-    world, data              : MuJoCo's model and its data
-    dof, qpos_index          : indices of the joints' rates in qvel and angles in qpos
-    sites                    : of the h striking points
-    normal_jacobian (h, nv)  : of their speeds along the normal, at the last call of `speeds_along`
-    force_map (h, nv)        : generalized forces of a unit of normal force at each, friction included;
-        without
-                               friction the same array
+    world, data : MuJoCo's model and its data
+    dof, qpos_index : indices of the joints' rates in qvel and angles in qpos
+    sites : of the h striking points
+    normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `speeds_along`
+    force_map (h, nv) : generalized forces of a unit of normal force at each, friction included;
+        without friction the same array
     """
 
     def __init__(

@@ -232,10 +232,10 @@ class Followed:
     """Result of the contact alone, from its planned beginning.
 
     impulse [N s] : on the target
-    peak [N]      : largest force of all strikers together
-    outcome       : of the target, by name and unit
-    touches       : start and end [s] of each touch, since the planned beginning of contact
-    events        : times [s] since then at which the target switched
+    peak [N] : largest force of all strikers together
+    outcome : of the target, by name and unit
+    touches : start and end [s] of each touch, since the planned beginning of contact
+    events : times [s] since then at which the target switched
     """
 
     impulse: float

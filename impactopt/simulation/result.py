@@ -78,19 +78,19 @@ def travelled(time: Array, speed: Array, contact_start: float) -> Array:
 class Scene:
     """Target, contact and ground of a replay.
 
-    point (3,) [m]     : where the target's surface is to be hit
-    normal (3,)        : direction in which the target is pushed
-    law, target        : contact law and target dynamics
-    striker            : frame of the model that hits
-    soles              : frames of the model that the plan fixes to the ground
-    corners            : (k, 2) [m] of each sole, in the plane of its frame, counter-clockwise
+    point (3,) [m] : where the target's surface is to be hit
+    normal (3,) : direction in which the target is pushed
+    law, target : contact law and target dynamics
+    striker : frame of the model that hits
+    soles : frames of the model that the plan fixes to the ground
+    corners : (k, 2) [m] of each sole, in the plane of its frame, counter-clockwise
     polygon (k, 2) [m] : support polygon on the ground, counter-clockwise
-    solids             : bodies that can touch each other
-    hands              : frames of the model that hold on to where the reference has them at first
-    friction           : of the striking points on the target
-    second             : frame and point (3,) [m] of another striker that hits the same target
-    standing           : (stances, soles) soles that stand in each stance phase; (0, 0): one stance, on all
-    polygons           : support polygon of each stance phase; (): one stance
+    solids : bodies that can touch each other
+    hands : frames of the model that hold on to where the reference has them at first
+    friction : of the striking points on the target
+    second : frame and point (3,) [m] of another striker that hits the same target
+    standing : (stances, soles) soles that stand in each stance phase; (0, 0): one stance, on all
+    polygons : support polygon of each stance phase; (): one stance
     """
 
     point: Array
@@ -120,53 +120,50 @@ class Simulation:
 
     Histories:
 
-    q (k, nq), v (k, nv)           : Pinocchio's
-    force (k,) [N]                 : contact force of all strikers
-    target_speed, hand_speed (k,)  : [m/s] along the normal
-    demand, torque (k, n) [N m]    : of the servo before saturation, and of the motors
-    gear (k, n) [N m]              : torque of largest magnitude through each gear since the instant before
-    sole_ground (k, soles, 6)      : [N, N m] wrench of the ground on each sole about the world's origin; it
-        may
-                                     pull where the engine fixes the soles
-    cop_margin (k, soles) [m]      : from each sole's centre of pressure to its own nearest edge, as in
-                                     :func:`impactopt.robots.loads.cop_margin`
-    slip, lift (k, soles) [m]      : motion along the ground, and rise, of the corner that moved most since
-        the
-                                     sole began to stand
-    grip_force (k, hands) [N]      : on each hand that holds on
-    stance (k,)                    : number of the reference's stance phase; (0,): there is one
+    q (k, nq), v (k, nv) : Pinocchio's
+    force (k,) [N] : contact force of all strikers
+    target_speed, hand_speed (k,) : [m/s] along the normal
+    demand, torque (k, n) [N m] : of the servo before saturation, and of the motors
+    gear (k, n) [N m] : torque of largest magnitude through each gear since the instant before
+    sole_ground (k, soles, 6) : [N, N m] wrench of the ground on each sole about the world's origin; it may
+        pull where the engine fixes the soles
+    cop_margin (k, soles) [m] : from each sole's centre of pressure to its own nearest edge, as in
+        :func:`impactopt.robots.loads.cop_margin`
+    slip, lift (k, soles) [m] : motion along the ground, and rise, of the corner that moved most since the
+        sole began to stand
+    grip_force (k, hands) [N] : on each hand that holds on
+    stance (k,) : number of the reference's stance phase; (0,): there is one
 
     Contact and target:
 
     contact_start, contact_end [s] : of the impact, whose touches are less than 5 ms apart; nan if the target
-                                     was not hit
-    touches                        : start [s], end [s] and impulse [N s] of each
-    impulse, impulses [N s]        : integral of the contact force over the whole motion; of each striker
-    peak_force [N]                 : largest force, which may occur within a step
-    outcome                        : the target's result after the last touch, by name and unit
-                                     (``speed_m_s``, ``depth_m``, ``broken``)
-    missed                         : there was no target
-    expected [s]                   : begin of contact in the reference
-    step_error                     : estimated relative error of the impulse by the engine's steps; nan if it
-                                     was not computed, or nothing was hit
+        was not hit
+    touches : start [s], end [s] and impulse [N s] of each
+    impulse, impulses [N s] : integral of the contact force over the whole motion; of each striker
+    peak_force [N] : largest force, which may occur within a step
+    outcome : the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
+        ``broken``)
+    missed : there was no target
+    expected [s] : begin of contact in the reference
+    step_error : estimated relative error of the impulse by the engine's steps; nan if it was not computed, or
+        nothing was hit
 
     Robot:
 
-    fall                           : reason why the robot does not stand at the end, "" if it stands; None if
-                                     the engine fixes the soles
-    posture_error [rad]            : of the joint, or of the base's orientation, that ends farthest from the
-                                     reference's last posture
-    beyond_range                   : joint or tendon that was farthest out of its range, and by how much [rad]
-    saturated [s]                  : time in which the demand of some joint was above its torque limit
-    loads, cuts                    : largest loads of gears and motors; joints whose demand was cut by their
-                                     motor's line, the longest first, None if no motor's line is known
-    landing_speed (soles,) [m/s]   : of the fastest corner as a sole touches down; nan if it does not
+    fall : reason why the robot does not stand at the end, "" if it stands; None if the engine fixes the soles
+    posture_error [rad] : of the joint, or of the base's orientation, that ends farthest from the reference's
+        last posture
+    beyond_range : joint or tendon that was farthest out of its range, and by how much [rad]
+    saturated [s] : time in which the demand of some joint was above its torque limit
+    loads, cuts : largest loads of gears and motors; joints whose demand was cut by their motor's line, the
+        longest first, None if no motor's line is known
+    landing_speed (soles,) [m/s] : of the fastest corner as a sole touches down; nan if it does not
 
     Bodies and scene:
 
-    touched                        : unintended contacts
-    clearance [m], nearest         : least exact distance of two bodies that must not touch, and their names
-    soles, stands, polygons        : names of the soles; the scene's ``standing`` and ``polygons``
+    touched : unintended contacts
+    clearance [m], nearest : least exact distance of two bodies that must not touch, and their names
+    soles, stands, polygons : names of the soles; the scene's ``standing`` and ``polygons``
     """
 
     engine: str

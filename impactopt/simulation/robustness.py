@@ -121,11 +121,11 @@ class Outcome(NamedTuple):
 class Robustness:
     """Results of replays under n drawn perturbations.
 
-    standing (n,)          : whether the robot stands at the end
-    reason (n,)            : why it does not, or why a replay has no result; else ""
-    impulse (n,) [N s]     : nan without a result
-    slip, lift (n,) [m]    : largest of all corners of soles; nan without a result
-    planned_impulse [N s]  : of the plan
+    standing (n,) : whether the robot stands at the end
+    reason (n,) : why it does not, or why a replay has no result; else ""
+    impulse (n,) [N s] : nan without a result
+    slip, lift (n,) [m] : largest of all corners of soles; nan without a result
+    planned_impulse [N s] : of the plan
     """
 
     perturbations: Sequence[Perturbation] = field(repr=False)

@@ -29,15 +29,15 @@ MAX_POINTS = 20_000  # of the integration within one step; a contact that needs 
 class Push:
     """Contact forces and target motion within one step of an engine.
 
-    forces (h,) [N]     : of each striker, mean over the step
+    forces (h,) [N] : of each striker, mean over the step
     first_half (h,) [N] : mean over the first half of the step
-    peaks (h,) [N]      : at the instant at which their sum is largest
-    state, travel [m]   : of the target, at the end
-    depths (h,) [m]     : of each striker in the target, at the end
-    since [s]           : time in the step up to which there was no force
-    times (k,) [s]      : instants in the step
-    touching (k,)       : whether there is a force then
-    last [N]            : sum of the forces at the end
+    peaks (h,) [N] : at the instant at which their sum is largest
+    state, travel [m] : of the target, at the end
+    depths (h,) [m] : of each striker in the target, at the end
+    since [s] : time in the step up to which there was no force
+    times (k,) [s] : instants in the step
+    touching (k,) : whether there is a force then
+    last [N] : sum of the forces at the end
     """
 
     forces: Array

@@ -35,10 +35,10 @@ HAND_FORCE = 2.0  # [N] of the wrist's sensor
 class Measured:
     """Sensor readings at one instant.
 
-    angles, rates (n,)  : of the joints [rad, rad/s]
-    rotation (3, 3)     : of the base
-    gyro (3,) [rad/s]   : angular velocity of the base, in its own axes
-    forces (h,) [N]     : against the normal, at each striking point
+    angles, rates (n,) : of the joints [rad, rad/s]
+    rotation (3, 3) : of the base
+    gyro (3,) [rad/s] : angular velocity of the base, in its own axes
+    forces (h,) [N] : against the normal, at each striking point
     """
 
     angles: Array

@@ -29,9 +29,9 @@ Array = NDArray[np.float64]
 class ReferenceSample:
     """Reference at an instant.
 
-    q (nq,), v, a (nv,), torque (n,)
-    com (3, 3)                : centre of mass, its velocity and acceleration
-    angular_momentum (2, 3)   : about the centre of mass, and its rate
+    q (nq,), v, a (nv,), torque (n,) : of the robot
+    com (3, 3) : centre of mass, its velocity and acceleration
+    angular_momentum (2, 3) : about the centre of mass, and its rate
     striking_points (h, 3, 3) : position, velocity and acceleration of each
     """
 

@@ -101,14 +101,14 @@ class ConstrainedDynamics:
 
     frames = soles, then gripping hands; h = number of striking points.
 
-    A (nv, n), a0 (nv,)            : accelerations A tau + a0
-    B (6 frames, n), b0            : wrenches of the ground on the frames at their origins, world axes
-    placements                     : of the frames
-    striking_points (h, 3) [m]     : positions
-    striking_jacobians (h, 3, nv)  : of their velocities
-    striking_drift (h, 3) [m/s^2]  : their accelerations for a = 0
-    stabilizing_wrenches           : part of b0 that returns the soles to their initial height and tilt
-    impulse_response (nv, h)       : change of v by a unit impulse against the normal at each striking point
+    A (nv, n), a0 (nv,) : accelerations A tau + a0
+    B (6 frames, n), b0 : wrenches of the ground on the frames at their origins, world axes
+    placements : of the frames
+    striking_points (h, 3) [m] : positions
+    striking_jacobians (h, 3, nv) : of their velocities
+    striking_drift (h, 3) [m/s^2] : their accelerations for a = 0
+    stabilizing_wrenches : part of b0 that returns the soles to their initial height and tilt
+    impulse_response (nv, h) : change of v by a unit impulse against the normal at each striking point
     """
 
     def __init__(

@@ -26,14 +26,14 @@ class Poses:
     """A motion in a few poses, in the world frame.
 
     time (m,) [s]
-    links (m, l, 2, 3) [m]           : ends of each link
-    strikes (l,)                     : whether a link belongs to the striking limb
-    contact                          : index of the first pose in contact
-    path (k, 3) [m]                  : of the striking point, at the k instants of the reference
-    target, obstacles (b, c, 3) [m]  : corners of each body of the target at contact, and of the obstacles
-    ground (1,) [m]                  : height; (0,) without ground
-    normal (3,)                      : of the impact
-    inverse_mass (3, 3) [1/kg]       : of the striking point at contact
+    links (m, l, 2, 3) [m] : ends of each link
+    strikes (l,) : whether a link belongs to the striking limb
+    contact : index of the first pose in contact
+    path (k, 3) [m] : of the striking point, at the k instants of the reference
+    target, obstacles (b, c, 3) [m] : corners of each body of the target at contact, and of the obstacles
+    ground (1,) [m] : height; (0,) without ground
+    normal (3,) : of the impact
+    inverse_mass (3, 3) [1/kg] : of the striking point at contact
     """
 
     time: Array

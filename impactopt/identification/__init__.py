@@ -1,9 +1,10 @@
-"""Contact laws from measured blows: least squares on the package's own collision.
+"""Contact laws from measured impacts, by least squares on the package's own collision.
 
-* log.py       a log's columns, what is wrong with them, and the contacts in it
-* fitting.py   one law's numbers, with intervals, by the collision of two masses as histories
-* start.py     where the search for them begins
-* result.py    what comes out; identify.py puts all together
+* log.py               logs and their checks, and the impacts in them
+* fitting.py           fit of one law, with intervals, by the collision of two masses
+* free_parameters.py   fitted parameters of a law, and their initial guesses
+* result.py            result of an identification
+* identify.py          the public function
 """
 
 from impactopt.identification.identify import identify

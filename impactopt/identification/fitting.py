@@ -1,4 +1,4 @@
-"""One law's numbers by least squares on our own collision, with intervals."""
+"""Least-squares fit of one contact law to measured impacts, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -16,23 +16,28 @@ from scipy.special import stdtrit
 from impactopt.collision.sdc import VirtualMass
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass
-from impactopt.identification.log import Blow, noise_of
+from impactopt.identification.free_parameters import (
+    MASS,
+    FreeParameter,
+    free_parameters,
+    initial_guesses,
+)
+from impactopt.identification.log import MeasuredImpact, noise_of
 from impactopt.identification.result import Estimate, LawFit
-from impactopt.identification.start import MASS, Free, free_numbers, starts
 from impactopt.robots.robot import Robot, Striker
 
-__all__ = ["HEAVIEST_HAND", "Course", "Lump", "fit_law"]
+__all__ = ["MAX_HAND_MASS", "ContactHistory", "TwoMassModel", "fit_law"]
 
 Array = NDArray[np.float64]
-_HEAVY = 1e6  # [kg] of the side that stands for all the rest
-HEAVIEST_HAND = 1e5  # [kg]
+_HEAVY = 1e6  # [kg] of the mass that hardly moves
+MAX_HAND_MASS = 1e5  # [kg]
 _INSTANTS = 1500  # of a history, over its horizon
-_TOLERANCE = 1e-10  # tight, as derivatives are differences of these collisions
+_COLLISION_TOLERANCE = 1e-10  # tight, because derivatives are differences of collisions
 
 
 @lru_cache(maxsize=1)
 def _heavy_hand() -> Robot:
-    """A mass on a slide."""
+    """Robot with a single prismatic joint that moves a heavy mass."""
     model = pin.Model()
     model.name = "heavy_hand"
     model.addBodyFrame("base", 0, pin.SE3.Identity(), 0)
@@ -45,48 +50,52 @@ def _heavy_hand() -> Robot:
 
 
 @dataclass(frozen=True)
-class Course:
-    """One collision at its instants (k,): time [s] since the touch, force [N] and its slope [N/s], impulse so
-    far [N s], and how far impulses have carried by then [N s2]: the integral of impulse."""
+class ContactHistory:
+    """History of one simulated contact at its instants (k,).
+
+    time [s] since the touch; force [N] and its slope [N/s]; impulse [N s] so far; impulse_integral [N s2],
+    which over a mass is the displacement by the contact.
+    """
 
     time: Array
     force: Array
     slope: Array
     impulse: Array
-    carried: Array
+    impulse_integral: Array
 
     def force_at(self, t: Array) -> Array:
-        """[N] at times [s] since the touch; zero before and after the contact."""
+        """Force [N] at times [s] since the touch; zero before and after the contact."""
         return np.interp(t, self.time, self.force, left=0.0, right=0.0)
 
     def slope_at(self, t: Array) -> Array:
-        """[N/s]"""
+        """Slope [N/s] of the force at times [s] since the touch."""
         return np.interp(t, self.time, self.slope, left=0.0, right=0.0)
 
     def impulse_at(self, t: Array) -> Array:
-        """[N s]"""
+        """Impulse [N s] up to times [s] since the touch."""
         return np.interp(t, self.time, self.impulse)
 
-    def carried_at(self, t: Array) -> Array:
-        """[N s2]; impulses go on to carry after the contact."""
-        return np.interp(t, self.time, self.carried) + self.impulse[-1] * np.maximum(t - self.time[-1], 0.0)
+    def impulse_integral_at(self, t: Array) -> Array:
+        """Integral [N s2] of the impulse up to times [s] since the touch; it grows on after the contact."""
+        after = self.impulse[-1] * np.maximum(t - self.time[-1], 0.0)
+        return np.interp(t, self.time, self.impulse_integral) + after
 
 
-class Lump:
-    """`VirtualMass` under one contact law, with all its numbers, the mass and the speed as inputs.
+class TwoMassModel:
+    """Two masses that collide under one contact law, whose parameters, mass and speed are inputs.
 
-    The relative motion of two free masses is that of their reduced mass against something that stays, or
-    that goes on at its speed. So what varies is the mass of the *struck* side, an input of the compiled
-    collision, and a hand of 1000 t goes on.
+    The relative motion of two free masses is that of their reduced mass against a fixed one, or against one
+    that moves on at constant speed. So a hand of 1000 t, which hardly slows down, hits a target with the
+    reduced mass, an input of the compiled collision.
 
     Parameters
     ----------
-    law : whose numbers are replaced.
+    law : whose parameters are replaced.
     longest : [s] that a contact may last.
     """
 
     def __init__(self, law: ContactLaw, longest: float) -> None:
-        # by powers of two, so that few lengths are ever compiled
+        # powers of two, so that few horizons are ever compiled
         horizon = 2.0 ** np.ceil(np.log2(longest))
         self.law = law
         self._model = VirtualMass(
@@ -97,17 +106,17 @@ class Lump:
             target=FreeMass(mass=1.0),
             horizon=horizon,
             step=horizon / _INSTANTS,
-            tolerance=_TOLERANCE,
+            tolerance=_COLLISION_TOLERANCE,
         )
 
-    def courses(self, numbers: Mapping[str, Array], mass: Array, speed: Array) -> list[Course]:
-        """Collisions of N cases.
+    def histories(self, parameters: Mapping[str, Array], mass: Array, speed: Array) -> list[ContactHistory]:
+        """Simulates N contacts.
 
-        numbers : of the law, (N,) each.  mass : (N,) [kg], reduced, up to `HEAVIEST_HAND`.  speed : (N,)
+        parameters : of the law, (N,) each.  mass : (N,) [kg], reduced, up to `MAX_HAND_MASS`.  speed : (N,)
         [m/s] of approach.
         """
-        struck = 1.0 / (1.0 / mass - 1.0 / _HEAVY)
-        settings: dict[str, Any] = {f"contact_{name}": values for name, values in numbers.items()}
+        struck = 1.0 / (1.0 / mass - 1.0 / _HEAVY)  # with the heavy hand, it has the reduced mass
+        settings: dict[str, Any] = {f"contact_{name}": values for name, values in parameters.items()}
         found = self._model.batch(
             np.zeros((len(speed), 1)),
             speed[:, None],
@@ -116,32 +125,35 @@ class Lump:
             target_mass=struck,
             **settings,
         )
-        rows = zip(found["time"], found["force"], struck[:, None] * found["target_speed"], strict=True)
-        return [_course(*row) for row in rows]
+        cases = zip(found["time"], found["force"], struck[:, None] * found["target_speed"], strict=True)
+        return [_history(*case) for case in cases]
 
 
-def _course(time: Array, force: Array, impulse: Array) -> Course:
-    if not np.isfinite(time).all():  # a collision that there is not, such as one without any force
-        none = np.zeros(2)
-        return Course(np.array([0.0, 1e-9]), none, none, none, none)
-    last = int(np.searchsorted(time, time[-1])) + 1  # the last instant is repeated
+def _history(time: Array, force: Array, impulse: Array) -> ContactHistory:
+    """History from padded arrays (k,)."""
+    if not np.isfinite(time).all():  # no contact, as of a law without any force
+        zero = np.zeros(2)
+        return ContactHistory(np.array([0.0, 1e-9]), zero, zero, zero, zero)
+    last = int(np.searchsorted(time, time[-1])) + 1  # padding repeats the last instant
     t, f, J = time[:last], force[:last], impulse[:last]
     steps = np.diff(t, prepend=0.0)
-    carried = np.cumsum(steps * (J + np.concatenate([J[:1], J[:-1]])) / 2)
-    return Course(t, f, np.gradient(f, t) if last > 1 else 0.0 * f, J, carried)
+    integral = np.cumsum(steps * (J + np.concatenate([J[:1], J[:-1]])) / 2)
+    return ContactHistory(t, f, np.gradient(f, t) if last > 1 else 0.0 * f, J, integral)
 
 
-_LONGEST = 2.5  # durations of the longest contact that a search may try
-_DIFFERENCE = 1e-4  # of numbers, for central differences
-_ROUNDS = 2  # in which the weights of force and motion follow from what the fit has left
-_CLEAN = 1e-5  # of the peak, and of the hand's motion: no log has less noise than our interpolation
-_ROUGH, _FINE = 1e-5, 1e-10  # tolerances of a search among starts, and of the last one
-_ABOUT = 2  # samples to each side of a first estimate between which the touch may be
+_MAX_DURATION = 2.5  # of a simulated contact, over the longest measured one
+_DIFFERENCE = 1e-4  # of z, for central differences
+_ROUNDS = 2  # of re-weighting force and motion by the residuals of the fit
+# Least standard deviation, relative to peak force and to the hand's motion: no log has less noise than the
+# error of our interpolation.
+_MIN_NOISE = 1e-5
+_COARSE, _FINE = 1e-5, 1e-10  # tolerances of the fit of a single impact, and of the final one
+_NEIGHBOURS = 2  # gaps between samples to each side of the estimated touch in which it may be
 
 
 @dataclass(frozen=True)
 class _Weights:
-    """Standard deviations: force [N], motion [m/s] or [m]."""
+    """Standard deviations of force [N] and motion [m/s] or [m]."""
 
     force: float
     motion: float
@@ -149,151 +161,169 @@ class _Weights:
 
 @dataclass
 class _Fit:
-    """Residuals of blows that share a law and a mass; z has the shared numbers, and then those of each blow:
-    speed, touch, and where travel is measured, its begin, each in its own scale."""
+    """Least-squares problem of impacts that share a law and a mass.
 
-    lump: Lump
-    free: tuple[Free, ...]
-    blows: Sequence[Blow]
+    The unknowns z are first the shared parameters, then for each impact its speed, its instant of touch and,
+    if travel is measured, the travel at the touch; each scaled.
+
+    fixed : parameters of the law that are not fitted.
+    touches : bounds [s] of each impact's touch.
+    """
+
+    model: TwoMassModel
+    free: tuple[FreeParameter, ...]
+    impacts: Sequence[MeasuredImpact]
     target_mass: float
     weights: _Weights
-    held: dict[str, float]
-    touches: list[tuple[float, float]] = field(default_factory=list)  # [s] bounds of each blow's
+    fixed: dict[str, float]
+    touches: list[tuple[float, float]] = field(default_factory=list)
 
     @property
-    def own(self) -> int:
-        """Numbers of each blow."""
-        return 3 if self.blows[0].travels else 2
+    def per_impact(self) -> int:
+        """Number of unknowns of each impact."""
+        return 3 if self.impacts[0].travels else 2
 
-    def of_blow(self, k: int) -> slice:
-        begin = len(self.free) + k * self.own
-        return slice(begin, begin + self.own)
+    def of_impact(self, k: int) -> slice:
+        """Slice of z with the unknowns of an impact."""
+        begin = len(self.free) + k * self.per_impact
+        return slice(begin, begin + self.per_impact)
 
-    def first(self, shared: Array) -> Array:
-        """z with the shared numbers and a start for each blow."""
-        return np.concatenate([shared, *(self._start_of(k) for k in range(len(self.blows)))])
+    def with_shared(self, shared: Array) -> Array:
+        """z with these shared parameters, and an initial guess for each impact."""
+        return np.concatenate([shared, *(self._initial_guess(k) for k in range(len(self.impacts)))])
 
-    def _start_of(self, k: int) -> Array:
+    def _initial_guess(self, k: int) -> Array:
         low, high = self.touches[k]
-        touch = self._scaled(k, np.clip(_guess(self.blows[k]), low, high))
-        return np.array([1.0, touch, 0.0][: self.own])
+        touch = self._scaled(k, np.clip(_touch_estimate(self.impacts[k]), low, high))
+        return np.array([1.0, touch, 0.0][: self.per_impact])
 
     def _scaled(self, k: int, touch: float) -> float:
-        return float((touch - _guess(self.blows[k])) / self.blows[k].duration)
+        return float((touch - _touch_estimate(self.impacts[k])) / self.impacts[k].duration)
 
-    def _touch(self, k: int, z: Array) -> float:
-        return float(_guess(self.blows[k]) + z[self.of_blow(k)][1] * self.blows[k].duration)
+    def touch(self, k: int, z: Array) -> float:
+        """Instant [s] at which an impact begins."""
+        return float(_touch_estimate(self.impacts[k]) + z[self.of_impact(k)][1] * self.impacts[k].duration)
+
+    def speed(self, k: int, z: Array) -> float:
+        """Speed [m/s] of an impact at the touch."""
+        return float(z[self.of_impact(k)][0] * self.impacts[k].speed)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of z."""
         low = [each.lower for each in self.free]
         high = [each.upper for each in self.free]
-        high[-1] = min(high[-1], float(np.log(0.5 * HEAVIEST_HAND / self.free[-1].scale)))
-        for k in range(len(self.blows)):
-            places = [self._scaled(k, touch) for touch in self.touches[k]]
-            low += [0.1, places[0], -np.inf][: self.own]
-            high += [10.0, places[1], np.inf][: self.own]
+        high[-1] = min(high[-1], float(np.log(0.5 * MAX_HAND_MASS / self.free[-1].scale)))  # of the mass
+        for k in range(len(self.impacts)):
+            earliest, latest = (self._scaled(k, touch) for touch in self.touches[k])
+            low += [0.1, earliest, -np.inf][: self.per_impact]
+            high += [10.0, latest, np.inf][: self.per_impact]
         return np.array(low), np.array(high)
 
     # ------------------------------------------------------------ collisions
-    def _courses(self, shared: Array, speed: Array) -> tuple[list[Course], Array]:
-        """Collisions and masses [kg] of rows (N, shared) at speeds (N,)."""
-        numbers = {each.name: each.number(z) for each, z in zip(self.free, shared.T, strict=True)}
-        mass = numbers.pop(MASS)
-        numbers |= {name: np.full(len(shared), value) for name, value in self.held.items()}
-        return self.lump.courses(numbers, 1.0 / (1.0 / mass + 1.0 / self.target_mass), speed), mass
+    def _histories(self, shared: Array, speed: Array) -> tuple[list[ContactHistory], Array]:
+        """Contacts, and masses (N,) [kg] of the hand, for shared parameters (N, shared) and speeds (N,)."""
+        parameters = {each.name: each.value(z) for each, z in zip(self.free, shared.T, strict=True)}
+        mass = parameters.pop(MASS)
+        parameters |= {name: np.full(len(shared), value) for name, value in self.fixed.items()}
+        reduced = 1.0 / (1.0 / mass + 1.0 / self.target_mass)
+        return self.model.histories(parameters, reduced, speed), mass
 
-    def _at(self, k: int, z: Array, course: Course, mass: float, speed: float) -> Array:
-        """Force and motion of one blow at its samples, weighted."""
-        blow = self.blows[k]
-        t = blow.time - self._touch(k, z)
-        if blow.travels:
-            begin = z[self.of_blow(k)][2] * blow.speed * blow.duration + blow.motion[blow.touch]
-            motion = begin + speed * t - course.carried_at(t) / mass
+    def _predicted(self, k: int, z: Array, history: ContactHistory, mass: float, speed: float) -> Array:
+        """Weighted force and motion (2 samples,) of one impact at its samples."""
+        impact = self.impacts[k]
+        t = impact.time - self.touch(k, z)
+        if impact.travels:
+            begin = z[self.of_impact(k)][2] * impact.speed * impact.duration + impact.motion[impact.touch]
+            motion = begin + speed * t - history.impulse_integral_at(t) / mass
         else:
-            motion = speed - course.impulse_at(t) / mass
-        force = np.where(blow.clipped, 0.0, course.force_at(t))
+            motion = speed - history.impulse_at(t) / mass
+        force = np.where(impact.clipped, 0.0, history.force_at(t))
         return np.concatenate([force / self.weights.force, motion / self.weights.motion])
 
-    def _speed(self, k: int, z: Array) -> float:
-        return float(z[self.of_blow(k)][0] * self.blows[k].speed)
-
     def measured(self) -> Array:
+        """Weighted force and motion of all impacts as measured; clipped samples of force are 0."""
         both = [
-            (np.where(b.clipped, 0.0, b.force) / self.weights.force, b.motion / self.weights.motion)
-            for b in self.blows
+            (np.where(i.clipped, 0.0, i.force) / self.weights.force, i.motion / self.weights.motion)
+            for i in self.impacts
         ]
         return np.concatenate([part for pair in both for part in pair])
 
     def residuals(self, z: Array) -> Array:
-        n = len(self.blows)
-        speeds = np.array([self._speed(k, z) for k in range(n)])
-        courses, mass = self._courses(np.tile(z[: len(self.free)], (n, 1)), speeds)
+        """Weighted residuals, of force and then motion of each impact."""
+        n = len(self.impacts)
+        speeds = np.array([self.speed(k, z) for k in range(n)])
+        histories, mass = self._histories(np.tile(z[: len(self.free)], (n, 1)), speeds)
         return (
-            np.concatenate([self._at(k, z, courses[k], mass[k], speeds[k]) for k in range(n)])
+            np.concatenate([self._predicted(k, z, histories[k], mass[k], speeds[k]) for k in range(n)])
             - self.measured()
         )
 
-    def best_of(self, tried: Sequence[Array]) -> Array:
-        """The z of least squares for the first blow."""
-        speeds = np.array([self._speed(0, z) for z in tried])
-        courses, mass = self._courses(np.array(tried)[:, : len(self.free)], speeds)
-        rows = zip(tried, courses, mass, speeds, strict=True)
-        measured = self.measured()[: 2 * len(self.blows[0].time)]
-        costs = [float(np.sum((self._at(0, *row) - measured) ** 2)) for row in rows]
-        return tried[int(np.argmin(costs))]
+    def best_of(self, guesses: Sequence[Array]) -> Array:
+        """The guess of z with the least squares of the first impact's residuals."""
+        speeds = np.array([self.speed(0, z) for z in guesses])
+        histories, mass = self._histories(np.array(guesses)[:, : len(self.free)], speeds)
+        cases = zip(guesses, histories, mass, speeds, strict=True)
+        measured = self.measured()[: 2 * len(self.impacts[0].time)]
+        costs = [float(np.sum((self._predicted(0, *case) - measured) ** 2)) for case in cases]
+        return guesses[int(np.argmin(costs))]
 
     def jacobian(self, z: Array) -> Array:
-        """(samples, z): by central differences of collisions; by the touch, and by where travel begins,
-        in closed form."""
-        shared, n = len(self.free), len(self.blows)
+        """Jacobian (samples, z) of the residuals.
+
+        Derivatives by shared parameters and speeds are central differences of collisions, simulated in one
+        batch; those by touch and travel at the touch have a closed form.
+        """
+        shared, n = len(self.free), len(self.impacts)
         low = self.bounds[0]
-        rows: list[Array] = []
+        # two points for each impact and each of its differentiated unknowns, in this order
+        points: list[Array] = []
         for k in range(n):
             for j in range(shared + 1):
-                place = j if j < shared else self.of_blow(k).start
+                index = j if j < shared else self.of_impact(k).start
                 for side in (-1, 1):
-                    moved = z.copy()
-                    moved[place] = max(moved[place] + side * _DIFFERENCE, low[place])
-                    rows.append(moved)
+                    point = z.copy()
+                    point[index] = max(point[index] + side * _DIFFERENCE, low[index])
+                    points.append(point)
         owner = [k for k in range(n) for _ in range(2 * (shared + 1))]
-        speeds = np.array([self._speed(k, row) for k, row in zip(owner, rows, strict=True)])
-        courses, mass = self._courses(np.array(rows)[:, :shared], speeds)
+        speeds = np.array([self.speed(k, point) for k, point in zip(owner, points, strict=True)])
+        histories, mass = self._histories(np.array(points)[:, :shared], speeds)
         values = [
-            self._at(k, row, c, m, s)
-            for k, row, c, m, s in zip(owner, rows, courses, mass, speeds, strict=True)
+            self._predicted(k, point, h, m, s)
+            for k, point, h, m, s in zip(owner, points, histories, mass, speeds, strict=True)
         ]
-        blocks, begin = np.zeros((sum(2 * len(b.time) for b in self.blows), len(z))), 0
-        base, base_mass = self._courses(
-            np.tile(z[:shared], (n, 1)), np.array([self._speed(k, z) for k in range(n)])
+        out, begin = np.zeros((sum(2 * len(i.time) for i in self.impacts), len(z))), 0
+        base, base_mass = self._histories(
+            np.tile(z[:shared], (n, 1)), np.array([self.speed(k, z) for k in range(n)])
         )
-        for k, blow in enumerate(self.blows):
-            end, at = begin + 2 * len(blow.time), 2 * (shared + 1) * k
+        for k, impact in enumerate(self.impacts):
+            end, first = begin + 2 * len(impact.time), 2 * (shared + 1) * k
             for j in range(shared + 1):
-                place = j if j < shared else self.of_blow(k).start
-                less, more = at + 2 * j, at + 2 * j + 1
-                step = rows[more][place] - rows[less][place]
-                blocks[begin:end, place] = (values[more] - values[less]) / step
-            blocks[begin:end, self.of_blow(k)][:, 1:] = self._in_time(k, z, base[k], base_mass[k])
+                index = j if j < shared else self.of_impact(k).start
+                less, more = first + 2 * j, first + 2 * j + 1
+                step = points[more][index] - points[less][index]
+                out[begin:end, index] = (values[more] - values[less]) / step
+            out[begin:end, self.of_impact(k)][:, 1:] = self._by_touch(k, z, base[k], base_mass[k])
             begin = end
-        return blocks
+        return out
 
-    def _in_time(self, k: int, z: Array, course: Course, mass: float) -> Array:
-        blow, speed = self.blows[k], self._speed(k, z)
-        t = blow.time - self._touch(k, z)
-        out = np.zeros((2 * len(t), self.own - 1))
-        out[: len(t), 0] = np.where(blow.clipped, 0.0, -course.slope_at(t) / self.weights.force)
-        moves = -speed + course.impulse_at(t) / mass if blow.travels else course.force_at(t) / mass
-        out[len(t) :, 0] = moves / self.weights.motion
-        out[:, 0] *= blow.duration
-        if blow.travels:
-            out[len(t) :, 1] = blow.speed * blow.duration / self.weights.motion
+    def _by_touch(self, k: int, z: Array, history: ContactHistory, mass: float) -> Array:
+        """Derivatives (2 samples, 1 or 2) of an impact's residuals by touch, and by travel at the touch."""
+        impact, speed = self.impacts[k], self.speed(k, z)
+        t = impact.time - self.touch(k, z)
+        out = np.zeros((2 * len(t), self.per_impact - 1))
+        out[: len(t), 0] = np.where(impact.clipped, 0.0, -history.slope_at(t) / self.weights.force)
+        by_touch = -speed + history.impulse_at(t) / mass if impact.travels else history.force_at(t) / mass
+        out[len(t) :, 0] = by_touch / self.weights.motion
+        out[:, 0] *= impact.duration
+        if impact.travels:
+            out[len(t) :, 1] = impact.speed * impact.duration / self.weights.motion
         return out
 
     def solve(self, z: Array, tolerance: float) -> tuple[Array, float]:
-        """The best z, and half its sum of squares."""
+        """Optimal z, and half its sum of squares, from an initial guess."""
         low, high = self.bounds
-        edge = 1e-9 * np.minimum(high - low, 1.0)
+        edge = 1e-9 * np.minimum(high - low, 1.0)  # strictly inside the bounds
         inside = np.clip(z, low + edge, high - edge)
         found = least_squares(
             self.residuals,
@@ -308,70 +338,79 @@ class _Fit:
         return np.asarray(found.x), float(found.cost)
 
 
-def fit_law(law: ContactLaw, blows: Sequence[Blow], target_mass: float, level: float) -> LawFit:
-    """The numbers of a law, the effective mass and the speeds that fit all blows together best.
+def fit_law(law: ContactLaw, impacts: Sequence[MeasuredImpact], target_mass: float, level: float) -> LawFit:
+    """Fits a law's parameters, the effective mass and the speeds to all impacts together.
 
-    law : its held numbers, and of one's own law all as a start.  target_mass : [kg], infinite for a target
-    that stays.  level : of the intervals, 0 to 1.
+    law : its fixed parameters are taken; of a user's law, all parameters as the initial guess.
+    target_mass : [kg], infinite for a fixed target.  level : of the intervals, 0 to 1.
     """
-    lump = Lump(law, _LONGEST * max(blow.duration for blow in blows))
-    free = free_numbers(law, blows[0])
+    model = TwoMassModel(law, _MAX_DURATION * max(impact.duration for impact in impacts))
+    free = free_parameters(law, impacts[0])
     names = {each.name for each in free}
-    held = {name: value for name, value in law.parameters.items() if name not in names}
-    alone = [_alone(_Fit(lump, free, (blow,), target_mass, _first_weights(blow), held)) for blow in blows]
-    weights = _Weights(*np.median([(w.force, w.motion) for w in map(_first_weights, blows)], axis=0))
-    fit = _Fit(lump, free, blows, target_mass, weights, held, [touch for _, touch in alone])
+    fixed = {name: value for name, value in law.parameters.items() if name not in names}
+    # each impact alone, then all together from the mean of their shared parameters
+    alone = [
+        _fit_single(_Fit(model, free, (impact,), target_mass, _first_weights(impact), fixed))
+        for impact in impacts
+    ]
+    weights = _Weights(*np.median([(w.force, w.motion) for w in map(_first_weights, impacts)], axis=0))
+    fit = _Fit(model, free, impacts, target_mass, weights, fixed, [touch for _, touch in alone])
     shared = np.mean([z[: len(free)] for z, _ in alone], axis=0)
     z = np.concatenate([shared, *(z[len(free) :] for z, _ in alone)])
     for _ in range(_ROUNDS):
         z, _ = fit.solve(z, _FINE)
-        fit.weights = _weights_left(fit, z)
+        fit.weights = _weights_of_residuals(fit, z)
     z, _ = fit.solve(z, _FINE)
-    return _told(law, fit, z, level)
+    return _law_fit(law, fit, z, level)
 
 
-def _guess(blow: Blow) -> float:
-    """[s] of the touch."""
-    return float((blow.time[blow.touch - 1] + blow.time[blow.touch]) / 2)
+def _touch_estimate(impact: MeasuredImpact) -> float:
+    """First estimate [s] of the touch: between the last sample before contact and the first in it."""
+    return float((impact.time[impact.touch - 1] + impact.time[impact.touch]) / 2)
 
 
-def _first_weights(blow: Blow) -> _Weights:
-    moved = blow.speed * (blow.duration if blow.travels else 1.0)
-    return _Weights(max(noise_of(blow.force), _CLEAN * blow.peak), max(noise_of(blow.motion), _CLEAN * moved))
+def _first_weights(impact: MeasuredImpact) -> _Weights:
+    """Weights from the noise of the samples."""
+    motion = impact.speed * (impact.duration if impact.travels else 1.0)
+    return _Weights(
+        max(noise_of(impact.force), _MIN_NOISE * impact.peak),
+        max(noise_of(impact.motion), _MIN_NOISE * motion),
+    )
 
 
-def _alone(fit: _Fit) -> tuple[Array, tuple[float, float]]:
-    """z of a single blow, and the bounds [s] within which its touch is.
+def _fit_single(fit: _Fit) -> tuple[Array, tuple[float, float]]:
+    """Optimal z of a single impact, and the bounds [s] of its touch.
 
-    A force that jumps at the touch has a residual that jumps where the touch passes a sample. So each gap
-    between two samples is a search of its own, and smooth.
+    If the law's force jumps at the touch, a residual jumps when the touch passes a sample. The problem is
+    smooth only while the touch stays between two samples: each such gap near the first estimate is a fit of
+    its own, and the best one is taken.
     """
-    (blow,) = fit.blows
-    first = blow.time[0], blow.time[blow.touch] + 0.3 * blow.duration
+    (impact,) = fit.impacts
+    first = impact.time[0], impact.time[impact.touch] + 0.3 * impact.duration
     fit.touches = [first]
-    z, _ = fit.solve(fit.best_of([fit.first(z) for z in starts(fit.free)]), _ROUGH)
-    numbers = {each.name: float(each.number(z[j])) for j, each in enumerate(fit.free)}
-    numbers.pop(MASS)
-    law = type(fit.lump.law)(**{**fit.lump.law.parameters, **fit.held, **numbers})
-    if not float(law.force(0.0, fit._speed(0, z))) > 0:
+    z, _ = fit.solve(fit.best_of([fit.with_shared(z) for z in initial_guesses(fit.free)]), _COARSE)
+    parameters = {each.name: float(each.value(z[j])) for j, each in enumerate(fit.free)}
+    parameters.pop(MASS)
+    law = type(fit.model.law)(**{**fit.model.law.parameters, **fit.fixed, **parameters})
+    if not float(law.force(0.0, fit.speed(0, z))) > 0:  # no jump
         return z, first
-    near = int(np.searchsorted(blow.time, fit._touch(0, z)))
-    gaps = range(max(near - _ABOUT, 1), min(near + _ABOUT, len(blow.time) - 1) + 1)
+    near = int(np.searchsorted(impact.time, fit.touch(0, z)))
+    gaps = range(max(near - _NEIGHBOURS, 1), min(near + _NEIGHBOURS, len(impact.time) - 1) + 1)
     found = []
-    for k in {*gaps, blow.touch}:
-        fit.touches = [(float(blow.time[k - 1]), float(blow.time[k]))]
-        found.append((*fit.solve(z, _ROUGH), fit.touches[0]))
+    for k in {*gaps, impact.touch}:
+        fit.touches = [(float(impact.time[k - 1]), float(impact.time[k]))]
+        found.append((*fit.solve(z, _COARSE), fit.touches[0]))
     z, _, touches = min(found, key=lambda each: each[1])
     return z, touches
 
 
-# ---------------------------------------------------------------- what is reported
+# ---------------------------------------------------------------- results
 def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
-    """Residuals of force [N], without clipped samples, and of motion [m/s] or [m], all blows."""
+    """Residuals of force [N], without clipped samples, and of motion [m/s] or [m], of all impacts."""
     force, motion, begin = [], [], 0
-    for blow in fit.blows:
-        n = len(blow.time)
-        force.append(residuals[begin : begin + n][~blow.clipped] * fit.weights.force)
+    for impact in fit.impacts:
+        n = len(impact.time)
+        force.append(residuals[begin : begin + n][~impact.clipped] * fit.weights.force)
         motion.append(residuals[begin + n : begin + 2 * n] * fit.weights.motion)
         begin += 2 * n
     return np.concatenate(force), np.concatenate(motion)
@@ -379,57 +418,60 @@ def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
 
 def _correlation(fit: _Fit, force: Array) -> float:
     """Correlation of the force's residuals at neighbouring samples."""
-    ends = np.cumsum([np.sum(~blow.clipped) for blow in fit.blows])[:-1]
-    together = sum(float(r[1:] @ r[:-1]) for r in np.split(force, ends))
-    return together / max(float(force @ force), 1e-300)
+    ends = np.cumsum([np.sum(~impact.clipped) for impact in fit.impacts])[:-1]
+    products = sum(float(r[1:] @ r[:-1]) for r in np.split(force, ends))
+    return products / max(float(force @ force), 1e-300)
 
 
 def _rms(x: Array) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def _weights_left(fit: _Fit, z: Array) -> _Weights:
+def _weights_of_residuals(fit: _Fit, z: Array) -> _Weights:
+    """Weights from the residuals of a fit, corrected for its degrees of freedom."""
     force, motion = _parts(fit, fit.residuals(z))
     n = len(force) + len(motion)
-    spread = np.sqrt(n / max(n - len(z), 1))
-    least = [_first_weights(blow) for blow in fit.blows]
-    clean = _CLEAN * max(blow.peak for blow in fit.blows)
+    correction = np.sqrt(n / max(n - len(z), 1))
+    first = [_first_weights(impact) for impact in fit.impacts]
+    min_force = _MIN_NOISE * max(impact.peak for impact in fit.impacts)
     return _Weights(
-        max(spread * _rms(force), clean),
-        max(spread * _rms(motion), 1e-3 * min(weights.motion for weights in least)),
+        max(correction * _rms(force), min_force),
+        max(correction * _rms(motion), 1e-3 * min(weights.motion for weights in first)),
     )
 
 
-def _told(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
+def _law_fit(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
+    """Result of a fit; intervals are those of its linearization, by Student's t distribution."""
     residuals, jacobian = fit.residuals(z), fit.jacobian(z)
     force, motion = _parts(fit, residuals)
     n, m, p = len(force), len(motion), len(z)
-    spread = _standard_errors(jacobian) * float(stdtrit(max(n + m - p, 1), 0.5 + level / 2))
+    half_width = _standard_errors(jacobian) * float(stdtrit(max(n + m - p, 1), 0.5 + level / 2))
     estimates = {}
-    for each, at, off in zip(fit.free, z, spread, strict=False):
-        low, high = (float(each.number(np.asarray(at + side * off))) for side in (-1, 1))
+    for each, at, half in zip(fit.free, z, half_width, strict=False):
+        low, high = (float(each.value(np.asarray(at + side * half))) for side in (-1, 1))
         if not each.logarithmic:
             low = max(low, 0.0) if each.lower == 0 else min(low, high)
-        estimates[each.name] = Estimate(float(each.number(at)), low, max(low, high), each.unit)
+        estimates[each.name] = Estimate(float(each.value(at)), low, max(low, high), each.unit)
     speeds = []
-    for k, blow in enumerate(fit.blows):
-        at, off = fit._speed(k, z), spread[fit.of_blow(k)][0] * blow.speed
-        speeds.append(Estimate(at, at - off, at + off, "m/s"))
-    numbers = {name: each.value for name, each in estimates.items() if name != MASS}
-    peak = max(blow.peak for blow in fit.blows)
-    floor = (_CLEAN * peak, fit.weights.motion * 1e-6)
-    left = 2 * n * np.log(max(_rms(force), floor[0])) + 2 * m * np.log(max(_rms(motion), floor[1]))
+    for k, impact in enumerate(fit.impacts):
+        at, half = fit.speed(k, z), half_width[fit.of_impact(k)][0] * impact.speed
+        speeds.append(Estimate(at, at - half, at + half, "m/s"))
+    parameters = {name: each.value for name, each in estimates.items() if name != MASS}
+    peak = max(impact.peak for impact in fit.impacts)
+    # Akaike's criterion, with the variances of force and motion unknown: each sample counts 2 log(rms)
+    min_force, min_motion = _MIN_NOISE * peak, fit.weights.motion * 1e-6
+    deviance = 2 * n * np.log(max(_rms(force), min_force)) + 2 * m * np.log(max(_rms(motion), min_motion))
     return LawFit(
-        law=type(law)(**{**law.parameters, **numbers}),
+        law=type(law)(**{**law.parameters, **parameters}),
         estimates=estimates,
         speeds=tuple(speeds),
-        touches=tuple(fit._touch(k, z) for k in range(len(fit.blows))),
-        held=dict(fit.held),
+        touches=tuple(fit.touch(k, z) for k in range(len(fit.impacts))),
+        held=dict(fit.fixed),
         force_left=_rms(force),
         force_left_pct=100 * _rms(force) / peak,
         motion_left=_rms(motion),
         correlation=_correlation(fit, force),
-        aic=left + 2 * p,
+        aic=deviance + 2 * p,
     )
 
 
@@ -438,5 +480,5 @@ def _standard_errors(jacobian: Array) -> Array:
     _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
     known = s > 1e-10 * s[0]
     out = np.sqrt(np.sum((vt[known] / s[known, None]) ** 2, axis=0))
-    lost = np.sum(vt[~known] ** 2, axis=0) > 1e-12
-    return np.where(lost, np.inf, out)
+    undetermined = np.sum(vt[~known] ** 2, axis=0) > 1e-12
+    return np.where(undetermined, np.inf, out)

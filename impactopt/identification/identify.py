@@ -1,4 +1,4 @@
-"""Contact laws from a measured log of blows."""
+"""Identification of contact laws from a measured log."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from impactopt.contact.laws import LAWS, ContactLaw
 from impactopt.errors import InputError, check_choice, check_number
 from impactopt.identification.fitting import fit_law
-from impactopt.identification.log import ImpactLog, find_blows, read_log
+from impactopt.identification.free_parameters import sample_law
+from impactopt.identification.log import ImpactLog, find_impacts, read_log
 from impactopt.identification.result import Identification
-from impactopt.identification.start import sample_law
 from impactopt.robots.robot import Robot
 
 __all__ = ["identify"]
@@ -29,31 +29,33 @@ def identify(
     striker: str = "",
     normal: ArrayLike | None = None,
 ) -> Identification:
-    """Stiffness, damping and effective mass from a measured log of one blow or several, with intervals.
+    """Identifies stiffness, damping and effective mass, with intervals, from a log of one impact or several.
 
     For each law, the collision of the hand, as a mass, with the target is fitted to force and motion of all
-    blows together by least squares: `VirtualMass` with unknown numbers, an unknown mass, and for each blow an
-    unknown speed and instant of touch. Intervals are those of the linearized fit with white noise, whose size
-    on force and motion follows from what is left. Samples on flat tops, where the sensor's range has cut
-    the force off, are left out. The hand's drives do not act in the model: that is right for short blows.
-    Exponents are held at their values.
+    impacts together by least squares: `VirtualMass` with unknown parameters and mass, and for each impact an
+    unknown speed and instant of touch. Intervals are those of the linearized fit with white noise, whose
+    standard deviations follow from the residuals of force and motion. Samples on flat tops, where the
+    sensor's range has cut off the force, are left out. The hand's drives do not act in the model, which holds
+    for short impacts. Exponents are fixed.
 
     Parameters
     ----------
-    log : measured; or a file, as of `read_log`, which takes `robot`, `striker` and `normal` too.
-    laws : to fit: by their words in problem files, classes, or laws, whose held numbers are taken, such as
-        another exponent; all numbers of a `CustomLaw` are looked for, from those that it has.
-    target_mass : [kg] of a target that is free; infinite for one that stays, such as a load cell on a wall.
+    log : measured; or a file, as in `read_log`, which also takes `robot`, `striker` and `normal`.
+    laws : to fit: their words in problem files, classes, or laws with fixed parameters, such as another
+        exponent. All parameters of a `CustomLaw` are fitted, with its values as initial guess.
+    target_mass : [kg] of a free target; infinite for a fixed one, such as a load cell on a wall.
     level : of the intervals.
 
     Raises
     ------
-    InputError : a log that cannot be used, with what is wrong; an unknown law; numbers out of their range.
+    InputError : an unusable log, with the reason; an unknown law; values out of range.
     """
     if not 0 < check_number("level", level) < 1:
         raise InputError(f"level: {level:g}; give a number between 0 and 1, such as 0.95")
     if not check_number("target_mass [kg]", target_mass, finite=False) > 0:
-        raise InputError(f"target_mass [kg]: {target_mass:g}; give a number > 0; infinity: it stays")
+        raise InputError(
+            f"target_mass [kg]: {target_mass:g}; give a number > 0, or infinity for a fixed target"
+        )
     chosen = [_law(law) for law in laws]
     if not chosen:
         raise InputError("laws: none; give at least one")
@@ -61,21 +63,22 @@ def identify(
         measured = log
     else:
         measured = read_log(log, robot=robot, striker=striker, normal=normal)
-    blows = find_blows(measured)
-    fits = [fit_law(law, blows, float(target_mass), level) for law in chosen]
+    impacts = find_impacts(measured)
+    fits = [fit_law(law, impacts, float(target_mass), level) for law in chosen]
     return Identification(
         log=measured.name,
         fits=tuple(sorted(fits, key=lambda fit: fit.aic)),
-        samples=sum(len(blow.time) for blow in blows),
-        clipped=tuple(int(blow.clipped.sum()) for blow in blows),
-        top=max(blow.peak for blow in blows),
+        samples=sum(len(impact.time) for impact in impacts),
+        clipped=tuple(int(impact.clipped.sum()) for impact in impacts),
+        top=max(impact.peak for impact in impacts),
         level=level,
         target_mass=float(target_mass),
-        model_mass=tuple(blow.model_mass for blow in blows),
+        model_mass=tuple(impact.model_mass for impact in impacts),
     )
 
 
 def _law(law: str | type[ContactLaw] | ContactLaw) -> ContactLaw:
+    """Law from its word, its class, or itself."""
     if isinstance(law, ContactLaw):
         return law
     if isinstance(law, str):
@@ -83,5 +86,5 @@ def _law(law: str | type[ContactLaw] | ContactLaw) -> ContactLaw:
         check_choice("there is no law", law, words)
         law = words[law]
     if law not in LAWS:
-        raise InputError(f"laws: {law!r}; give one of the package's, or one with numbers")
+        raise InputError(f"laws: {law!r}; give one of the package's, or one with parameters")
     return sample_law(law)

@@ -1,4 +1,4 @@
-"""Measured impacts: logs of force or motion, and the blows in them."""
+"""Logs of measured force and motion, and the impacts in them."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ from impactopt.kinematics.operational_space import Held
 from impactopt.robots.couplings import axis_of
 from impactopt.robots.robot import Robot
 
-__all__ = ["FORCE", "SPEED", "TIME", "Blow", "ImpactLog", "find_blows", "noise_of", "read_log"]
+__all__ = ["FORCE", "SPEED", "TIME", "ImpactLog", "MeasuredImpact", "find_impacts", "noise_of", "read_log"]
 
 Array = NDArray[np.float64]
 TIME, FORCE, SPEED = "time_s", "force_N", "hand_speed_m_s"
-LARGEST, COLUMNS = 1 << 29, 1000  # bytes and arrays of an npz file: an hour at 1 kHz of 15 columns has 430 MB
-_BEYOND = 2 * np.pi  # [rad] outside its limits, of a joint that is no longer believed to be in radians
+# bytes and arrays of an npz file: an hour of 15 columns at 1 kHz has 430 MB
+MAX_BYTES, MAX_ARRAYS = 1 << 29, 1000
+_MAX_BEYOND = 2 * np.pi  # [rad] of a joint beyond its limits; farther, it is probably in degrees
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImpactLog:
-    """Measurements of one blow or several, all along the normal of the blow.
+    """Measurements of one impact or several, along their normal.
 
     Attributes
     ----------
     time : (k,) [s], increasing.
-    force : (k,) [N] on the target, which the blow pushes: positive.
-    speed : (k,) [m/s] of the striking point, towards the target: positive; or None.
-    travel : (k,) [m] of the striking point, in the place of its speed; or None.
-    model_mass : (k,) [kg] effective mass by the robot's model, where the log has joint positions.
+    force : (k,) [N] on the target, positive in contact.
+    speed : (k,) [m/s] of the striking point, positive towards the target; or None.
+    travel : (k,) [m] of the striking point, instead of its speed; or None.
+    model_mass : (k,) [kg] effective mass by the robot's model, if the log has joint positions.
     name : of the log, for messages.
 
     Raises
@@ -63,7 +64,7 @@ class ImpactLog:
             k = int(back[0])
             raise InputError(
                 f"{self.name}: {TIME} does not increase: {time[k]:.9g} s at row {k}, and {time[k + 1]:.9g} s "
-                f"at row {k + 1}; sort the rows, and take out those that stand twice"
+                f"at row {k + 1}; sort the rows, and remove duplicates"
             )
         object.__setattr__(self, "time", time)
         if (self.speed is None) == (self.travel is None):
@@ -87,16 +88,16 @@ def read_log(
     striker: str = "",
     normal: ArrayLike | None = None,
 ) -> ImpactLog:
-    """A log from a CSV file with a header, or from the arrays of an npz file.
+    """Reads a log from a CSV file with a header, or from the arrays of an npz file.
 
-    Columns are `time_s`, `force_N`, and `hand_speed_m_s`. In the place of the last there may be all joint
-    positions of a robot on a fixed base, `<joint>_rad` (`<joint>_m` of a sliding one); then `robot`,
-    `striker` and `normal` say where the hand is. Other columns are not read.
+    Columns are `time_s`, `force_N`, and `hand_speed_m_s`. Instead of the last there may be all joint
+    positions of a robot on a fixed base, `<joint>_rad` (`<joint>_m` of a sliding one), from which `robot`,
+    `striker` and `normal` give the motion of the hand. Other columns are ignored.
 
     Raises
     ------
-    InputError : no such file, or one that is neither; columns that are missing or no numbers; joint positions
-        without a robot, or that look like degrees; as of `ImpactLog`.
+    InputError : a missing file, or one of another format; columns that are missing or no numbers; joint
+        positions without a robot, or that look like degrees; as in `ImpactLog`.
     """
     file = Path(path)
     name = shortened(str(file))
@@ -117,6 +118,7 @@ def read_log(
 
 # ---------------------------------------------------------------- files
 def _csv(file: Path, name: str) -> dict[str, Array]:
+    """Columns of a CSV file, by their headings."""
     try:
         with open(file, newline="", encoding="utf-8-sig") as text:
             rows = [row for row in csv.reader(text) if row]
@@ -139,7 +141,7 @@ def _csv(file: Path, name: str) -> dict[str, Array]:
 
 
 def _numbers(cells: list[str]) -> Array:
-    """Numbers of a column; other text becomes NaN, which is refused in columns that are needed."""
+    """Numbers of a column; other text becomes NaN, which is an error in required columns only."""
     out = np.empty(len(cells))
     for k, cell in enumerate(cells):
         try:
@@ -150,8 +152,9 @@ def _numbers(cells: list[str]) -> Array:
 
 
 def _npz(file: Path, name: str) -> dict[str, Array]:
+    """Arrays of an npz file, by name."""
     try:
-        with np.load(read_archive(file, LARGEST, COLUMNS), allow_pickle=False) as arrays:
+        with np.load(read_archive(file, MAX_BYTES, MAX_ARRAYS), allow_pickle=False) as arrays:
             found = {key: arrays[key] for key in arrays.files}
     except OSError as error:
         raise InputError(f"{name}: cannot be read: {error.strerror or error}") from None
@@ -177,11 +180,11 @@ def _hand(
     """Travel (k,) [m] of the striking point along the normal, and effective mass (k,) [kg] there."""
     if robot.floating:
         raise InputError(
-            f"{name}: joint positions do not say where the hand of {robot.name!r} is, whose base moves too; "
-            f"give the column {SPEED}"
+            f"{name}: joint positions do not determine the motion of {robot.name!r}'s hand, because its base "
+            f"moves too; give the column {SPEED}"
         )
     if normal is None:
-        raise InputError(f"{name}: joint positions need the normal of the blow: give normal=[x, y, z]")
+        raise InputError(f"{name}: joint positions need the normal of the impact: give normal=[x, y, z]")
     n, frame = check_direction("normal", normal), robot.striker(striker).model_frame
     model, data = robot.model, robot.model.createData()
     angles = np.column_stack([_joint(columns, robot, k, name) for k in range(robot.n)])
@@ -194,12 +197,13 @@ def _hand(
 
 
 def _joint(columns: Mapping[str, Array], robot: Robot, k: int, name: str) -> Array:
+    """Positions (k,) [rad] or [m] of a joint, by its number."""
     joint, slides = robot.joint_names[k], not _turns(robot, k)
     values = _column(columns, f"{joint}_{'m' if slides else 'rad'}", name)
     low, high = robot.lower[k], robot.upper[k]
     values = check_array(f"{name}: {joint}", values, (None,))
     far = np.maximum(values - high, low - values).max(initial=0.0)
-    if not slides and far > _BEYOND:
+    if not slides and far > _MAX_BEYOND:
         raise InputError(
             f"{name}: {joint} is {far:.3g} rad outside its limits, {low:.3g} to {high:.3g} rad; are these "
             "degrees? Multiply them by pi / 180"
@@ -212,7 +216,7 @@ def _turns(robot: Robot, k: int) -> bool:
 
 
 def _configurations(robot: Robot, angles: Array) -> Array:
-    """(k, nq) of joint positions (k, n): a continuous joint is (cosine, sine) there."""
+    """Configurations (k, nq) of joint positions (k, n); a continuous joint has its cosine and sine."""
     out = np.empty((len(angles), robot.nq))
     for joint, values in zip(robot.joint_models, angles.T, strict=True):
         if joint.nq == 2:
@@ -222,24 +226,28 @@ def _configurations(robot: Robot, angles: Array) -> Array:
     return out
 
 
-_LEAST, _SMALL = 0.1, 0.2  # of the largest force: what counts as contact, and as a blow of its own
-_SAMPLES = 8  # in contact, at least
-# a top is flat where so many samples in a row are within these shares of the noise and of the peak; unless it
-# is quantized: the top of a parabola falls by 3 steps over half its length beyond either end
-_FLAT, _ALIKE, _EQUAL, _STEPS = 4, 0.1, 1e-6, 6.0
-_BEFORE, _AFTER = 0.5, 0.25  # of the contact's duration: what is looked at before the touch and after the end
-# beyond these, units are doubted
-_LONGEST, _FASTEST, _LIGHTEST, _HEAVIEST = 1.0, 50.0, 1e-3, 1e4  # s, m/s, kg, kg
+_MIN_CONTACT_FORCE, _MIN_PEAK = 0.1, 0.2  # of contact, and of an impact's peak, over the log's largest force
+_MIN_SAMPLES = 8  # in contact
+# A top is flat if at least so many samples in a row are within this fraction of the noise, or of the peak.
+_FLAT_SAMPLES, _NOISE_FRACTION, _PEAK_FRACTION = 4, 0.1, 1e-6
+# Except for quantization: within half the length of a quantized top beyond its ends, a parabola falls by 3
+# steps; a force that is cut off falls by more than so many.
+_QUANTIZATION_STEPS = 6.0
+_BEFORE, _AFTER = 0.5, 0.25  # fitted times before the touch and after the end, over the contact's duration
+# limits beyond which other units are suspected
+_MAX_DURATION, _MAX_SPEED, _MIN_MASS, _MAX_MASS = 1.0, 50.0, 1e-3, 1e4  # s, m/s, kg, kg
 
 
 @dataclass(frozen=True, eq=False)
-class Blow:
-    """One contact: samples (k,) of time [s], force [N] and motion, and what is plain to see of it.
+class MeasuredImpact:
+    """Samples (k,) of one impact, with first estimates.
 
-    motion : speed [m/s], or travel [m].  travels : which of them.  clipped (k,) : samples whose force was
-    beyond the sensor's range.  touch : index of the first sample in contact.  duration [s], speed [m/s] at
-    contact, mass [kg]: first estimates.  model_mass [kg]: by the robot's model, at the touch; nan where it
-    is not known.
+    time, force : [s], [N]
+    motion, travels : travel [m] if travels, else speed [m/s]
+    clipped : samples whose force was beyond the sensor's range
+    touch : index of the first sample in contact
+    duration, speed, mass : first estimates of contact time [s], speed at contact [m/s], and mass [kg]
+    model_mass [kg] : effective mass by the robot's model, at the touch; nan if unknown
     """
 
     time: Array
@@ -255,58 +263,61 @@ class Blow:
 
     @property
     def peak(self) -> float:
-        """[N]"""
+        """Largest force [N]."""
         return float(self.force.max())
 
 
 def _clipped(force: Array) -> NDArray[np.bool_]:
-    """Samples (k,) of a log at which its force is cut off: at its largest, if that has a flat top."""
+    """Mask (k,) of the samples of a log whose force is cut off: those at a flat top."""
     top = float(force.max())
-    at_top = force >= top - max(_ALIKE * noise_of(force), _EQUAL * top)
+    at_top = force >= top - max(_NOISE_FRACTION * noise_of(force), _PEAK_FRACTION * top)
     step = float(np.diff(np.unique(force)).min(initial=np.inf))
     for begin, end in np.flatnonzero(np.diff(np.concatenate([[0], at_top, [0]]))).reshape(-1, 2):
         beyond = (end - begin) // 2
         sides = [force[k] for k in (begin - 1 - beyond, end + beyond) if 0 <= k < len(force)]
-        if end - begin >= _FLAT and top - max(sides, default=-np.inf) > _STEPS * step:
+        if end - begin >= _FLAT_SAMPLES and top - max(sides, default=-np.inf) > _QUANTIZATION_STEPS * step:
             return at_top
     return np.zeros(len(force), dtype=bool)
 
 
 def noise_of(values: Array) -> float:
-    """Standard deviation of white noise on values (k,) of a smooth course, from their second differences."""
+    """Standard deviation of white noise on values (k,) of a smooth history, from second differences.
+
+    Those of white noise have sqrt(6) times its deviation. Their 80 % quantile, 1.2816 deviations, is robust
+    against jumps and bends in a fifth of the samples.
+    """
     if len(values) < 3:
         return 0.0
-    # robust: a fifth of them may be jumps and bends
     return float(np.quantile(np.abs(np.diff(values, 2)), 0.8) / (1.2816 * np.sqrt(6)))
 
 
-def find_blows(log: ImpactLog) -> tuple[Blow, ...]:
-    """The contacts of a log.
+def find_impacts(log: ImpactLog) -> tuple[MeasuredImpact, ...]:
+    """Finds the impacts in a log.
 
     Raises
     ------
     InputError : no contact, a force of the wrong sign, too few samples, a log that begins or ends in contact,
-        a hand that does not come; numbers that look like other units.
+        a hand that does not approach; values that look like other units.
     """
     peak, name = float(log.force.max()), log.name
     noise = noise_of(log.force)
     if -log.force.min() > max(peak, 8 * noise, 0.0):
         raise InputError(
             f"{name}: {FORCE} goes down to {log.force.min():.4g} N, and up to {peak:.4g} N only; the "
-            "force on the target counts along the blow: turn its sign"
+            "force on the target is positive in contact: turn its sign"
         )
-    # unlike a blow, noise is as often below the median as above
-    middle = float(np.median(log.force))
-    if peak <= 0 or peak - middle < max(6 * noise, 2 * (middle - float(log.force.min()))):
-        raise InputError(f"{name}: no contact: {FORCE} is at most {peak:.4g} N, which its noise is too")
-    spans = _spans(log.force, max(_LEAST * peak, 4.5 * noise))
-    spans = [span for span in spans if log.force[slice(*span)].max() > _SMALL * peak]
+    # noise is as far below the median as above it, unlike an impact
+    median = float(np.median(log.force))
+    if peak <= 0 or peak - median < max(6 * noise, 2 * (median - float(log.force.min()))):
+        raise InputError(f"{name}: no contact: {FORCE} is at most {peak:.4g} N, as large as its noise")
+    spans = _spans(log.force, max(_MIN_CONTACT_FORCE * peak, 4.5 * noise))
+    spans = [span for span in spans if log.force[slice(*span)].max() > _MIN_PEAK * peak]
     clipped = _clipped(log.force)
-    return tuple(_blow(log, span, spans, noise, clipped) for span in spans)
+    return tuple(_impact(log, span, spans, noise, clipped) for span in spans)
 
 
 def _spans(force: Array, least: float) -> list[tuple[int, int]]:
-    """(begin, end) of what is above a force [N]; gaps are noise if they are short, or have force in them."""
+    """Spans (begin, end) of samples above a force [N]; short gaps, and gaps with force, are noise."""
     inside = force > least
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
     spans: list[tuple[int, int]] = []
@@ -319,36 +330,43 @@ def _spans(force: Array, least: float) -> list[tuple[int, int]]:
     return spans
 
 
-def _blow(
+def _impact(
     log: ImpactLog,
     span: tuple[int, int],
     spans: list[tuple[int, int]],
     noise: float,
     clipped: NDArray[np.bool_],
-) -> Blow:
+) -> MeasuredImpact:
+    """Impact from the span of its samples, and all spans of the log.
+
+    Raises
+    ------
+    InputError : as in `find_impacts`.
+    """
     (begin, end), t, f, name = span, log.time, log.force, log.name
     quiet = max(2 * noise, 1e-3 * float(f[begin:end].max()))
     before = max((e for _, e in spans if e <= begin), default=0)
     after = min((b for b, _ in spans if b >= end), default=len(t))
+    # extend the span to samples with little force, up to the neighbouring impacts
     while begin > before and f[begin - 1] > quiet:
         begin -= 1
     while end < after and f[end] > quiet:
         end += 1
-    where = f"{name}, blow at {t[begin]:.6g} s"
+    where = f"{name}, impact at {t[begin]:.6g} s"
     if begin == 0 or end == len(t):
         raise InputError(
             f"{where}: the log {'begins' if begin == 0 else 'ends'} in contact; it has to begin before the "
-            "touch, and to end after the hand has left; take an offset off the force first"
+            "touch, and end after the hand has left; take an offset off the force first"
         )
     duration = float(t[end] - t[begin])
-    if duration > _LONGEST:
+    if duration > _MAX_DURATION:
         raise InputError(
-            f"{where}: the contact lasts {duration:.3g} s, which is no blow; is {TIME} in milliseconds?"
+            f"{where}: the contact lasts {duration:.3g} s, too long for an impact; is {TIME} in milliseconds?"
         )
-    if end - begin < _SAMPLES:
+    if end - begin < _MIN_SAMPLES:
         raise InputError(
-            f"{where}: {end - begin} samples in contact; at least {_SAMPLES} are needed: log at "
-            f"{1.5 * _SAMPLES / duration:.0f} Hz or more"
+            f"{where}: {end - begin} samples in contact; at least {_MIN_SAMPLES} are needed: log at "
+            f"{1.5 * _MIN_SAMPLES / duration:.0f} Hz or more"
         )
     low = int(np.searchsorted(t, t[begin] - _BEFORE * duration))
     high = int(np.searchsorted(t, t[end] + _AFTER * duration, side="right"))
@@ -362,17 +380,18 @@ def _blow(
             f"{where}: the hand moves at {speed:.3g} m/s before the touch; its speed towards the target is "
             "positive: turn its sign, or that of the normal"
         )
-    if speed > _FASTEST:
-        raise InputError(f"{where}: the hand comes at {speed:.4g} m/s; is {SPEED} in mm/s?")
+    if speed > _MAX_SPEED:
+        raise InputError(f"{where}: the hand approaches at {speed:.4g} m/s; is {SPEED} in mm/s?")
     impulse = float(trapezoid(f[begin:end], t[begin:end]))
     lost = speed - mean(t[end:high], motion[end:high])
+    # without a plausible loss of speed, assume a rebound with half the speed
     mass = impulse / (lost if lost > 0.2 * speed else 1.5 * speed)
-    if not _LIGHTEST < mass < _HEAVIEST:
+    if not _MIN_MASS < mass < _MAX_MASS:
         raise InputError(
-            f"{where}: {impulse:.3g} N s take {max(lost, 0.0):.3g} of {speed:.3g} m/s from the hand, as of a "
-            f"mass of {mass:.3g} kg; are all columns in s, N and m/s?"
+            f"{where}: an impulse of {impulse:.3g} N s slows the hand down by {max(lost, 0.0):.3g} of "
+            f"{speed:.3g} m/s, as of a mass of {mass:.3g} kg; are all columns in s, N and m/s?"
         )
-    return Blow(
+    return MeasuredImpact(
         time=t[low:high],
         force=f[low:high],
         motion=motion[low:high],

@@ -12,20 +12,20 @@ from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.errors import InputError
 from impactopt.files.problem_file.toml import write_toml
-from impactopt.identification.start import MASS
+from impactopt.identification.free_parameters import MASS
 
 __all__ = ["Estimate", "Identification", "LawFit"]
 
-_WIDE = 1.0  # of the value: an interval wider than that determines nothing
-_DIGITS = 5  # of numbers in a file
-_WHITE = 4.0  # standard deviations of a correlation
-_EXACT = 0.05  # [% of the peak] that our interpolation may leave of a log without noise
-_TIE = 10.0  # of AIC: laws nearer to each other than that cannot be told apart
+_MAX_WIDTH = 1.0  # of the interval of a determined parameter, over its value
+_DIGITS = 5  # of parameters in a file
+_MAX_CORRELATION = 4.0  # of white noise, in standard deviations
+_INTERPOLATION_ERROR = 0.05  # [% of the peak] residual of a log without noise
+_TIE = 10.0  # difference of AIC below which a log cannot distinguish laws
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number, its confidence interval, and its unit."""
+    """A parameter's value, confidence interval, and unit."""
 
     value: float
     low: float
@@ -35,25 +35,29 @@ class Estimate:
     @property
     def determined(self) -> bool:
         """True if the interval is narrower than the parameter is large, and excludes 0."""
-        return bool(self.high - self.low <= _WIDE * abs(self.value) and self.low * self.high > 0)
+        return bool(self.high - self.low <= _MAX_WIDTH * abs(self.value) and self.low * self.high > 0)
 
     def describe(self) -> dict[str, Any]:
-        """value, low, high, unit, determined; None for an end that is nowhere."""
+        """JSON form: value, low, high, unit, determined; None for an infinite end."""
         ends = {name: x if np.isfinite(x) else None for name, x in (("low", self.low), ("high", self.high))}
         return {"value": self.value, **ends, "unit": self.unit, "determined": self.determined}
 
 
 @dataclass(frozen=True, kw_only=True)
 class LawFit:
-    """One law, fitted to all blows of a log together.
+    """Fit of one law to all impacts of a log together.
 
-    law : with the numbers that fit best.  estimates : its numbers and `effective_mass`, by name; speeds: of
-    each blow at the touch [m/s]; touches: when [s].  held : numbers that were not looked for.
-    force_left [N], motion_left [m/s] (or [m], of joint positions) : root mean square of what the fit leaves
-    of all samples; force_left_pct : of the largest force; correlation : of the force's residuals at
-    neighbouring samples, about 0 for white noise, and nearer to 1 the less the law fits.  aic : Akaike's
-    information criterion, with the noise of force and motion unknown; only differences between laws mean
-    something.
+    law : with the fitted parameters
+    estimates : of its parameters and of `effective_mass`, by name
+    speeds, touches : speed [m/s] of each impact at the touch, and instant [s] of the touch
+    held : fixed parameters, by name
+    force_left [N] : root mean square of the force's residuals
+    force_left_pct : the same, in % of the largest force
+    motion_left : root mean square of the motion's residuals [m/s], or [m] for joint positions
+    correlation : of the force's residuals at neighbouring samples; about 0 for white noise, closer
+        to 1 the less the law fits
+    aic : Akaike's information criterion, with unknown noise of force and motion; only differences between
+        laws are meaningful
     """
 
     law: ContactLaw
@@ -74,16 +78,16 @@ class LawFit:
 
     @property
     def effective_mass(self) -> Estimate:
-        """[kg] of the hand."""
+        """Effective mass [kg] of the hand."""
         return self.estimates[MASS]
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Names of the numbers that the log does not determine."""
+        """Names of the parameters that the log does not determine."""
         return tuple(name for name, each in self.estimates.items() if not each.determined)
 
     def describe(self) -> dict[str, Any]:
-        """All of it, as JSON has it."""
+        """JSON form."""
         return {
             "law": self.name,
             "estimates": {name: each.describe() for name, each in self.estimates.items()},
@@ -99,15 +103,15 @@ class LawFit:
         }
 
     def toml(self) -> str:
-        """The section `[contact]` of a problem file.
+        """Section `[contact]` of a problem file, with intervals as comments.
 
         Raises
         ------
-        InputError : a law of one's own, which a file cannot have.
+        InputError : a user's law, which a file cannot have.
         """
         if not self.law.word:
             raise InputError(f"{type(self.law).__name__}: a file cannot have it; use it in Python")
-        keys = {f.name: told.key_of(f.name) for f, told in abouts(type(self.law))}
+        keys = {f.name: about.key_of(f.name) for f, about in abouts(type(self.law))}
         section: dict[str, Any] = {"law": self.law.word}
         section |= {keys[name]: float(f"{x:.{_DIGITS}g}") for name, x in self.law.parameters.items()}
         comments = {}
@@ -122,11 +126,15 @@ class LawFit:
 
 @dataclass(frozen=True, kw_only=True)
 class Identification:
-    """Contact laws fitted to a log: `fits`, the best first.
+    """Contact laws fitted to a log.
 
-    log : its name.  samples : that were fitted.  level : of the intervals.  target_mass [kg] : infinite for
-    one that stays.  clipped : of each blow, samples of force that were cut off at the log's largest, `top`
-    [N], and are not fitted.  model_mass : [kg] of each blow, by the robot's model; nan where it is not known.
+    log : its name
+    fits : of each law, the best first
+    samples : number of fitted samples
+    level : of the intervals
+    target_mass [kg] : infinite for a fixed target
+    clipped, top [N] : number of samples of each impact whose force was cut off at `top`, and is not fitted
+    model_mass [kg] : effective mass of each impact by the robot's model; nan if unknown
     """
 
     log: str
@@ -140,7 +148,7 @@ class Identification:
 
     @property
     def best(self) -> LawFit:
-        """The law of the least AIC."""
+        """Fit with the least AIC."""
         return self.fits[0]
 
     def fit(self, law: str | type[ContactLaw]) -> LawFit:
@@ -148,7 +156,7 @@ class Identification:
 
         Raises
         ------
-        InputError : one that was not fitted.
+        InputError : the law was not fitted.
         """
         for each in self.fits:
             if law in (each.name, type(each.law)):
@@ -158,25 +166,30 @@ class Identification:
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """Warnings about results that are not to be trusted."""
+        """Warnings about unreliable results."""
         best, out = self.best, []
         if any(self.clipped):
             out.append(
                 f"the force is cut off at {self.top:.4g} N: {sum(self.clipped)} samples of "
-                f"{sum(count > 0 for count in self.clipped)} of {len(self.clipped)} blows are left out; "
+                f"{sum(count > 0 for count in self.clipped)} of {len(self.clipped)} impacts are left out; "
                 "peak and impulse of the log are too small: log again with a sensor of a larger range"
             )
         near = [each.name for each in self.fits[1:] if each.aic - best.aic < _TIE]
         if near:
-            out.append(f"the log cannot tell {best.name} from {', '.join(near)}; blows at other speeds may")
-        if best.correlation > _WHITE / np.sqrt(self.samples) and best.force_left_pct > _EXACT:
             out.append(
-                f"what {best.name} leaves of the force, {best.force_left_pct:.2g} % of the peak, is no "
-                f"white noise (neighbouring samples correlate by {best.correlation:.2f}): the law is "
-                "another one, or the log is filtered; intervals are too narrow then"
+                f"the log cannot distinguish {best.name} from {', '.join(near)}; impacts at other speeds may"
+            )
+        if (
+            best.correlation > _MAX_CORRELATION / np.sqrt(self.samples)
+            and best.force_left_pct > _INTERPOLATION_ERROR
+        ):
+            out.append(
+                f"the residual force of {best.name}, {best.force_left_pct:.2g} % of the peak, is not white "
+                f"noise (correlation of neighbouring samples: {best.correlation:.2f}): another law holds, or "
+                "the log is filtered; intervals are too narrow then"
             )
         elif len(self.fits) > 1:
-            out.append("a law that fits best among these is not thereby true")
+            out.append("the best of these laws need not be the true one")
         if best.undetermined:
             out.append(f"the log does not determine {', '.join(best.undetermined)} of {best.name}")
         mass = best.effective_mass
@@ -189,7 +202,7 @@ class Identification:
         return tuple(out)
 
     def describe(self) -> dict[str, Any]:
-        """All of it, as `impactopt identify --json` prints it."""
+        """JSON form, as `impactopt identify --json` prints it."""
         return {
             "log": self.log,
             "best": self.best.name,

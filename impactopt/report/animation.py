@@ -1,4 +1,4 @@
-"""A motion in three dimensions, as a page of its own or in a notebook."""
+"""Three-dimensional animation of a motion, as a page of its own or in a notebook."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ HEIGHT = 660  # pixels, in a notebook
 
 @dataclass(frozen=True)
 class Page:
-    """A page.  html : all of it; it needs no network."""
+    """A page that needs no network.  html : its text."""
 
     html: str
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write it as one HTML file; its folder is there already.
+        """Writes the page as one HTML file, into an existing folder.
 
         Raises
         ------
-        InputError : it cannot be written, or its name does not end in .html.
+        InputError : the file cannot be written, or its name does not end with .html.
         """
         path = Path(path)
         if path.suffix.lower() not in (".html", ".htm"):
@@ -43,13 +43,13 @@ class Page:
 
 @dataclass(frozen=True)
 class Animation(Page):
-    """A page with the moving robot, contact force, ZMP, support polygon and centre of mass.
+    """Page with the moving robot, contact force, ZMP, support polygon and centre of mass.
 
-    A notebook shows it where it is the value of a cell.  html : the whole page; it needs no network.
+    A notebook shows it as the value of a cell.  html : the whole page, which needs no network.
     """
 
     def _repr_html_(self) -> str:
-        """A frame of its own, so that the notebook's styles and scripts stay apart from its."""
+        """HTML frame that separates the page's styles and scripts from those of the notebook."""
         return (
             f'<iframe srcdoc="{escape(self.html)}" title="animation" width="100%" height="{HEIGHT}" '
             'style="border: 0"></iframe>'
@@ -57,23 +57,23 @@ class Animation(Page):
 
 
 def animation_of(record: Record, problem: ImpactProblem) -> Animation:
-    """The record's motions: planned, and those of engines that it has.
+    """Animation of a record's motions: the planned one, and the simulated ones.
 
     Raises
     ------
-    InputError : the record holds no motion.
+    InputError : the record has no motion.
     """
     if not record.completed:
-        raise InputError("this result holds no motion to show: the solve ended before there was one")
+        raise InputError("this result has no motion to show: the solve ended before there was one")
     header, arrays = stage_of(record, problem)
     name = str(record.summary.get("problem", {}).get("name", "")) or "motion"
     return Animation(html_page(title=name, kind="alone", body=BODY, header=header, arrays=arrays))
 
 
 def animate(solution: Solution, *, simulation: Any | None = None, replay: Any | None = None) -> Animation:
-    """The planned motion; and beside it, if given, its simulations on held and on free soles.
+    """Animation of the planned motion and, if given, of its simulations on fixed and on free soles.
 
-    simulation, replay : what :meth:`impactopt.Solution.validate` gave, by "pinocchio" and by "mujoco".
+    simulation, replay : of :meth:`impactopt.Solution.validate`, by "pinocchio" and by "mujoco".
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Charts of a report: for each one a description and the arrays that it names."""
+"""Charts of a report: descriptions, and the arrays to which they refer."""
 
 from __future__ import annotations
 
@@ -26,18 +26,21 @@ __all__ = ["charts_of"]
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
-NEAR = (0.01, 0.03)  # [s] before and after contact that the force is shown over at first
+NEAR = (0.01, 0.03)  # [s] before and after contact, shown of the force at first
 # label, prefix in a record, style; the styles are those of style.css
 SOURCES = (
     ("planned", "reference", "planned"),
     ("simulated", "simulated", "simulated"),
     ("free soles", "replayed", "free"),
 )
-OTHERS = ("one", "two")  # styles of what is no motion
+OTHERS = ("one", "two")  # styles of series that are no motions
 
 
 def charts_of(record: Record, problem: ImpactProblem | None = None) -> tuple[list[dict[str, Any]], Arrays]:
-    """Descriptions, in the order of the page, and arrays by name; problem: for the planned hand's speed."""
+    """Descriptions in the order of the page, and arrays by name.
+
+    problem : for the planned speed of the hand; None: without it.
+    """
     arrays: Arrays = {}
     charts: list[dict[str, Any] | None] = []
     if record.completed:
@@ -77,7 +80,7 @@ def _series(
 
 
 def _close_up(record: Record) -> list[float]:
-    """[s] of contact and what is near it."""
+    """Time span [s] of contact and its neighbourhood."""
     start, end = _bands(record)[0]
     return [max(0.0, start - NEAR[0]), end + NEAR[1]]
 
@@ -137,7 +140,7 @@ def _zmp_margin(record: Record, arrays: Arrays, present: list[Any]) -> dict[str,
 
 
 def _stances(record: Record, arrays: Arrays) -> dict[str, Any] | None:
-    """A strip that shows which soles the plan has on the ground; None where it has one stance."""
+    """Strip of the soles that are planned to stand; None for a plan with one stance."""
     time = record.arrays["reference_time"]
     standing, series = soles_standing(record, time), []
     for k, (name, on) in enumerate(standing.items()):
@@ -147,7 +150,7 @@ def _stances(record: Record, arrays: Arrays) -> dict[str, Any] | None:
     if not series:
         return None
     around = [-1.0, float(len(series))]
-    more: dict[str, Any] = {"word": "stands", "include": around, "height": 120}  # its heights are no numbers
+    more: dict[str, Any] = {"word": "stands", "include": around, "height": 120}  # no axis of values
     return _chart("Soles on the ground", "", series, bands=_bands(record), **more)
 
 
@@ -161,7 +164,7 @@ def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, A
         t, x, y = thinned(time, *centre_of_pressure(wrench).T, whole=_close_up(record))
         points, name = np.column_stack([x, y]), f"zmp_{style}"
         arrays |= {name: points, f"{name}_time": t}
-        # its number is the margin that the chart beside it draws
+        # the value shown for a point is that of the margin's chart
         beside = {"x": f"margin_{style}_x", "y": f"margin_{style}_y"}
         series.append({"label": label, "style": style, "xy": name, "time": f"{name}_time", **beside})
     soles = footprints(record)
@@ -176,7 +179,7 @@ def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, A
         "polygon": "ground_polygon",
         "soles": [f"ground_{name}" for name in soles],
         "height": 300,
-        "note": "From above; drag to move. The dots are where the ZMP is at the time of the animation.",
+        "note": "From above; drag to move. The dots show the ZMP at the time of the animation.",
     }
 
 
@@ -202,12 +205,12 @@ def _torque_ratio(record: Record, arrays: Arrays) -> dict[str, Any]:
         bands=_bands(record),
         include=[0.0, 1.0],
         limits=limits,
-        note="Of the joint that is nearest to its limit.",
+        note="Of the joint closest to its limit.",
     )
 
 
 def _joint(record: Record, arrays: Arrays, which: str, title: str, unit: str) -> dict[str, Any]:
-    """One joint's history, which the reader chooses; at first that with the torque nearest to its limit."""
+    """History of one joint, chosen by the reader; at first the one whose torque is closest to its limit."""
     a, series = record.arrays, []
     limit = a["torque_limit"]
     for label, style, time, torque in _torque(record):
@@ -237,13 +240,13 @@ def _joint(record: Record, arrays: Arrays, which: str, title: str, unit: str) ->
 
 
 def _soles(record: Record, arrays: Arrays) -> list[dict[str, Any]]:
-    """Each sole by itself, in the replay that is nearest to the truth."""
+    """Charts of each sole in the most faithful replay."""
     prefix = "replayed" if record.replayed else "simulated"
     a = record.arrays
     names = a.get(f"{prefix}_soles", [n.removeprefix("sole_") for n in a if n.startswith("sole_")])
     if f"{prefix}_sole_ground" not in a or not len(names):
         return []
-    how, out = "on free soles" if record.replayed else "on held soles", []
+    how, out = "on free soles" if record.replayed else "on fixed soles", []
     time = a[f"{prefix}_time"]
     standing, always = soles_standing(record, time), np.ones(len(time), dtype=bool)
     away = np.column_stack([~standing.get(str(name), always) for name in names])
@@ -268,13 +271,14 @@ def _soles(record: Record, arrays: Arrays) -> list[dict[str, Any]]:
             )
             for k, name in enumerate(names)
         ]
-        note = {"note": "Distance from its own nearest edge; at 0 it tips."} if what == "pressed" else {}
+        note = {"note": "Distance to the sole's nearest edge; at 0 it tips."} if what == "pressed" else {}
         bands = _bands(record)
         out.append(_chart(f"{title}, simulated {how}", unit, series, bands=bands, include=[0.0], **note))
     return out
 
 
 def _convergence(record: Record, arrays: Arrays) -> list[dict[str, Any]]:
+    """Chart of violation and optimality over the solver's iterations."""
     a = record.arrays
     if "history_iteration" not in a:
         return []

@@ -1,4 +1,4 @@
-"""Results beside each other: their numbers, where their problems and versions differ, and a page of it."""
+"""Comparison of results: their values, differences of problems and versions, and a page of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from impactopt.report.report import Report
 from impactopt.report.result_rows import (
     Cell,
     Row,
-    blow_rows,
+    contact_rows,
     number_row,
     phase_rows,
     standing,
@@ -29,10 +29,10 @@ from impactopt.report.result_rows import (
 __all__ = ["MOST", "Comparison", "Difference", "compare", "histories_of"]
 
 Array = NDArray[np.float64]
-MOST = 5  # results: the page has a line's style for each of so many
+MOST = 5  # results: the page has as many line styles
 STYLES = ("planned", "simulated", "free", "one", "two")
 NOT_SET = "-"
-NUMBERS = (
+COMPARED = (  # keys of ``summary.json``
     *("status", "message", "impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target"),
     *("duration_s", "zmp_margin_m", "torque_ratio", "clearance_mm", "max_violation"),
     *("solver", "iterations", "solve_seconds", "collision_model"),
@@ -42,7 +42,7 @@ REPLAYS = ("simulated", "replayed")
 
 @dataclass(frozen=True)
 class Difference:
-    """A key, and what each result has there, as text."""
+    """A key in which results differ, and the value of each, as text."""
 
     key: str
     values: tuple[str, ...]
@@ -50,9 +50,10 @@ class Difference:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
-    """Results beside each other.
+    """Comparison of results.
 
-    records : by name.  rows : numbers, a cell for each.  problem, versions : keys in which they differ.
+    records : by name.  rows : of a table with a column for each result.
+    problem, versions : differences of problems and versions.
     """
 
     records: Mapping[str, Record]
@@ -64,22 +65,22 @@ class Comparison:
         """JSON form, as `impactopt compare --json` prints it."""
         results = []
         for name, record in self.records.items():
-            row: dict[str, Any] = {"name": name}
-            row |= {key: record.summary.get(key) for key in NUMBERS}
-            row |= {key: record.summary[key] for key in REPLAYS if key in record.summary}
-            results.append(row)
+            values: dict[str, Any] = {"name": name}
+            values |= {key: record.summary.get(key) for key in COMPARED}
+            values |= {key: record.summary[key] for key in REPLAYS if key in record.summary}
+            results.append(values)
 
-        def told(differences: Sequence[Difference]) -> dict[str, dict[str, str]]:
+        def by_key(differences: Sequence[Difference]) -> dict[str, dict[str, str]]:
             return {d.key: dict(zip(self.records, d.values, strict=True)) for d in differences}
 
         return {
             "results": plain(results),
-            "problem": told(self.problem),
-            "versions": told(self.versions),
+            "problem": by_key(self.problem),
+            "versions": by_key(self.versions),
         }
 
     def page(self) -> Report:
-        """All of it as one HTML page; times are since each one's own contact."""
+        """HTML page of the comparison, with histories over the time since each result's contact."""
         arrays: dict[str, Any] = {}
         charts = list(_charts(self.records, arrays))
         title = " and ".join(self.records)
@@ -90,7 +91,7 @@ class Comparison:
 
 
 def compare(records: Mapping[str, Record]) -> Comparison:
-    """Results beside each other, by name.
+    """Compares results, given by name.
 
     Raises
     ------
@@ -109,6 +110,7 @@ def compare(records: Mapping[str, Record]) -> Comparison:
 
 
 def _rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    """Rows of the table of values; None for one without values."""
     yield Row(
         "status",
         tuple(
@@ -117,10 +119,10 @@ def _rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
         ),
     )
     replays = [s.get("replayed") or s.get("simulated") or {} for s in summaries]
-    yield from blow_rows(summaries)
+    yield from contact_rows(summaries)
     yield number_row("duration [s]", [s.get("duration_s") for s in summaries], 2)
-    said = [s.get(key, {}) for s in summaries for key in ("zmp_margin_m", "torque_ratio")]
-    yield from phase_rows(summaries, tuple(dict.fromkeys(phase for table in said for phase in table)))
+    by_phase = [s.get(key, {}) for s in summaries for key in ("zmp_margin_m", "torque_ratio")]
+    yield from phase_rows(summaries, tuple(dict.fromkeys(phase for values in by_phase for phase in values)))
     yield number_row("least distance of bodies [mm]", [s.get("clearance_mm") for s in summaries], 1)
     yield number_row("replayed impulse [N s]", [r.get("impulse_Ns") for r in replays], 2)
     yield number_row("replayed, largest slip of a sole [mm]", [r.get("sole_slip_mm") for r in replays], 2)
@@ -130,7 +132,7 @@ def _rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
 
 
 def _problems(records: Sequence[Record]) -> list[dict[str, str]]:
-    """Flat keys of each problem's file; of what a summary says of it if one has no file."""
+    """Flat keys of each problem's file; if a result has no file, those of all summaries."""
     tables = []
     for record in records:
         try:
@@ -143,7 +145,7 @@ def _problems(records: Sequence[Record]) -> list[dict[str, str]]:
 
 
 def _flat(above: str, value: Any) -> Iterator[tuple[str, str]]:
-    """Keys with dots, a list of tables by number, and values as text."""
+    """Dotted keys, with numbers for a list of tables, and values as text."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             yield from _flat(f"{above}.{key}" if above else str(key), item)
@@ -155,7 +157,7 @@ def _flat(above: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def _text(value: Any) -> str:
-    """5 and 5.0 are the same."""
+    """Value as text; 5 and 5.0 are the same."""
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_text, value))}]"
     if isinstance(value, bool):
@@ -164,32 +166,34 @@ def _text(value: Any) -> str:
 
 
 def _differences(flat: Sequence[Mapping[str, str]]) -> tuple[Difference, ...]:
+    """Keys whose values are not the same in all tables of flat keys."""
     keys = dict.fromkeys(key for table in flat for key in table)
-    rows = [Difference(key, tuple(table.get(key, NOT_SET) for table in flat)) for key in keys]
-    return tuple(row for row in rows if len(set(row.values)) > 1)
+    compared = [Difference(key, tuple(table.get(key, NOT_SET) for table in flat)) for key in keys]
+    return tuple(one for one in compared if len(set(one.values)) > 1)
 
 
 def histories_of(record: Record) -> dict[str, tuple[Array, Array]]:
-    """Time since contact [s] and values, of what a record has: `force` [N], `margin` of the ZMP [mm], `ratio`
-    of the largest torque to its limit.
+    """Time since contact [s] and values of the histories that a record has, by name.
+
+    force : [N] on the target.  margin : [mm] of the ZMP.  ratio : of the largest torque to its limit.
     """
-    a, found = record.arrays, dict[str, tuple[Array, Array]]()
+    a, histories = record.arrays, dict[str, tuple[Array, Array]]()
     if not record.completed:
-        return found
+        return histories
     start = float(a["reference_contact_start"])
     if len(a["collision_time"]) > 1:
         time, force = at_contact(record, a["collision_force"], 0.0)
-        found["force"] = time - start, force
+        histories["force"] = time - start, force
     if len(a["polygon"]):
         time, wrench = ground_wrenches(record, "reference")
-        found["margin"] = time - start, 1e3 * zmp_margins(record, time, wrench)
+        histories["margin"] = time - start, 1e3 * zmp_margins(record, time, wrench)
     time, torque = planned_torque(record)
-    found["ratio"] = time - start, np.abs(torque / a["torque_limit"]).max(axis=1)
-    return found
+    histories["ratio"] = time - start, np.abs(torque / a["torque_limit"]).max(axis=1)
+    return histories
 
 
 def _charts(records: Mapping[str, Record], arrays: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Descriptions of the page's charts; their numbers go to `arrays`."""
+    """Descriptions of the page's charts; their data are added to `arrays`."""
     known = [histories_of(record) for record in records.values()]
     longest = max((float(r.summary.get("contact_ms") or 0.0) for r in records.values()), default=0.0)
     for which, title, unit, more in (
@@ -229,25 +233,25 @@ def _body(comparison: Comparison, title: str) -> Iterator[str]:
     yield _table(names, rows)
     yield '<h2>Planned histories</h2><div id="charts"></div>'
     for heading, differences in (
-        ("Where the problems differ", comparison.problem),
-        ("Where the versions differ", comparison.versions),
+        ("Differences of the problems", comparison.problem),
+        ("Differences of the versions", comparison.versions),
     ):
         rows = [(d.key, [(value, True) for value in d.values]) for d in differences]
         yield f"<h2>{heading}</h2>"
-        yield _table(names, rows) if rows else "<p>They do not.</p>"
+        yield _table(names, rows) if rows else "<p>None.</p>"
     yield "</main><footer><main>Made by impactopt. This file holds all that it shows and needs no network."
     yield "</main></footer>"
 
 
 def _table(names: Sequence[str], rows: Sequence[tuple[str, list[tuple[str, bool]]]]) -> str:
-    """A column for each result; cells are text, and whether it is good."""
+    """HTML table with a column for each result; a cell is its text, and whether it is good."""
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
     lines = []
     for label, cells in rows:
-        told = "".join(
+        values = "".join(
             f"<td>{escape(text)}</td>" if good else f'<td class="bad">! {escape(text)}</td>'
             for text, good in cells
         )
-        lines.append(f'<tr><th scope="row">{escape(label)}</th>{told}</tr>')
+        lines.append(f'<tr><th scope="row">{escape(label)}</th>{values}</tr>')
     table = f"<table><thead><tr><td></td>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
     return f'<section class="card"><div class="scroll" tabindex="0">{table}</div></section>'

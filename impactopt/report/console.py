@@ -1,4 +1,4 @@
-"""Terminal output: progress while a problem is solved, and the results as a table."""
+"""Terminal output: progress of a solve, and tables of results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from impactopt.report.result_rows import (
     replay_columns,
     result_columns,
     result_rows,
-    worst_rows,
+    worst_constraints,
 )
 from impactopt.solvers.program import IterationRecord, without_violations
 
@@ -48,33 +48,31 @@ __all__ = [
 ]
 
 PHASES_OF_STRIKE = ("contact", "collision")
-PIPED = 500  # columns of what is no terminal
-QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot be rewritten
+PIPE_WIDTH = 500  # columns of output that does not go to a terminal
+MIN_INTERVAL = 1.0  # [s] between lines about iterations where a line cannot be rewritten
 
 
 def _plain(text: str) -> str:
-    """Text that comes from files, for a console: neither markup nor control characters are obeyed."""
+    """Text from files, with markup and control characters escaped."""
     return escape(printable(text))
 
 
 def output() -> Console:
-    """Console on stdout; where that is no terminal and nobody says how wide it is, lines are as long as they
-    need to be.
-    """
+    """Console on stdout; without a terminal and a given width, lines are not wrapped."""
     console = Console()
-    return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=PIPED)
+    return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=PIPE_WIDTH)
 
 
 class SolveConsole:
-    """Lines about what is being done, and a live line about the iterations.
+    """Progress lines, and a live line about the iterations.
 
-    Where there is no terminal, iterations are plain lines, one a second at most; `verbose`: all of them.
+    Without a terminal, iterations are plain lines, at most one a second; `verbose`: all of them.
     """
 
     def __init__(self, console: Console, *, quiet: bool = False, verbose: bool = False) -> None:
         self._console, self._quiet, self._verbose = console, quiet, verbose
         self._live: Status | None = None
-        self._last = -QUIET_BETWEEN
+        self._last = -MIN_INTERVAL
         self._start = time.perf_counter()
 
     def __enter__(self) -> SolveConsole:
@@ -90,7 +88,7 @@ class SolveConsole:
             self._live.stop()
 
     def say(self, text: str) -> None:
-        """One more thing is done or begun."""
+        """Prints a line about a step that has begun or ended."""
         if self._quiet:
             return
         elapsed = time.perf_counter() - self._start
@@ -99,7 +97,7 @@ class SolveConsole:
             self._live.update(_plain(text))
 
     def iteration(self, record: IterationRecord) -> None:
-        """A solver's callback."""
+        """Prints an iteration; the callback of a solver."""
         text = (
             f"iteration {record.iteration:4d}   objective {record.objective:10.4f}   "
             f"violation {record.max_violation:8.1e}   {record.seconds:6.1f} s"
@@ -108,46 +106,45 @@ class SolveConsole:
             return
         if self._live is not None:
             self._live.update(text)
-        if self._verbose or (self._live is None and record.seconds - self._last >= QUIET_BETWEEN):
+        if self._verbose or (self._live is None and record.seconds - self._last >= MIN_INTERVAL):
             self._last = record.seconds
             self._console.print(f"          {text}", highlight=False, soft_wrap=True)
 
 
 def result_table(summary: Mapping[str, Any]) -> Table:
-    """Planned beside simulated, and beside the replay on free soles; what is outside its limit is marked."""
+    """Table of plan, simulation and replay on free soles; values outside their limits are marked."""
     return _table(summary, result_columns(summary))
 
 
 def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
-    """A replay beside the plan; `report` as in `impactopt validate --json`."""
+    """Table of the plan and a replay; `report` as in `impactopt validate --json`."""
     return _table(summary, replay_columns(report, summary))
 
 
 def touch_message(report: Mapping[str, Any]) -> str:
-    """Impulse and first touch of the striking link's hull beside those of its striking point; "" without."""
+    """Sentence that compares impulse and first touch of the striking link's hull and point; "" if none."""
     if "point" not in report:
         return ""
-    one, other = (
-        f"{found['impulse_Ns']:.2f} N s, {found['first_touch_ms']:+.2f} ms early"
-        for found in (report, report["point"])
+    hull, point = (
+        f"{contact['impulse_Ns']:.2f} N s, {contact['first_touch_ms']:+.2f} ms early"
+        for contact in (report, report["point"])
     )
-    return f"contact of the link's hull: {one}; of the striking point: {other}"
+    return f"contact of the link's hull: {hull}; of the striking point: {point}"
 
 
 def verdict_table(verdict: Mapping[str, Any]) -> Table:
-    """Table of a verification, the worst first; `verdict` as in `impactopt verify --json`."""
+    """Table of a verification, worst constraint first; `verdict` as in `impactopt verify --json`."""
     kkt = "not computed" if verdict["kkt"] is None else f"KKT residual {verdict['kkt']:.2g}"
-    words = "ok" if verdict["ok"] else "not ok"
-    table = Table(title=_plain(f"{words}; {kkt}"), title_justify="left")
+    table = Table(title=_plain(f"{'ok' if verdict['ok'] else 'not ok'}; {kkt}"), title_justify="left")
     for name in ("constraint", "violation", "where"):
         table.add_column(name, justify="right" if name == "violation" else "left")
-    for name, row in sorted(verdict["rows"].items(), key=lambda item: -item[1]["violation"]):
-        table.add_row(_plain(name), f"{row['violation']:.2g}", _plain(row["where"]))
+    for name, worst in sorted(verdict["rows"].items(), key=lambda item: -item[1]["violation"]):
+        table.add_row(_plain(name), f"{worst['violation']:.2g}", _plain(worst["where"]))
     return table
 
 
 def strike_table(summary: Mapping[str, Any]) -> Table:
-    """The planned blow; `summary` as of a :class:`impactopt.StrikeSolution`."""
+    """Table of a planned strike; `summary` as in a :class:`impactopt.StrikeSolution`."""
     table = _table(summary, {"planned": summary}, PHASES_OF_STRIKE)
     margin = [summary.get("capture_margin_m")]
     row = number_row("capture point's margin after contact [mm]", margin, 1, scale=1e3, least=-1e-6)
@@ -157,14 +154,14 @@ def strike_table(summary: Mapping[str, Any]) -> Table:
 
 
 def collision_table(found: Mapping[str, Any]) -> Table:
-    """One collision, beside what a saved result says of it; `found` as in `impactopt collide --json`."""
+    """Table of one collision and those of a saved result; `found` as in `impactopt collide --json`."""
     model = f"{found['model']}, freezes = {found['freezes']}" if found.get("freezes") else found["model"]
     table = Table(title=_plain(f"{found['problem']}: {model}"), title_justify="left")
-    words = [f"caution: {found['caution']}"] if found.get("caution") else []
-    words += [f"{found['model']}: {found['believe']}"] if "believe" in found else []
-    words += ["no peak force: the impact takes no time"] if found["model"] == "rigid" else []
-    if words:
-        table.caption, table.caption_justify = _plain("\n".join(words)), "left"
+    notes = [f"caution: {found['caution']}"] if found.get("caution") else []
+    notes += [f"{found['model']}: {found['believe']}"] if "believe" in found else []
+    notes += ["no peak force: the impact takes no time"] if found["model"] == "rigid" else []
+    if notes:
+        table.caption, table.caption_justify = _plain("\n".join(notes)), "left"
     table.add_column("")
     for name in ("collision", *(found.get("saved") or {})):
         table.add_column(name, justify="right")
@@ -174,22 +171,22 @@ def collision_table(found: Mapping[str, Any]) -> Table:
 
 
 def comparison_tables(found: Comparison) -> list[Table]:
-    """Numbers of results beside each other, and the keys in which their problems and versions differ."""
-    numbers = _beside("numbers", found.records)
+    """Tables of results side by side: their values, and the keys in which problems and versions differ."""
+    values = _empty_comparison("values", found.records)
     for row in found.rows:
-        _add(numbers, row)
-    tables = [numbers]
+        _add(values, row)
+    tables = [values]
     for what, differences in (("problems", found.problem), ("versions", found.versions)):
         if differences:
-            table = _beside(f"where the {what} differ", found.records)
+            table = _empty_comparison(f"{what}: differences", found.records)
             for difference in differences:
                 table.add_row(_plain(difference.key), *map(_plain, difference.values))
             tables.append(table)
     return tables
 
 
-def _beside(title: str, names: Iterable[str]) -> Table:
-    """A table with a column for each result."""
+def _empty_comparison(title: str, names: Iterable[str]) -> Table:
+    """Table without rows, with a column for each result."""
     table = Table(title=title, title_justify="left")
     table.add_column("", overflow="fold")
     for name in names:
@@ -198,7 +195,7 @@ def _beside(title: str, names: Iterable[str]) -> Table:
 
 
 def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
-    """The joints whose servos are asked for most; `joints` as in `impactopt collide --json`."""
+    """Table of the largest torque demands; `joints` as in `impactopt collide --json`."""
     table = Table(title="largest torque demands", title_justify="left")
     for name in ("joint", "torque [N m]", "limit [N m]", "ratio"):
         table.add_column(name, justify="left" if name == "joint" else "right")
@@ -209,15 +206,15 @@ def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
 
 
 def identified_table(found: Mapping[str, Any]) -> Table:
-    """Contact laws and their numbers, the best law first; `found` as in `impactopt identify --json`."""
-    blows = "one blow" if found["blows"] == 1 else f"{found['blows']} blows"
-    table = Table(title=_plain(f"{found['log']}: {blows}"), title_justify="left")
+    """Table of contact laws and their parameters, best law first; `found` as in `identify --json`."""
+    impacts = "one impact" if found["blows"] == 1 else f"{found['blows']} impacts"
+    table = Table(title=_plain(f"{found['log']}: {impacts}"), title_justify="left")
     for name in ("", "value", f"{100 * found['level']:g} % interval"):
         table.add_column(name, justify="right" if name else "left")
     for law in found["laws"]:
         more = law["aic"] - found["laws"][0]["aic"]
-        left = f"leaves {law['force_left_pct']:.2g} % of the peak force, AIC {more:+.0f}"
-        table.add_row(_plain(f"{law['law']}: {left}"), end_section=False)
+        fit = f"residual {law['force_left_pct']:.2g} % of the peak force, AIC {more:+.0f}"
+        table.add_row(_plain(f"{law['law']}: {fit}"), end_section=False)
         for name, each in law["estimates"].items():
             ends = [f"{x:.4g}" if x is not None else "?" for x in (each["low"], each["high"])]
             label = f"  {name} [{each['unit']}]" if each["unit"] else f"  {name}"
@@ -228,7 +225,7 @@ def identified_table(found: Mapping[str, Any]) -> Table:
 
 
 def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
-    """Table of the starts' results; `starts` as in a summary."""
+    """Table of the results from several initial guesses; `starts` as in a summary."""
     table = Table(title="starts", title_justify="left")
     for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
         table.add_column(name, justify="left" if name in ("start", "status") else "right")
@@ -244,6 +241,7 @@ def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
 def _table(
     summary: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]], phases: Sequence[str] = PHASES
 ) -> Table:
+    """Table titled with the problem's name, with the rows of `result_rows`."""
     table = Table(title=_plain(str(summary.get("problem", {}).get("name", "result"))), title_justify="left")
     table.add_column("")
     for name in columns:
@@ -254,13 +252,14 @@ def _table(
 
 
 def _add(table: Table, row: Row) -> None:
+    """Adds a row; values outside their limits are marked."""
     texts = ((_plain(cell.text), cell.good) for cell in row.cells)
     cells = (text if good else f"[bold red]! {text}[/]" for text, good in texts)
     table.add_row(_plain(row.label), *cells)
 
 
 def touches_message(summary: Mapping[str, Any]) -> str:
-    """Sentence about contacts between a plan's bodies; "" if there are none."""
+    """Sentence about unintended contacts of bodies; "" without any."""
     touches = summary.get("contacts_besides") or ()
     if not touches:
         return ""
@@ -274,30 +273,30 @@ def touches_message(summary: Mapping[str, Any]) -> str:
 
 
 def reason_message(summary: Mapping[str, Any]) -> str:
-    """Sentences about why a plan is not called solved, without its violations; "" of one that is."""
+    """Sentences about why a problem is not solved, without its violations; "" if it is solved."""
     if summary["status"] == "solved":
         return ""
     return without_violations(str(summary["message"]))
 
 
 def switched_off_message(summary: Mapping[str, Any]) -> str:
-    """Sentence about the standard bounds that a plan was made without; "" if all are on."""
+    """Sentence about default terms that are switched off; "" without any."""
     off = summary.get("problem", {}).get("off") or ()
     return f"switched off: {', '.join(off)}" if off else ""
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
-    """Table of violations, worst first, one a term."""
+    """Table of violated constraints, worst first, one of each term."""
     table = Table(title="violations, worst first", title_justify="left")
     table.add_column("constraint", overflow="fold")
     table.add_column("violation", overflow="fold")
-    for row, by in worst_rows(violations):
-        table.add_row(_plain(row), _plain(by))
+    for constraint, amount in worst_constraints(violations):
+        table.add_row(_plain(constraint), _plain(amount))
     return table
 
 
 def nail_driving_table(series: Mapping[str, Any]) -> Table:
-    """A row for each blow on a nail; `series` as in `impactopt drive --json`."""
+    """Table of the blows on a nail; `series` as in `impactopt drive --json`."""
     table = Table(title="blows on the nail", title_justify="left")
     columns = (
         ("driven [mm]", "driven_m", 1e3, 1),

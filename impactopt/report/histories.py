@@ -1,4 +1,4 @@
-"""Histories of a result over its whole time: in contact those of the model that the plan has of it."""
+"""Planned and simulated histories of a result; planned ones in contact are those of the collision model."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-BUCKETS = 400  # of a history; of each its ends, and its least and largest value are kept
+BUCKETS = 400  # of a thinned history
 
 
 def thinned(time: Array, *columns: Array, whole: Sequence[float] = (np.inf, -np.inf)) -> list[Array]:
-    """Time (k,) and columns at fewer instants: of each bucket its ends, and where a column is least and most.
+    """Time (k,) and columns at fewer instants: of each bucket, its ends and the extrema of each column.
 
-    Source: U. Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB 2014: lines
-    through these look as through all. Between the two times of `whole`, which are looked at closely, all is
-    kept.
+    Lines through these look the same as through all instants. Between the two times of `whole`, where the
+    reader zooms in, all instants are kept.
+
+    Source: U. Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB 2014.
     """
     if len(time) <= 3 * BUCKETS:
         return [time, *columns]
@@ -44,14 +45,14 @@ def thinned(time: Array, *columns: Array, whole: Sequence[float] = (np.inf, -np.
             part = column[low:high]
             if np.isfinite(part).any():
                 kept |= {low + int(np.nanargmin(part)), low + int(np.nanargmax(part))}
-            if not np.isfinite(part).all():  # where a history has a gap, so has its picture
+            if not np.isfinite(part).all():  # keep gaps
                 kept.add(low + int(np.argmin(np.isfinite(part))))
     chosen = np.array(sorted(kept))
     return [time[chosen], *(column[chosen] for column in columns)]
 
 
 def at_contact(record: Record, values: Array, otherwise: float) -> tuple[Array, Array]:
-    """A history of the planned collision, and one value for all time before and after."""
+    """Time [s] and values of a history of the planned collision, with a constant value before and after."""
     a = record.arrays
     start, end, last = (float(a[f"reference_{n}"]) for n in ("contact_start", "contact_end", "end"))
     time = np.concatenate([[0.0, start], start + a["collision_time"], [end, last]])
@@ -59,7 +60,7 @@ def at_contact(record: Record, values: Array, otherwise: float) -> tuple[Array, 
 
 
 def ground_wrenches(record: Record, prefix: str) -> tuple[Array, Array]:
-    """Time and the ground's wrench (k, 6) about the origin; in the planned collision that of its model."""
+    """Time and the ground's wrench (k, 6) about the origin; in planned contact, of the collision model."""
     a = record.arrays
     time = a[f"{prefix}_time"]
     if prefix != "reference":
@@ -75,9 +76,7 @@ def ground_wrenches(record: Record, prefix: str) -> tuple[Array, Array]:
 
 
 def soles_standing(record: Record, time: Array) -> dict[str, NDArray[np.bool_]]:
-    """Mask (k,) of the times [s] at which the plan has each sole on the ground, by its name; none where it
-    has one stance.
-    """
+    """Mask (k,) of the times [s] at which each sole is planned to stand, by name; empty with one stance."""
     phases = record.summary.get("stances") or []
     names = [name.removeprefix("sole_") for name in record.arrays if name.startswith("sole_")]
     last = len(phases) - 1
@@ -95,7 +94,7 @@ def soles_standing(record: Record, time: Array) -> dict[str, NDArray[np.bool_]]:
 
 
 def zmp_margins(record: Record, time: Array, wrench: Array) -> Array:
-    """Distance (k,) [m] of the ZMP of ground wrenches (k, 6) from the edges of what stands then."""
+    """Distance (k,) [m] of the ZMP of ground wrenches (k, 6) to the edges of the support polygon then."""
     place, phases = centre_of_pressure(wrench), record.summary.get("stances") or []
     if not phases:
         return margin(record.arrays["polygon"], place)
@@ -108,7 +107,7 @@ def zmp_margins(record: Record, time: Array, wrench: Array) -> Array:
 
 
 def footprints(record: Record) -> dict[str, Array]:
-    """Corners (k, 2) [m] of each sole on the ground by ``sole_<name>``; and where it stands after a step."""
+    """Corners (k, 2) [m] of each sole on the ground by ``sole_<name>``, also after each step."""
     out = {name: corners for name, corners in record.arrays.items() if name.startswith("sole_")}
     for k, phase in enumerate(record.summary.get("stances") or []):
         for name in phase.get("moved_m", {}):

@@ -1,4 +1,4 @@
-"""One HTML file with all in it: style, scripts and packed numbers. It asks nothing of any network."""
+"""Self-contained HTML file: style, scripts and packed arrays. It needs no network."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from impactopt.files.output import plain
 
 __all__ = ["html_page", "pack", "unpack"]
 
-KINDS = {"<f4": np.float32, "<u2": np.uint16, "<u4": np.uint32, "|u1": np.uint8}  # as JavaScript has them
+KINDS = {"<f4": np.float32, "<u2": np.uint16, "<u4": np.uint32, "|u1": np.uint8}  # JavaScript's typed arrays
 
 
 def pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
     """Base64 of a zlib stream: length of the JSON (4 bytes), JSON, and arrays, each aligned to 4 bytes.
 
-    The JSON is the header, and under "arrays" each array's kind, shape and place after the JSON. What is not
-    of one of the KINDS is kept with single precision.
+    The JSON is the header, and under "arrays" each array's kind, shape and offset (place) after the JSON.
+    Arrays of other kinds than KINDS are stored in single precision.
     """
     table: dict[str, Any] = {}
-    parts, place = [], 0
+    parts, offset = [], 0
     for name, array in arrays.items():
-        kept = array if array.dtype.str in KINDS else array.astype("<f4")
-        data = np.ascontiguousarray(kept).tobytes()
-        table[name] = {"kind": kept.dtype.str, "shape": kept.shape, "place": place}
+        stored = array if array.dtype.str in KINDS else array.astype("<f4")
+        data = np.ascontiguousarray(stored).tobytes()
+        table[name] = {"kind": stored.dtype.str, "shape": stored.shape, "place": offset}
         parts.append(data + bytes(-len(data) % 4))
-        place += len(parts[-1])
+        offset += len(parts[-1])
     text = json.dumps(plain({**header, "arrays": table}), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     return base64.b64encode(
@@ -44,7 +44,7 @@ def pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def unpack(packed: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """The header and the arrays of a packed text."""
+    """Header and arrays of a packed text."""
     data = zlib.decompress(base64.b64decode(packed))
     start = 4 + int.from_bytes(data[:4], "little")
     header = json.loads(data[4:start])
@@ -56,14 +56,14 @@ def unpack(packed: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     return header, arrays
 
 
-# in this order: each uses what is in those before it
+# in this order: each uses those before it
 SCRIPTS = ("unpack", "geometry", "view", "player", "charts", "main")
 
 
 def html_page(
     *, title: str, kind: str, body: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> str:
-    """The page; `body` is HTML, `title` is text; kind: "report", or "alone" for an animation by itself."""
+    """HTML of a page; `body` is HTML, `title` is text; kind: "report", or "alone" for an animation alone."""
     scripts = "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
     given = {
         "generator": f"impactopt {__version__}",
@@ -75,7 +75,7 @@ def html_page(
         "scripts": scripts,
     }
     page = _asset("page.html")
-    # in one pass: what is put in may have such marks in it
+    # in a single pass, because the inserted texts may contain such marks
     return re.sub(r"\{\{(\w+)\}\}", lambda mark: given[mark.group(1)], page)
 
 

@@ -1,4 +1,4 @@
-"""Bad input and warnings as plain messages on stderr, without tracebacks, for every command."""
+"""Plain messages on stderr for bad input and warnings, without tracebacks, for every command."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BAD_INPUT, BUG, INTERRUPTED = 2, 70, 130  # exit codes
 
 @contextlib.contextmanager
 def _terminated_as_interrupted() -> Iterator[None]:
-    """SIGTERM raises KeyboardInterrupt, in the main thread and where nobody else handles it."""
+    """Makes SIGTERM raise KeyboardInterrupt, in the main thread, unless it has another handler."""
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
@@ -36,10 +36,11 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 @contextlib.contextmanager
 def plain_errors(interrupted: str, *, verbose: bool = False, keeps: bool = False) -> Iterator[Console]:
-    """A console on stderr, for a command's body.
+    """Context of a command's body, with a console on stderr.
 
-    interrupted : what Ctrl-C prints, where the body does not catch it.  verbose : bad input has a traceback.
-    keeps : the body keeps what it has on Ctrl-C, and is to do so on SIGTERM, as of a scheduler, too.
+    interrupted : printed on a Ctrl-C that the body does not catch.
+    verbose : bad input prints a traceback.
+    keeps : the body saves its results on Ctrl-C; then SIGTERM, as of a scheduler, has the same effect.
     """
     from rich.console import Console
 
@@ -64,7 +65,7 @@ def plain_errors(interrupted: str, *, verbose: bool = False, keeps: bool = False
         except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
             raise
         except Exception:
-            # 1 is a command's "no", which a script may count on
+            # exit code 1 is a command's "no", on which a script may rely
             traceback.print_exc()
             typer.echo("error: this is a fault of impactopt; please report it with the lines above", err=True)
             raise typer.Exit(BUG) from None

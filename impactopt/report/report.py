@@ -1,4 +1,4 @@
-"""A result as one page: its numbers, planned beside simulated, plots, the motion, and how it was made."""
+"""Page of a result: plan and simulations in tables and charts, animation, and how the result was made."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.animation import Page
 from impactopt.report.charts import charts_of
 from impactopt.report.page import html_page
-from impactopt.report.result_rows import result_columns, result_rows, worst_rows
+from impactopt.report.result_rows import result_columns, result_rows, worst_constraints
 from impactopt.report.stage import stage_of
 from impactopt.robots.loads import shortfalls
 
@@ -21,23 +21,23 @@ __all__ = ["Report", "report_of", "report_page"]
 
 COLUMN_NOTES = {
     "simulated": "Simulated: replayed in Pinocchio's full dynamics, any soles fixed.",
-    "held soles": "Held soles: replayed in Pinocchio's full dynamics, with the soles fixed.",
+    "fixed soles": "Fixed soles: replayed in Pinocchio's full dynamics, with the soles fixed.",
     "free soles": "Free soles: replayed in MuJoCo, with nothing fixed.",
 }
 BAD_NOTE = (
-    "! is outside a limit, or has less than half of the margin that is asked of the plan; a robot that uses "
-    "up a margin may stand all the same."
+    "! is outside a limit, or has less than half of the margin required of the plan; a robot that uses up "
+    "a margin may stand all the same."
 )
-NARROW = "\u202f"  # between a number and its unit: no line ends there
+NARROW = "\u202f"  # narrow no-break space, between a number and its unit
 
 
 @dataclass(frozen=True)
 class Report(Page):
-    """A page; `save` writes it.  html : all of it; it needs no network."""
+    """A page that needs no network; `save` writes it.  html : its text."""
 
 
 def report_of(record: Record, problem: ImpactProblem | None = None) -> Report:
-    """The record as a page; with the animation, if the problem is given and there is a motion."""
+    """Page of a record; with the animation, if the problem is given and there is a motion."""
     charts, arrays = charts_of(record, problem)
     header: dict[str, Any] = {}
     if problem is not None and record.completed:
@@ -52,7 +52,7 @@ def report_of(record: Record, problem: ImpactProblem | None = None) -> Report:
 
 
 def report_page(solution: Solution, *, simulation: Any | None = None, replay: Any | None = None) -> Report:
-    """A page as of `impactopt show`; simulation, replay : as of :func:`impactopt.animate`."""
+    """Page as of `impactopt show`; simulation, replay : as in :func:`impactopt.animate`."""
     record = record_of(solution, simulation=simulation, replay=replay)
     return report_of(record, solution.problem)
 
@@ -96,7 +96,7 @@ def _body(record: Record, title: str, *, animated: bool) -> Iterator[str]:
 
 
 def _cards(s: Mapping[str, Any]) -> str:
-    """The numbers that matter most, with what the most faithful replay says of them."""
+    """Cards of the main results, with those of the most faithful replay."""
     replay: Mapping[str, Any] = s.get("replayed") or s.get("simulated") or {}
     cards = []
 
@@ -119,8 +119,8 @@ def _cards(s: Mapping[str, Any]) -> str:
     margins = s.get("sole_cop_margin_mm") or {}
     if margins:
         least = min(min(phases.values()) for phases in margins.values())
-        asked = min((s.get("sole_cop_margin_asked_mm") or {}).values(), default=None)
-        beside = "" if asked is None else f", {asked:g}{NARROW}mm asked"
+        required = min((s.get("sole_cop_margin_asked_mm") or {}).values(), default=None)
+        beside = "" if required is None else f", {required:g}{NARROW}mm required"
         kind = "bad" if shortfalls(s) else ""
         card(f"{least:.0f} mm", f"least planned margin of a sole's centre of pressure{beside}", kind)
     standing = s.get("replayed", {}).get("standing")
@@ -151,11 +151,11 @@ def _violations(s: Mapping[str, Any]) -> str:
     if not s.get("violations"):
         return ""
     rows = "".join(
-        f'<tr><th scope="row">{escape(row)}</th><td>{escape(by)}</td></tr>'
-        for row, by in worst_rows(s["violations"])
+        f'<tr><th scope="row">{escape(constraint)}</th><td>{escape(amount)}</td></tr>'
+        for constraint, amount in worst_constraints(s["violations"])
     )
     table = f'<div class="card scroll"><table><tbody>{rows}</tbody></table></div>'
-    return f"<h2>What is not met, worst first</h2>{table}"
+    return f"<h2>Violated constraints, worst first</h2>{table}"
 
 
 def _solve(s: Mapping[str, Any]) -> dict[str, Any]:

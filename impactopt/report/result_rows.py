@@ -1,4 +1,4 @@
-"""Planned beside simulated, as rows of text: for tables on the console and in reports."""
+"""Rows of text for the tables of results, on the console and in reports."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from impactopt.solvers.program import MINOR
 __all__ = [
     "Cell",
     "Row",
-    "blow_rows",
     "collision_rows",
+    "contact_rows",
     "number_row",
     "phase_rows",
     "replay_columns",
@@ -26,18 +26,18 @@ __all__ = [
     "standing",
     "target_rows",
     "word_row",
-    "worst_rows",
+    "worst_constraints",
 ]
 
 PHASES = ("swing", "collision", "follow", "missed")
-SLIP = 5.0  # [mm] on free soles: a plan within its friction slides less
-EDGE = 0.1  # [mm, N] by which a sole that tips on its edge may seem to be outside
+MAX_SLIP = 5.0  # [mm] on free soles: a plan within its friction slips less
+TOLERANCE = 0.1  # [mm, N] of sole margins: a sole that tips on its edge may seem to be slightly outside
 Columns = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A number as text, and whether it is within its limit."""
+    """A value as text, and whether it is within its limit."""
 
     text: str
     good: bool = True
@@ -52,50 +52,50 @@ class Row:
 
 
 def result_columns(summary: Mapping[str, Any]) -> Columns:
-    """The plan, its simulation on fixed soles, and its replay on free ones, as far as there are any.
+    """Columns of the plan, its simulation on fixed soles, and its replay on free ones, as far as they exist.
 
     summary : the content of ``summary.json``.
     """
     replayed = _by_phase(summary.get("replayed", {}))
     simulated = summary.get("simulated", {})
-    return _said({"planned": summary, "simulated": simulated, replay_name(summary): replayed})
+    return _present({"planned": summary, "simulated": simulated, replay_name(summary): replayed})
 
 
 def replay_columns(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Columns:
-    """The plan and one replay; `report` as in `impactopt validate --json`."""
-    held = "held soles" if summary.get("sole_cop_margin_mm") else "Pinocchio"
-    name = replay_name(summary) if report["engine"] == "mujoco" else held
-    return _said({"planned": summary, name: _by_phase(report)})
+    """Columns of the plan and one replay; `report` as in `impactopt validate --json`."""
+    fixed = "fixed soles" if summary.get("sole_cop_margin_mm") else "Pinocchio"
+    name = replay_name(summary) if report["engine"] == "mujoco" else fixed
+    return _present({"planned": summary, name: _by_phase(report)})
 
 
 def result_rows(columns: Columns, phases: Sequence[str] = PHASES) -> list[Row]:
-    """Rows that some column has something to say in; the first column is the plan's."""
+    """Rows with a value in at least one column; the first column is the plan's."""
     return [row for row in _rows(list(columns.values()), phases) if row is not None]
 
 
 def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterator[Row | None]:
-    yield from blow_rows(sources)
+    yield from contact_rows(sources)
     yield from phase_rows(sources, phases)
     yield from _sole_rows(sources)
     for label, key, joint, digits, most in (
         ("gear load / torque limit", "gear_ratio", "gear_joint", 2, np.inf),
-        ("motor's use of its line", "motor_ratio", "motor_joint", 2, 1.0),
+        ("motor load / torque-speed line", "motor_ratio", "motor_joint", 2, 1.0),
         ("cut by the motor's line [ms]", "motor_cut_ms", "motor_cut_joint", 1, 0.0),
         ("power of a motor [W]", "power_W", "power_joint", 0, np.inf),
         ("joint out of its range [rad]", "beyond_range_rad", "beyond_range", 3, 0.0),
         ("jump of a joint's speed [rad/s]", "velocity_jump_rad_s", "velocity_jump_joint", 2, np.inf),
     ):
         row = number_row(label, [source.get(key) for source in sources], digits, most=most)
-        if row is not None:  # names in a line of their own: beside the numbers they would fill a terminal
+        if row is not None:  # names get a row of their own: beside the values they would be too wide
             yield row
             if any(names := [source.get(joint) for source in sources]):
                 yield _of_joints(names)
     slips = [None, *(source.get("sole_slip_mm") for source in sources[1:])]
-    yield _of_replays(number_row("largest slip of a sole [mm]", slips, 2, most=SLIP))
+    yield _of_replays(number_row("largest slip of a sole [mm]", slips, 2, most=MAX_SLIP))
     for label, key, digits in (
         ("largest lift of a sole [mm]", "sole_lift_mm", 2),
         ("impulse error [%]", "impulse_error_pct", 2),
-        ("left uncertain by steps [%]", "step_error_pct", 3),
+        ("impulse, uncertainty by steps [%]", "step_error_pct", 3),
     ):
         yield _of_replays(number_row(label, [None, *(source.get(key) for source in sources[1:])], digits))
     yield from _gain_rows(sources)
@@ -105,36 +105,40 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
 
 
 def _sole_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
-    """Margins of each sole by itself, beside what is asked of the plan: of its centre of pressure to its own
-    edges in each phase, and its least normal force.
+    """Rows of each sole: margin of its centre of pressure to its own edges in each phase, and least force.
 
-    Good is half of that in a plan and on fixed soles, and a sole that does not tip on free ones.
+    Labels have the margins required of the plan. Good is at least half of them in a plan and on fixed soles;
+    on free ones, a sole that does not tip.
     """
-    asked, force = sources[0].get("sole_cop_margin_asked_mm") or {}, sources[0].get("sole_force_asked_N") or 0
+    required, force = (
+        sources[0].get("sole_cop_margin_asked_mm") or {},
+        sources[0].get("sole_force_asked_N") or 0,
+    )
     free = np.array([source.get("engine") == "mujoco" for source in sources])
     margins, forces = (
         [source.get(key) or {} for source in sources] for key in ("sole_cop_margin_mm", "sole_force_N")
     )
     for sole in dict.fromkeys(name for source in margins for name in source):
         own = [source.get(sole, {}) for source in margins]
-        for phase in dict.fromkeys(name for found in own for name in found):
-            wanted, half = "", -np.inf
-            if phase in asked:
-                wanted, half = f" (of {asked[phase]:g})", 1e3 * least_kept(1e-3 * asked[phase])
-            label = f"{sole} CoP margin [mm], {phase}{wanted}"
-            yield number_row(label, [f.get(phase) for f in own], 1, least=np.where(free, 0.0, half) - EDGE)
+        for phase in dict.fromkeys(name for by_phase in own for name in by_phase):
+            of, half = "", -np.inf
+            if phase in required:
+                of, half = f" (of {required[phase]:g})", 1e3 * least_kept(1e-3 * required[phase])
+            label = f"{sole} CoP margin [mm], {phase}{of}"
+            least = np.where(free, 0.0, half) - TOLERANCE
+            yield number_row(label, [by_phase.get(phase) for by_phase in own], 1, least=least)
         label = f"{sole} least force [N]{f' (of {force:g})' if force else ''}"
         values = [min(source.get(sole, {}).values(), default=None) for source in forces]
-        yield number_row(label, values, 0, least=np.where(free, 0.0, SHARE * force) - EDGE)
+        yield number_row(label, values, 0, least=np.where(free, 0.0, SHARE * force) - TOLERANCE)
 
 
 def standing(replay: Mapping[str, Any]) -> bool | None:
-    """True if a replay stands at the end; None if there are no soles, as a bolted robot cannot fall."""
+    """True if the robot stands at the end of a replay; None without soles: a bolted robot cannot fall."""
     return replay.get("standing") if replay.get("sole_force_N") else None
 
 
-def blow_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
-    """The blow itself, and what it has brought the target."""
+def contact_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    """Rows of the contact and of its result for the target."""
     for label, key, digits in (
         ("impulse [N s]", "impulse_Ns", 2),
         ("peak force [N]", "peak_force_N", 0),
@@ -146,7 +150,7 @@ def blow_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
 
 
 def phase_rows(sources: Sequence[Mapping[str, Any]], phases: Iterable[str]) -> Iterator[Row | None]:
-    """Rows with a number of their own in each phase."""
+    """Rows of the quantities that have a value in each phase."""
     for label, key, digits, scale, least, most in (
         ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
         ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
@@ -157,7 +161,7 @@ def phase_rows(sources: Sequence[Mapping[str, Any]], phases: Iterable[str]) -> I
 
 
 def collision_rows(found: Mapping[str, Any]) -> list[Row]:
-    """One collision, and what a saved result says of it; `found` as in `impactopt collide --json`."""
+    """Rows of one collision and those of a saved result; `found` as in `impactopt collide --json`."""
     sources = [found, *(found.get("saved") or {}).values()]
     most_uncertain = -np.inf if found.get("caution") else np.inf
     rows = [
@@ -166,7 +170,7 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
             ("speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),
             ("effective mass [kg]", "effective_mass_kg", 2, 1.0, -np.inf, np.inf),
             ("impulse [N s]", "impulse_Ns", 3, 1.0, -np.inf, np.inf),
-            ("left uncertain by freezing [%]", "freeze_error_pct", 1, 1.0, -np.inf, most_uncertain),
+            ("impulse, uncertainty by freezing [%]", "freeze_error_pct", 1, 1.0, -np.inf, most_uncertain),
             ("peak force [N]", "peak_force_N", 1, 1.0, -np.inf, np.inf),
             ("contact time [ms]", "contact_ms", 2, 1.0, -np.inf, np.inf),
             ("energy to the target [J]", "energy_J", 3, 1.0, -np.inf, np.inf),
@@ -180,11 +184,11 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
     return [row for row in rows if row is not None]
 
 
-def worst_rows(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Violated constraints and amounts, worst first: the worst one of each term, and the number of its
-    others.
+def worst_constraints(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Violated constraints and amounts, worst first: the worst of each term, and the number of the others.
 
-    violations : as in ``summary.json``. What is off by less than `MINOR` of the worst only follows from it.
+    violations : as in ``summary.json``. Those below `MINOR` times the worst are consequences of it, and are
+        left out.
     """
     worst = max((v.get("amount") or 0.0 for v in violations), default=0.0)
     terms: dict[str, list[Mapping[str, Any]]] = {}
@@ -195,18 +199,18 @@ def worst_rows(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]
     def more(count: int) -> str:
         return f" (and {count} more)" if count else ""
 
-    return [(f"{rows[0]['row']}{more(len(rows) - 1)}", str(rows[0]["by"])) for rows in terms.values()]
+    return [(f"{first['row']}{more(len(others))}", str(first["by"])) for first, *others in terms.values()]
 
 
 def target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
-    """Rows for the impact's effects on the targets."""
+    """Rows of the impact's effects on the target."""
     yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
     yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
     yield word_row("the board breaks", [target.get("broken") for target in targets])
 
 
 def _gain_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
-    """Gains that the plan has chosen."""
+    """Rows of the gains that the plan has chosen."""
     others = (Cell(""),) * (len(sources) - 1)
     for chosen in sources[0].get("gains") or ():
         least, largest = chosen["between"]
@@ -217,12 +221,12 @@ def _gain_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
 
 
 def _model_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
-    """The model of the collision that the plan has in it, and how far it is from full dynamics."""
+    """Rows of the plan's collision model, and of its errors against full dynamics."""
     plan, others = sources[0], (Cell(""),) * (len(sources) - 1)
     if (name := plan.get("collision_model")) is not None:
         freezes = plan.get("freezes") or 0
-        often = f", {freezes:g} freeze{'s' if freezes > 1 else ''} on the way" if freezes else ""
-        yield Row("model of the collision", (Cell(f"{name}{often}"), *others))
+        again = f", {freezes:g} freeze{'s' if freezes > 1 else ''} on the way" if freezes else ""
+        yield Row("model of the collision", (Cell(f"{name}{again}"), *others))
     for label, key, digits in (
         ("model error, impulse [%]", "model_error_pct", 2),
         ("model error, ZMP [mm]", "model_error_zmp_mm", 1),
@@ -240,9 +244,7 @@ def number_row(
     least: float | NDArray[np.float64] = -np.inf,
     most: float = np.inf,
 ) -> Row | None:
-    """None where no column has a number; what is not between `least`, of each or all, and `most` is not
-    good.
-    """
+    """Row of numbers, good between `least` (of all, or of each) and `most`; None without any number."""
     if all(value is None for value in values):
         return None
     cells = [
@@ -259,7 +261,7 @@ def _rounded(value: float, digits: int) -> str:
 
 
 def word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> Row | None:
-    """Yes or no; None where no column has either."""
+    """Row of yes and no; None if no column has either."""
     if all(value is None for value in values):
         return None
     cells = [
@@ -270,21 +272,22 @@ def word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> R
 
 
 def _of_joints(names: Sequence[Any]) -> Row:
-    """Row with the joints that the numbers above belong to, from the left."""
+    """Row with the joints of the values above, from the left."""
     different = dict.fromkeys(str(name) for name in names if name)
     return Row(f"  at {', '.join(different)}", (Cell(""),) * len(names))
 
 
 def _of_replays(row: Row | None) -> Row | None:
-    """Row with an empty cell for the plan, which has no such number."""
+    """Row with an empty cell for the plan, which has no such value."""
     return None if row is None else Row(row.label, (Cell(""), *row.cells[1:]))
 
 
 def _by_phase(report: Mapping[str, Any]) -> dict[str, Any]:
-    """A report with its numbers by phase, named as in a summary."""
+    """Report with its values by phase, under the keys of a summary."""
     names = {"zmp_margin_m": "zmp_margin_by_phase_m", "torque_ratio": "torque_ratio_by_phase"}
     return {**report, **{name: report.get(other) or {} for name, other in names.items()}} if report else {}
 
 
-def _said(sources: Columns) -> Columns:
+def _present(sources: Columns) -> Columns:
+    """Columns with values, without those of simulations that failed."""
     return {name: source for name, source in sources.items() if source and "error" not in source}

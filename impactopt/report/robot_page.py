@@ -1,4 +1,4 @@
-"""A robot's bodies on a page: convex hulls over its meshes, and which may touch."""
+"""Page of a robot's bodies: convex hulls over its meshes, and pairs that may touch."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from impactopt.robots.robot import Robot
 __all__ = ["bodies_page", "bodies_page_of_problem"]
 
 Array = NDArray[np.float64]
-USUAL = "half_sitting"  # the posture that a robot without a problem is shown in, if it has one
+DEFAULT_POSTURE = "half_sitting"  # of a robot without a problem, if the robot has it
 
 
 def bodies_page(robot: Robot) -> Report:
-    """The bodies of a robot in its posture `USUAL`, or else in its first one, or at its model's neutral."""
-    names = sorted(robot.postures, key=lambda name: name != USUAL)
+    """Page of a robot's bodies in `DEFAULT_POSTURE`, else in its first posture, or else in the neutral."""
+    names = sorted(robot.postures, key=lambda name: name != DEFAULT_POSTURE)
     posture = robot.posture(names[0]) if names else pin.neutral(robot.model)
     return _page(robot, posture, names[0] if names else "neutral", robot.name)
 
 
 def bodies_page_of_problem(problem: ImpactProblem) -> Report:
-    """The bodies of a problem's robot where it starts, and of the problem's world."""
-    where = problem.start if isinstance(problem.start, str) else "start"
+    """Page of the bodies of a problem's world, and of its robot in the initial posture."""
+    posture = problem.start if isinstance(problem.start, str) else "start"
     title = problem.name or problem.robot.name
     return _page(
         problem.robot,
         problem.start_posture,
-        where,
+        posture,
         title,
         world=problem.world,
         normal=problem.normal,
@@ -81,29 +81,29 @@ def _page(
 
 def _pack_hulls(links: RobotBodies, arrays: Arrays) -> list[dict[str, Any]]:
     out = []
-    for k, piece in enumerate(links.pieces):
-        packed = pack_solid(f"hull{k}", Solid(vertices=piece.vertices, triangles=piece.triangles), arrays)
-        out.append({"joint": piece.joint, "colour": links.joints.index(piece.joint), **packed})
+    for k, hull in enumerate(links.pieces):
+        packed = pack_solid(f"hull{k}", Solid(vertices=hull.vertices, triangles=hull.triangles), arrays)
+        out.append({"joint": hull.joint, "colour": links.joints.index(hull.joint), **packed})
     return out
 
 
 def _still(robot: Robot, q: Array, label: str) -> Track:
-    """One instant, in which nothing is hit."""
+    """Track of a single instant without contact."""
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, q)
-    nothing, none = np.zeros(1), np.full((1, 3), np.nan)
+    zero, unknown = np.zeros(1), np.full((1, 3), np.nan)
     strikers = [data.oMf[model.getFrameId(s.model_frame)].translation for s in robot.strikers.values()]
-    middle = np.array(pin.centerOfMass(model, data, q))
+    com = np.array(pin.centerOfMass(model, data, q))
     return Track(
         name=label,
-        time=nothing,
+        time=zero,
         places=np.array([[pin.SE3ToXYZQUAT(place) for place in data.oMi]]),
-        hand=np.array([strikers[0] if strikers else middle]),
-        mass=middle[None],
-        force=nothing,
-        travel=nothing,
-        zmp=none[:, :2],
-        ground=none,
+        hand=np.array([strikers[0] if strikers else com]),
+        mass=com[None],
+        force=zero,
+        travel=zero,
+        zmp=unknown[:, :2],
+        ground=unknown,
         contact_start=np.nan,
         contact_end=np.nan,
     )
@@ -113,19 +113,18 @@ def _body(
     links: RobotBodies, q: Array, posture: str, title: str, world: Sequence[WorldBody]
 ) -> Iterator[str]:
     yield f'<header><h1>{escape(title)}</h1><span class="sub">'
-    yield f"{escape(links.robot.name)}: what of it can touch something</span>"
+    yield f"{escape(links.robot.name)}: collision bodies</span>"
     yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
     yield '<div id="trouble"></div>'
-    yield f'<p id="source">Bodies are convex hulls. They are from the {escape(links.source)}. Point at '
-    yield "a row to see its link."
-    yield "</p>"
+    yield f'<p id="source">Bodies are convex hulls of the {escape(links.source)}. Point at a row to see its '
+    yield "link.</p>"
     yield '<div class="top"><section class="card stays" id="animation" aria-label="bodies"></section>'
     yield f'<section class="card" id="fit" aria-label="links"><h3>Links</h3>{_fit(links)}'
     yield "</section></div>"
     if world:
         yield f'<h2>The world</h2><section class="card" id="world">{_world(world)}</section>'
     yield "<h2>Pairs that may touch</h2>"
-    for number, (why, pairs) in enumerate(_left_out(links, q, posture)):
+    for number, (why, pairs) in enumerate(_excluded_pairs(links, q, posture)):
         rows = [(one, other) for one, other in pairs] or [("none", "")]
         yield f'<section class="card left-out" id="why{number}"><h3>{escape(why)}</h3>'
         yield f"{_table(('link', 'and link'), rows)}</section>"
@@ -150,27 +149,29 @@ def _world(world: Sequence[WorldBody]) -> str:
 
     rows = [(b.name, shape(b), place(b)) for b in world if not (b.core or b.ground)]
     return _table(
-        ("body", "shape", "middle"),
+        ("body", "shape", "centre"),
         rows or [("nothing but the ground" if any(b.ground for b in world) else "nothing", "", "")],
     )
 
 
-def _left_out(links: RobotBodies, q: Array, posture: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+def _excluded_pairs(
+    links: RobotBodies, q: Array, posture: str
+) -> Iterator[tuple[str, list[tuple[str, str]]]]:
     """Reasons why pairs of links may touch, with the pairs."""
     robot = links.robot
     yield "A joint connects them", [(links.name(a), links.name(b)) for a, b in links.connected]
-    said = {frozenset(pair) for pair in robot.disable_collisions}
-    joints = {piece.link: piece.joint for piece in links.pieces}
-    near = {frozenset(pair) for pair in links.connected}
-    told = [p for p in said if p <= joints.keys() and len(p) == 2]
-    beyond = [p for p in told if len(moved := {joints[n] for n in p}) == 2 and frozenset(moved) not in near]
-    yield "The robot's files, or its disable_collisions, say so", _sorted(beyond)
-    _, touching = links.piece_pairs(q, said)
+    disabled = {frozenset(pair) for pair in robot.disable_collisions}
+    joints = {hull.link: hull.joint for hull in links.pieces}
+    connected = {frozenset(pair) for pair in links.connected}
+    known = [p for p in disabled if p <= joints.keys() and len(p) == 2]
+    others = [p for p in known if len(of := {joints[n] for n in p}) == 2 and frozenset(of) not in connected]
+    yield "The robot's files, or its disable_collisions, exclude them", _sorted(others)
+    _, touching = links.piece_pairs(q, disabled)
     yield f"They touch in the posture {posture}", _sorted(map(frozenset, touching))
 
 
 def _sorted(pairs: Iterable[frozenset[str]]) -> list[tuple[str, str]]:
-    """Names of two each, of a pair of one link that name twice."""
+    """Sorted pairs of names; a pair of one link with itself has its name twice."""
     return sorted({(min(pair), max(pair)) for pair in pairs})
 
 

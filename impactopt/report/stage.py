@@ -1,4 +1,4 @@
-"""The numbers of an animation: solids on the robot's joints, the world's bodies, soles, and every motion."""
+"""Data of an animation: solids on the robot's joints, bodies of the world, soles, and motions."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ __all__ = ["bodies_drawn", "pack_robot", "pack_solid", "pack_track", "pack_world
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
-TRIANGLES = 120_000  # at most, of a robot
-CELL = 0.004  # [m] that solids are simplified to at least
-SMALL = 0.3  # [m] smaller solids have smaller cells, but not below a third
-GRID = 65535  # steps of a vertex's coordinate in its solid's bounds
+MAX_TRIANGLES = 120_000  # of a robot
+MIN_CELL = 0.004  # [m] of simplified solids
+SMALL = 0.3  # [m] size below which solids have smaller cells, down to a third
+GRID = 65535  # steps of a vertex's coordinate within its solid's bounds
 
 
 def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Arrays]:
-    """Header and arrays, for :func:`impactopt.report.page.pack`, of the record's motions."""
+    """Header and arrays of a record's motions, for :func:`impactopt.report.page.pack`."""
     arrays: Arrays = {}
     bodies = pack_robot(problem.robot, arrays)
     world = pack_world(problem.world, arrays)
@@ -60,7 +60,7 @@ def pack_robot(robot: Robot, arrays: Arrays) -> list[dict[str, Any]]:
 
 
 def pack_world(world: tuple[WorldBody, ...], arrays: Arrays) -> list[dict[str, Any]]:
-    """The same of the world's bodies."""
+    """Solids of the world's bodies for the page's header; their triangles are added to `arrays`."""
     return [
         {
             "kind": part.kind,
@@ -74,7 +74,7 @@ def pack_world(world: tuple[WorldBody, ...], arrays: Arrays) -> list[dict[str, A
 
 
 def _middle(places: Array) -> float:
-    """y [m] of the robot's middle, from which side it strikes: of its joints, at the start."""
+    """Mean y [m] of the robot's joints at the start, by which the view's side is chosen."""
     return float(places[0, 1:, 1].mean())
 
 
@@ -84,7 +84,7 @@ def bodies_drawn(robot: Robot) -> list[Visual]:
     for visual in visuals_of(robot):
         groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)
     whole = {key: joined(solids) for key, solids in groups.items()}
-    if sum(len(solid.triangles) for solid in whole.values()) > TRIANGLES:
+    if sum(len(solid.triangles) for solid in whole.values()) > MAX_TRIANGLES:
         whole = _few(whole)
     return [
         Visual(joint=joint, solid=solid, colour=colour)
@@ -94,22 +94,22 @@ def bodies_drawn(robot: Robot) -> list[Visual]:
 
 
 def _few(whole: dict[Any, Solid]) -> dict[Any, Solid]:
-    """The same with cells that grow until there are few enough triangles."""
-    cell = CELL
+    """Simplified solids, with cells large enough for `MAX_TRIANGLES` in all."""
+    cell = MIN_CELL
     while True:
-        few = {key: simplified(solid, cell * _share(solid)) for key, solid in whole.items()}
+        few = {key: simplified(solid, cell * _cell_factor(solid)) for key, solid in whole.items()}
         count = sum(len(solid.triangles) for solid in few.values())
-        if count <= TRIANGLES:
+        if count <= MAX_TRIANGLES:
             return few
-        cell *= max(1.1, (count / TRIANGLES) ** 0.8)
+        cell *= max(1.1, (count / MAX_TRIANGLES) ** 0.8)
 
 
-def _share(solid: Solid) -> float:
+def _cell_factor(solid: Solid) -> float:
     return float(np.clip(np.linalg.norm(np.ptp(solid.vertices, axis=0)) / SMALL, 1 / 3, 1.0))
 
 
 def pack_solid(name: str, solid: Solid, arrays: Arrays) -> dict[str, Any]:
-    """Its name and scale, for the header; its triangles are added to `arrays`."""
+    """Name and scale of a solid for the header; its triangles are added to `arrays`."""
     low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     span = np.maximum(high - low, 1e-9)
     arrays[f"{name}_vertices"] = np.round((solid.vertices - low) / span * GRID).astype("<u2")
@@ -119,7 +119,7 @@ def pack_solid(name: str, solid: Solid, arrays: Arrays) -> dict[str, Any]:
 
 
 def pack_track(name: str, track: Track, arrays: Arrays) -> dict[str, Any]:
-    """The same of a motion."""
+    """Name and contact of a motion for the header; its histories are added to `arrays`."""
     given = ("time", "places", "hand", "mass", "force", "travel", "zmp", "ground")
     arrays |= {f"{name}_{part}": getattr(track, part) for part in given}
     return {

@@ -1,4 +1,4 @@
-"""Moving objects of an animation at chosen instants: robot, target, force, ZMP and centre of mass."""
+"""Motions of an animation at sampled instants: robot, target, force, ZMP and centre of mass."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
 FRAME, FINE = 1 / 30, 1 / 500  # [s] between instants, and around contact
 AFTER = 1.0  # [s] shown beyond the end of the planned motion
-FAR = 3.0  # [m] that a target that flies off is followed; it fades on the second half of that
+FAR = 3.0  # [m] travel of a flying target that is shown; it fades out on the second half
 
 # name of each motion in a record, and the prefix of its arrays
 MISSED = "missed"
@@ -38,11 +38,15 @@ MOTIONS = (
 class Track:
     """One motion at k instants.
 
-    time (k,) [s]; places (k, joints, 7): each joint of the model in the world, position [m] and quaternion
-    x, y, z, w, the universe first; hand, mass (k, 3) [m]: striking point and centre of mass; force (k,) [N]
-    on the target, along its normal; travel (k,) [m] of the target along it, at most FAR; zmp (k, 2) [m] and
-    ground (k, 3) [N], the ground's force on the robot, nan where nothing presses or nothing is known of it.
-    contact_start, contact_end [s], nan without contact.  missing : whether the target is not there.
+    time (k,) [s]
+    places (k, joints, 7) : position [m] and quaternion x, y, z, w of each joint of the model in the world,
+        the universe first
+    hand, mass (k, 3) [m] : striking point, centre of mass
+    force (k,) [N] : on the target along its normal
+    travel (k,) [m] : of the target along its normal, at most FAR
+    zmp (k, 2) [m], ground (k, 3) [N] : ZMP, and force of the ground on the robot; nan if unknown
+    contact_start, contact_end [s] : nan without contact
+    missing : whether there is no target
     """
 
     name: str
@@ -60,20 +64,20 @@ class Track:
 
 
 def tracks_of(record: Record, problem: ImpactProblem) -> list[Track]:
-    """The planned motion, those that the record has of engines, and the planned one if there is no target.
+    """Tracks of the planned motion, of the simulated ones, and of the planned one for a missing target.
 
     The servo's reference coasts through contact; the planned robot does not. In contact it is drawn on the
-    cubic between the planned states before and after, whose ends and velocities are the plan's.
+    cubic Hermite interpolation between the planned states before and after.
     """
-    there = [(name, prefix) for name, prefix in MOTIONS if f"{prefix}_q" in record.arrays]
+    present = [(name, prefix) for name, prefix in MOTIONS if f"{prefix}_q" in record.arrays]
     free = replay_name(record.summary)
-    return [_track(record, problem, free if p == "replayed" else name, p) for name, p in there]
+    return [_track(record, problem, free if p == "replayed" else name, p) for name, p in present]
 
 
 def planned_track(solution: Solution, reference: Trajectory | None = None) -> Track:
-    """The planned motion of a solution, of which there is no record.
+    """Track of the planned motion of a solution without a record.
 
-    reference : the servo's, sampled otherwise than `Solution.trajectory`.
+    reference : of the servo, if sampled otherwise than `Solution.trajectory`.
 
     Raises
     ------
@@ -88,6 +92,7 @@ def planned_track(solution: Solution, reference: Trajectory | None = None) -> Tr
 
 
 def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Track:
+    """Track of a motion by the prefix of its arrays in the record."""
     a, robot = record.arrays, problem.robot
     time = a[f"{prefix}_time"]
     start, end = float(a[f"{prefix}_contact_start"]), float(a[f"{prefix}_contact_end"])
@@ -104,7 +109,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
         wrench, speed = a[f"{prefix}_sole_ground"].sum(axis=1)[chosen], a[f"{prefix}_target_speed"]
     travel = travelled(time, speed, start)
     if prefix == "reference" and record.summary.get("target", {}).get("broken", 1.0) < 0.5:
-        travel[time > end] = 0.0  # a board that holds springs back
+        travel[time > end] = 0.0  # an unbroken board springs back
     travel = travel[chosen]
     model = robot.model
     data, striker = model.createData(), model.getFrameId(robot.striker(problem.striker).model_frame)
@@ -132,7 +137,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
 
 
 def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.intp]:
-    """Indices of what is shown: dense around contact, until `last` [s]."""
+    """Indices of the shown instants: dense around contact, until `last` [s]."""
     last = min(last, float(time[-1]))
     grid = np.arange(0.0, last + FRAME / 2, FRAME)
     if np.isfinite(start):
@@ -148,26 +153,28 @@ def _planned(problem: ImpactProblem, record: Record) -> Callable[[NDArray[np.int
     """Configurations (k, nq) of the plan at instants of its reference."""
     a, model = record.arrays, problem.robot.model
     time, phase, q, v = (a[f"reference_{name}"] for name in ("time", "phase", "q", "v"))
-    inside = np.flatnonzero(phase == 1)
-    if not len(inside):
+    in_contact = np.flatnonzero(phase == 1)
+    if not len(in_contact):
         return lambda chosen: np.asarray(q[chosen])
-    first, after = int(inside[0]), min(int(inside[-1]) + 1, len(time) - 1)
+    first, after = int(in_contact[0]), min(int(in_contact[-1]) + 1, len(time) - 1)
     span = float(time[after] - time[first])
-    way = pin.difference(model, q[first], q[after])
+    difference = pin.difference(model, q[first], q[after])
 
     def at(chosen: NDArray[np.intp]) -> Array:
-        rows = q[chosen].copy()
+        out = q[chosen].copy()
         for k in np.flatnonzero(phase[chosen] == 1):
             s = (time[chosen[k]] - time[first]) / span if span > 0 else 0.0
-            bend = s * (1 - s) * ((1 - s) * (span * v[first] - way) - s * (span * v[after] - way))
-            rows[k] = pin.integrate(model, q[first], s * way + bend)
-        return np.asarray(rows)
+            # cubic Hermite interpolation in the tangent space: linear part, and part of the end velocities
+            start, end = span * v[first] - difference, span * v[after] - difference
+            bend = s * (1 - s) * ((1 - s) * start - s * end)
+            out[k] = pin.integrate(model, q[first], s * difference + bend)
+        return np.asarray(out)
 
     return at
 
 
 def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, Array]:
-    """Ground wrench and force of the plan at the chosen instants, and the target's speed at all of them."""
+    """Planned ground wrench and force at the chosen instants, and the target's speed at all instants."""
     a = record.arrays
     time, phase, wrench = a["reference_time"], a["reference_phase"], a["reference_ground"][chosen].copy()
     since = time - float(a["reference_contact_start"])
@@ -178,15 +185,15 @@ def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, 
         wrench[contact] = np.column_stack([np.interp(since[chosen][contact], at, w) for w in ground.T])
     force = np.where(contact, np.interp(since[chosen], hit, a["collision_force"]), 0.0)
     speed = np.interp(since, hit, a["collision_target_speed"])
-    if "depth_m" in record.summary.get("target", {}):  # a nail stays in its wood
+    if "depth_m" in record.summary.get("target", {}):  # a nail stays in the wood
         speed = np.where(since > hit[-1], 0.0, speed)
     return wrench, force, speed
 
 
 def planned_hand_speed(record: Record, problem: ImpactProblem) -> Array:
-    """(k,) [m/s] along the normal, at the reference's instants.
+    """Planned speed (k,) [m/s] of the hand along the normal, at the reference's instants.
 
-    It is nan in contact: there the servo's reference coasts, and the plan does not.
+    It is nan in contact, where the servo's reference coasts, unlike the plan.
     """
     a, robot = record.arrays, problem.robot
     model, data = robot.model, robot.model.createData()

@@ -1,4 +1,4 @@
-"""Postures of a given effective mass, and errors of one collision against another."""
+"""Search for postures of a given effective mass, and errors of one collision against another."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-LEAST_WEIGHT = 50.0  # [N] on the ground; with less the ZMP is a quotient of small numbers
+MIN_NORMAL_FORCE = 50.0  # [N] of the ground; with less the ZMP is a quotient of small numbers
 _MASS_TOLERANCE = 1e-6  # [kg]
+_POSITION_TOLERANCE = 1e-8  # [m, rad]
+_RANGE_MARGIN = 0.02  # [rad] that joints keep from their limits
 _AXES = pin.LOCAL_WORLD_ALIGNED
 
 
@@ -40,11 +42,11 @@ def posture_of_effective_mass(
     start: ArrayLike | None = None,
     inside: float = 0.06,
 ) -> Array:
-    """A configuration (nq,) whose effective mass at the striking point is `mass` [kg], within 1e-6 kg.
+    """Configuration (nq,) whose effective mass at the striking point is `mass` [kg], within 1e-6 kg.
 
-    The one found nearest to `start` (None: the posture half_sitting) by SLSQP, in the sum of squares of what
-    the joints move [rad], with held soles where they are, joints inside their limits by 0.02 rad, and the
-    centre of mass over the soles, `inside` [m] from their edge. Deterministic.
+    SLSQP minimizes the sum of squares of the joints' displacements [rad] from `start` (None: the posture
+    half_sitting). Fixed soles stay in place, joints stay inside their limits by 0.02 rad, and the centre of
+    mass stays over the soles, `inside` [m] from their edge. The result is deterministic.
 
     Raises
     ------
@@ -56,20 +58,20 @@ def posture_of_effective_mass(
         raise InputError(f"robot {robot.name!r} has no posture half_sitting; give start=")
     q0 = robot.posture("half_sitting") if start is None else robot.check_configuration(start, name="start")
     search = _PostureSearch(robot, float(mass), striker, normal, stance, q0, inside)
-    d, off = np.zeros(robot.nv), np.inf
-    for _ in range(4):  # SLSQP gives up early where its estimate of curvature is off; from there it goes on
-        d = search.from_here(d)
-        off = search.mass_error(d)
+    d, error = np.zeros(robot.nv), np.inf
+    for _ in range(4):  # SLSQP may stop early by a bad estimate of the Hessian: restart it from there
+        d = search.improve(d)
+        error = search.mass_error(d)
         if search.violation(d) <= 1.0:
             return np.array(pin.integrate(robot.model, q0, d))
     raise InputError(
         f"mass [kg]: no posture near the start has an effective mass of {mass:g} kg at {striker!r} (nearest: "
-        f"{mass + off:.4g} kg): choose another mass or start"
+        f"{mass + error:.4g} kg): choose another mass or start"
     )
 
 
 class _PostureSearch:
-    """Motions d (nv) from a configuration, in the basis of v, and what is asked of where they lead."""
+    """Optimization problem of a posture, in displacements d (nv,) from q0, in the tangent space."""
 
     def __init__(
         self,
@@ -82,88 +84,90 @@ class _PostureSearch:
         inside: float,
     ) -> None:
         self.robot, self.model, self.q0, self.inside = robot, robot.model, q0, inside
-        self.wanted, self.data = mass, robot.model.createData()
-        held_by = usual_stance(robot) if stance is None else stance
-        self._mass = effective_mass(robot, striker=striker, normal=normal, stance=held_by)
-        frames = held_by.constraint_frames(robot)
+        self.mass, self.data = mass, robot.model.createData()
+        taken = usual_stance(robot) if stance is None else stance
+        self._effective_mass = effective_mass(robot, striker=striker, normal=normal, stance=taken)
+        frames = taken.constraint_frames(robot)
         pin.framesForwardKinematics(self.model, self.data, q0)
         ids = [self.model.getFrameId(frame) for frame in frames]
-        self.held = [(i, self.data.oMf[i].copy()) for i in ids]
-        soles = held_by.soles(robot)
+        self.fixed = [(i, self.data.oMf[i].copy()) for i in ids]
+        soles = taken.soles(robot)
         self.standing = bool(soles)
         self.polygon = support_polygon(robot, StanceCoordinates(robot, soles, q0)) if soles else np.zeros(0)
         joints = robot.joint_positions(q0)
         free = np.full(robot.nv - robot.n, np.inf)
-        self.low = np.concatenate([-free, np.minimum(robot.lower + 0.02 - joints, 0.0)])
-        self.high = np.concatenate([free, np.maximum(robot.upper - 0.02 - joints, 0.0)])
-        # the base goes where the legs let it; a little weight keeps the search well posed
+        self.low = np.concatenate([-free, np.minimum(robot.lower + _RANGE_MARGIN - joints, 0.0)])
+        self.high = np.concatenate([free, np.maximum(robot.upper - _RANGE_MARGIN - joints, 0.0)])
+        # the base follows from the legs; a small weight makes the Hessian regular
         self.weight = np.concatenate([np.full(robot.nv - robot.n, 0.1), np.ones(robot.n)])
 
     def mass_error(self, d: Array) -> float:
-        """[kg]"""
-        return float(self._mass(pin.integrate(self.model, self.q0, d))) - self.wanted
+        """Error [kg] of the effective mass."""
+        return float(self._effective_mass(pin.integrate(self.model, self.q0, d))) - self.mass
 
     def equalities(self, d: Array) -> Array:
+        """Displacements of the fixed frames, and logarithmic error of the effective mass; 0 if feasible."""
         q = pin.integrate(self.model, self.q0, d)
         pin.framesForwardKinematics(self.model, self.data, q)
-        off = [pin.log6(at.actInv(self.data.oMf[i])).vector for i, at in self.held]
-        return np.concatenate([*off, [np.log(float(self._mass(q)) / self.wanted)]])
+        displacements = [pin.log6(at.actInv(self.data.oMf[i])).vector for i, at in self.fixed]
+        return np.concatenate([*displacements, [np.log(float(self._effective_mass(q)) / self.mass)]])
 
     def balance(self, d: Array) -> Array:
-        """(1,) [m] by which the centre of mass is farther inside the soles' hull than asked."""
+        """Margin (1,) [m] of the centre of mass to the support polygon's edge, beyond the required one."""
         com = pin.centerOfMass(self.model, self.data, pin.integrate(self.model, self.q0, d))
         return np.asarray(margin_in(self.polygon, com[None, :2]) - self.inside)
 
-    def from_here(self, d: Array) -> Array:
-        """Point (nv,) that SLSQP goes to."""
-        rules: list[dict[str, Any]] = [
-            {"type": "eq", "fun": self.equalities, "jac": lambda x: _slopes(self.equalities, x)}
+    def improve(self, d: Array) -> Array:
+        """Result (nv,) of SLSQP from the initial guess d."""
+        constraints: list[dict[str, Any]] = [
+            {"type": "eq", "fun": self.equalities, "jac": lambda x: _jacobian(self.equalities, x)}
         ]
         if self.standing:
-            rules.append({"type": "ineq", "fun": self.balance, "jac": lambda x: _slopes(self.balance, x)})
+            constraints.append(
+                {"type": "ineq", "fun": self.balance, "jac": lambda x: _jacobian(self.balance, x)}
+            )
         found = minimize(
             lambda x: 0.5 * float(self.weight @ x**2),
             d,
             jac=lambda x: self.weight * x,
             bounds=list(zip(self.low, self.high, strict=True)),
-            constraints=rules,
+            constraints=constraints,
             method="SLSQP",
             options={"maxiter": 200, "ftol": 1e-12},
         )
         return np.clip(found.x, self.low, self.high)
 
     def violation(self, d: Array) -> float:
-        """Largest violation over what is tolerated: 1e-6 kg, and 1e-8 m and rad."""
+        """Largest violation of a constraint, relative to its tolerance."""
         worst = abs(self.mass_error(d)) / _MASS_TOLERANCE
-        held = self.equalities(d)[:-1]
-        if held.size:
-            worst = max(worst, float(np.abs(held).max()) / 1e-8)
+        displacements = self.equalities(d)[:-1]
+        if displacements.size:
+            worst = max(worst, float(np.abs(displacements).max()) / _POSITION_TOLERANCE)
         if self.standing:
-            worst = max(worst, -float(self.balance(d)[0]) / 1e-8)
+            worst = max(worst, -float(self.balance(d)[0]) / _POSITION_TOLERANCE)
         return worst if np.isfinite(worst) else np.inf
 
 
-def _slopes(function: Any, x: Array, by: float = 1e-6) -> Array:
-    """Jacobian by central differences: a search asks no more of it than its direction."""
-    steps = by * np.eye(len(x))
-    return np.stack([(function(x + s) - function(x - s)) / (2 * by) for s in steps], axis=1)
+def _jacobian(function: Any, x: Array, step: float = 1e-6) -> Array:
+    """Jacobian by central differences, exact enough for a search direction."""
+    steps = step * np.eye(len(x))
+    return np.stack([(function(x + s) - function(x - s)) / (2 * step) for s in steps], axis=1)
 
 
 # ---------------------------------------------------------------- errors
 def errors_against(
     result: Collision, reference: Collision, *, torque_limit: ArrayLike | None = None
 ) -> dict[str, float | None]:
-    """Errors of a model's collision against a reference's; None where one of them has no such history.
+    """Errors of a model's collision against that of a reference; None if one of them lacks the history.
 
-    * impulse_error_pct, f_max_error_pct : 100 (result - reference) / reference, so positive where the model
-      promises too much. The paper's eq. (24) has the other sign.
+    * impulse_error_pct, f_max_error_pct : 100 (result - reference) / reference, positive for an overestimate.
+      The paper's eq. (24) has the opposite sign.
     * zmp_error_mm : largest distance of the ZMPs.
-    * torque_error_pct : largest difference of the servos' torques over `torque_limit` (n) [N m], all joints;
-      None without limits.
+    * torque_error_pct : largest difference of the servos' torques over `torque_limit` (n,) [N m], of all
+      joints; None without limits.
 
-    The last two are taken at the result's own instants while both are in contact, at equal times since
-    contact, between the reference's instants by straight lines; ZMPs only while both press on the ground with
-    more than 50 N.
+    The last two are evaluated at the result's instants, as long as both are in contact, with linear
+    interpolation of the reference; ZMPs only while both normal forces exceed 50 N.
     """
     time = result.time[result.time <= reference.time[-1]]
     k = time.size
@@ -178,13 +182,13 @@ def errors_against(
         "torque_error_pct": None,
     }
     if result.ground_wrench is not None and reference.ground_wrench is not None:
-        # the ZMP anew from wrenches: where the force is near zero it is not to be interpolated
+        # the ZMP from interpolated wrenches: near zero force it cannot be interpolated itself
         ground = result.ground_wrench[:k], of_reference(reference.ground_wrench)
-        loaded = np.logical_and(*(wrench[:, 2] > LEAST_WEIGHT for wrench in ground))
+        loaded = np.logical_and(*(wrench[:, 2] > MIN_NORMAL_FORCE for wrench in ground))
         if loaded.any():
             own, true = (np.stack([-w[loaded, 4], w[loaded, 3]]) / w[loaded, 2] for w in ground)
             out["zmp_error_mm"] = 1e3 * float(np.linalg.norm(own - true, axis=0).max())
     if result.torque is not None and reference.torque is not None and torque_limit is not None:
-        off = np.abs(result.torque[:k] - of_reference(reference.torque))
-        out["torque_error_pct"] = 100 * float((off / np.asarray(torque_limit)).max())
+        error = np.abs(result.torque[:k] - of_reference(reference.torque))
+        out["torque_error_pct"] = 100 * float((error / np.asarray(torque_limit)).max())
     return out

@@ -1,4 +1,4 @@
-"""Collision geometry of a replay, and contacts that are not intended."""
+"""Collision geometry of a replay, and record of unintended contacts."""
 
 from __future__ import annotations
 
@@ -12,23 +12,28 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-__all__ = ["FLOOR", "Besides", "Solid", "Solids", "Touched"]
+__all__ = ["FLOOR", "Solid", "Solids", "UnintendedContact", "UnintendedContacts"]
 
 Array = NDArray[np.float64]
 FLOOR = -1  # in place of a solid's number
-NEAR = 0.05  # [m] of the balls about two solids in the reference's motion: others are not looked at
-LOOK = 0.02  # [s] at which it is looked at
+NEAR = (
+    0.05  # [m] between the enclosing balls of two solids in the reference's motion; other pairs are ignored
+)
+SAMPLING = 0.02  # [s] between the instants of the reference that are checked
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
-    """A convex solid: of the link that a joint of the model moves, or of the world.
+    """A convex solid of a link of the robot, or of the world.
 
-    name : of the link, or of the body.  joint : index in the model; 0: of the world.
+    name : of the link, or of the body.
+    joint : index in the model of the joint that moves it; 0: a body of the world.
     vertices (k, 3) [m] : of a hull, in the joint's frame; None: a box with half sides ``half`` (3,) [m],
-    inflated by ``radius`` [m], at ``place`` (3,) with axes ``rotation`` (3, 3).
-    of_target : it is there only if the target is.  moves : with it.  before : it is gone after contact.
-    strikable : the link that strikes may touch it.
+        inflated by ``radius`` [m], at ``place`` (3,) with axes ``rotation`` (3, 3).
+    of_target : it exists only with the target.
+    moves : it moves with the target.
+    before : it exists before contact only.
+    strikable : the striking link may touch it.
     """
 
     name: str
@@ -53,7 +58,7 @@ class Solid:
         return coal.Convex(points, facets)
 
     def ball(self) -> tuple[Array, float]:
-        """Centre (3,) and radius [m] of a ball about it, in its frame."""
+        """Centre (3,) and radius [m] of an enclosing ball, in the joint's frame."""
         if self.vertices is not None:
             centre = (self.vertices.max(axis=0) + self.vertices.min(axis=0)) / 2
             return centre, float(np.linalg.norm(self.vertices - centre, axis=1).max())
@@ -63,21 +68,23 @@ class Solid:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solids:
-    """All solids of a scene; pairs of their numbers that are not to touch, the floor's being `FLOOR`.
+    """Solids of a scene.
 
-    floor : its height [m], where a pair has it.
+    pairs : of numbers of solids that must not touch; `FLOOR` stands for the floor.
+    floor : height of the floor [m], for pairs with it.
     """
 
     solids: tuple[Solid, ...] = ()
     pairs: tuple[tuple[int, int], ...] = ()
     floor: float = 0.0
 
-    def moved(self, way: Array) -> Solids:
-        """Copy with the target and its support moved by ``way`` (3,) [m]."""
+    def moved(self, displacement: Array) -> Solids:
+        """Copy with the target and its support displaced by (3,) [m]."""
         return replace(
             self,
             solids=tuple(
-                replace(s, place=np.asarray(s.place) + way) if s.of_target else s for s in self.solids
+                replace(s, place=np.asarray(s.place) + displacement) if s.of_target else s
+                for s in self.solids
             ),
         )
 
@@ -87,36 +94,50 @@ class Solids:
         return replace(self, pairs=tuple(p for p in self.pairs if not gone & set(p)))
 
     def near(self, model: Any, reference: Any) -> tuple[tuple[int, int], ...]:
-        """Pairs that can come near when the robot follows a reference: time (k,), q (k, nq)."""
+        """Pairs that may come near when the robot follows a reference: time (k,), q (k, nq)."""
         time = np.asarray(reference.time)
-        chosen = np.searchsorted(time, np.arange(time[0], time[-1] + LOOK, LOOK)).clip(0, len(time) - 1)
-        return self.near_at(model, np.asarray(reference.q)[chosen])
+        instants = np.arange(time[0], time[-1] + SAMPLING, SAMPLING)
+        sampled = np.searchsorted(time, instants).clip(0, len(time) - 1)
+        return self.near_at(model, np.asarray(reference.q)[sampled])
 
     def links_between(self, model: Any, moves: Array) -> Solids:
-        """Copy with only the pairs of links whose distance changes when velocities move (nv,) are not 0."""
-        moving = {j for j in range(2, model.njoints) if np.any(_own(model.joints[j], moves))}
+        """Copy with only the pairs of links whose distance changes by a motion of the joints.
+
+        moves (nv,) : velocity, or displacement in the tangent space; zero for joints that do not move.
+        """
+        # joint 1 moves the whole robot; a follower has its leader's place in `moves`, and nv = 0
+        moving = {
+            j
+            for j, joint in enumerate(model.joints)
+            if j >= 2 and np.any(moves[joint.idx_v : joint.idx_v + max(joint.nv, 1)])
+        }
         paths = [moving.intersection(model.supports[solid.joint]) for solid in self.solids]
         links = [k for k, solid in enumerate(self.solids) if solid.vertices is not None]
         chosen = [p for p in self.pairs if set(p) <= set(links) and paths[p[0]] != paths[p[1]]]
         return replace(self, pairs=tuple(chosen))
 
-    def apart(self, model: Any, q: Array) -> Array:
-        """(k,) [m] between the two links that are nearest to each other in configurations q (k, nq), by their
-        hulls; < 0 for penetration, inf where none come near.
+    def least_distance(self, model: Any, q: Array) -> Array:
+        """Least distance (k,) [m] between hulls of links in configurations q (k, nq).
+
+        It is < 0 for penetration, and inf where no pair comes near.
         """
         near = self.near_at(model, q)
-        data, asked, out = model.createData(), coal.DistanceRequest(), np.full(len(q), np.inf)
+        data, request, out = model.createData(), coal.DistanceRequest(), np.full(len(q), np.inf)
         for i, posture in enumerate(q):
             pin.forwardKinematics(model, data, posture)
-            at = {k: _placed(data.oMi[self.solids[k].joint]) for pair in near for k in pair}
+            joints = {k: data.oMi[self.solids[k].joint] for pair in near for k in pair}
+            at = {k: coal.Transform3s(joint.rotation, joint.translation) for k, joint in joints.items()}
             for one, other in near:
-                found, shapes = coal.DistanceResult(), (self.solids[one].hull, self.solids[other].hull)
-                coal.distance(shapes[0], at[one], shapes[1], at[other], asked, found)
-                out[i] = min(out[i], found.min_distance)
+                result, shapes = coal.DistanceResult(), (self.solids[one].hull, self.solids[other].hull)
+                coal.distance(shapes[0], at[one], shapes[1], at[other], request, result)
+                out[i] = min(out[i], result.min_distance)
         return out
 
     def near_at(self, model: Any, q: Array) -> tuple[tuple[int, int], ...]:
-        """Pairs that can come near in configurations q (k, nq)."""
+        """Pairs whose enclosing balls come within `NEAR` in configurations q (k, nq).
+
+        Pairs with a body that moves with the target are always included.
+        """
         data = model.createData()
         balls = [s.ball() for s in self.solids]
         radius = np.array([r for _, r in balls])
@@ -130,8 +151,8 @@ class Solids:
             if other == FLOOR:
                 gap = centre[:, one, 2] - radius[one] - self.floor
             else:
-                way = centre[:, one] - centre[:, other]
-                gap = np.linalg.norm(way, axis=1) - radius[one] - radius[other]
+                distance = np.linalg.norm(centre[:, one] - centre[:, other], axis=1)
+                gap = distance - radius[one] - radius[other]
             moving = other != FLOOR and (self.solids[one].moves or self.solids[other].moves)
             if moving or gap.min() < NEAR:
                 out.append((one, other))
@@ -139,9 +160,10 @@ class Solids:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Touched:
-    """Two that touched what they should not: names, from when till when [s], how deep [m] and with which
-    force [N] at most; no force where nothing pushes back.
+class UnintendedContact:
+    """Contact of two bodies that must not touch: names, start and end [s], largest depth [m] and force [N].
+
+    force : None where the engine's bodies do not collide.
     """
 
     one: str
@@ -163,34 +185,29 @@ class Touched:
         return out if self.force is None else {**out, "force_N": self.force}
 
 
-def _own(joint: Any, moves: Array) -> Array:
-    return moves[joint.idx_v : joint.idx_v + max(joint.nv, 1)]  # a follower has its leader's
+class UnintendedContacts:
+    """Record of contacts between the solids of a compiled MuJoCo world.
 
-
-def _placed(place: Any) -> Any:
-    return coal.Transform3s(place.rotation, place.translation)
-
-
-class Besides:
-    """Watches a compiled world's solids, named ``solid <number>``; the floor is geom 0."""
+    Solids are the geoms ``solid <number>``; the floor is geom 0.
+    """
 
     def __init__(self, world: Any, solids: Solids) -> None:
         self._names = np.array(["ground", *(s.name for s in solids.solids)])
-        self._number = np.full(world.ngeom, -1)
+        self._number = np.full(world.ngeom, -1)  # of each geom: index in the names, or -1
         self._number[0] = 0
         for k in range(world.ngeom):
             kind, _, number = world.geom(k).name.partition(" ")
             if kind == "solid":
                 self._number[k] = 1 + int(number)
         self._mocap = int(world.body("target").mocapid[0])
-        self._found: dict[tuple[int, int], list[float]] = {}
+        self._contacts: dict[tuple[int, int], list[float]] = {}  # start, end, depth, force
 
-    def place(self, data: Any, way: Array) -> None:
-        """Bodies that move with the target are ``way`` (3,) [m] from where they were."""
-        data.mocap_pos[self._mocap] = way
+    def place_target(self, data: Any, displacement: Array) -> None:
+        """Sets the displacement (3,) [m] of the bodies that move with the target."""
+        data.mocap_pos[self._mocap] = displacement
 
-    def look(self, data: Any, t: float) -> None:
-        """Records the contacts at a time [s]; called once a step's forces are known."""
+    def update(self, data: Any, t: float) -> None:
+        """Records the contacts at a time [s]; to be called once a step's forces are known."""
         if not data.ncon:
             return
         contacts = data.contact
@@ -202,15 +219,15 @@ class Besides:
             one, other = (int(n) for n in sorted(numbers[k], reverse=True))
             address = contacts.efc_address[k]
             force = float(data.efc_force[address]) if address >= 0 else 0.0
-            row = self._found.setdefault((one, other), [t, t, 0.0, 0.0])
-            row[1] = t
-            row[2] = max(row[2], -float(contacts.dist[k]))
-            row[3] = max(row[3], force)
+            contact = self._contacts.setdefault((one, other), [t, t, 0.0, 0.0])
+            contact[1] = t
+            contact[2] = max(contact[2], -float(contacts.dist[k]))
+            contact[3] = max(contact[3], force)
 
-    def touched(self) -> tuple[Touched, ...]:
-        """All that has touched, deepest first."""
-        rows = [
-            Touched(
+    def contacts(self) -> tuple[UnintendedContact, ...]:
+        """All contacts, deepest first."""
+        out = [
+            UnintendedContact(
                 one=str(self._names[one]),
                 other=str(self._names[other]),
                 start=start,
@@ -218,6 +235,6 @@ class Besides:
                 depth=depth,
                 force=force,
             )
-            for (one, other), (start, end, depth, force) in self._found.items()
+            for (one, other), (start, end, depth, force) in self._contacts.items()
         ]
-        return tuple(sorted(rows, key=lambda row: -row.depth))
+        return tuple(sorted(out, key=lambda contact: -contact.depth))

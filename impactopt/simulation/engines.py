@@ -1,4 +1,4 @@
-"""The engines by name."""
+"""Replay of a problem's reference by an engine, with checks of its steps and of clearance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impactopt.bodies.clearance import MISSED, Places
 from impactopt.errors import InputError, check_array, check_choice
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
-from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, Touched
+from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, UnintendedContact
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
@@ -44,19 +44,19 @@ def scene_of(problem: ImpactProblem) -> Scene:
 
 
 def solids_of(problem: ImpactProblem) -> Solids:
-    """The hulls of the robot's links, the bodies of the world, and which of them are not to touch."""
+    """Hulls of the robot's links, bodies of the world, and the pairs of them that must not touch."""
     bodies = problem.bodies
-    pieces = bodies.links.pieces
-    solids = [Solid(name=piece.link, joint=piece.joint, vertices=piece.vertices) for piece in pieces]
-    number = {id(piece): k for k, piece in enumerate(pieces)}
-    pairs = [(number[id(a)], number[id(b)]) for found in bodies.pairs.values() for a, b in found]
-    place = dict[int, int]()
+    hulls = bodies.links.pieces
+    solids = [Solid(name=hull.link, joint=hull.joint, vertices=hull.vertices) for hull in hulls]
+    number = {id(hull): k for k, hull in enumerate(hulls)}
+    pairs = [(number[id(a)], number[id(b)]) for of_links in bodies.pairs.values() for a, b in of_links]
+    world_number = dict[int, int]()  # of the world's bodies, among the solids
     for w, body in enumerate(bodies.world):
         if body.ground:
-            place[w] = FLOOR
+            world_number[w] = FLOOR
         if body.ground or body.core:
             continue
-        place[w] = len(solids)
+        world_number[w] = len(solids)
         solids.append(
             Solid(
                 name=body.name,
@@ -71,111 +71,117 @@ def solids_of(problem: ImpactProblem) -> Solids:
             )
         )
     for joint, w in bodies.world_pairs:
-        if w in place:
-            pairs += [(number[id(piece)], place[w]) for piece in bodies.links.of_joint[joint]]
+        if w in world_number:
+            pairs += [(number[id(hull)], world_number[w]) for hull in bodies.links.of_joint[joint]]
     height = problem.ground_height
     return Solids(solids=tuple(solids), pairs=tuple(pairs), floor=0.0 if height is None else height)
 
 
 Array = NDArray[np.float64]
-STEP = 1e-3  # [s] at which a replay is looked at
-MOVED = 5e-4  # [rad, m] by which a coordinate has moved since the last look, as at 0.5 rad/s in such a step
+SAMPLING = 1e-3  # [s] between instants at which a replay's clearance may be computed
+# [rad, m] by which a coordinate must have moved since the last computation, as at 0.5 rad/s in `SAMPLING`
+MIN_MOTION = 5e-4
 
 
 def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation:
-    """The simulation with its least clearance; and what touched what, where the engine has not said so
-    itself.
-    """
+    """Simulation with its least clearance, and with unintended contacts if the engine has recorded none."""
     time = simulation.time
-    chosen = _instants(time, simulation.q, simulation.travel())
+    chosen = _sampled(time, simulation.q, simulation.travel())
     phase = np.full(len(time), MISSED) if simulation.missed else simulation.phase()
     bodies = problem.bodies
     at = Places.of(problem.robot, simulation.q[chosen], simulation.travel()[chosen], phase[chosen])
-    found = bodies.survey(time[chosen], at)
+    survey = bodies.survey(time[chosen], at)
     touched = simulation.touched
-    if simulation.fall is None or not problem.keeps_apart:  # this replay's robot has no solids
+    if simulation.fall is None or not problem.keeps_apart:  # the engine had no solids that collide
         touched = tuple(
-            Touched(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth) for t in found.touches
+            UnintendedContact(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth)
+            for t in survey.touches
         )
     return replace(
         simulation,
-        clearance=found.clearance,
-        nearest=found.nearest,
+        clearance=survey.clearance,
+        nearest=survey.nearest,
         touched=touched,
     )
 
 
-def _instants(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
+def _sampled(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
     """Indices of the first and last instant, and of those at which bodies have moved since the one before."""
-    _, every = np.unique(np.floor(time / STEP), return_index=True)
-    places = np.column_stack([q, travel])
+    _, every = np.unique(np.floor(time / SAMPLING), return_index=True)
+    coordinates = np.column_stack([q, travel])
     chosen = [0]
     for k in map(int, every[1:]):
-        if np.abs(places[k] - places[chosen[-1]]).max() > MOVED:
+        if np.abs(coordinates[k] - coordinates[chosen[-1]]).max() > MIN_MOTION:
             chosen.append(k)
     return np.unique([*chosen, len(time) - 1])
 
 
-ALLOWED = 1e-2  # of the impulse
-HALVINGS = 3
-ALLOWED_RANGE = 1e-3  # [rad] that a joint may be out of its range untold
-BEYOND = 0.02  # [s] after the blow that the comparison goes on
+ALLOWED = 1e-2  # error of the impulse by the steps, relative
+HALVINGS = 3  # of the step, at most
+ALLOWED_RANGE = 1e-3  # [rad] out of range that is not reported
+COMPARED_AFTER = 0.02  # [s] after the impact up to which two simulations are compared
 
 
 def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any) -> Simulation:
-    """The simulation by an engine, with how far off its impulse is by its steps, as an estimate.
+    """Simulation by an engine, with an estimate of its impulse's error by the steps.
 
-    It is compared up to the end of the blow with one of twice the step, or where that was given longer than
-    the engine's own with one of that. Where more than 1 % is left, or it diverges, and the step is no longer,
-    it is halved, three times at most.
+    The impulse up to the end of the impact is compared with that of a simulation with twice the step, or, if
+    the given step is longer than the engine's default, with the default. If the error is above 1 %, or the
+    simulation diverges, the step is halved, at most three times; a given step longer than the default is
+    kept.
     """
     own = float((run.__kwdefaults__ or {})["step"])
     step = float(options.pop("step", own))
     for left in range(HALVINGS, -1, -1):
         try:
-            found = run(*given, **options, step=step)
+            simulation = run(*given, **options, step=step)
         except InputError:  # light links on stiff servos need shorter steps
             if step > own or not left:
                 raise
             step /= 2
             continue
-        found = replace(found, step_error=_error(run, given, options, found, step, own))
-        if not found.step_error > ALLOWED or step > own:
+        simulation = replace(simulation, step_error=_step_error(run, given, options, simulation, step, own))
+        if not simulation.step_error > ALLOWED or step > own:
             break
         step /= 2
-    return found
+    return simulation
 
 
-def _error(
+def _step_error(
     run: Callable[..., Simulation],
     given: tuple[Any, ...],
     options: dict[str, Any],
-    found: Simulation,
+    simulation: Simulation,
     step: float,
     own: float,
 ) -> float:
-    """Relative to the larger of the impulses; nan where both have missed the target."""
-    until = np.inf if np.isnan(found.contact_end) else found.contact_end + BEYOND
-    if found.missed or (until == np.inf and step <= own):
+    """Difference of two simulations' impulses, relative to the larger; nan if both missed the target.
+
+    own [s] : default step of the engine.
+    """
+    end = simulation.contact_end
+    until = np.inf if np.isnan(end) else end + COMPARED_AFTER
+    if simulation.missed or (until == np.inf and step <= own):
         return np.nan
     for other in (own if step > own else 2 * step, step / 2):
         try:
             compared = run(*given, **options, step=other, until=until)
         except InputError:
             continue  # twice the step may be too long for the servo
-        impulses = [sum(touch[2] for touch in s.touches if touch[0] <= until) for s in (found, compared)]
+        impulses = [sum(touch[2] for touch in s.touches if touch[0] <= until) for s in (simulation, compared)]
         largest = max(impulses)
         return abs(impulses[0] - impulses[1]) / largest if largest > 0 else np.nan
     return np.inf
 
 
-def check_steps(found: Simulation, step: float | None) -> None:
-    """InputError where the steps leave more than 1 % of the impulse uncertain."""
-    if found.step_error > ALLOWED:
+def check_steps(simulation: Simulation, step: float | None) -> None:
+    """Raises an InputError if the steps leave more than 1 % of the impulse uncertain."""
+    error, impulse = simulation.step_error, simulation.impulse
+    if error > ALLOWED:
         given = "the engine's steps leave" if step is None else f"steps of {step:g} s leave"
         raise InputError(
-            f"the replay is not to be trusted: {given} {100 * min(found.step_error, 1.0):.2g} % of its "
-            f"impulse, {found.impulse:.4g} N s, uncertain; give a shorter step (--step), or a softer contact"
+            f"the replay is not reliable: {given} {100 * min(error, 1.0):.2g} % of its impulse, "
+            f"{impulse:.4g} N s, uncertain; give a shorter step (--step), or a softer contact"
         )
 
 
@@ -185,22 +191,23 @@ ENGINES: dict[str, Callable[..., Simulation]] = {
 }
 
 
-STEPS = (1e-6, 1e-2)  # [s]: below, a replay takes hours; above, it steps over most contacts
-LONGEST = 60.0  # [s] beyond the motion: what falls has fallen in a tenth of that
-MOST_STEPS = 20_000_000  # an hour's work
+STEP_RANGE = (1e-6, 1e-2)  # [s]: below, a replay takes hours; above, it steps over most contacts
+MAX_SETTLE = 60.0  # [s] beyond the motion: a robot that falls has fallen after a tenth of that
+MAX_STEPS = 20_000_000  # an hour of computing
 
 
 def simulate(
     problem: ImpactProblem, reference: Any, *, engine: str = "pinocchio", **options: Any
 ) -> Simulation:
-    """Re-simulate a reference for a problem: "pinocchio" holds the soles, "mujoco" holds nothing.
+    """Re-simulates a reference for a problem: "pinocchio" fixes the soles, "mujoco" leaves the robot free.
 
-    reference : as of :class:`impactopt.transcription.plan.Trajectory`.  options : of the engine, such as
-        ``step`` [s]; of "mujoco" also ``controller``, "servo" or "wbc", or its settings.
+    reference : as :class:`impactopt.transcription.plan.Trajectory`.
+    options : of the engine, such as ``step`` [s]; of "mujoco" also ``controller``, "servo" or "wbc", or its
+        settings.
 
     Raises
     ------
-    InputError : an unknown engine or option; a step or a time beyond the motion that no replay has.
+    InputError : an unknown engine or option; a step or a time to settle out of range.
     """
     check_choice("unknown engine", engine, ENGINES)
     run = ENGINES[engine]
@@ -216,23 +223,23 @@ def simulate(
             )
         check_choice(f"engine {engine!r} has no option", name, sorted(known))
     _check_times({**(run.__kwdefaults__ or {}), **options}, float(reference.end))
-    found = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
-    name, beyond = problem.robot.ranges.excess(problem.robot.joint_positions(found.q))
+    simulation = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
+    name, beyond = problem.robot.ranges.excess(problem.robot.joint_positions(simulation.q))
     beyond_range = (name, beyond) if beyond > ALLOWED_RANGE else ("", 0.0)
-    found = replace(found, expected=float(reference.contact_start), beyond_range=beyond_range)
-    return with_clearance(problem, found)
+    simulation = replace(simulation, expected=float(reference.contact_start), beyond_range=beyond_range)
+    return with_clearance(problem, simulation)
 
 
 def _check_times(options: Mapping[str, Any], end: float) -> None:
-    """InputError for a step or a time to settle that is out of its range."""
+    """Raises an InputError for a step or a time to settle out of range."""
     given = {name: 0.0 if options[name] is None else options[name] for name in ("step", "settle")}
     step, settle = (float(check_array(f"{name} [s]", value, ())) for name, value in given.items())
-    if not STEPS[0] <= step <= STEPS[1]:
-        raise InputError(f"step [s]: {step:g}; give a number of {STEPS[0]:g} to {STEPS[1]:g}")
-    if not 0 <= settle <= LONGEST:
-        raise InputError(f"settle [s]: {settle:g}; give a number of 0 to {LONGEST:g}")
-    if (end + settle) / step > MOST_STEPS:
+    if not STEP_RANGE[0] <= step <= STEP_RANGE[1]:
+        raise InputError(f"step [s]: {step:g}; give a number of {STEP_RANGE[0]:g} to {STEP_RANGE[1]:g}")
+    if not 0 <= settle <= MAX_SETTLE:
+        raise InputError(f"settle [s]: {settle:g}; give a number of 0 to {MAX_SETTLE:g}")
+    if (end + settle) / step > MAX_STEPS:
         raise InputError(
             f"a replay of {end + settle:g} s in steps of {step:g} s has {(end + settle) / step:.2g} of them; "
-            f"give a longer step, for at most {MOST_STEPS:.2g}"
+            f"give a longer step, for at most {MAX_STEPS:.2g}"
         )

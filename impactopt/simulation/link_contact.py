@@ -1,4 +1,4 @@
-"""Contact of the striking links' hulls with the target's body, in place of their striking points."""
+"""Contact of the hulls of striking links with the target's body, in place of striking points."""
 
 from __future__ import annotations
 
@@ -15,50 +15,51 @@ __all__ = ["CONTACTS", "LinkContact", "solids_in_contact"]
 
 Array = NDArray[np.float64]
 CONTACTS = ("point", "link")
-FAR = 0.05  # [m] between a link and the target: how far they are apart beyond that is not asked
+MAX_DISTANCE = 0.05  # [m] between link and target; larger distances are not computed
 
 
 def solids_in_contact(robot: Robot, scene: Scene) -> list[list[tuple[int, int]]]:
-    """Numbers of solids that meet: of each striker, pieces of its link, each with a body of the target.
+    """Pairs of solids that can touch, of each striker: a piece of its link, and a body of the target.
 
     Raises
     ------
     InputError : a striking link or the target has no body.
     """
     solids, out = scene.solids.solids, []
-    struck = [k for k, solid in enumerate(solids) if solid.strikable]
+    targets = [k for k, solid in enumerate(solids) if solid.strikable]
     for striker in scene.strikers:
         joint = robot.model.frames[robot.model.getFrameId(striker)].parentJoint
         links = [k for k, solid in enumerate(solids) if solid.vertices is not None and solid.joint == joint]
-        if not links or not struck:
-            what = "the striking link" if struck else "the target"
+        if not links or not targets:
+            what = "the striking link" if targets else "the target"
             raise InputError(
                 f"contact 'link' needs bodies, and {what} has none: switch on [terms.keep_out] and give "
                 "[target.body] a shape, or take contact 'point'"
             )
-        out.append([(link, body) for link in links for body in struck])
+        out.append([(link, body) for link in links for body in targets])
     return out
 
 
 class LinkContact:
-    """The point of each striking link that is deepest in the target, by MuJoCo's distances of convex bodies.
+    """Deepest point of each striking link in the target, by MuJoCo's distances between convex bodies.
 
     pairs : of :func:`solids_in_contact`.
     """
 
     def __init__(self, mujoco: Any, world: Any, pairs: list[list[tuple[int, int]]]) -> None:
         self._mujoco, self._world = mujoco, world
-        geom = {k: int(world.geom(f"solid {k}").id) for each in pairs for pair in each for k in pair}
-        self._pairs = [[(geom[link], geom[body]) for link, body in each] for each in pairs]
+        geom = {k: int(world.geom(f"solid {k}").id) for of_one in pairs for pair in of_one for k in pair}
+        self._pairs = [[(geom[link], geom[body]) for link, body in of_one] for of_one in pairs]
         self._ends = np.zeros(6)
 
     def deepest(self, data: Any, striker: int) -> tuple[float, Array | None]:
-        """Depth [m] of a striker's link in the target, below 0 apart, and the place (3,) [m] of its point
-        there; None where they are farther apart than 5 cm.
+        """Depth [m] of a striker's link in the target, and its deepest point (3,) [m].
+
+        Without a touch the depth is negative. The point is None beyond `MAX_DISTANCE`.
         """
-        apart, place = FAR, None
+        distance, point = MAX_DISTANCE, None
         for link, body in self._pairs[striker]:
-            found = self._mujoco.mj_geomDistance(self._world, data, link, body, FAR, self._ends)
-            if found < apart:
-                apart, place = found, self._ends[:3].copy()
-        return -apart, place
+            of_pair = self._mujoco.mj_geomDistance(self._world, data, link, body, MAX_DISTANCE, self._ends)
+            if of_pair < distance:
+                distance, point = of_pair, self._ends[:3].copy()
+        return -distance, point

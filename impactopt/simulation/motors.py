@@ -1,4 +1,4 @@
-"""Servo, motors and gears of a replay."""
+"""Servo, motors, delays and gear loads of a replay."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Array = NDArray[np.float64]
 
 
 class Servo:
-    """Feed-forward, stiffness and damping about a sampled reference, saturated.
+    """Joint servo: feed-forward, stiffness and damping about a sampled reference, saturated.
 
-    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n). An instant that stands twice is a jump.
+    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n). A time that occurs twice marks a jump.
     kp, kd, limit : factors of the robot's kp, kd and torque limit.
 
-    Joints that nothing drives (`Robot.passive`) have a spring and a damper at rest at the reference's start.
+    Joints without a motor (`Robot.passive`) have a spring and a damper, at rest at the reference's start.
     """
 
     def __init__(
@@ -34,15 +34,16 @@ class Servo:
         self.time = np.asarray(reference.time)
         joints = robot.joint_models
         self.place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
-        # a continuous joint's angle is kept as (cosine, sine)
+        # q has the cosine and sine of a continuous joint's angle
         self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
         angles = np.array([self.angles(q) for q in reference.q])
         angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
         rates, torques = np.array(reference.v[:, -robot.n :]), np.array(reference.torque)
-        # a spring does not know of a plan: it bears the tool at rest at first, and gives way from there
-        own = robot.passive
-        angles[:, own], rates[:, own], torques[:, own] = angles[0, own], 0.0, torques[0, own]
-        self.limit[own] = np.inf
+        # springs do not follow the plan: they carry the tool at rest at first, and deflect from there
+        passive = robot.passive
+        angles[:, passive], rates[:, passive] = angles[0, passive], 0.0
+        torques[:, passive] = torques[0, passive]
+        self.limit[passive] = np.inf
         self.reference = np.hstack([angles, rates, torques])
 
     def angles(self, q: Array) -> Array:
@@ -53,55 +54,55 @@ class Servo:
         return out
 
     def target(self, t: float) -> Array:
-        """Reference angles, rates and feed-forward (3 n,) at a time; at a jump, what comes after it."""
+        """Reference angles, rates and feed-forward (3 n,) at a time [s]; at a jump, the values after it."""
         i = min(max(int(np.searchsorted(self.time, t, side="right")) - 1, 0), len(self.time) - 2)
         f = min((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 1.0)
         return np.asarray((1 - f) * self.reference[i] + f * self.reference[i + 1])
 
     def springs(self, angles: Array, rates: Array) -> Array:
-        """Torque (n,) [N m] of the joints that nothing drives, at any time; of the others it is none of
-        theirs.
-        """
+        """Torque (n,) [N m] of the springs of joints without a motor; meaningless for the other joints."""
         n, rest = self.n, self.reference[0]
         return rest[2 * n :] + self.kp * (rest[:n] - angles) - self.kd * rates
 
     def torque(self, t: float, angles: Array, rates: Array) -> tuple[Array, Array]:
-        """Torque demand (n,) [N m] and what saturation leaves of it."""
-        row, n = self.target(t), self.n
-        error = row[:n] - angles
-        if self.continuous.size:
+        """Torque demand (n,) [N m], and the demand after saturation."""
+        target, n = self.target(t), self.n
+        error = target[:n] - angles
+        if self.continuous.size:  # the shorter way round
             error[self.continuous] = np.remainder(error[self.continuous] + np.pi, 2 * np.pi) - np.pi
-        demand = row[2 * n :] + self.kp * error + self.kd * (row[n : 2 * n] - rates)
+        demand = target[2 * n :] + self.kp * error + self.kd * (target[n : 2 * n] - rates)
         return demand, np.clip(demand, -self.limit, self.limit)
 
 
 class GearWatch:
-    """Keeps the torque of largest magnitude through each gear since the last recorded instant.
+    """Torque of largest magnitude through each gear since the last recorded instant.
 
-    A blow's peak may last for less than the time between two of these.
+    The peak of an impact may be shorter than the time between two recorded instants.
     """
 
     def __init__(self, robot: Robot) -> None:
         self._armature = robot.armature
         self._high, self._low = np.zeros((2, robot.n))
 
-    def look(self, torque: Array, acceleration: Array) -> None:
-        """Torque (n,) [N m] of the servos, acceleration (nv,) of the robot."""
+    def update(self, torque: Array, acceleration: Array) -> None:
+        """Records an instant: torque (n,) [N m] of the motors, acceleration (nv,) of the robot."""
+        # the motor's share that accelerates its own rotor does not pass the gear
         load = torque - self._armature * acceleration[-len(self._armature) :]
         np.maximum(self._high, load, out=self._high)
         np.minimum(self._low, load, out=self._low)
 
-    def taken(self) -> Array:
-        """(n,) [N m]; from now on it begins anew."""
-        found = np.where(self._high >= -self._low, self._high, self._low)
+    def take(self) -> Array:
+        """Largest torque (n,) [N m] so far; the record begins anew."""
+        largest = np.where(self._high >= -self._low, self._high, self._low)
         self._high[:], self._low[:] = 0.0, 0.0
-        return found
+        return largest
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotorCut:
-    """Torque cut from a joint's demand by its motor's line: duration [s], largest cut [N m], first instant
-    [s].
+    """Cut of a joint's demand by its motor's torque-speed line.
+
+    duration [s], largest cut (most) [N m], first instant (since) [s].
     """
 
     joint: str
@@ -122,10 +123,10 @@ class MotorCut:
 class Motors:
     """Torque that motors produce for a demand; joints without motor data produce all of it.
 
-    A motor under its full voltage has the torque stall_torque (1 - w / no_load_speed), and braked by it
-    -stall_torque (1 + w / no_load_speed): at speed, it can brake harder than it can drive. Friction takes its
-    part of both. The torque goes to what is asked for, inside that, as a current does through an inductance:
-    with the rate 2 pi bandwidth.
+    At speed w, full voltage gives the torque stall_torque (1 - w / no_load_speed), and full reverse voltage
+    -stall_torque (1 + w / no_load_speed): a motor brakes harder than it drives. Friction reduces both.
+    Between these lines the torque approaches the demand as a current through an inductance does, with the
+    rate 2 pi bandwidth.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -142,39 +143,41 @@ class Motors:
         known = ~np.isnan(stall)
         self.lines = bool(known.any())
         self._stall = np.where(known, stall, np.inf)
-        # friction is part of the line where there is one
+        # friction counts only for motors with a line
         self._slope = np.where(known, stall / idle + viscous, 0.0)
         self._coulomb = np.where(known, coulomb, 0.0)
         self._rate = np.where(np.isnan(bandwidth), np.inf, 2 * np.pi * bandwidth)
         self._slow = bool(np.isfinite(self._rate).any())
 
     def cut(self, torque: Array, rates: Array) -> Array:
-        """(n,) [N m] what the motors' lines leave of a torque (n,) at joint rates (n,)."""
+        """Torque (n,) [N m], clipped to the motors' lines at joint rates (n,)."""
         if not self.lines:
             return torque
+        # back-EMF and viscous friction are linear in the rate; all of them shift both limits against the
+        # motion
         lost = self._slope * rates + self._coulomb * np.sign(rates)
         return np.clip(torque, -self._stall - lost, self._stall - lost)
 
     def now(self, torque: Array, wanted: Array) -> Array:
-        """(n,) [N m] the torque of motors whose torque is `torque` where it cannot change at once."""
+        """Present torque (n,) [N m]: `wanted` of motors without inductance, `torque` of the others."""
         return np.where(np.isfinite(self._rate), torque, wanted) if self._slow else wanted
 
     def after(self, torque: Array, wanted: Array, time: float) -> Array:
-        """(n,) [N m] the torque (n,) a time [s] later, if one (n,) is wanted all the while."""
+        """Torque (n,) [N m] a time [s] later, for a constant wanted torque (n,)."""
         if not self._slow:
             return wanted
-        return wanted + np.exp(-self._rate * time) * (torque - wanted)
+        return wanted + np.exp(-self._rate * time) * (torque - wanted)  # first-order lag
 
     def mean(self, torque: Array, wanted: Array, time: float) -> Array:
-        """(n,) [N m] of `after`, its mean in that time."""
+        """Mean torque (n,) [N m] during a time [s], for a constant wanted torque (n,)."""
         if not self._slow:
             return wanted
-        turns = self._rate * time
-        return wanted - np.expm1(-turns) / turns * (torque - wanted)
+        decay = self._rate * time  # integral of the exponential in `after`, over the time
+        return wanted - np.expm1(-decay) / decay * (torque - wanted)
 
 
 class Delay:
-    """Delay by joint, from reading the joints to setting their torque."""
+    """Delay of each joint, from reading the joints to setting their torque."""
 
     def __init__(self, robot: Robot) -> None:
         delay = numbers_of(robot.actuators, "delay")
@@ -183,17 +186,18 @@ class Delay:
         self._kept: deque[tuple[float, Array]] = deque()
 
     def keep(self, t: float, values: Array) -> None:
-        """Values (..., n) that are asked for at a time [s], after those kept before."""
+        """Stores the commanded values (..., n) of a time [s], later than all before."""
         if not self._longest:
             return
+        # the oldest needed instant is the last one before the longest delay
         while len(self._kept) > 1 and self._kept[1][0] <= t - self._longest:
             self._kept.popleft()
         self._kept.append((t, values))
 
     def at(self, t: float, now: Array) -> Array:
-        """Demand that reaches the motors at a time [s] at which the present demand is `now` (..., n).
+        """Values (..., n) that reach the motors at a time [s], while those commanded are `now` (..., n).
 
-        Linear between the instants that are kept; before the first, the same was asked for.
+        They are linear between the stored instants, and constant before the first.
         """
         if not self._longest:
             return now
@@ -204,29 +208,29 @@ class Delay:
             then, late = t - delay, self._delay == delay
             k = min(max(int(np.searchsorted(times, then)), 1), len(times) - 1)
             span = times[k] - times[k - 1]
-            share = min(max((then - times[k - 1]) / span, 0.0), 1.0) if span > 0 else 1.0
-            out[..., late] = ((1 - share) * values[k - 1] + share * values[k])[..., late]
+            f = min(max((then - times[k - 1]) / span, 0.0), 1.0) if span > 0 else 1.0
+            out[..., late] = ((1 - f) * values[k - 1] + f * values[k])[..., late]
         return out
 
 
 class CutWatch:
-    """Records the joints, and the durations, in which motor lines have cut the demand."""
+    """Record of the joints whose demand was cut by their motor's line, and for how long."""
 
     def __init__(self, robot: Robot) -> None:
         self._names, n = robot.joint_names, robot.n
         self._limit = robot.torque_limit
         self._time, self._most, self._since = np.zeros(n), np.zeros(n), np.full(n, np.inf)
 
-    def look(self, t: float, wanted: Array, cut: Array, step: float) -> None:
-        """Torque (n,) [N m] before and after the line, for a step [s] from a time [s]."""
+    def update(self, t: float, wanted: Array, cut: Array, step: float) -> None:
+        """Records a step [s] from a time [s], with torques (n,) [N m] before and after the line."""
         lost = np.abs(wanted - cut)
-        some = lost > 1e-9 * self._limit
-        self._time += step * some
+        is_cut = lost > 1e-9 * self._limit
+        self._time += step * is_cut
         self._most = np.maximum(self._most, lost)
-        self._since = np.where(some, np.minimum(self._since, t), self._since)
+        self._since = np.where(is_cut, np.minimum(self._since, t), self._since)
 
-    def told(self) -> tuple[MotorCut, ...]:
-        """The joints that were cut, the longest first."""
+    def cuts(self) -> tuple[MotorCut, ...]:
+        """Cuts of all joints with any, the longest first."""
         order = [int(k) for k in np.argsort(-self._time, kind="stable") if self._time[k] > 0]
         return tuple(
             MotorCut(

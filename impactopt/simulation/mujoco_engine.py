@@ -1,8 +1,8 @@
-"""Replay in MuJoCo with nothing held, but by its own hands: the robot is free on its soles.
+"""Replay in MuJoCo with a free robot: only hands that hold on are fixed.
 
-Unilateral contact with friction at the soles' corners, the servo with its limits, the target moved by the
-contact law's force. Shares no code with the planner: it reads a reference (times, positions, velocities,
-feed-forward), the robot's numbers and the scene's.
+Soles have unilateral contact with friction at their corners, the servo saturates, and the contact law's force
+moves the target. The engine shares no code with the planner: it reads a reference (times, positions,
+velocities, feed-forward), the robot's parameters and the scene.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, check_choice, check_positive
 from impactopt.robots.loads import BEARS, weight_of
 from impactopt.robots.robot import Robot
-from impactopt.simulation.collision_geometry import Besides
+from impactopt.simulation.collision_geometry import UnintendedContacts
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
 from impactopt.simulation.link_contact import CONTACTS, LinkContact, solids_in_contact
 from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
@@ -40,20 +40,24 @@ from impactopt.simulation.result import (
     simulation_of,
     stance_at,
 )
-from impactopt.simulation.target_dynamics import Push, Struck
+from impactopt.simulation.target_dynamics import Push, TargetContact
 
 Array = NDArray[np.float64]
-THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after and before each
-AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
-FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
-LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
-SETTLES, SETTLES_SOLELESS = 2.0, 0.3  # [s] beyond the motion: a robot on its feet may fall late
-TOUCHING = 1e-9  # [m] that the robot starts lower: soles that rounding has above the floor bear nothing
-MOVED = 1e-3  # [m] from one step to the next: a striking link meets the target at another point
-SLID = 0.05  # [m] of a sole along the floor, about half of one's width: it stands where it was not to
+AXES, NEXT_AXES, PREVIOUS_AXES = np.arange(3), [1, 2, 0], [2, 0, 1]
+AWAY = np.array([0.0, 0.0, -100.0])  # [m] where the body of a broken target goes
+# A robot has fallen beyond these errors of its base: tilt [rad], loss of height (fraction of the reference)
+FALLEN_TILT, FALLEN_DROP = 0.7, 0.3
+# A robot does not stand at the end beyond these: tilt [rad] and speed [m/s] of the base
+STANDING_TILT, STANDING_SPEED = 0.2, 0.05
+SETTLE, SETTLE_WITHOUT_SOLES = 2.0, 0.3  # [s] simulated beyond the motion: a robot on its feet may fall late
+INITIAL_SINK = 1e-9  # [m]: rounding may leave a sole above the floor, without load in the first step
+NEW_POINT = 1e-3  # [m] from one step to the next: the striking link now touches the target at another point
+MAX_SLIP = 0.05  # [m] of a sole, about half its width: farther, it stands where it was not planned to
 
 
 class _Replay(MujocoRobot):
+    """State of a replay: robot, target, servo or controller, and forces of the last step."""
+
     def __init__(
         self,
         robot: Robot,
@@ -73,38 +77,43 @@ class _Replay(MujocoRobot):
             )
         solids = self.scene.solids
         near = solids.near(robot.model, reference)
-        meeting = solids_in_contact(robot, self.scene) if contact == "link" else []
-        struck = [k for each in meeting for pair in each for k in pair]
-        world = build_world(robot, self.scene, perturbation, solver, near, struck)
+        link_pairs = solids_in_contact(robot, self.scene) if contact == "link" else []
+        in_contact = [k for pairs in link_pairs for pair in pairs for k in pair]
+        world = build_world(robot, self.scene, perturbation, solver, near, in_contact)
         sites = (site_name(k + 1) for k in range(len(scene.strikers)))
         super().__init__(robot, world, *sites, friction=scene.friction)
-        self.links = LinkContact(self.mujoco, self.world, meeting) if meeting else None
-        self.depths = np.full(len(scene.strikers), -np.inf)  # [m] of strikers in the target
+        self.links = LinkContact(self.mujoco, self.world, link_pairs) if link_pairs else None
+        self.depths = np.full(len(scene.strikers), -np.inf)  # [m] of striking points in the target
         if self.links is not None:
-            self.world.site_sameframe[self.sites] = 0  # they move in their bodies
+            self.world.site_sameframe[self.sites] = 0  # striking points move on their links
         self.grips = Welds(self.world, scene.hands)
-        self.besides = Besides(self.world, solids)
+        self.unintended = UnintendedContacts(self.world, solids)
         self.planned = self.followed = reference
         self.follow(reference)
-        self.struck = Struck(self.scene)
-        # the target's state, and how far it has gone [m]
-        self.target, self.travel = self.struck.untouched, self.struck.travel_at_start(reference)
-        self.placed: tuple[Array | None, float, bool] = (None, 0.0, False)  # as its body is: both, and broken
-        # strikers' depths in it at the end of a step in contact; of the step before, their speeds and forces
-        self.kept: Array | None = None
-        self.before: tuple[Array, Array] | None = None
-        # how fast the robot accelerates (h, nv) by a unit of each contact's force, where there may be one
-        self.yields: Array | None = None
-        self.held = {name: k for k, name in enumerate(scene.soles)}
+        self.contact = TargetContact(self.scene)
+        # the target's state and travel [m]
+        self.target, self.travel = self.contact.untouched, self.contact.travel_at_start(reference)
+        # state, travel and whether it is broken, for which the target's body was placed last
+        self.placed: tuple[Array | None, float, bool] = (None, 0.0, False)
+        # depths of the striking points at the end of the last step, None if it had no contact
+        self.last_depths: Array | None = None
+        # speeds of the striking points in the last step, and forces on them
+        self.last_step: tuple[Array, Array] | None = None
+        # accelerations (h, nv) of the robot by a unit of each contact force; None: no contact is near
+        self.response: Array | None = None
+        self.sole_index = {name: k for k, name in enumerate(scene.soles)}
+        # of each geom: index of the scene's sole that it is a corner of, or -1
         self.geom_sole = np.full(self.world.ngeom, -1)
         for sole in robot.soles:
             for k in range(len(sole.polygon)):
-                self.geom_sole[self.world.geom(f"sole {sole.frame} {k}").id] = self.held.get(sole.frame, -1)
+                self.geom_sole[self.world.geom(f"sole {sole.frame} {k}").id] = self.sole_index.get(
+                    sole.frame, -1
+                )
         frames = [robot.model.frames[robot.model.getFrameId(name)] for name in scene.soles]
-        on = list(zip(frames, scene.corners, strict=True))
-        bodies = [self.world.body(f"body {robot.model.names[f.parentJoint]}").id for f, _ in on]
+        with_corners = list(zip(frames, scene.corners, strict=True))
+        bodies = [self.world.body(f"body {robot.model.names[f.parentJoint]}").id for f in frames]
         self.corner_body = np.repeat(bodies, [len(corners) for corners in scene.corners]).astype(np.intp)
-        places = [f.placement.act(np.array([*c, 0.0])) for f, corners in on for c in corners]
+        places = [f.placement.act(np.array([*c, 0.0])) for f, corners in with_corners for c in corners]
         self.corners = np.reshape(places, (-1, 3))
         self.start(self.reference_q[0])
 
@@ -118,114 +127,131 @@ class _Replay(MujocoRobot):
         if self.wbc is not None:
             self.wbc.follow(None if reference is self.planned else reference)
 
-    def asked(self, t: float, forces: Array) -> tuple[Array, Array]:
-        """Torque demand (n,) [N m] at a time [s], and what saturation leaves of it."""
+    def command(self, t: float, forces: Array) -> tuple[Array, Array]:
+        """Torque demand (n,) [N m] at a time [s], and the demand after saturation.
+
+        forces : (h,) [N] of the last step, which the controller senses.
+        """
         d = self.data
         if self.wbc is None:
-            return self.servo.torque(t, d.qpos[self.place], d.qvel[self.dof])
+            return self.servo.torque(t, d.qpos[self.qpos_index], d.qvel[self.dof])
         _, v = self.state()
         rotation = self.base_rotation() if self.floating else np.eye(3)
-        demand = self.wbc.torque(t, d.qpos[self.place], v, rotation, forces)
+        demand = self.wbc.torque(t, d.qpos[self.qpos_index], v, rotation, forces)
         return demand, np.clip(demand, -self.servo.limit, self.servo.limit)
 
     def start(self, q: Array) -> None:
+        """Puts the robot at q (nq,), and welds gripping hands there."""
         self.put(q)
         if self.scene.soles:
-            self.data.qpos[2] -= TOUCHING
+            self.data.qpos[2] -= INITIAL_SINK
         self.mujoco.mj_kinematics(self.world, self.data)
         self.grips.put(self.data)
         self.mujoco.mj_forward(self.world, self.data)
 
-    # ------------------------------------------------------------------ what a step needs
+    # ---------------------------------------------------------------- parts of a step
     def hand_speeds(self) -> Array:
-        """Speeds (h,) of the striking points along the normal [m/s]; sets their depths in the target."""
-        places = self.places()
-        if self.kept is not None:
-            # depths are the contact's: they are followed more exactly there than the arms are
-            gone = self.struck.depths(places, 0.0) - self.kept
-            known = gone[np.isfinite(gone)]
+        """Speeds (h,) of the striking points along the normal [m/s]; updates their depths in the target."""
+        places = self.striking_points()
+        if self.last_depths is not None:
+            # The contact's integration gives depths more exactly than MuJoCo's step gives the robot: take the
+            # travel that makes them agree.
+            travels = self.contact.depths(places, 0.0) - self.last_depths
+            known = travels[np.isfinite(travels)]
             self.travel = float(known.mean()) if known.size else self.travel
-        self.kept = None
-        self.depths = self.struck.depths(places, self.travel)
+        self.last_depths = None
+        self.depths = self.contact.depths(places, self.travel)
         if self.links is not None:
-            self._meet(self.links)
+            self._move_striking_points(self.links)
         return self.speeds_along(self.scene.normal)
 
-    def _meet(self, links: LinkContact) -> None:
-        """Striking points are where their links are deepest in the target's body."""
+    def _move_striking_points(self, links: LinkContact) -> None:
+        """Moves each striking point to where its link is deepest in the target's body."""
         d = self.data
         for k, site in enumerate(self.sites):
             depth, place = links.deepest(d, k)
-            self.depths[k] = depth - (self.travel - self.placed[1])  # its body is where it was placed
+            # MuJoCo's distance is to the body as it was placed last, not at the present travel
+            self.depths[k] = depth - (self.travel - self.placed[1])
             if place is None:
                 continue
-            if np.linalg.norm(place - d.site_xpos[site]) > MOVED:
-                self.before = None
+            if np.linalg.norm(place - d.site_xpos[site]) > NEW_POINT:
+                self.last_step = (
+                    None  # the speeds are those of another point: no acceleration follows from them
+                )
             body = self.world.site_bodyid[site]
             self.world.site_pos[site] = d.xmat[body].reshape(3, 3).T @ (place - d.xpos[body])
             d.site_xpos[site] = place
 
     def push(self, speeds: Array, step: float) -> Push:
-        """The contact in the step that begins now; moves the target.
+        """Contact forces in the step that begins now; advances the target.
 
-        Hands gain speed as in the step before, where soles and servos had the same to say.
+        speeds : (h,) [m/s] of the striking points along the normal.
+
+        MuJoCo's accelerations are known only after the step, so that those without the contact are taken from
+        the step before: the change of speed, without the part of its contact forces.
         """
-        struck, d, none = self.struck, self.data, 0.0 * speeds
-        depths = none - np.inf if self.perturbation.missing else self.depths
-        self.yields = None
-        if struck.near(depths, speeds, self.target, step):
-            self.yields = np.zeros_like(self.along)
-            self.mujoco.mj_solveM(self.world, d, self.yields, self.pushes)
-            yields = self.along @ self.yields.T
-            gains = none if self.before is None else (speeds - self.before[0]) / step
-            gains = gains + (none if self.before is None else yields @ self.before[1])
-            push = struck.pushed(depths, speeds, gains, yields, self.target, self.travel, step)
-            self.kept = push.depths
-            if self.links is not None:  # as those of points in a plane
-                self.kept = self.kept + struck.depths(self.places(), self.travel) - depths
+        contact, d, zero = self.contact, self.data, 0.0 * speeds
+        depths = zero - np.inf if self.perturbation.missing else self.depths
+        self.response = None
+        if contact.near(depths, speeds, self.target, step):
+            self.response = np.zeros_like(self.normal_jacobian)
+            self.mujoco.mj_solveM(self.world, d, self.response, self.force_map)
+            inverse_mass = self.normal_jacobian @ self.response.T
+            accelerations = zero if self.last_step is None else (speeds - self.last_step[0]) / step
+            accelerations = accelerations + (
+                zero if self.last_step is None else inverse_mass @ self.last_step[1]
+            )
+            push = contact.pushed(depths, speeds, accelerations, inverse_mass, self.target, self.travel, step)
+            self.last_depths = push.depths
+            if self.links is not None:  # to depths of the points in the target's plane, as in `hand_speeds`
+                self.last_depths = (
+                    self.last_depths + contact.depths(self.striking_points(), self.travel) - depths
+                )
         else:
-            state, travel = struck.untouched_step(self.target, self.travel, step)
-            push = Push(forces=none, halves=none, peaks=none, state=state, travel=travel, depths=depths)
-        self.before = (speeds, push.forces)
+            state, travel = contact.untouched_step(self.target, self.travel, step)
+            push = Push(forces=zero, first_half=zero, peaks=zero, state=state, travel=travel, depths=depths)
+        self.last_step = (speeds, push.forces)
         self.target, self.travel = push.state, push.travel
         return push
 
-    def shove(self, t: float) -> None:
-        """The perturbation's push at the base, if it is on at a time [s]."""
+    def apply_perturbation(self, t: float) -> None:
+        """Applies the perturbation's push on the base at a time [s]."""
         world = self.perturbation
         if not (self.floating and world.push):
             return
         on = world.push_start <= t < world.push_start + world.push_time
-        way = np.array([np.cos(world.push_way), np.sin(world.push_way)])
-        self.data.xfrc_applied[1, :2] = on * world.push * way
+        direction = np.array([np.cos(world.push_way), np.sin(world.push_way)])
+        self.data.xfrc_applied[1, :2] = on * world.push * direction
 
     def place_target(self) -> None:
-        """Its body goes with it; what a blow has broken is put away."""
+        """Moves the target's body with the target; a broken one is put away."""
         state, travel, broken = self.placed
-        if state is not self.target:  # it is replaced where it changes
+        if state is not self.target:  # a state that changes is a new array
             broken = bool(self.scene.target.outcome(self.target).get("broken", False))
         elif travel == self.travel:
             return
-        self.besides.place(self.data, self.travel * self.scene.normal + broken * AWAY)
+        self.unintended.place_target(self.data, self.travel * self.scene.normal + broken * AWAY)
         self.placed = self.target, self.travel, broken
 
-    # ------------------------------------------------------------------ what a record needs
-    def look_at(self, gears: GearWatch, torque: Array, push: Push) -> None:
-        """Records gear loads after a step with torque (n,) [N m] of the servos, under these forces."""
+    # ---------------------------------------------------------------- recorded quantities
+    def record_gears(self, gears: GearWatch, torque: Array, push: Push) -> None:
+        """Records gear loads after a step with motor torques (n,) [N m] and the contact forces `push`."""
         acceleration = self.data.qacc[self.dof]
-        gears.look(torque, acceleration)
-        if self.yields is not None:
-            gears.look(torque, acceleration + (push.forces - push.peaks) @ self.yields[:, self.dof])
+        gears.update(torque, acceleration)
+        if self.response is not None:  # at the peak of the forces, instead of their mean
+            gears.update(torque, acceleration + (push.forces - push.peaks) @ self.response[:, self.dof])
 
     def corner_places(self) -> Array:
-        """World places (k, 3) of all fixed soles' corners."""
+        """World positions (k, 3) [m] of all corners of the scene's soles."""
         rotations = self.data.xmat[self.corner_body].reshape(-1, 3, 3)
         return self.data.xpos[self.corner_body] + (rotations @ self.corners[:, :, None])[:, :, 0]
 
     def sole_ground(self) -> Array:
-        """(soles, 6) wrench of the floor on each fixed sole about the world's origin; after the step's forces
-        are known."""
-        out = np.zeros((len(self.held), 6))
+        """Wrench (soles, 6) of the floor on each of the scene's soles about the world's origin.
+
+        To be called once the step's forces are known.
+        """
+        out = np.zeros((len(self.sole_index), 6))
         contacts = self.data.contact
         if not self.data.ncon:
             return out
@@ -233,69 +259,71 @@ class _Replay(MujocoRobot):
         on = (contacts.efc_address >= 0) & (sole >= 0)
         axes, place = contacts.frame[on].reshape(-1, 3, 3), contacts.pos[on]
         # the frame's first axis points from the first geom to the second: from the floor, geom 0, up
-        parts = self.data.efc_force[contacts.efc_address[on][:, None] + THREE]
+        parts = self.data.efc_force[contacts.efc_address[on][:, None] + AXES]
         force = (parts[:, None] @ axes)[:, 0]
         # place x force; np.cross takes several times as long
-        moment = place[:, NEXT] * force[:, LAST] - place[:, LAST] * force[:, NEXT]
+        moment = place[:, NEXT_AXES] * force[:, PREVIOUS_AXES] - place[:, PREVIOUS_AXES] * force[:, NEXT_AXES]
         np.add.at(out, sole[on], np.concatenate([force, moment], axis=1))
         return out
 
     def ground(self) -> Array:
-        """(soles and hands, 6) wrench of the world on what stands on it and holds on to it, about its origin;
-        after the step's forces are known.
+        """Wrenches (soles and gripping hands, 6) of the world on them, about its origin.
+
+        To be called once the step's forces are known.
         """
         if not self.grips.frames:
             return self.sole_ground()
-        found, places = self.grips.wrenches(self.data)
-        found[:, 3:] += np.cross(places, found[:, :3])
-        return np.vstack([self.sole_ground(), found])
+        wrenches, places = self.grips.wrenches(self.data)
+        wrenches[:, 3:] += np.cross(places, wrenches[:, :3])
+        return np.vstack([self.sole_ground(), wrenches])
 
     def fallen(self, t: float) -> str:
-        """Reason why the robot counts as fallen, "" if it stands: the base is far from the reference's at a
-        time [s], which may bow deeply itself. A robot that recovers reaches the reference's postures after
-        the blow later.
+        """Reason why the robot counts as fallen at a time [s], "" if it stands.
+
+        The base is compared with that of the reference, which may bow deeply itself. A robot that recovers
+        goes through the reference's postures after the impact more slowly: it is compared with all of them.
         """
         if not self.scene.soles:
             return ""
         times = self.servo.time
-        row = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
-        since = row
-        if self.wbc is not None and self.wbc.target.recovers(t):
-            since = min(int(np.searchsorted(times, self.wbc.target.contact[1])), row)
-        lean = float(self.base_errors(slice(since, row + 1)).min())
-        height, planned = self.data.qpos[2], float(self.reference_q[since : row + 1, 2].min())
+        now = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
+        since = now
+        if self.wbc is not None and self.wbc.tracking.recovers(t):
+            since = min(int(np.searchsorted(times, self.wbc.tracking.contact[1])), now)
+        lean = float(self.base_errors(slice(since, now + 1)).min())
+        height, planned = self.data.qpos[2], float(self.reference_q[since : now + 1, 2].min())
         if lean > FALLEN_TILT:
             return f"fell: the base leans {lean:.1f} rad from where it should be"
         if height < (1 - FALLEN_DROP) * planned:
             return f"fell: the base is {height:.2f} m high where it should be {planned:.2f} m"
         return ""
 
-    def base_errors(self, rows: slice) -> Array:
-        """Angles [rad] between the verticals of the base and of the reference's configurations in rows."""
+    def base_errors(self, instants: slice) -> Array:
+        """Angles [rad] between the vertical axes of the base and of the reference at these instants."""
         w, x, y, z = self.data.qpos[3:7].tolist()
-        return np.arccos(np.clip(self.upright[rows] @ _upright((x, y, z, w)), -1.0, 1.0))
+        return np.arccos(np.clip(self.upright[instants] @ _upright((x, y, z, w)), -1.0, 1.0))
 
     def not_standing(self, simulation: Simulation) -> str:
-        """Reason why the robot does not stand at the end of its simulation; "" if it does."""
+        """Reason why the robot does not stand at the end of the simulation; "" if it does."""
         if not self.scene.soles:
             return ""
         lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))
-        if lean > LEANS:
+        if lean > STANDING_TILT:
             return f"leans at the end: base {lean:.2f} rad from where it should be"
-        if speed > STIRS:
+        if speed > STANDING_SPEED:
             return f"still moves at the end: base at {speed:.2f} m/s"
         least = BEARS * weight_of(self.robot)
         normal, slip = simulation.sole_normal[-1], simulation.slip.max(axis=0)
         for name, force, slid in zip(simulation.soles, normal, slip, strict=True):
             if force < least:
-                return f"the sole {name!r} bears no load at the end"
-            if slid > SLID:
+                return f"the sole {name!r} carries no load at the end"
+            if slid > MAX_SLIP:
                 return f"the sole {name!r} slid: {1e3 * slid:.0f} mm along the floor"
         return ""
 
 
 def _upright(quaternion: Any) -> Array:
-    """(..., 3) the world's vertical in axes turned by quaternions (x, y, z, w) of numbers or arrays (...)."""
+    """World's vertical (..., 3) in axes rotated by quaternions (x, y, z, w), of numbers or arrays (...)."""
     x, y, z, w = quaternion
     return np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]).T
 
@@ -316,21 +344,23 @@ def simulate_mujoco(
     contact: str = "point",
     until: float = np.inf,
 ) -> Simulation:
-    """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
+    """Simulates the whole motion on free soles, from the reference's first posture at rest.
 
-    settle : by default 2 s, in which it can fall, and 0.3 s for a robot without soles.
-    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of
-    :class:`impactopt.transcription.plan.Trajectory`. step [s], iterations, tolerance : of MuJoCo
-    (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
-    recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
-    missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
-        :class:`impactopt.simulation.result.FollowedReference`); default: it does not notice.
+    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as
+        :class:`impactopt.transcription.plan.Trajectory`.
+    step [s], iterations, tolerance : of MuJoCo (semi-implicit Euler, Newton, elliptic cones).
+    settle [s] : simulated beyond the motion, in which the robot may fall; default: 2 s, and 0.3 s for a robot
+        without soles.
+    record : steps between recorded instants; in contact every step is recorded.
+    perturbation : differences of the world from the planned one; default: none.
+    missed : reference of a robot that hit nothing, followed from ``missed.contact_end`` on
+        (:class:`impactopt.simulation.result.FollowedReference`); default: the robot does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
-    contact : "point": the striking point meets the target's plane; "link": the hull of the striking link
-        meets the target's body, and the law's force acts where it is deepest.
-    until [s] : it ends, if that is earlier.
+    contact : "point": the striking point touches the target's plane; "link": the hull of the striking link
+        touches the target's body, and the law's force acts where it is deepest.
+    until [s] : ends the simulation earlier.
 
-    A fall ends the simulation early; the result says so.
+    A fall ends the simulation early, and is reported in the result.
 
     Raises
     ------
@@ -341,34 +371,33 @@ def simulate_mujoco(
     check_choice("contact", contact, CONTACTS)
     if controller is not None and robot.floating and not scene.soles and not scene.hands:
         raise InputError(
-            f"robot {robot.name!r} floats freely, and the whole-body controller moves bases by what they "
-            "stand on: take the servo"
+            f"robot {robot.name!r} floats freely, and the whole-body controller needs soles or gripping "
+            "hands: take the servo"
         )
     world = perturbation if perturbation is not None else Perturbation()
-    beyond = settle if settle is not None else SETTLES if scene.soles else SETTLES_SOLELESS
+    beyond = settle if settle is not None else SETTLE if scene.soles else SETTLE_WITHOUT_SOLES
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller, contact)
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
-    most = servo.limit * (1 + 1e-9)  # demand that does not saturate
-    period, wait = world.period, world.delay
+    limit = servo.limit * (1 + 1e-9)
+    period, delay = world.period, world.delay
     if controller is not None:
-        period, wait = period or controller.period, wait or controller.delay
-    hold = max(1, round(period / step))
-    waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque
-    lag = round(wait / step)
-    # what the servo tells the motors, and what reaches them: demand, and what saturation leaves of it
-    told, reached = np.zeros((2, robot.n)), np.zeros((2, robot.n))
+        period, delay = period or controller.period, delay or controller.delay
+    hold, lag = max(1, round(period / step)), round(delay / step)  # in steps
+    waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # step in which a command takes effect; command
+    # (2, n) demand, and demand after saturation: as commanded, and as it reaches the motors
+    commanded, reached = np.zeros((2, robot.n)), np.zeros((2, robot.n))
     force, forces = 0.0, np.zeros(len(scene.strikers))
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
-    rows: list[tuple[Any, ...]] = []
+    recorded: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
     followed = FollowedReference(reference, missed)
-    motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
-    undriven = bool(passive.any())
+    motors, motor_delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
+    has_passive = bool(passive.any())
     drive: Array | None = None  # torque of the motors
     gears = GearWatch(robot)
-    # given to the target [N s] by each striker, and its state when it was last touched
-    impulses, left = np.zeros(len(scene.strikers)), replay.target
+    # [N s] of each striker on the target, and the target's state at the last touch
+    impulses, last_touched = np.zeros(len(scene.strikers)), replay.target
     with no_log_file():
         for k in range(round(min(float(reference.end) + beyond, until) / step)):
             t = k * step
@@ -377,48 +406,48 @@ def simulate_mujoco(
                 replay.follow(now)
                 servo = replay.servo
             if k % hold == 0:
-                asked = replay.asked(t, forces)
-                # at rest before the start, it asked for the same
-                waiting.append((k + lag if k else 0, asked))
+                # the first command takes effect at once: at rest before the start, it was the same
+                waiting.append((k + lag if k else 0, replay.command(t, forces)))
             while waiting and waiting[0][0] <= k:
-                told = np.array(waiting.popleft()[1])
-            reached, late = delay.at(t, told), reached
-            delay.keep(t, told)
-            if reached is not late:
-                demand, wanted = reached
-                saturates = bool((np.abs(demand) > most).any())
+                commanded = np.array(waiting.popleft()[1])
+            reached, previous = motor_delay.at(t, commanded), reached
+            motor_delay.keep(t, commanded)
+            if reached is not previous:
+                demand, saturated_demand = reached
+                saturates = bool((np.abs(demand) > limit).any())
             rates = data.qvel[replay.dof]
-            cut = motors.cut(wanted, rates)
+            cut = motors.cut(saturated_demand, rates)
             if motors.lines:
-                cuts.look(t, wanted, cut, step)
+                cuts.update(t, saturated_demand, cut, step)
             drive = cut if drive is None else drive
             torque, drive = motors.mean(drive, cut, step), motors.after(drive, cut, step)
-            if undriven:  # springs, that no computer samples
-                torque = np.where(passive, servo.springs(data.qpos[replay.place], rates), torque)
+            if has_passive:  # springs act at every step: no computer samples them
+                torque = np.where(passive, servo.springs(data.qpos[replay.qpos_index], rates), torque)
             speeds = replay.hand_speeds()
             target_before = replay.target
             push = replay.push(speeds, step)
             forces, force = push.forces, push.force
             peak = max(peak, push.peak)
             replay.apply(torque, push.forces)
-            replay.shove(t)
+            replay.apply_perturbation(t)
             touches.add(t, force, step, push.since)
             saturated += step * saturates
             replay.place_target()
             impulses += step * push.forces
-            left = replay.target if force > 0 else left
-            kept = k % record == 0 or touches.touched
-            state = replay.state() if kept else None
-            corners = replay.corner_places() if kept else None
+            last_touched = replay.target if force > 0 else last_touched
+            records = k % record == 0 or touches.touched
+            # positions are those before the step, forces and accelerations those in it
+            state = replay.state() if records else None
+            corners = replay.corner_places() if records else None
             mujoco.mj_step2(model, data)
-            replay.besides.look(data, t)
-            replay.look_at(gears, torque, push)
-            if kept:
+            replay.unintended.update(data, t)
+            replay.record_gears(gears, torque, push)
+            if records:
                 ground = replay.ground()
                 assert state is not None
-                met = force, replay.struck.speed(target_before), float(speeds[0])
-                loads = demand, torque, ground, corners, gears.taken()
-                rows.append((t, *state, *met, *loads, stance_at(now, t)))
+                contact_values = force, replay.contact.speed(target_before), float(speeds[0])
+                loads = demand, torque, ground, corners, gears.take()
+                recorded.append((t, *state, *contact_values, *loads, stance_at(now, t)))
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(t)
                 if fall:
@@ -427,18 +456,18 @@ def simulate_mujoco(
     simulation = simulation_of(
         robot,
         replay.scene,
-        rows,
+        recorded,
         touches,
         engine="mujoco",
         impulse=float(impulses.sum()),
         impulses=impulses,
         peak_force=peak,
-        outcome=replay.scene.target.outcome(left),
+        outcome=replay.scene.target.outcome(last_touched),
         saturated=saturated,
-        cuts=cuts.told() if motors.lines else None,
+        cuts=cuts.cuts() if motors.lines else None,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
         fall=fall,
-        touched=replay.besides.touched(),
+        touched=replay.unintended.contacts(),
         missed=world.missing,
     )
     return simulation if fall else replace(simulation, fall=replay.not_standing(simulation))

@@ -1,4 +1,4 @@
-"""A robot and its floor as a MuJoCo model, built body by body from the robot's numbers."""
+"""MuJoCo model of a robot and its floor, built body by body from the robot's parameters."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-# of a weld, MuJoCo's own limits: impedance, and time constant in steps
-_IMPEDANCE, _TIME_CONSTANT = 0.9999, 2.0
-FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the floor where the corner is
+# hardest equality that MuJoCo accepts: impedance, and time constant in steps
+_MAX_IMPEDANCE, _MIN_TIME_CONSTANT = 0.9999, 2.0
+CORNER_RADIUS = 0.005  # [m] of the spheres at a sole's corners; they touch the floor where the corner is
 
 
 @dataclass(frozen=True)
 class MujocoOptions:
-    """MuJoCo's own settings: step [s], iterations and tolerance of its contact solver."""
+    """Settings of MuJoCo: step [s], iterations and tolerance of its contact solver."""
 
     step: float = 2e-4
     iterations: int = 100
@@ -53,7 +53,12 @@ class MujocoOptions:
 
 
 def mujoco_module() -> Any:
-    """MuJoCo, or an error that says how to get it."""
+    """MuJoCo's module.
+
+    Raises
+    ------
+    InputError : it is not installed, with the command that installs it.
+    """
     try:
         import mujoco
     except ImportError as error:
@@ -63,7 +68,7 @@ def mujoco_module() -> Any:
 
 @contextlib.contextmanager
 def no_log_file() -> Iterator[None]:
-    """MuJoCo's warnings are not written to a file in the user's directory: the engine raises its own."""
+    """Suppresses MuJoCo's log file in the working directory: the engine raises errors of its own."""
     mujoco = mujoco_module()
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _message: None)
@@ -79,19 +84,24 @@ def build_world(
     perturbation: Perturbation,
     solver: MujocoOptions,
     near: Sequence[tuple[int, int]] = (),
-    struck: Sequence[int] = (),
+    in_contact: Sequence[int] = (),
 ) -> Any:
-    """The compiled mujoco.MjModel.
+    """Compiled mujoco.MjModel of a robot in a scene.
 
-    Joints have the model's names; striking points are the sites ``striker`` and ``striker 2``; each sole of
-    the robot, held by the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing
-    else touches anything, but the pairs of solids (`near`), which push each other back: hulls of links, named
-    ``solid <number>``, and bodies of the world; those that move with the target are on the mocap body
-    ``target``. Other solids (`struck`) are there to be asked for their distance. The contact law between
-    target and striker is the engine's business. Hands that hold on are welded.
+    near : pairs of solids that collide.
+    in_contact : other solids, of which only distances are computed.
+
+    * Joints have the names of the robot's model.
+    * Striking points are the sites ``striker`` and ``striker 2``. The contact law at them is not part of the
+      model: the engine applies its force.
+    * Every sole of the robot, whether the plan uses it or not, has a sphere ``sole <frame> <k>`` at each of
+      its corners, which collides with the floor.
+    * Solids are the geoms ``solid <number>``: hulls of links, and bodies of the world. Those that move with
+      the target are on the mocap body ``target``.
+    * Hands that hold on are welded.
     """
     spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver, scene.solids.floor)
-    _solids(mujoco_module(), spec, bodies, scene, near, struck)
+    _solids(mujoco_module(), spec, bodies, scene, near, in_contact)
     add_welds(spec, bodies, robot, scene.hands, solver.step)
     return spec.compile()
 
@@ -103,10 +113,11 @@ def robot_on_floor(
     solver: MujocoOptions,
     height: float | None = 0.0,
 ) -> tuple[Any, list[Any]]:
-    """The world of :func:`build_world` before it is compiled, without target and solids; and its bodies, as
-    of :func:`robot_bodies`.
+    """Specification of :func:`build_world`'s model without target and solids, and its bodies.
 
     strikers : frames of the model that hit.  height : of the floor [m]; None: nothing can touch it.
+
+    The bodies are those of :func:`robot_bodies`.
     """
     mujoco = mujoco_module()
     spec = spec_of(robot, solver)
@@ -121,7 +132,7 @@ def robot_on_floor(
 
 
 def spec_of(robot: Robot, solver: MujocoOptions) -> Any:
-    """An empty world with the robot's gravity, that is integrated and solved so."""
+    """Specification of an empty world with the robot's gravity and these options."""
     mujoco = mujoco_module()
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -129,7 +140,7 @@ def spec_of(robot: Robot, solver: MujocoOptions) -> Any:
     spec.option.timestep = solver.step
     spec.option.iterations, spec.option.tolerance = solver.iterations, solver.tolerance
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    # the engine says so itself when it diverges, and does not begin anew
+    # no automatic reset on divergence: the engine raises an error
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.option.gravity = robot.model.gravity.linear
     return spec
@@ -141,12 +152,12 @@ def _solids(
     bodies: list[Any],
     scene: Scene,
     near: Sequence[tuple[int, int]],
-    struck: Sequence[int],
+    in_contact: Sequence[int],
 ) -> None:
-    """Geometry of the solids that are in a pair, and the pairs."""
+    """Adds the geoms of the solids that are needed, and their colliding pairs."""
     solids = scene.solids.solids
     target = spec.worldbody.add_body(name="target", mocap=True)
-    for k in sorted({*struck, *(k for pair in near for k in pair if k != FLOOR)}):
+    for k in sorted({*in_contact, *(k for pair in near for k in pair if k != FLOOR)}):
         solid = solids[k]
         body = bodies[solid.joint] if solid.joint else (target if solid.moves else spec.worldbody)
         if solid.vertices is not None:
@@ -158,6 +169,7 @@ def _solids(
             shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": f"solid {k}"}
         else:
             shape = primitive(mujoco, solid)
+        # no general collisions: only the explicit pairs below collide
         body.add_geom(name=f"solid {k}", contype=0, conaffinity=0, mass=0.0, **shape)
     for one, other in near:
         spec.add_pair(
@@ -171,8 +183,9 @@ def _solids(
 
 
 def primitive(mujoco: Any, solid: Any) -> dict[str, Any]:
-    """Shape and place of a geom that is a box, inflated: of a `Solid` without vertices, or of a body of the
-    world.
+    """Shape and placement of a geom that is an inflated box: sphere, capsule or box.
+
+    solid : a `Solid` without vertices, or a body of the world.
     """
     half, radius = np.asarray(solid.half), solid.radius
     place = {"pos": solid.place, "quat": quaternion(solid.rotation)}
@@ -191,16 +204,17 @@ def site_name(number: int) -> str:
 def _robot_bodies(
     mujoco: Any, spec: Any, robot: Robot, strikers: Sequence[str], perturbation: Perturbation
 ) -> list[Any]:
+    """The bodies of :func:`robot_bodies`, with spheres at the soles' corners, striking points and payload."""
     model = robot.model
     bodies = robot_bodies(mujoco, spec, robot)
     for sole in robot.soles:
         frame = model.frames[model.getFrameId(sole.frame)]
         for k, corner in enumerate(sole.polygon):
-            centre = frame.placement.act(np.array([*corner, FOOT]))
+            centre = frame.placement.act(np.array([*corner, CORNER_RADIUS]))
             sphere = bodies[frame.parentJoint].add_geom(
                 name=f"sole {sole.frame} {k}",
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=[FOOT, 0.0, 0.0],
+                size=[CORNER_RADIUS, 0.0, 0.0],
                 pos=centre,
                 mass=0.0,
             )
@@ -216,22 +230,22 @@ def _robot_bodies(
 
 
 def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
-    """The robot's links and joints, without anything that touches; the body of each joint of the model, in
-    its order, the world first. Names are ``body <joint>`` and the joints' own.
+    """Adds the robot's links and joints; returns the body of each joint of the model, the world first.
 
-    MuJoCo has no moving body without mass: joints that move nothing of their own move the next one's body.
+    The bodies are named ``body <joint>``, and have no geoms. MuJoCo has no moving body without mass: a joint
+    whose own link has none becomes a joint of the next body in the chain.
     """
     model = robot.model
     bodies = [spec.worldbody] * model.njoints
     for j in range(1, model.njoints):
-        inertia, above, way = model.inertias[j], parent_body(model, j), list(model.supports[j])
+        inertia, parent, chain = model.inertias[j], parent_body(model, j), list(model.supports[j])
         if not inertia.mass:
             continue
-        joints, placement, places = way[way.index(above) + 1 :], pin.SE3.Identity(), list[Any]()
+        joints, placement, placements = chain[chain.index(parent) + 1 :], pin.SE3.Identity(), list[Any]()
         for i in joints:
             placement = placement * model.jointPlacements[i]
-            places.append(placement)
-        body = bodies[above].add_body(
+            placements.append(placement)
+        body = bodies[parent].add_body(
             name=f"body {model.names[j]}", pos=placement.translation, quat=quaternion(placement.rotation)
         )
         bodies[j] = body
@@ -239,13 +253,16 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
         if model.joints[j].nv == 6:
             body.add_freejoint(name=model.names[j])
             continue
-        for i, place in zip(joints, places, strict=True):
-            _add_joint(mujoco, spec, body, robot, i, placement.actInv(place))
+        for i, joint_placement in zip(joints, placements, strict=True):
+            _add_joint(mujoco, spec, body, robot, i, placement.actInv(joint_placement))
     return bodies
 
 
 def _add_joint(mujoco: Any, spec: Any, body: Any, robot: Robot, j: int, at: Any) -> None:
-    """Joint j of the model, which is there in the body's frame; a follower's law is an equality."""
+    """Adds joint j of the model to a body, at this placement in it.
+
+    A joint that follows another gets an equality constraint with its law, and no armature of its own.
+    """
     model, subspace = robot.model, axis_of(robot.model, j).subspace
     turns, coupling = bool(np.any(subspace[3:])), robot.couplings.get(str(model.names[j]))
     stiffness, rest = robot.springs.get(str(model.names[j]), (0.0, 0.0))
@@ -255,24 +272,25 @@ def _add_joint(mujoco: Any, spec: Any, body: Any, robot: Robot, j: int, at: Any)
         type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=at.rotation @ (subspace[3:] if turns else subspace[:3]),
         pos=at.translation,
+        # a follower's armature is already in that of its leader
         armature=0.0 if coupling else float(model.armature[model.joints[j].idx_v]),
         **spring,
     )
     if coupling is not None:
-        law = _hard(spec.add_equality(), spec.option.timestep)
+        law = _as_hard_as_possible(spec.add_equality(), spec.option.timestep)
         law.type, law.name1, law.name2 = mujoco.mjtEq.mjEQ_JOINT, model.names[j], coupling.leader
         law.data[:5] = [coupling.offset, coupling.ratio, 0.0, 0.0, 0.0]
 
 
-def _hard(equality: Any, step: float) -> Any:
-    """The equality, as hard as MuJoCo lets it be in steps [s] of this length."""
-    equality.solref = [_TIME_CONSTANT * step, 1.0]
-    equality.solimp = [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0]
+def _as_hard_as_possible(equality: Any, step: float) -> Any:
+    """The equality constraint, as hard as MuJoCo permits with this step [s]."""
+    equality.solref = [_MIN_TIME_CONSTANT * step, 1.0]
+    equality.solimp = [_MAX_IMPEDANCE, _MAX_IMPEDANCE, 1e-3, 0.5, 2.0]
     return equality
 
 
 def put_followers(world: Any, robot: Robot, qpos: Array, qvel: Array) -> None:
-    """Put joints that follow others, in place, where their laws have them and as fast."""
+    """Sets positions and velocities, in place, of joints that follow others, by their laws."""
     for name, (leader, ratio, offset) in robot.couplings.items():
         own, other = world.joint(name), world.joint(leader)
         qpos[own.qposadr[0]] = ratio * qpos[other.qposadr[0]] + offset
@@ -280,7 +298,7 @@ def put_followers(world: Any, robot: Robot, qpos: Array, qvel: Array) -> None:
 
 
 def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[str], step: float) -> None:
-    """Sites at these frames of the robot, welded as hard as MuJoCo lets them be in steps [s] of this length.
+    """Welds these frames of the robot to the ground, as hard as MuJoCo permits with this step [s].
 
     bodies : of :func:`robot_bodies`.
     """
@@ -291,25 +309,27 @@ def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[s
             name=name, pos=frame.placement.translation, quat=quaternion(frame.placement.rotation)
         )
         spec.worldbody.add_site(name=f"ground {name}")
-        weld = _hard(spec.add_equality(), step)
+        weld = _as_hard_as_possible(spec.add_equality(), step)
         weld.type, weld.objtype = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_SITE
         weld.name1, weld.name2 = name, f"ground {name}"
     if frames:
-        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # their rows are read
+        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # `Welds.wrenches` reads it
 
 
 def _surface(geom: Any, perturbation: Perturbation, *, sole: bool) -> None:
-    geom.contype, geom.conaffinity = int(sole), int(not sole)  # soles meet the floor, not each other
+    """Sets the contact parameters of the floor, or of a corner of a sole."""
+    geom.contype, geom.conaffinity = int(sole), int(not sole)  # soles touch the floor, not each other
     geom.friction = [perturbation.friction, 1e-3, 1e-4]
     geom.condim = 3
     geom.solref = [perturbation.floor_time, 1.0]
-    # as soft as a rubber sole: with more impedance the corners leave the floor by micrometres, many times a
-    # millisecond, and the force and ZMP of one step say nothing (the motion hardly changes). One impedance at
-    # all depths makes a linear floor.
+    # As soft as a rubber sole: with a higher impedance the corners leave the floor by micrometres, many times
+    # in a millisecond, and force and ZMP of a single step are meaningless (the motion hardly changes). The
+    # same impedance at all depths makes the floor linear.
     geom.solimp = [0.5, 0.5, 5e-4, 0.5, 2.0]
 
 
 def _inertial(body: Any, mass: float, centre: Any, inertia: Any) -> None:
+    """Sets mass [kg], centre (3,) [m] and inertia (3, 3) [kg m^2] about it, in the body's axes."""
     body.explicitinertial = True
     body.mass = float(mass)
     body.ipos = centre
@@ -318,17 +338,20 @@ def _inertial(body: Any, mass: float, centre: Any, inertia: Any) -> None:
 
 
 def quaternion(rotation: Any) -> list[float]:
-    """(w, x, y, z), as MuJoCo has it."""
+    """Quaternion (w, x, y, z), in MuJoCo's order, of a rotation (3, 3)."""
     x, y, z, w = pin.Quaternion(np.asarray(rotation)).normalized().coeffs()
     return [w, x, y, z]
 
 
 class MujocoRobot:
-    """A robot in a compiled MuJoCo model, struck at one of its sites.
+    """A robot in a compiled MuJoCo model, with contact forces at striking points.
 
-    world, data : MuJoCo's model and its data.  dof, place : where the joints' rates and angles are in qvel
-    and qpos.  sites : of the striking points, and along (h, nv): their Jacobians along the normal, where they
-    have been last; pushes (h, nv): the forces of a unit of normal force, which are these without friction.
+    world, data : MuJoCo's model and its data
+    dof, qpos_index : indices of the joints' rates in qvel and angles in qpos
+    sites : of the h striking points
+    normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `speeds_along`
+    force_map (h, nv) : generalized forces of a unit of normal force at each, friction included;
+        without friction the same array
     """
 
     def __init__(
@@ -340,86 +363,90 @@ class MujocoRobot:
         self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv
         joints = [world.joint(name) for name in robot.joint_names]
         self.dof = np.array([joint.dofadr[0] for joint in joints])
-        self.place = np.array([joint.qposadr[0] for joint in joints])
-        own = robot.joint_models
-        self._place = np.array([joint.idx_q for joint in own], dtype=np.intp)
-        # a continuous joint's angle is (cosine, sine) in Pinocchio
-        self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
+        self.qpos_index = np.array([joint.qposadr[0] for joint in joints])
+        models = robot.joint_models
+        self._q_index = np.array([joint.idx_q for joint in models], dtype=np.intp)
+        # Pinocchio's q has the cosine and sine of a continuous joint's angle
+        self._continuous = np.flatnonzero([joint.nq == 2 for joint in models])
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
-        self._rows, self.along = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
+        self._jacobian, self.normal_jacobian = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
         self.friction = friction
-        self.pushes = self.along if friction is None else np.zeros_like(self.along)
+        self.force_map = self.normal_jacobian if friction is None else np.zeros_like(self.normal_jacobian)
 
     def put(self, q: Array, v: Array | None = None) -> None:
-        """Go to q (nq), v (nv; None: the rates stay); what depends on them is not computed yet."""
+        """Sets q (nq,) and v (nv,), None: v stays; quantities that depend on them are not updated."""
         d, robot = self.data, self.robot
         if self.floating:
-            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
-        d.qpos[self.place] = robot.joint_positions(q)
+            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]  # MuJoCo's quaternions begin with w
+        d.qpos[self.qpos_index] = robot.joint_positions(q)
         if v is not None:
             if self.floating:
+                # MuJoCo's linear velocity is in world axes, Pinocchio's in those of the base
                 d.qvel[:3], d.qvel[3:6] = self.base_rotation() @ v[:3], v[3:6]
             d.qvel[self.dof] = v[-robot.n :]
         put_followers(self.world, robot, d.qpos, d.qvel)
 
     def state(self) -> tuple[Array, Array]:
-        """q (nq), v (nv)."""
+        """q (nq,), v (nv,), in Pinocchio's conventions."""
         qpos, qvel = self.data.qpos, self.data.qvel
         q, v = np.zeros(self._nq), np.zeros(self._nv)
         if self.floating:
             q[:3], q[3:6], q[6] = qpos[:3], qpos[4:7], qpos[3]
             v[:3], v[3:6] = self.base_rotation().T @ qvel[:3], qvel[3:6]
-        angles = qpos[self.place]
-        q[self._place] = angles
+        angles = qpos[self.qpos_index]
+        q[self._q_index] = angles
         for k in self._continuous:
-            at = self._place[k]
+            at = self._q_index[k]
             q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
         v[-self._n :] = qvel[self.dof]
         return q, v
 
     def base_rotation(self) -> Array:
-        """(3, 3) of a floating base."""
+        """Rotation (3, 3) of a floating base."""
         rotation = np.zeros(9)
         self.mujoco.mju_quat2Mat(rotation, self.data.qpos[3:7])
         return rotation.reshape(3, 3)
 
-    def places(self) -> Array:
-        """(h, 3) [m] of the striking points."""
+    def striking_points(self) -> Array:
+        """Positions (h, 3) [m] of the striking points."""
         return np.asarray(self.data.site_xpos[self.sites])
 
     def speeds_along(self, normal: Array) -> Array:
-        """Speeds (h,) [m/s] of the striking points along a normal (3,); leaves their rows in `along`, and
-        what a unit of the contacts' normal forces does in `pushes`.
+        """Speeds (h,) [m/s] of the striking points along a normal (3,).
+
+        Updates `normal_jacobian` and `force_map`.
         """
+        J = self._jacobian
         for k, site in enumerate(self.sites):
-            self.mujoco.mj_jacSite(self.world, self.data, self._rows, None, site)
-            self.along[k] = normal @ self._rows
+            self.mujoco.mj_jacSite(self.world, self.data, J, None, site)
+            self.normal_jacobian[k] = normal @ J
             if self.friction is not None:
-                self.pushes[k] = self.friction.way(normal, self._rows @ self.data.qvel) @ self._rows
-        return np.asarray(self.along @ self.data.qvel)
+                self.force_map[k] = self.friction.way(normal, J @ self.data.qvel) @ J
+        return np.asarray(self.normal_jacobian @ self.data.qvel)
 
     def apply(self, torque: Array, forces: Array | float) -> None:
-        """Torque (n) [N m] at the joints, and the contacts' forces (h,) [N], against the normal."""
+        """Applies torques (n,) [N m] at the joints, and contact forces (h,) [N] against the normal."""
         applied = self.data.qfrc_applied
-        applied[:] = -np.atleast_1d(forces) @ self.pushes
+        applied[:] = -np.atleast_1d(forces) @ self.force_map
         applied[self.dof] += torque
 
 
 class Welds:
-    """The welds of a compiled world, whose other equalities are the laws of joints that follow others.
+    """Welds of a compiled world, added last by :func:`impactopt.simulation.mujoco_world.add_welds`.
 
-    frames : as :func:`impactopt.simulation.mujoco_world.add_welds` has added them.
+    frames : the welded ones, in the order in which they were added. Equalities before them are the laws of
+        joints that follow others.
     """
 
     def __init__(self, world: Any, frames: Sequence[str]) -> None:
         self.mujoco, self.world = mujoco_module(), world
         self.frames = [world.site(name).id for name in frames]
         self.ground = [world.site(f"ground {name}").id for name in frames]
-        world.site_sameframe[self.ground] = self.mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # they are moved
-        self._map = np.zeros((6, world.nv))
+        world.site_sameframe[self.ground] = self.mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # `put` moves them
+        self._jacobian = np.zeros((6, world.nv))
 
     def put(self, data: Any) -> None:
-        """They hold the frames where they are; needs kinematics."""
+        """Sets the welds to the frames' present placements; data must have updated kinematics."""
         for frame, ground in zip(self.frames, self.ground, strict=True):
             self.world.site_pos[ground] = data.site_xpos[frame]
             rotation = np.zeros(4)
@@ -427,19 +454,21 @@ class Welds:
             self.world.site_quat[ground] = rotation
 
     def wrenches(self, data: Any) -> tuple[Array, Array]:
-        """Wrenches of the world on the frames (frames, 6), world axes, and their places, at the last step's
-        start.
+        """Wrenches (frames, 6) of the world on the frames, world axes, and positions (frames, 3) [m] of them.
+
+        Both are those at the start of the last step.
         """
-        d, J = data, self._map
+        d, J = data, self._jacobian
         out, places = np.empty((len(self.frames), 6)), np.empty((len(self.frames), 3))
         if not self.frames:
             return out, places
-        rows = np.reshape(d.efc_J, (-1, self.world.nv))
+        efc_J = np.reshape(d.efc_J, (-1, self.world.nv))
         for k, frame in enumerate(self.frames):
+            # constraints of MuJoCo: first one for each law of a follower, then six for each weld
             first = 6 * k + self.world.neq - len(self.frames)
             its = slice(first, first + 6)
             self.mujoco.mj_jacSite(self.world, d, J[:3], J[3:], frame)
-            # the rows of a weld are in coordinates of its own
-            out[k] = np.linalg.lstsq(J.T, rows[its].T @ d.efc_force[its], rcond=None)[0]
+            # MuJoCo scales a weld's constraints its own way: find the wrench of the same generalized forces
+            out[k] = np.linalg.lstsq(J.T, efc_J[its].T @ d.efc_force[its], rcond=None)[0]
             places[k] = d.site_xpos[frame]
         return out, places

@@ -10,33 +10,34 @@ from impactopt.contact.targets.base import scaled_numbers
 from impactopt.errors import FARTHEST, InputError, check_array, check_positive, shortened
 from impactopt.simulation.result import Scene
 
-LARGEST = 1e6  # factor, friction, payload [kg]
-SLOWEST = 10.0  # [s] of the servo's clock and of the floor: longer than most motions
-LIGHTEST = 1e-6  # [kg] of a payload that is one: MuJoCo takes no body without inertia
+MAX_VALUE = 1e6  # of factors, friction and payload [kg]
+MAX_TIME = 10.0  # [s] of period, delay, floor and push: longer than most motions
+MIN_PAYLOAD = 1e-6  # [kg] if not 0: MuJoCo takes no body without inertia
 
 
 @dataclass(frozen=True, kw_only=True)
 class Perturbation:
-    """Differences of a replay's world from the plan. By default there are none, and the floor's friction is
-    0.9.
+    """Differences of a replay's world from the planned one; by default only the floor's friction, 0.9.
 
-    mass : of the target, as a factor of the planned one.  stiffness, damping : of the contact law, as
-        factors.
-    distance [m] : how much farther along the normal the target is; negative: nearer, so it is hit early.
+    mass : of the target, as a factor of the planned one.
+    stiffness, damping : of the contact law, as factors.
+    distance [m] : displacement of the target along the normal; < 0: nearer, so that it is hit early.
     missing : there is no target.
-    payload [kg] : a point mass at the striking point that the plan does not know of.
-    friction : coefficient between soles and floor.  floor_time [s] : time constant of the floor's contact
-        (MuJoCo's solref), the softness of floor and soles: a sole sinks in proportion to its square. MuJoCo
-        takes at least two steps.
+    payload [kg] : unplanned point mass at the striking point.
+    friction : coefficient between soles and floor.
+    floor_time [s] : time constant of the floor's contact (MuJoCo's solref), which sets the softness of floor
+        and soles: a sole sinks in proportion to its square. MuJoCo takes at least two steps.
     kp, kd, torque_limit : of the servo, as factors of the robot's.
-    period [s] : time between two samples of the servo, which holds its torques between them; 0: it samples in
-        every step of the simulation.  delay [s] : from reading the joints to setting the torque. Both are
-    rounded to steps. With a whole-body controller 0 stands for its own.
-    push [N] : on the base, level, from push_start [s] for push_time [s], at an angle push_way [rad] from x.
+    period [s] : sampling period of the servo, which holds its torques between samples; 0: it samples in every
+        step of the simulation.
+    delay [s] : from reading the joints to setting the torque. Period and delay are rounded to steps. With a
+        whole-body controller 0 stands for the controller's own.
+    push [N] : horizontal force on the base, from push_start [s] for push_time [s], at an angle push_way [rad]
+        from x.
 
     Raises
     ------
-    InputError : naming the number that is out of its range.
+    InputError : a value is out of its range.
     """
 
     mass: float = 1.0
@@ -60,7 +61,7 @@ class Perturbation:
     def __post_init__(self) -> None:
         most = {
             "distance": FARTHEST,
-            **dict.fromkeys(("period", "delay", "floor_time", "push_start", "push_time"), SLOWEST),
+            **dict.fromkeys(("period", "delay", "floor_time", "push_start", "push_time"), MAX_TIME),
         }
         for f in fields(self):
             if f.name == "missing":
@@ -71,14 +72,14 @@ class Perturbation:
                 continue
             value = float(
                 check_array(
-                    f"perturbation: {f.name}", getattr(self, f.name), (), most=most.get(f.name, LARGEST)
+                    f"perturbation: {f.name}", getattr(self, f.name), (), most=most.get(f.name, MAX_VALUE)
                 )
             )
             if f.name not in ("distance", "push_way") and value < 0:
                 raise InputError(f"perturbation: {f.name} is {value:g}; give a number >= 0")
-        if 0 < self.payload < LIGHTEST:
+        if 0 < self.payload < MIN_PAYLOAD:
             raise InputError(
-                f"perturbation: payload is {self.payload:g}; give 0, or at least {LIGHTEST:g} kg"
+                f"perturbation: payload is {self.payload:g}; give 0, or at least {MIN_PAYLOAD:g} kg"
             )
         for name in ("mass", "stiffness", "friction", "floor_time", "torque_limit"):
             check_positive(f"perturbation: {name}", getattr(self, name))
@@ -88,20 +89,20 @@ class Perturbation:
 
         Raises
         ------
-        InputError : a factor of a number that the law or the target does not have.
+        InputError : a factor for a parameter that the law or the target does not have.
         """
         law, target = planned.law, planned.target
         of_law, of_target = scaled_numbers(
             "perturbation", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
         )
-        way = self.distance * planned.normal
-        solids = planned.solids.moved(way) if self.distance else planned.solids
+        displacement = self.distance * planned.normal
+        solids = planned.solids.moved(displacement) if self.distance else planned.solids
         solids = solids.without_target() if self.missing else solids
         return replace(
             planned,
             solids=solids,
-            point=planned.point + way,
-            second=None if planned.second is None else (planned.second[0], planned.second[1] + way),
+            point=planned.point + displacement,
+            second=None if planned.second is None else (planned.second[0], planned.second[1] + displacement),
             law=type(law)(**of_law),
             target=type(target)(**of_target),
         )

@@ -1,8 +1,7 @@
-"""Full dynamics in numeric Pinocchio.
+"""Replay in Pinocchio's full dynamics, with soles as bilateral constraints.
 
-Soles are bilateral constraints, the servo saturates, the target is moved by the contact law's force. Shares
-no code with the planner: it reads a reference (times, positions, velocities, feed-forward), the robot's
-numbers and the scene's.
+The servo saturates, and the contact law's force moves the target. The engine shares no code with the planner:
+it reads a reference (times, positions, velocities, feed-forward), the robot's parameters and the scene.
 """
 
 from __future__ import annotations
@@ -27,147 +26,160 @@ from impactopt.simulation.result import (
     simulation_of,
     stance_at,
 )
-from impactopt.simulation.target_dynamics import Push, Struck
+from impactopt.simulation.target_dynamics import Push, TargetContact
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class _State:
+    """State of robot, target and motors, and the impulses so far."""
+
     q: Array
     v: Array
-    x: float  # the target's travel [m]
-    target: Array  # and state
-    impulses: Array  # that it was given by each striker [N s]
-    drive: Array  # torque of the motors [N m]
+    travel: float  # of the target [m]
+    target: Array  # its state
+    impulses: Array  # (h,) of each striker on the target [N s]
+    drive: Array  # (n,) torque of the motors [N m]
 
 
 @dataclass(frozen=True)
 class _Rates:
+    """Rates of a state, with forces and torques."""
+
     v: Array
     a: Array
-    vt: float  # the target's speed [m/s]
-    forces: Array  # of each striker [N]
-    hand_speed: float
-    asked: Array  # (2, n) of the servos: demand, and what saturation leaves of it
-    demand: Array  # that reaches the motors
-    wanted: Array  # of it, after saturation
-    cut: Array  # what the motors' lines leave of that
-    torque: Array  # of the motors, as they are in the state
-    push: Push | None  # what the contact comes to in the step that begins here
+    target_speed: float  # [m/s]
+    forces: Array  # (h,) of each striker [N]
+    hand_speed: float  # of the first striking point along the normal [m/s]
+    # torques (n,) [N m], from the servo to the joints:
+    commanded: Array  # (2, n) demand of the servo, and the demand after saturation
+    demand: Array  # demand that reaches the motors, after the delay
+    saturated: Array  # the same after saturation
+    cut: Array  # after the motors' torque-speed lines
+    torque: Array  # of the motors in this state, which follow `cut` with their time constant
+    push: Push | None  # contact in the step that begins here; None: there is none
 
 
 class _World:
+    """Robot, target and servo of a replay, with the frames of the current stance phase fixed."""
+
     def __init__(self, robot: Robot, scene: Scene, reference: Any, *, missing: bool = False) -> None:
         self.robot, self.scene, self.missing, self.followed = robot, scene, missing, reference
         self.model, self.base = robot.model, robot.model.nv - robot.n
         self._soles = [robot.model.getFrameId(frame) for frame in scene.soles]
         self._bodies: dict[int, tuple[NDArray[np.intp], PinocchioBody]] = {}
         self._stance = stance_at(reference, 0.0)
-        self.held, self.body = self._held(self._stance)
-        self.servo, self.struck = Servo(robot, reference), Struck(scene)
+        self.fixed, self.body = self._body_of(self._stance)
+        self.servo, self.contact = Servo(robot, reference), TargetContact(scene)
         self.motors, self.delay = Motors(robot), Delay(robot)
 
     def follow(self, reference: Any) -> None:
         """Sets the reference that the servo follows from now on."""
         self.servo, self.followed = Servo(self.robot, reference), reference
 
-    def _held(self, stance: int) -> tuple[NDArray[np.intp], PinocchioBody]:
-        """Indices of the soles and hands that are held in a stance phase, and the robot so held."""
+    def _body_of(self, stance: int) -> tuple[NDArray[np.intp], PinocchioBody]:
+        """Indices of the soles and hands that are fixed in a stance phase, and the robot's dynamics then."""
         if stance not in self._bodies:
             scene = self.scene
             frames = (*scene.soles, *scene.hands)
-            held = np.arange(len(frames))
+            fixed = np.arange(len(frames))
             if scene.standing.size:
-                held = np.flatnonzero(scene.standing[stance])
-            chosen = tuple(frames[k] for k in held)
+                fixed = np.flatnonzero(scene.standing[stance])
+            chosen = tuple(frames[k] for k in fixed)
             body = PinocchioBody(
                 self.robot, chosen, np.zeros(6), scene.strikers, scene.normal, scene.friction
             )
-            self._bodies[stance] = held, body
+            self._bodies[stance] = fixed, body
         return self._bodies[stance]
 
-    def stand(self, t: float, s: _State) -> _State:
-        """The state with the soles held that stand from a time [s] on; those that touch down stop at once."""
+    def switch_stance(self, t: float, s: _State) -> _State:
+        """State after fixing the soles that stand at a time [s]; soles that touch down stop inelastically."""
         if (stance := stance_at(self.followed, t)) == self._stance:
             return s
-        before = self.held
+        before = self.fixed
         self._stance = stance
-        self.held, self.body = self._held(stance)
-        if np.isin(self.held, before).all():
+        self.fixed, self.body = self._body_of(stance)
+        if np.isin(self.fixed, before).all():  # soles only lift off
             return s
-        self.body.look(s.q, s.v)
-        return replace(s, v=self.body.stopped(s.v))
+        self.body.update(s.q, s.v)
+        return replace(s, v=self.body.after_touchdown(s.v))
 
     def at_start(self, reference: Any) -> _State:
-        """State at the motion's start: at rest, with motors that give the demanded torque."""
-        travel = self.struck.travel_at_start(reference)
-        return self._begin(0.0, np.array(reference.q[0]), np.zeros(self.model.nv), travel)
+        """State at the motion's start: at rest, with motors that deliver the demanded torque."""
+        travel = self.contact.travel_at_start(reference)
+        return self._without_contact(0.0, np.array(reference.q[0]), np.zeros(self.model.nv), travel)
 
     def at_contact(self, reference: Any) -> _State:
         """State at the planned beginning of contact, where the swing's reference ends."""
         k = int(np.flatnonzero(reference.phase == 0)[-1])
         self._stance = stance_at(reference, float(reference.contact_start))
-        self.held, self.body = self._held(self._stance)
-        return self._begin(float(reference.contact_start), np.array(reference.q[k]), reference.v[k], 0.0)
+        self.fixed, self.body = self._body_of(self._stance)
+        return self._without_contact(
+            float(reference.contact_start), np.array(reference.q[k]), reference.v[k], 0.0
+        )
 
-    def _begin(self, t: float, q: Array, v: Array, travel: float) -> _State:
-        """A state before any contact."""
-        first = np.array(self.servo.torque(t, self.servo.angles(q), v[self.base :]))
-        drive = self.motors.cut(first[1], v[self.base :])
-        return _State(q, v, travel, self.struck.untouched, np.zeros(len(self.scene.strikers)), drive)
+    def _without_contact(self, t: float, q: Array, v: Array, travel: float) -> _State:
+        """State before any contact."""
+        commanded = np.array(self.servo.torque(t, self.servo.angles(q), v[self.base :]))
+        drive = self.motors.cut(commanded[1], v[self.base :])
+        return _State(q, v, travel, self.contact.untouched, np.zeros(len(self.scene.strikers)), drive)
 
     def depths(self, s: _State) -> Array:
-        """(h,) [m] of the striking points in the target, at the state at which the body has been last; -inf
-        where there is none."""
+        """Depths (h,) [m] of the striking points in the target, in the current state; -inf without one."""
         if self.missing:
             return np.full(len(self.scene.strikers), -np.inf)
-        return self.struck.depths(self.body.hand_places(), s.x)
+        return self.contact.depths(self.body.striking_points(), s.travel)
 
     def rates(self, t: float, s: _State, *, forces: Array | None = None, step: float = 0.0) -> _Rates:
-        """Rates of a state under the forces [N] of its step, or those of the step [s] that begins here."""
+        """Rates of a state.
+
+        forces : (h,) [N] of the contact, as known for a state in the middle of a step; None: they follow from
+            the state, and the contact is integrated over the step [s] that begins here.
+        """
         body = self.body
-        speed = body.look(s.q, s.v)
-        speeds, depths = body.rows @ s.v, self.depths(s)
+        speed = body.update(s.q, s.v)
+        speeds, depths = body.normal_jacobian @ s.v, self.depths(s)
         joints = s.v[self.base :]
-        asked = np.array(self.servo.torque(t, self.servo.angles(s.q), joints))
-        demand, wanted = self.delay.at(t, asked)
-        cut = self.motors.cut(wanted, joints)
+        commanded = np.array(self.servo.torque(t, self.servo.angles(s.q), joints))
+        demand, saturated = self.delay.at(t, commanded)
+        cut = self.motors.cut(saturated, joints)
         torque = self.motors.now(s.drive, cut)
-        push, struck = None, self.struck
+        push, contact = None, self.contact
         if forces is None:
-            forces = struck.forces(depths, speeds, s.target)
-            if struck.near(depths, speeds, s.target, step):
+            forces = contact.forces(depths, speeds, s.target)
+            if contact.near(depths, speeds, s.target, step):
                 units = np.eye(len(speeds))
                 a = body.accelerate(torque, 0.0 * speeds)
-                lost = np.column_stack([a - body.accelerate(torque, unit) for unit in units])
-                push = struck.pushed(depths, speeds, body.drifts(a), body.rows @ lost, s.target, s.x, step)
+                response = np.column_stack([a - body.accelerate(torque, unit) for unit in units])
+                inverse_mass = body.normal_jacobian @ response
+                push = contact.pushed(
+                    depths, speeds, body.normal_accelerations(a), inverse_mass, s.target, s.travel, step
+                )
         return _Rates(
             v=s.v.copy(),
             a=body.accelerate(torque, forces),
-            vt=struck.speed(s.target),
+            target_speed=contact.speed(s.target),
             forces=forces,
             hand_speed=speed,
-            asked=asked,
+            commanded=commanded,
             demand=demand,
-            wanted=wanted,
+            saturated=saturated,
             cut=cut,
             torque=torque,
             push=push,
         )
 
     def ground(self) -> Array:
-        """(soles and hands, 6) wrench of the world on what it holds, about its origin, of the last call of
-        ``rates``.
-        """
-        found = self.body.wrenches()
-        found[:, 3:] += np.cross(self.body.places(), found[:, :3])
+        """Wrenches (soles and hands, 6) of the world on them, about its origin, of the last `rates`."""
+        wrenches = self.body.wrenches()
+        wrenches[:, 3:] += np.cross(self.body.origins(), wrenches[:, :3])
         out = np.zeros((len(self.scene.soles) + len(self.scene.hands), 6))
-        out[self.held] = found
+        out[self.fixed] = wrenches
         return out
 
     def corners(self) -> Array:
-        """World places (k, 3) of all soles' corners."""
+        """World positions (k, 3) [m] of all soles' corners."""
         at = [pin.updateFramePlacement(self.model, self.body.data, frame) for frame in self._soles]
         places = [
             np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
@@ -176,51 +188,54 @@ class _World:
         return np.concatenate([np.zeros((0, 3)), *places])
 
     def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
-        """A step of the midpoint rule from a state with its rates, under the contact's mean force in it.
+        """State after a step h [s] of the explicit midpoint rule, under the contact's mean forces in it.
 
-        The body is where `rates` has left it: at the state.
+        first : rates at the state `s`, for which they must have been evaluated last.
         """
         push = first.push
         a = first.a
-        if push is not None and np.any(push.halves != first.forces):
-            a = self.body.accelerate(first.torque, push.halves)
+        if push is not None and np.any(push.first_half != first.forces):
+            a = self.body.accelerate(first.torque, push.first_half)
         half = _State(
             q=pin.integrate(self.model, s.q, h / 2 * s.v),
             v=s.v + h / 2 * a,
-            x=s.x,
+            travel=s.travel,
             target=s.target,
             impulses=s.impulses,
             drive=self.motors.after(s.drive, first.cut, h / 2),
         )
         middle = self.rates(t + h / 2, half, forces=0.0 * first.forces if push is None else push.forces)
         if push is None:
-            target, travel = self.struck.untouched_step(s.target, s.x, h)
+            target, travel = self.contact.untouched_step(s.target, s.travel, h)
         else:
             target, travel = push.state, push.travel
         after = _State(
             q=pin.integrate(self.model, s.q, h * middle.v),
             v=s.v + h * middle.a,
-            x=travel,
+            travel=travel,
             target=target,
             impulses=s.impulses + h * middle.forces,
             drive=self.motors.after(s.drive, middle.cut, h),
         )
         if push is None:
             return after
-        # depths are the contact's: they are followed more exactly there than the arms are
-        self.body.look(after.q, after.v)
-        gone = self.depths(replace(after, x=0.0)) - push.depths
-        known = gone[np.isfinite(gone)]
-        return replace(after, x=float(known.mean())) if known.size else after
+        # The contact's integration gives depths more exactly than the midpoint rule gives the robot: take the
+        # travel that makes them agree.
+        self.body.update(after.q, after.v)
+        travels = self.depths(replace(after, travel=0.0)) - push.depths
+        known = travels[np.isfinite(travels)]
+        return replace(after, travel=float(known.mean())) if known.size else after
 
 
 @dataclass(frozen=True, kw_only=True)
 class Followed:
-    """A contact, from where it is planned to begin.
+    """Result of the contact alone, from its planned beginning.
 
-    impulse [N s] to the target.  peak [N] : the largest force of all strikers together.  outcome : of the
-    target, by name and unit.  touches : start and end [s] since contact of each time that they touch.
-    events : when [s] since contact the target has switched.
+    impulse [N s] : on the target
+    peak [N] : largest force of all strikers together
+    outcome : of the target, by name and unit
+    touches : start and end [s] of each touch, since the planned beginning of contact
+    events : times [s] since then at which the target switched
     """
 
     impulse: float
@@ -233,31 +248,31 @@ class Followed:
 def follow_contact(
     robot: Robot, reference: Any, scene: Scene, *, step: float, until: float, longest: float
 ) -> Followed:
-    """The contact alone, in the same full dynamics, from the state and at the time at which it is planned.
+    """Simulates the contact alone, in the same full dynamics, from its planned state and time.
 
     reference : as of :func:`simulate_pinocchio`.
-    step [s] : at most; less where the servo's damping needs it.
-    until [s] : since contact: it goes on for so long, and from then on while they touch, for the `longest`
-        time.
+    step [s] : at most; smaller where the servo's damping requires it.
+    until, longest [s] : since contact; the simulation ends at the first instant after `until` without a
+        touch, and at `longest` in any case.
 
     Raises
     ------
-    InputError : it diverges.
+    InputError : the simulation diverges.
     """
     world = _World(robot, scene, reference)
     state, start = world.at_contact(reference), float(reference.contact_start)
-    world.body.look(state.q, state.v)
+    world.body.update(state.q, state.v)
     fastest = world.body.fastest_rate(np.diag(world.servo.kd))
-    step = min(step, 1 / fastest) if fastest > 0 else step  # explicit midpoint rule: stable up to twice that
-    left, peak, touches = state.target, 0.0, list[list[float]]()
-    side, events = world.struck.side(state.target, 0.0), list[float]()
+    step = min(step, 1 / fastest) if fastest > 0 else step  # explicit midpoint rule: stable up to 2 / fastest
+    last_touched, peak, touches = state.target, 0.0, list[list[float]]()  # target state at the last touch
+    side, events = world.contact.side(state.target, 0.0), list[float]()
     touching = False
     for k in range(round(longest / step)):
         since = k * step
         if since >= until and not touching:
             break
         first = world.rates(start + since, state, step=step)
-        world.delay.keep(start + since, first.asked)
+        world.delay.keep(start + since, first.commanded)
         push = first.push
         if push is None:
             touching = False
@@ -270,15 +285,15 @@ def follow_contact(
                     touches[-1][1] = t
                 touching = bool(on)
         before, state = state, world.step(start + since, state, first, step)
-        now = world.struck.side(state.target, 0.0 if push is None else push.last)
+        now = world.contact.side(state.target, 0.0 if push is None else push.last)
         events += [since + step] if now != side else []
         side = now
-        left = state.target if state.impulses.sum() > before.impulses.sum() else left
+        last_touched = state.target if state.impulses.sum() > before.impulses.sum() else last_touched
         check_not_diverged(state.v, start + since, step)
     return Followed(
         impulse=float(state.impulses.sum()),
         peak=peak,
-        outcome=scene.target.outcome(left),
+        outcome=scene.target.outcome(last_touched),
         touches=tuple((float(a), float(b)) for a, b in touches),
         events=tuple(events),
     )
@@ -296,16 +311,17 @@ def simulate_pinocchio(
     missed: Any = None,
     until: float = np.inf,
 ) -> Simulation:
-    """The whole motion from the reference's first posture at rest, in constrained forward dynamics.
+    """Simulates the whole motion from the reference's first posture at rest, in constrained forward dynamics.
 
-    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of
-    :class:`impactopt.transcription.plan.Trajectory`. step [s] : of the explicit midpoint rule (second
-        order).  settle [s] : simulated beyond the end of the reference's motion.
-    until [s] : it ends, if that is earlier.
-    record : steps between recorded instants; every step is recorded in contact.
-    missing : there is no target.  missed : the reference of a robot that hits nothing, which it notices at
-        ``missed.contact_end`` (:class:`impactopt.simulation.result.FollowedReference`); default: it
-        does not.
+    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as
+        :class:`impactopt.transcription.plan.Trajectory`.
+    step [s] : of the explicit midpoint rule (second order).
+    settle [s] : simulated beyond the end of the reference's motion.
+    until [s] : ends the simulation earlier.
+    record : steps between recorded instants; in contact every step is recorded.
+    missing : there is no target.
+    missed : reference of a robot that hit nothing, followed from ``missed.contact_end`` on
+        (:class:`impactopt.simulation.result.FollowedReference`); default: the robot does not notice.
 
     Raises
     ------
@@ -313,9 +329,9 @@ def simulate_pinocchio(
     """
     world = _World(robot, scene, reference, missing=missing)
     state = world.at_start(reference)
-    left = state.target  # as the last touch has left it
+    last_touched = state.target  # the target's state at the last touch
     end = min(float(reference.end) + settle, until)
-    rows: list[tuple[Any, ...]] = []
+    recorded: list[tuple[Any, ...]] = []
     saturated = peak = 0.0
     touches, gears, cuts = Touches(), GearWatch(robot), CutWatch(robot)
     followed = FollowedReference(reference, missed)
@@ -323,10 +339,10 @@ def simulate_pinocchio(
         t = k * step
         if (now := followed.at(t, bool(touches.intervals))) is not world.followed:
             world.follow(now)
-        state = world.stand(t, state)
+        state = world.switch_stance(t, state)
         first = world.rates(t, state, step=step)
-        world.delay.keep(t, first.asked)
-        cuts.look(t, first.wanted, first.cut, step)
+        world.delay.keep(t, first.commanded)
+        cuts.update(t, first.saturated, first.cut, step)
         push = first.push
         saturated += step * bool(np.any(np.abs(first.demand) > world.servo.limit))
         if push is None:
@@ -334,10 +350,10 @@ def simulate_pinocchio(
         else:
             touches.add(t, push.force, step, push.since)
         peak = max(peak, float(first.forces.sum()) if push is None else push.peak)
-        gears.look(first.torque, first.a)
+        gears.update(first.torque, first.a)
         if touches.touched or k % record == 0:
-            motion = (state.q, state.v, float(first.forces.sum()), first.vt, first.hand_speed)
-            rows.append(
+            motion = (state.q, state.v, float(first.forces.sum()), first.target_speed, first.hand_speed)
+            recorded.append(
                 (
                     t,
                     *motion,
@@ -345,27 +361,27 @@ def simulate_pinocchio(
                     first.torque,
                     world.ground(),
                     world.corners(),
-                    gears.taken(),
+                    gears.take(),
                     stance_at(now, t),
                 )
             )
-        if push is not None:  # the force of a contact that begins within the step jumps there
-            gears.look(first.torque, world.body.accelerate(first.torque, push.peaks))
+        if push is not None:  # forces jump within the step in which a contact begins
+            gears.update(first.torque, world.body.accelerate(first.torque, push.peaks))
         before, state = state, world.step(t, state, first, step)
-        left = state.target if state.impulses.sum() > before.impulses.sum() else left
+        last_touched = state.target if state.impulses.sum() > before.impulses.sum() else last_touched
         check_not_diverged(state.v, t, step)
     return simulation_of(
         robot,
         scene,
-        rows,
+        recorded,
         touches,
         engine="pinocchio",
         impulse=float(state.impulses.sum()),
         impulses=state.impulses,
         peak_force=peak,
-        outcome=scene.target.outcome(left),
+        outcome=scene.target.outcome(last_touched),
         saturated=saturated,
-        cuts=cuts.told() if world.motors.lines else None,
+        cuts=cuts.cuts() if world.motors.lines else None,
         posture_error=posture_error(robot.model, state.q, np.asarray(world.followed.q[-1])),
         fall=None,
         missed=missing,

@@ -1,4 +1,4 @@
-"""Result of a replay, and how an engine records it: contact times, histories, sole wrenches."""
+"""Scene and result of a replay, and helpers of the engines: touches, stance phases, sole quantities."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.robots.loads import DriveLoads, cop_margin, least_margins
 from impactopt.robots.robot import Robot
-from impactopt.simulation.collision_geometry import Solids, Touched
+from impactopt.simulation.collision_geometry import Solids, UnintendedContact
 from impactopt.simulation.motors import MotorCut
 
 Array = NDArray[np.float64]
-ONE_BLOW = 5e-3  # [s] apart: touches of one blow
+MAX_GAP = 5e-3  # [s] between touches that belong to one impact
 PHASES = ("swing", "collision", "follow")
-PHASES_OF_MISS = ("swing", "missed")  # up to the planned contact, and from there on
+PHASES_OF_MISS = ("swing", "missed")  # before and after the planned contact
+# keys of `impactopt validate --json`
 REPORT = (
     "engine",
     "standing",
@@ -68,24 +69,28 @@ REPORT = (
 
 
 def travelled(time: Array, speed: Array, contact_start: float) -> Array:
-    """(k,) [m] that something with these speeds [m/s] has gone since contact began; nan: since the start."""
+    """Travel (k,) [m] since contact began, from speeds (k,) [m/s]; without contact (nan), since the start."""
     gone = np.concatenate([[0.0], np.cumsum(np.diff(time) * (speed[1:] + speed[:-1]) / 2)])
     return gone - np.interp(contact_start, time, gone) if np.isfinite(contact_start) else gone
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """The target, its contact and the ground.
+    """Target, contact and ground of a replay.
 
-    point (3,) [m], normal (3,): where the target's surface is to be hit, and the way it is pushed; law,
-    target: the contact's force and the target's motion; striker: frame of the model that hits; soles: frames
-    of the model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
-    counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what
-    else can touch. hands: frames of the model that hold on to where the reference has them at first.
-    friction: of the striking points on the target.
-    second: of another striker that hits the same target, its frame of the model and its point (3,) [m].
-    standing (stances, soles): which soles stand in each stance phase, and polygons of each; (0, 0), (): there
-    is one stance, on all of them.
+    point (3,) [m] : where the target's surface is to be hit
+    normal (3,) : direction in which the target is pushed
+    law, target : contact law and target dynamics
+    striker : frame of the model that hits
+    soles : frames of the model that the plan fixes to the ground
+    corners : (k, 2) [m] of each sole, in the plane of its frame, counter-clockwise
+    polygon (k, 2) [m] : support polygon on the ground, counter-clockwise
+    solids : bodies that can touch each other
+    hands : frames of the model that hold on to where the reference has them at first
+    friction : of the striking points on the target
+    second : frame and point (3,) [m] of another striker that hits the same target
+    standing : (stances, soles) soles that stand in each stance phase; (0, 0): one stance, on all
+    polygons : support polygon of each stance phase; (): one stance
     """
 
     point: Array
@@ -111,35 +116,54 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """Histories over ``time`` (k,) [s] of a re-simulated motion, and when contact began and ended.
+    """Result of a replay: histories over ``time`` (k,) [s], contact, and summary quantities.
 
-    q (k, nq) and v (k, nv), pin's; force (k,) [N]; target_speed, hand_speed (k,) [m/s]; demand (k, n) [N m]
-    servo torque before saturation; torque (k, n) after it; sole_ground (k, soles, 6) wrench of the ground on
-    each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; soles:
-    their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, as
-    of :func:`impactopt.robots.loads.cop_margin`; slip, lift (k, soles) [m]: how far the corner of a
-    sole that moved most went along the ground, and rose.
-    contact_start, contact_end [s]: of the blow, whose touches are less than 5 ms apart; nan if the target
-    was not hit.  impulse [N s]: the contact force's
-    integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.
-    outcome: the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
-    ``broken``).  saturated [s]: how long the demand of some joint was above its torque limit.  fall: why the
-    robot does not stand at the end, "" if it stands; None where the engine holds the soles and cannot say.
-    posture_error [rad]: of the joint, or of the base's orientation, that ends farthest from the reference's
-    last posture.  beyond_range: joint or tendon that was farthest out of its range, and by how much [rad];
-    "" if none was.  touched: pairs of bodies that touched and should not have, if the engine has solids that
-    push back.  clearance [m], nearest: the least distance of any two bodies that are not to touch, by exact
-    geometry, and which two.  missed: there was no target.  expected [s]: when the reference has contact
-    begin.  touches: start and end [s] and impulse [N s] of
-    each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
-    computed, or nothing was hit.
-    gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
-    before.  loads: what gears and motors carry at most.  cuts: joints whose demand the line of their motor
-    has cut, the longest first; None where no motor's line is known.
-    grip_force (k, hands) [N]: on each hand that holds on.  impulses (strikers,) [N s]: of each.
-    stance (k,): number of the stance phase that the reference is in, stands (stances, soles) and polygons:
-    the scene's; (0,): there is one. slip and lift are those since a sole has come to stand; landing_speed
-    (soles,) [m/s]: of the corner that is fastest as a sole touches down, nan of one that does not.
+    Histories:
+
+    q (k, nq), v (k, nv) : Pinocchio's
+    force (k,) [N] : contact force of all strikers
+    target_speed, hand_speed (k,) : [m/s] along the normal
+    demand, torque (k, n) [N m] : of the servo before saturation, and of the motors
+    gear (k, n) [N m] : torque of largest magnitude through each gear since the instant before
+    sole_ground (k, soles, 6) : [N, N m] wrench of the ground on each sole about the world's origin; it may
+        pull where the engine fixes the soles
+    cop_margin (k, soles) [m] : from each sole's centre of pressure to its own nearest edge, as in
+        :func:`impactopt.robots.loads.cop_margin`
+    slip, lift (k, soles) [m] : motion along the ground, and rise, of the corner that moved most since the
+        sole began to stand
+    grip_force (k, hands) [N] : on each hand that holds on
+    stance (k,) : number of the reference's stance phase; (0,): there is one
+
+    Contact and target:
+
+    contact_start, contact_end [s] : of the impact, whose touches are less than 5 ms apart; nan if the target
+        was not hit
+    touches : start [s], end [s] and impulse [N s] of each
+    impulse, impulses [N s] : integral of the contact force over the whole motion; of each striker
+    peak_force [N] : largest force, which may occur within a step
+    outcome : the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
+        ``broken``)
+    missed : there was no target
+    expected [s] : begin of contact in the reference
+    step_error : estimated relative error of the impulse by the engine's steps; nan if it was not computed, or
+        nothing was hit
+
+    Robot:
+
+    fall : reason why the robot does not stand at the end, "" if it stands; None if the engine fixes the soles
+    posture_error [rad] : of the joint, or of the base's orientation, that ends farthest from the reference's
+        last posture
+    beyond_range : joint or tendon that was farthest out of its range, and by how much [rad]
+    saturated [s] : time in which the demand of some joint was above its torque limit
+    loads, cuts : largest loads of gears and motors; joints whose demand was cut by their motor's line, the
+        longest first, None if no motor's line is known
+    landing_speed (soles,) [m/s] : of the fastest corner as a sole touches down; nan if it does not
+
+    Bodies and scene:
+
+    touched : unintended contacts
+    clearance [m], nearest : least exact distance of two bodies that must not touch, and their names
+    soles, stands, polygons : names of the soles; the scene's ``standing`` and ``polygons``
     """
 
     engine: str
@@ -165,7 +189,7 @@ class Simulation:
     posture_error: float
     fall: str | None
     beyond_range: tuple[str, float] = ("", 0.0)
-    touched: tuple[Touched, ...] = ()
+    touched: tuple[UnintendedContact, ...] = ()
     clearance: float = np.nan
     nearest: tuple[str, ...] = ()
     missed: bool = False
@@ -206,11 +230,11 @@ class Simulation:
         return centre_of_pressure(self.sole_ground)
 
     def travel(self) -> Array:
-        """(k,) [m] of the target along its normal, from where contact began."""
+        """Travel (k,) [m] of the target along its normal since contact began."""
         return travelled(self.time, self.target_speed, self.contact_start)
 
     def phase(self) -> NDArray[np.intp]:
-        """0 swing, 1 collision, 2 follow-through, by the contact that happened."""
+        """Phase (k,) by the contact that happened: 0 swing, 1 collision, 2 follow-through."""
         start = self.contact_start if np.isfinite(self.contact_start) else np.inf
         end = self.contact_end if np.isfinite(self.contact_end) else np.inf
         return np.asarray((self.time >= start).astype(int) + (self.time >= end).astype(int))
@@ -218,18 +242,23 @@ class Simulation:
     def summary(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
         """Impulse, force, margins and demand by phase, soles, standing; keys as in ``summary.json``.
 
-        Without contact there is no speed at contact and no error of its impulse: None.
+        Without contact, the speed at contact and the error of the impulse are None.
+
+        Raises
+        ------
+        InputError : the target was not hit, though there was one and the engine fixes the soles.
         """
         hit = bool(np.isfinite(self.contact_start))
         if not hit and self.fall is None and not self.missed:
             raise InputError("the simulated motion never touched the target")
         known = bool(np.isfinite(self.clearance))
+        # without contact, the motion is divided at the planned one
         phase = self.phase() if hit else (self.time >= self.expected).astype(int)
         names = PHASES if hit else PHASES_OF_MISS
         out: dict[str, Any] = {
             "engine": self.engine,
             "standing": self.standing,
-            "reason": "the soles are held: only an engine with free soles can tell"
+            "reason": "the soles are fixed: only an engine with free soles can tell"
             if self.fall is None
             else self.fall,
             "impulse_Ns": self.impulse,
@@ -238,7 +267,7 @@ class Simulation:
             "step_error_pct": None if np.isnan(self.step_error) else 100 * self.step_error,
             "peak_force_N": self.peak_force,
             "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else 0.0,
-            # a target that comes early may touch at once
+            # of the last instant before contact; a target that comes early may touch at once
             "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]) if hit else None,
             "saturated_ms": 1e3 * self.saturated,
             "final_posture_error_rad": self.posture_error,
@@ -247,9 +276,9 @@ class Simulation:
             "beyond_range": self.beyond_range[0] or None,
             "clearance_mm": 1e3 * self.clearance if known else None,
             "nearest": " and ".join(self.nearest),
-            "contacts_besides": [touched.summary() for touched in self.touched] if known else None,
+            "contacts_besides": [contact.summary() for contact in self.touched] if known else None,
             **({} if self.loads is None else self.loads.summary()),
-            **self._cut_numbers(),
+            **self._cut_summary(),
         }
         if len(self.impulses) > 1:
             out["impulses_Ns"] = self.impulses.tolist()
@@ -283,25 +312,29 @@ class Simulation:
         return out
 
     def _inside(self, polygon: Array) -> Array:
-        """Distance (k,) [m] of the ZMP from the edges of what stands, or presses on the ground all the same;
-        polygon : of one stance.
+        """Distance (k,) [m] of the ZMP from the edges of the support polygon at each instant, < 0 outside.
+
+        polygon : support polygon of a motion with one stance. With several, each instant takes the polygon of
+            a stance with all soles that stand as planned, or carry load all the same.
         """
         zmp = self.zmp()
         if not self.stance.size:
             return distance_inside(polygon, zmp)
-        found = np.array([distance_inside(own, zmp) for own in self.polygons])
-        on = self.stands[self.stance] | (self.sole_normal > 0)
-        # the smallest stance that has all of these soles; of several, which a step parts, the nearest in time
-        lacks = (on[:, None] & ~self.stands).any(axis=2)
-        size = np.where(lacks, self.stands.shape[1] + 1.0, self.stands.sum(axis=1))
-        number = np.arange(len(found))
+        distances = np.array([distance_inside(own, zmp) for own in self.polygons])  # (stances, k)
+        loaded = self.stands[self.stance] | (self.sole_normal > 0)
+        # Take the stance with the lowest cost: the number of its soles, if it has all that are needed. Ties,
+        # as of two stances before and after a step, go to the nearest in time: that part of the cost is below
+        # 1.
+        lacks = (loaded[:, None] & ~self.stands).any(axis=2)
+        cost = np.where(lacks, self.stands.shape[1] + 1.0, self.stands.sum(axis=1))
+        number = np.arange(len(distances))
         begins = self.time[np.searchsorted(self.stance, number).clip(max=len(self.time) - 1)]
-        at = np.interp(self.time, [*begins, self.time[-1]], [*number, len(number)]) - 0.5
-        size += np.abs(at[:, None] - number) / (len(number) + 1)
-        return np.asarray(found[size.argmin(axis=1), np.arange(len(zmp))])
+        progress = np.interp(self.time, [*begins, self.time[-1]], [*number, len(number)]) - 0.5
+        cost += np.abs(progress[:, None] - number) / (len(number) + 1)
+        return np.asarray(distances[cost.argmin(axis=1), np.arange(len(zmp))])
 
-    def _cut_numbers(self) -> dict[str, Any]:
-        """Summary of the joint that was cut longest; None if no motor's line is known, 0 if none was cut."""
+    def _cut_summary(self) -> dict[str, Any]:
+        """Summary of motor cuts; ``motor_cut_ms`` is None if no motor's line is known, 0 if none was cut."""
         if not self.cuts:
             return {
                 "motor_cut_ms": None if self.cuts is None else 0.0,
@@ -315,10 +348,10 @@ class Simulation:
         }
 
     def report(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
-        """The summary with one number for the whole motion where that one has one for each phase.
+        """Summary as `impactopt validate --json` prints it, with the worst value of all phases.
 
-        Keys as `impactopt validate --json` prints them: ``zmp_margin_m`` is the least, ``torque_ratio`` the
-        largest; ``zmp_margin_by_phase_m`` and ``torque_ratio_by_phase`` are the summary's.
+        ``zmp_margin_m`` is the least, ``torque_ratio`` the largest; ``zmp_margin_by_phase_m`` and
+        ``torque_ratio_by_phase`` are those of `summary`.
         """
         given = self.summary(torque_limit=torque_limit, polygon=polygon, planned_impulse=planned_impulse)
         margins, ratios = given.get("zmp_margin_m", {}), given["torque_ratio"]
@@ -329,7 +362,7 @@ class Simulation:
 
 
 def centre_of_pressure(wrench: Array) -> Array:
-    """(..., 2) [m] on the ground of (..., 6) wrenches about the world's origin; nan where f_z <= 0."""
+    """Centre of pressure (..., 2) [m] on the ground of wrenches (..., 6) about the origin; nan at no load."""
     normal = np.where(wrench[..., 2] > 1e-6, wrench[..., 2], np.nan)
     return np.stack([-wrench[..., 4], wrench[..., 3]], axis=-1) / normal[..., None]
 
@@ -342,10 +375,11 @@ def distance_inside(polygon: Array, points: Array) -> Array:
 
 
 def parts_from(reference: Any, missed: Any) -> float:
-    """Time [s] from which a robot that has felt no contact follows ``missed``, and not ``reference``.
+    """Time [s] from which a robot that has sensed no contact follows ``missed`` instead of ``reference``.
 
-    Both coast from the planned contact on. The one goes on to the follow-through at its ``contact_end``; the
-    other goes on coasting, until the robot notices at its own ``contact_end``, and is the abort motion then.
+    Both coast from the planned contact on. At its ``contact_end``, ``reference`` passes into the
+    follow-through. ``missed`` coasts until its own ``contact_end``, when the robot notices the miss, and is
+    then the abort motion.
     """
     return min(float(reference.contact_end), float(missed.contact_end))
 
@@ -365,13 +399,13 @@ def stance_at(reference: Any, t: float) -> int:
 
 
 class FollowedReference:
-    """Choice of the servo's reference, by whether the robot has felt a contact.
+    """Choice of the servo's reference, by whether the robot has sensed a contact.
 
-    A robot knows that it has hit something when it feels it, but that it has hit nothing only at
-    ``missed.contact_end``: until then it goes over to ``reference`` when it is late.
+    The robot senses a contact at once. It notices a miss only at ``missed.contact_end``: up to then, a late
+    contact still makes it follow ``reference``.
 
-    reference, missed : as of :class:`impactopt.transcription.plan.Trajectory`.  missed None: it does not
-        notice, and ``reference`` is all that it has.
+    reference, missed : as :class:`impactopt.transcription.plan.Trajectory`.  missed None: the robot does not
+        notice a miss, and always follows ``reference``.
     """
 
     def __init__(self, reference: Any, missed: Any = None) -> None:
@@ -380,7 +414,7 @@ class FollowedReference:
         self._aborts = False
 
     def at(self, t: float, felt: bool) -> Any:
-        """The reference from a time [s] on; felt : whether there has been a contact yet."""
+        """Reference to follow at a time [s]; felt : whether there was a contact before."""
         if t < self._parts:
             return self._reference
         self._aborts = self._aborts or (not felt and t >= self._missed.contact_end)
@@ -388,12 +422,12 @@ class FollowedReference:
 
 
 class Touches:
-    """Intervals of contact, told step by step.
+    """Intervals of contact, recorded step by step.
 
-    A graze before or after the blow is one of its own, and so is each touch of a blow in which bodies part
-    and meet again.
+    A graze before or after the impact is an interval of its own, and so is each touch of an impact in which
+    bodies separate and touch again.
 
-    touched : whether there was contact in the step that was told last, or in the one before it.
+    touched : whether there was contact in the last recorded step, or in the one before it.
     """
 
     def __init__(self) -> None:
@@ -401,8 +435,10 @@ class Touches:
         self.touching = self.touched = False
 
     def add(self, t: float, force: float, step: float, since: float = 0.0) -> None:
-        """The contact's mean force [N] in the step that begins at time t [s]; since [s]: when in it there was
-        one first."""
+        """Records a step that begins at time t [s], with the mean contact force [N] in it.
+
+        since [s] : time within the step at which the force begins.
+        """
         if force > 0:
             if not self.touching:
                 self.intervals.append([t + since, t + since, 0.0])
@@ -412,15 +448,15 @@ class Touches:
             self.intervals[-1][1] = max(t, self.intervals[-1][0])
         self.touching = force > 0
 
-    def blow(self) -> tuple[float, float]:
-        """Start and end [s] of the blow with the largest impulse; nan if there was none."""
-        blows = list[list[float]]()
+    def impact(self) -> tuple[float, float]:
+        """Start and end [s] of the impact with the largest impulse; nan if there was none."""
+        impacts = list[list[float]]()
         for start, end, impulse in self.intervals:
-            if blows and start - blows[-1][1] < ONE_BLOW:
-                blows[-1][1:] = end, blows[-1][2] + impulse
+            if impacts and start - impacts[-1][1] < MAX_GAP:
+                impacts[-1][1:] = end, impacts[-1][2] + impulse
             else:
-                blows.append([start, end, impulse])
-        start, end, _ = max(blows, key=lambda blow: blow[2], default=[np.nan] * 3)
+                impacts.append([start, end, impulse])
+        start, end, _ = max(impacts, key=lambda impact: impact[2], default=[np.nan] * 3)
         return start, end
 
 
@@ -431,7 +467,7 @@ def sole_names(robot: Robot, scene: Scene) -> tuple[str, ...]:
 
 
 def cop_margins(robot: Robot, scene: Scene, q: Array, sole_ground: Array) -> Array:
-    """Distance (k, soles) [m] of each sole's centre of pressure from its own edges, as of `cop_margin`.
+    """Distance (k, soles) [m] of each sole's centre of pressure from its own edges, as in `cop_margin`.
 
     q (k, nq); sole_ground (k, soles, 6) about the world's origin [N, N m].
     """
@@ -442,18 +478,20 @@ def cop_margins(robot: Robot, scene: Scene, q: Array, sole_ground: Array) -> Arr
         pin.forwardKinematics(model, data, posture)
         for i, frame in enumerate(frames):
             place = pin.updateFramePlacement(model, data, frame)
-            # in the sole's own frame, so that a tilted sole's edges are its edges
+            # in the sole's own frame, in which the edges are known for a tilted sole too
             wrenches[k, i] = place.actInv(pin.Force(sole_ground[k, i])).vector
     return cop_margin(robot, scene.corners, wrenches)
 
 
 def slip_and_lift(scene: Scene, corners: Array, stance: NDArray[np.intp]) -> tuple[Array, Array]:
-    """(k, soles) [m] of each sole, of the corner that moved most since the first instant, from the places
-    (k, corners, 3) of all soles' corners, in the scene's order; since it stands, by the stance phases (k,).
+    """Slip and lift (k, soles) [m] of the corner of each sole that moved most since the sole began to stand.
+
+    corners (k, corners, 3) [m] : positions of all soles' corners, in the scene's order.
+    stance (k,) : number of the stance phase; (0,): there is one.
     """
     slip, lift = np.zeros((2, len(corners), len(scene.corners)))
     for i, its in enumerate(_corners_of(scene)):
-        for begin, end in _spells(scene, stance, i, len(corners)):
+        for begin, end in _standing_intervals(scene, stance, i, len(corners)):
             moves = corners[begin:end, its] - corners[begin, its]
             slip[begin:end, i] = np.linalg.norm(moves[..., :2], axis=2).max(axis=1)
             lift[begin:end, i] = np.maximum(moves[..., 2], 0.0).max(axis=1)
@@ -461,12 +499,17 @@ def slip_and_lift(scene: Scene, corners: Array, stance: NDArray[np.intp]) -> tup
 
 
 def _corners_of(scene: Scene) -> list[slice]:
-    """Slices of each sole's corners among all."""
+    """Slice of each sole's corners in an array of all."""
     return [slice(a, b) for a, b in itertools.pairwise(np.cumsum([0, *(len(c) for c in scene.corners)]))]
 
 
-def _spells(scene: Scene, stance: NDArray[np.intp], sole: int, count: int) -> list[tuple[int, int]]:
-    """First instant and the one after the last, of each time that a sole stands, of so many instants."""
+def _standing_intervals(
+    scene: Scene, stance: NDArray[np.intp], sole: int, count: int
+) -> list[tuple[int, int]]:
+    """Index of the first instant, and that after the last, of each interval in which a sole stands.
+
+    count : number of instants.
+    """
     if not stance.size:
         return [(0, count)]
     on = np.pad(scene.standing[stance, sole].astype(int), 1)
@@ -476,34 +519,34 @@ def _spells(scene: Scene, stance: NDArray[np.intp], sole: int, count: int) -> li
 def landing_speeds(
     scene: Scene, time: Array, corners: Array, sole_ground: Array, stance: NDArray[np.intp]
 ) -> Array:
-    """(soles,) [m/s] Largest speed of a sole's corners as it touches the ground again; nan: it does not.
+    """Largest speed (soles,) [m/s] of a sole's corners at touchdown; nan without one.
 
-    That is when the ground first presses on it, in the later half of its time in the air or after that.
+    Touchdown is when the sole first carries load, but not in the first half of its planned time in the air.
     """
     out = np.full(len(scene.corners), np.nan)
     for i, its in enumerate(_corners_of(scene)):
-        spells = _spells(scene, stance, i, len(time))
-        for (_, left), (back, end) in itertools.pairwise(spells):
-            since = int(np.searchsorted(time, (time[left] + time[back]) / 2))
-            pressed = np.flatnonzero(sole_ground[since:end, i, 2] > 0)
-            if not pressed.size:
+        intervals = _standing_intervals(scene, stance, i, len(time))
+        for (_, lift_off), (planned, end) in itertools.pairwise(intervals):
+            middle = int(np.searchsorted(time, (time[lift_off] + time[planned]) / 2))
+            loaded = np.flatnonzero(sole_ground[middle:end, i, 2] > 0)
+            if not loaded.size:
                 continue
-            k = since + int(pressed[0])
-            gone = np.linalg.norm(corners[k, its] - corners[k - 1, its], axis=1).max()
-            out[i] = np.nanmax([out[i], gone / (time[k] - time[k - 1])])
+            k = middle + int(loaded[0])
+            distance = np.linalg.norm(corners[k, its] - corners[k - 1, its], axis=1).max()
+            out[i] = np.nanmax([out[i], distance / (time[k] - time[k - 1])])
     return out
 
 
 def check_not_diverged(rates: Array, t: float, step: float) -> None:
-    """InputError with the time [s] if the rates [rad/s, m/s] are of no robot."""
-    if not np.abs(rates).max() <= 1e4:  # nan is not, either
+    """Raises an InputError with the time [s] if the rates [rad/s, m/s] are not those of a robot."""
+    if not np.abs(rates).max() <= 1e4:  # true for nan, too
         raise InputError(
             f"the simulation diverged at t = {t:.4f} s: take a smaller step than {step:g} s, or softer gains"
         )
 
 
 def posture_error(model: Any, q: Array, planned: Array) -> float:
-    """[rad] of the joint, or of the base's orientation, that is farthest from where it should be."""
+    """Largest error [rad] of a joint or of the base's orientation at q (nq,)."""
     error = np.abs(pin.difference(model, planned, q))
     if model.joints[1].nv == 6:
         return float(max(np.linalg.norm(error[3:6]), error[6:].max(initial=0.0)))
@@ -511,20 +554,27 @@ def posture_error(model: Any, q: Array, planned: Array) -> float:
 
 
 def simulation_of(
-    robot: Robot, scene: Scene, rows: list[tuple[Any, ...]], touches: Touches, **rest: Any
+    robot: Robot, scene: Scene, recorded: list[tuple[Any, ...]], touches: Touches, **rest: Any
 ) -> Simulation:
-    """Histories of recorded instants: rows of time, q, v, force, target speed, hand speed, demand, torque,
-    wrench of each sole and each hand that holds on, places of the soles' corners, torque through the gears
-    since the row before, number of the stance phase; ``rest``: the other fields.
+    """Simulation from recorded instants.
+
+    recorded : of each instant: time, q, v, force, target speed, hand speed, demand, torque, wrenches of soles
+        and of hands that hold on, positions of the soles' corners, torque through the gears since the instant
+        before, number of the stance phase.
+    rest : the other fields of the simulation.
+
+    Raises
+    ------
+    InputError : there is no instant.
     """
-    if not rows:
+    if not recorded:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
-    columns = [np.array(c) for c in zip(*rows, strict=True)]
+    columns = [np.array(c) for c in zip(*recorded, strict=True)]  # one array for each quantity
     time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, corners, gear, stance = columns
     stance = stance if scene.standing.size else stance[:0]
     slip, lift = slip_and_lift(scene, corners, stance)
     landings = landing_speeds(scene, time, corners, sole_ground, stance) if stance.size else np.zeros(0)
-    contact_start, contact_end = touches.blow()
+    contact_start, contact_end = touches.impact()
     joints, soles = v[:, -robot.n :], len(scene.soles)
     sole_ground, grips = sole_ground[:, :soles], sole_ground[:, soles:]
     return Simulation(
@@ -562,8 +612,8 @@ def simulation_of(
 
 
 def _jump(time: Array, rates: Array, start: float, end: float) -> Array:
-    """(n,) Change of the joints' rates (k, n) from before the contact to after it; nan: there was none."""
-    if not (np.isfinite(start) and end <= time[-1]):
+    """Change (n,) of the joints' rates (k, n) from before the contact to after it; nan without contact."""
+    if not (np.isfinite(start) and end <= time[-1]):  # no contact, or it has not ended
         return np.full(rates.shape[1], np.nan)
     before = max(int(np.searchsorted(time, start, side="right")) - 1, 0)
     return np.asarray(rates[int(np.searchsorted(time, end))] - rates[before])

@@ -1,4 +1,4 @@
-"""Does it stand, and hit, when the world is not quite as planned? Replays under drawn perturbations."""
+"""Robustness of a plan: replays in MuJoCo under randomly drawn perturbations of the world."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from impactopt.simulation.workers import map_on_workers
 __all__ = ["PerturbationRanges", "Robustness", "draw_perturbations", "robustness"]
 
 Array = NDArray[np.float64]
-Z95 = 1.959964  # of the normal distribution: 95 % lie within
-STEP = 5e-4  # [s]: tells who stands as 1e-4 does, and costs a fifth
-MOST_SEED = 10**9
-MOST_DRAWS = 1_000_000  # each is a replay of a second
+Z95 = 1.959964  # 95 % of a normal distribution lie within as many standard deviations
+STEP = 5e-4  # [s]: the same robots stand as with 1e-4, at a fifth of the time
+MAX_SEED = 10**9
+MAX_DRAWS = 1_000_000  # each is a replay of a second
 LOGARITHMIC = ("mass", "stiffness", "kp", "kd", "floor_time")  # half is as far from planned as twice
 
 
@@ -42,7 +42,7 @@ class PerturbationRanges:
 
     Raises
     ------
-    InputError : naming the range that is empty, or that has values that no perturbation can have.
+    InputError : a range is empty, or has values that no perturbation can have.
     """
 
     mass: tuple[float, float] = (0.5, 2.0)
@@ -65,28 +65,30 @@ class PerturbationRanges:
             if name in LOGARITHMIC and not low > 0:
                 raise InputError(f"ranges: {name} starts at {low:g}; it is drawn by its logarithm: give > 0")
             for bound in (low, high):
-                _changed(Perturbation(), {name: bound})  # refuses what is out of range
+                _changed(Perturbation(), {name: bound})  # raises an InputError if it is out of range
         Perturbation(period=self.period)
 
     def of(self, scene: Scene) -> PerturbationRanges:
-        """These ranges, without factors of numbers that the scene's law or target does not have."""
-        has = {"mass": scene.target.parameters, "stiffness": scene.law.parameters}
-        none: dict[str, Any] = {name: (1.0, 1.0) for name, numbers in has.items() if name not in numbers}
-        return replace(self, **none)
+        """Ranges without factors of parameters that the scene's law or target does not have."""
+        known = {"mass": scene.target.parameters, "stiffness": scene.law.parameters}
+        fixed: dict[str, Any] = {
+            name: (1.0, 1.0) for name, parameters in known.items() if name not in parameters
+        }
+        return replace(self, **fixed)
 
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """(lower, upper) by name, of what is drawn."""
+        """Bounds (lower, upper) of the drawn parameters, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "period"}
 
 
 def draw_perturbations(n: int, seed: int = 0, ranges: PerturbationRanges | None = None) -> list[Perturbation]:
-    """n perturbations, drawn from ranges. With one seed, the first draws do not depend on n.
+    """Draws n perturbations from ranges. For a given seed, the first draws do not depend on n.
 
     Raises
     ------
     InputError : n is not at least 1, or the seed is negative.
     """
-    n = check_whole("draws", n, least=1, most=MOST_DRAWS)
+    n = check_whole("draws", n, least=1, most=MAX_DRAWS)
     seed = check_whole("seed", seed, least=0, most=2**63)
     if ranges is not None and not isinstance(ranges, PerturbationRanges):
         raise InputError(f"ranges: {shortened(repr(ranges))}; give PerturbationRanges")
@@ -95,17 +97,18 @@ def draw_perturbations(n: int, seed: int = 0, ranges: PerturbationRanges | None 
     unit = np.random.default_rng(seed).random((n, len(bounds)))
     columns, planned = {}, Perturbation(period=chosen.period)
     for (name, (low, high)), u in zip(bounds.items(), unit.T, strict=True):
+        # log-uniform, or uniform
         value = low * (high / low) ** u if name in LOGARITHMIC else low + (high - low) * u
-        columns[name] = np.clip(value, low, high)  # rounding does not leave the range
+        columns[name] = np.clip(value, low, high)  # against rounding
     return [_changed(planned, {name: float(value[k]) for name, value in columns.items()}) for k in range(n)]
 
 
-def _changed(perturbation: Perturbation, numbers: dict[str, Any]) -> Perturbation:
-    return replace(perturbation, **numbers)
+def _changed(perturbation: Perturbation, values: dict[str, Any]) -> Perturbation:
+    return replace(perturbation, **values)
 
 
-class Row(NamedTuple):
-    """Result of one replay: impulse [N s], largest slip and lift of a sole [m]; nan where it has none."""
+class Outcome(NamedTuple):
+    """Result of one replay: impulse [N s], largest slip and lift of a sole [m]; nan without a result."""
 
     standing: bool
     reason: str
@@ -116,11 +119,13 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Robustness:
-    """Replays under n drawn perturbations.
+    """Results of replays under n drawn perturbations.
 
-    standing (n,); reason (n,): why a robot does not stand, or a replay has no result, "" else; impulse (n,)
-    [N s]; slip, lift (n,) [m]: the most that a corner of a sole did; nan where a replay has no result.
-    planned_impulse [N s].
+    standing (n,) : whether the robot stands at the end
+    reason (n,) : why it does not, or why a replay has no result; else ""
+    impulse (n,) [N s] : nan without a result
+    slip, lift (n,) [m] : largest of all corners of soles; nan without a result
+    planned_impulse [N s] : of the plan
     """
 
     perturbations: Sequence[Perturbation] = field(repr=False)
@@ -134,68 +139,75 @@ class Robustness:
 
     @property
     def draws(self) -> int:
+        """Number of draws."""
         return len(self.perturbations)
 
     @property
     def rate(self) -> float:
-        """Share of the draws that stand; a replay without a result does not."""
+        """Fraction of the draws that stand; a replay without a result counts as a fall."""
         return float(np.mean(self.standing))
 
     @property
     def interval(self) -> tuple[float, float]:
         """Wilson's 95 % interval of the rate at which the plan stands under such perturbations."""
         n, p = self.draws, self.rate
-        middle = (p + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
+        centre = (p + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
         half = Z95 / (1 + Z95**2 / n) * np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n**2))
-        return max(0.0, float(middle - half)), min(1.0, float(middle + half))
+        return max(0.0, float(centre - half)), min(1.0, float(centre + half))
 
     @property
     def impulse_mean(self) -> float:
-        """[N s] of all draws, falls too; nan if no replay has a result."""
+        """Mean impulse [N s] of all draws, falls included; nan if no replay has a result."""
         known = self.impulse[np.isfinite(self.impulse)]
         return float(known.mean()) if known.size else float("nan")
 
     @property
     def impulse_std(self) -> float:
-        """Standard deviation [N s] of the same draws' impulses."""
+        """Standard deviation [N s] of the impulses of the same draws."""
         known = self.impulse[np.isfinite(self.impulse)]
         return float(known.std()) if known.size else float("nan")
 
     def reasons(self) -> dict[str, int]:
-        """Counts of each kind of reason, most frequent first; numbers in it are left out."""
+        """Counts of each kind of reason, most frequent first; numbers in a reason are replaced by "..."."""
         kinds = (re.sub(r"(?<= )[-+]?(\d[\d.e+-]*|nan|inf)(?=[ ,;:]|$)", "...", text) for text in self.reason)
         return dict(Counter(kind for kind in kinds if kind).most_common())
 
     def table(self) -> dict[str, Array]:
-        """Drawn parameters, (n,) by name."""
+        """Drawn values (n,) of each parameter, by name."""
         return {
             name: np.array([getattr(c, name) for c in self.perturbations])
             for name in self.drawn_from.bounds()
         }
 
     def separation(self) -> dict[str, dict[str, float]]:
-        """Separation by parameter: its mean among draws that stand and that do not (of factors: the
-        geometric mean), and the difference in standard deviations of the draws; nan where there are none.
+        """Separation of draws that stand from those that fall, by parameter.
+
+        stands, falls : mean of the parameter among those draws; geometric for log-uniform parameters.
+        apart : difference of the means in standard deviations of all draws.
+
+        Values are nan without draws.
         """
         out = {}
         for name, value in self.table().items():
-            factor = name in LOGARITHMIC
-            x = np.log(value) if factor else value
+            logarithmic = name in LOGARITHMIC
+            x = np.log(value) if logarithmic else value
             stands, falls = (
                 float(x[mask].mean()) if mask.any() else float("nan")
                 for mask in (self.standing, ~self.standing)
             )
             spread = float(x.std())
             out[name] = {
-                "stands": float(np.exp(stands)) if factor else stands,
-                "falls": float(np.exp(falls)) if factor else falls,
+                "stands": float(np.exp(stands)) if logarithmic else stands,
+                "falls": float(np.exp(falls)) if logarithmic else falls,
                 "apart": (falls - stands) / spread if spread > 0 else float("nan"),
             }
         return out
 
     def by_third(self) -> dict[str, list[float]]:
-        """Fraction that stands of draws in the lower, middle and upper third of each parameter's range (of
-        factors: of its logarithm), which means hide if draws fall at both ends; nan where there are none.
+        """Fraction of draws that stand in the lower, middle and upper third of each parameter's range.
+
+        Thirds of log-uniform parameters are those of the logarithm. Unlike means, thirds show draws that fall
+        at both ends of a range. A third without draws has nan.
         """
         out = {}
         for name, value in self.table().items():
@@ -210,7 +222,7 @@ class Robustness:
 
 @dataclass(frozen=True, kw_only=True)
 class Shared:
-    """Data that every replay needs."""
+    """Data shared by all replays."""
 
     robot: Robot
     reference: Any
@@ -222,37 +234,38 @@ class Shared:
 def _simulate(
     robot: Robot, reference: Any, scene: Scene, *, step: float = STEP, **options: Any
 ) -> Simulation:
-    """Simulates a draw with the draws' own step, which the step's error is measured from."""
+    """`simulate_mujoco` with another default step, which `with_step_error` takes as the engine's own."""
     return simulate_mujoco(robot, reference, scene, step=step, **options)
 
 
-def replay(shared: Shared, perturbation: Perturbation) -> Row:
-    """One draw; what goes wrong is its reason."""
+def replay(shared: Shared, perturbation: Perturbation) -> Outcome:
+    """Replays one draw; an error becomes its reason."""
     given = (shared.robot, shared.reference, shared.scene)
     controller = shared.controller
-    if controller is not None:  # every draw has sensors of its own, whichever process replays it
+    if controller is not None:  # every draw has its own sensor errors, in whichever process it is replayed
         draw = zlib.crc32(repr(perturbation).encode())
-        controller = replace(controller, seed=(controller.seed + draw) % MOST_SEED)
+        controller = replace(controller, seed=(controller.seed + draw) % MAX_SEED)
     try:
         options = {"step": shared.step, "perturbation": perturbation, "controller": controller}
         s = with_step_error(_simulate, *given, **options)
         check_steps(s, shared.step)
     except InputError as error:
-        return Row(standing=False, reason=str(error))
-    except Exception as error:  # whatever MuJoCo raises: other draws may still work
-        return Row(standing=False, reason=f"{type(error).__name__}: {error}")
-    moves = (float(m.max(initial=0.0)) for m in (s.slip, s.lift))
-    return Row(bool(s.standing), s.fall or "", s.impulse, *moves)
+        return Outcome(standing=False, reason=str(error))
+    except Exception as error:  # any error of MuJoCo: other draws may still work
+        return Outcome(standing=False, reason=f"{type(error).__name__}: {error}")
+    slip, lift = (float(m.max(initial=0.0)) for m in (s.slip, s.lift))
+    return Outcome(bool(s.standing), s.fall or "", s.impulse, slip, lift)
 
 
-def _crashed(code: int) -> Row:
-    return Row(standing=False, reason=f"the process of the replay died (exit code {code})")
+def _crashed(code: int) -> Outcome:
+    return Outcome(standing=False, reason=f"the process of the replay died (exit code {code})")
 
 
-def _check_travels(scene: Scene) -> None:
+def _check_picklable(scene: Scene) -> None:
+    """Raises an InputError if law or target cannot be sent to other processes."""
     try:
         pickle.dumps((scene.law, scene.target))
-    except Exception as error:  # as its kind is pickle's or Python's, by what is in the way
+    except Exception as error:  # pickling raises errors of many classes
         raise InputError(
             f"the law or target cannot go to other processes ({error}); define its functions at the top of a "
             "module, no lambdas, or ask for workers=1"
@@ -272,24 +285,23 @@ def robustness(
     controller: ControllerSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Robustness:
-    """Replay a reference in MuJoCo, on free soles, under drawn perturbations.
+    """Replays a reference in MuJoCo, on free soles, under drawn perturbations.
 
-    reference : as of :class:`impactopt.transcription.plan.Trajectory`.  planned_impulse [N s].
-    draws, seed, ranges : as of :func:`draw_perturbations`; a wall has no mass, so none is drawn.
-    workers : processes; the numbers do not depend on how many. A script that asks for more than 1 needs
+    reference : as :class:`impactopt.transcription.plan.Trajectory`.  planned_impulse [N s] : of the plan.
+    draws, seed, ranges : as in :func:`draw_perturbations`; a wall has no mass, so that none is drawn.
+    workers : number of processes, on which results do not depend. A script that asks for more than 1 needs
         `if __name__ == "__main__":`.
     controller : settings of a whole-body controller; None: the joints' servo.
-    step [s] : of the simulation; shorter where the impulse needs it, as of `validate`.
-    progress : called with how many replays are done, of how many.
+    step [s] : of the simulation; shorter where the impulse needs it, as in `validate`.
+    progress : called with the number of finished replays, and of all.
 
-    A replay that diverges, whose steps leave more than 1 % of its impulse uncertain though they were halved,
-    or whose process dies, is a draw that does not stand, with its reason. Ctrl-C ends the processes and is
-    raised.
+    A replay that diverges, whose halved steps still leave more than 1 % of its impulse uncertain, or whose
+    process dies, counts as a fall, with its reason. Ctrl-C ends the processes and is raised.
 
     Raises
     ------
     InputError : draws, seed, workers or step out of range; MuJoCo is not installed; the processes do not
-        start, or a law or target of one's own cannot go to them.
+        start, or a user's law or target cannot be sent to them.
     """
     scene = scene_of(problem)
     chosen = (ranges if ranges is not None else PerturbationRanges()).of(scene)
@@ -299,16 +311,18 @@ def robustness(
     check_positive("step [s]", step)
     mujoco_module()
     if workers > 1:
-        _check_travels(scene)
+        _check_picklable(scene)
     shared = Shared(robot=problem.robot, reference=reference, scene=scene, step=step, controller=controller)
-    rows = map_on_workers(replay, shared, perturbations, workers=workers, crashed=_crashed, progress=progress)
+    outcomes = map_on_workers(
+        replay, shared, perturbations, workers=workers, crashed=_crashed, progress=progress
+    )
     return Robustness(
         perturbations=tuple(perturbations),
         drawn_from=chosen,
-        standing=np.array([row.standing for row in rows]),
-        reason=tuple(row.reason for row in rows),
-        impulse=np.array([row.impulse for row in rows]),
-        slip=np.array([row.slip for row in rows]),
-        lift=np.array([row.lift for row in rows]),
+        standing=np.array([one.standing for one in outcomes]),
+        reason=tuple(one.reason for one in outcomes),
+        impulse=np.array([one.impulse for one in outcomes]),
+        slip=np.array([one.slip for one in outcomes]),
+        lift=np.array([one.lift for one in outcomes]),
         planned_impulse=float(planned_impulse),
     )

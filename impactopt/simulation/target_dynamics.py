@@ -16,25 +16,32 @@ from impactopt.simulation.result import Scene
 Array = NDArray[np.float64]
 State = TypeVar("State")
 Move = Callable[[float], tuple[State, bool]]
-FACE = 0.2  # [m] how far from the hit point, across the normal, there is something to hit
-PIECES, HALVINGS = 20, 30  # of one step: switches that it ends on; how exactly each is found
-RELATIVE, ABSOLUTE = 1e-6, 1e-10  # errors of the contact within a step; [m], [N s], and of the target's state
-NEAR = 2.0  # steps before a touch from which on the contact is followed within them
-MOST = 20_000  # places within one step: a contact that needs more is no contact to be followed
+FACE = 0.2  # [m] radius of the target's surface about the hit point, across the normal
+MAX_SWITCHES = 20  # of a target within one step
+BISECTIONS = 30  # of a step, to locate a switch
+# Tolerances of the contact within a step. The absolute one is in m, N s and units of the target's state.
+RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-10
+NEAR_STEPS = 2.0  # steps before a touch from which on the contact is integrated within them
+MAX_POINTS = 20_000  # of the integration within one step; a contact that needs more is refused
 
 
 @dataclass(frozen=True)
 class Push:
     """Contact forces and target motion within one step of an engine.
 
-    Of each striker (h,): forces [N], their means over the step, and over its first half (halves); peaks [N],
-    when their sum is largest; depths [m] in the target, at the end. state, travel [m]: of the target, then;
-    since [s]: up to when in the step there was no force. times (k,) [s] in the step, and whether there is a
-    force then (touching); last [N]: the force at the end.
+    forces (h,) [N] : of each striker, mean over the step
+    first_half (h,) [N] : mean over the first half of the step
+    peaks (h,) [N] : at the instant at which their sum is largest
+    state, travel [m] : of the target, at the end
+    depths (h,) [m] : of each striker in the target, at the end
+    since [s] : time in the step up to which there was no force
+    times (k,) [s] : instants in the step
+    touching (k,) : whether there is a force then
+    last [N] : sum of the forces at the end
     """
 
     forces: Array
-    halves: Array
+    first_half: Array
     peaks: Array
     state: Array
     travel: float
@@ -55,33 +62,38 @@ class Push:
         return float(self.peaks.sum())
 
 
-class Struck:
-    """The scene's law and target, evaluated. A target's state is (n_states,), zero before contact.
+class TargetContact:
+    """Contact law and target of a scene, evaluated numerically.
 
-    Targets know their speed only; how far one has gone is the engine's to integrate.
+    A target's state (n_states,) is zero before contact. It gives the target's speed only; engines integrate
+    the travel.
     """
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.law, self.target = scene, scene.law, scene.target
         points = [scene.point, *([] if scene.second is None else [scene.second[1]])]
-        # as floats: of three of them, arrays would take several times as long
+        # tuples of floats: with three components, arrays would take several times as long
         self._points, self._normal = [tuple(p.tolist()) for p in points], tuple(scene.normal.tolist())
         self.untouched: Array = np.zeros(self.target.n_states)
-        # read once: they are asked for in every step
-        self._law, self._target = self.law.parameters, self.target.parameters
+        # read once, because every step uses them
+        self._law_parameters, self._target_parameters = self.law.parameters, self.target.parameters
 
     def speed(self, state: Array) -> float:
-        """[m/s] of the hit surface along the normal."""
-        return float(self.target.velocity(state, self._target))
+        """Speed [m/s] of the hit surface along the normal."""
+        return float(self.target.velocity(state, self._target_parameters))
 
     def travel_at_start(self, reference: Any) -> float:
-        """[m] that it has to go until contact is planned, below zero, as it moves before contact already."""
+        """Travel [m] at the start of a motion, < 0 for a target that moves before contact.
+
+        It is zero at the planned contact.
+        """
         before = self.speed(self.untouched)
         return -before * float(reference.contact_start) if before else 0.0
 
     def depths(self, places: Array, travel: float) -> Array:
-        """(h,) [m] of striking points at places (h, 3) [m] in a target that has gone so far [m]; beside its
-        face minus infinity.
+        """Depths (h,) [m] of striking points at places (h, 3) [m] in a target with this travel [m].
+
+        Points beside the target's surface have minus infinity.
         """
         depths, (nx, ny, nz) = [], self._normal
         for (x, y, z), (px, py, pz) in zip(places.tolist(), self._points, strict=True):
@@ -92,59 +104,66 @@ class Struck:
         return np.array(depths)
 
     def forces(self, depths: Array, speeds: Array, state: Array) -> Array:
-        """Contact forces (h,) [N] of striking points so deep in the target [m], with speeds along the normal
-        [m/s].
-        """
+        """Contact forces (h,) [N] at depths (h,) [m] and speeds along the normal (h,) [m/s]."""
         rates = speeds - self.speed(state)
         pairs = zip(depths, rates, strict=True)
-        force, numbers = self.law.force, self._law
-        return np.array([float(force(depth, rate, numbers)) if depth > 0 else 0.0 for depth, rate in pairs])
+        force, parameters = self.law.force, self._law_parameters
+        return np.array(
+            [float(force(depth, rate, parameters)) if depth > 0 else 0.0 for depth, rate in pairs]
+        )
 
     def near(self, depths: Array, speeds: Array, state: Array, step: float) -> bool:
         """True if any of the strikers may touch the target within a step [s]."""
         speed, pairs = self.speed(state), zip(depths.tolist(), speeds.tolist(), strict=True)
-        return any(depth + NEAR * step * (abs(rate - speed) + 1.0) > 0 for depth, rate in pairs)
+        # with a margin of 1 m/s on the closing speed
+        return any(depth + NEAR_STEPS * step * (abs(rate - speed) + 1.0) > 0 for depth, rate in pairs)
 
     def pushed(
         self,
         depths: Array,
         speeds: Array,
-        gains: Array,
-        yields: Array,
+        accelerations: Array,
+        inverse_mass: Array,
         state: Array,
         travel: float,
         step: float,
     ) -> Push:
-        """The contact over one step [s] of the engine: hands and target alone, with errors of their own.
+        """Contact over one step [s] of the engine, integrated with an adaptive step of its own.
 
-        Hands are points whose speeds (h,) [m/s] gain so much [m/s2] without the contact, and lose `yields`
-        (h, h) [1/kg] times their impulses. A light target behind a stiff contact moves a thousand times
-        within a step, which an engine could not follow.
+        A light target behind a stiff contact may oscillate a thousand times within a step of the engine,
+        which the engine could not resolve. Within the step the robot is reduced to its striking points: their
+        speeds (h,) [m/s] change by `accelerations` (h,) [m/s2] without the contact, and by -`inverse_mass`
+        (h, h) [1/kg] times the contact impulses.
+
+        Raises
+        ------
+        InputError : the integration fails.
         """
         h = len(speeds)
-        there = np.maximum(depths, -FACE)  # beside the face: far away
+        first = np.maximum(depths, -FACE)  # beside the target's surface, where depths are -inf: far away
 
+        # y: depths (h,), impulses (h,), travel of the target in this step, state of the target
         def forces(t: float, y: Array) -> tuple[Array, Array, float]:
-            """Forces, and the speeds of hands and target."""
-            hands, target = speeds + gains * t - yields @ y[h : 2 * h], self.speed(y[2 * h + 1 :])
-            return self.forces(y[:h], hands, y[2 * h + 1 :]), hands, target
+            """Forces (h,), speeds of the striking points (h,), and speed of the target."""
+            hands = speeds + accelerations * t - inverse_mass @ y[h : 2 * h]
+            return self.forces(y[:h], hands, y[2 * h + 1 :]), hands, self.speed(y[2 * h + 1 :])
 
         def rates(t: float, y: Array) -> list[float]:
             force, hands, target = forces(t, y)
-            moves = self.target.derivative(y[2 * h + 1 :], float(force.sum()), self._target)
-            return [*(hands - target), *force, target, *moves]
+            state_rates = self.target.derivative(y[2 * h + 1 :], float(force.sum()), self._target_parameters)
+            return [*(hands - target), *force, target, *state_rates]
 
-        begin = np.concatenate([there, np.zeros(h + 1), state])
+        begin = np.concatenate([first, np.zeros(h + 1), state])
         found = solve_ivp(
             rates,
             (0.0, step),
             begin,
-            method="RK45",  # an implicit method's Newton steps do not get over a target's switches
-            rtol=RELATIVE,
-            atol=ABSOLUTE,
+            method="RK45",  # Newton's method, of implicit ones, does not converge across a target's switches
+            rtol=RELATIVE_TOLERANCE,
+            atol=ABSOLUTE_TOLERANCE,
             max_step=0.5 * step,
         )
-        if not found.success or found.t.size > MOST or not np.isfinite(found.y).all():
+        if not found.success or found.t.size > MAX_POINTS or not np.isfinite(found.y).all():
             raise InputError(
                 f"the contact cannot be followed within a step of {step:g} s: soften it, or give the target "
                 "more mass"
@@ -154,7 +173,7 @@ class Struck:
         total = values.sum(axis=1)
         return Push(
             forces=impulses[:, -1] / step,
-            halves=np.array([np.interp(step / 2, found.t, impulse) for impulse in impulses]) / (step / 2),
+            first_half=np.array([np.interp(step / 2, found.t, impulse) for impulse in impulses]) / (step / 2),
             peaks=values[int(np.argmax(total))],
             state=np.array(end[2 * h + 1 :]),
             travel=travel + float(end[2 * h]),
@@ -171,19 +190,22 @@ class Struck:
         return after, travel + step / 2 * (self.speed(state) + self.speed(after))
 
     def rates(self, state: Array, force: float) -> Array:
-        """d(state)/dt (n_states,)."""
-        return np.array([float(rate) for rate in self.target.derivative(state, force, self._target)])
+        """Time derivative (n_states,) of the target's state."""
+        derivative = self.target.derivative(state, force, self._target_parameters)
+        return np.array([float(rate) for rate in derivative])
 
     def side(self, state: Array, force: float) -> tuple[bool, ...]:
-        """Side of each of its switches that the target is on."""
-        return tuple(float(switch) > 0 for switch in self.target.switches(state, force, self._target))
+        """Signs of the target's switches, True if positive."""
+        switches = self.target.switches(state, force, self._target_parameters)
+        return tuple(float(switch) > 0 for switch in switches)
 
     def moved(self, state: Array, force: float, length: float) -> Array:
-        """The state after a time [s] under one force, by Runge-Kutta's steps of order four: the swing of a
-        board that has not broken does not grow by them.
+        """State after a time [s] under a constant force, by the classical Runge-Kutta method of order four.
+
+        A lower order would let the oscillation of an unbroken board grow.
         """
-        if not any(self.target.derivative(state, force, self._target)):
-            return state  # as it is before a blow
+        if not any(self.target.derivative(state, force, self._target_parameters)):
+            return state  # at rest, as before the impact
 
         def begin(_done: float, s: Array) -> Move[Array]:
             before = self.side(s, force)
@@ -202,19 +224,19 @@ class Struck:
 
 
 def smooth_steps(begin: Callable[[float, State], Move[State]], state: State, length: float) -> State:
-    """`state` after `length` [s], in one step, or in several that end just beyond a switch.
+    """State after `length` [s], in one step without a switch, or in several that end just beyond a switch.
 
-    begin : from the time done [s] and the state there, the step: from its length to the state after it, and
-        whether neither that nor what the step takes rates of is beyond a switch.
+    begin : maps the time passed [s] and the state then to a function of a step's length [s], which returns
+        the state after the step, and True if no state evaluated in the step is beyond a switch.
     """
     done = 0.0
-    for _ in range(PIECES):
+    for _ in range(MAX_SWITCHES):
         move = begin(done, state)
         low, high = 0.0, length - done
         after, smooth = move(high)
         if smooth:
             return after
-        for _ in range(HALVINGS):
+        for _ in range(BISECTIONS):  # `low` is before the switch, `high` beyond it
             middle = (low + high) / 2
             low, high = (middle, high) if move(middle)[1] else (low, middle)
         state, done = move(high)[0], done + high

@@ -1,9 +1,9 @@
-"""The same function for many inputs, on several processes; a process that dies costs its own input only.
+"""Pool of worker processes for a function of many inputs; a process that dies loses its own input only.
 
-Processes are spawned, not forked: a fork copies the locks that CasADi's and BLAS's threads hold, not the
-threads. Each gets what all inputs share once, when it starts, and ends with the process that started it,
-however that ends. The pools of `concurrent.futures` do not do: a worker that is killed breaks the whole pool,
-which says neither whose input it was nor with which exit code.
+Processes are spawned, not forked: a fork copies the locks that CasADi's and BLAS's threads hold, but not the
+threads. Each process receives the shared data once, when it starts, and ends with its parent, however that
+ends. The pools of `concurrent.futures` do not suffice: a killed worker breaks the whole pool, which reports
+neither the input nor the exit code.
 """
 
 from __future__ import annotations
@@ -32,15 +32,18 @@ _Shared = TypeVar("_Shared")
 _Input = TypeVar("_Input")
 _Output = TypeVar("_Output")
 
-AWAKE = 1.0  # [s]: the longest that Ctrl-C is overlooked for which comes between two looks and the wait
-STARTS = 3  # that may fail one after another, if it was a signal that ended them
+POLL = 1.0  # [s] timeout of a wait; a Ctrl-C that comes just before the wait is seen after it
+MAX_FAILED_STARTS = 3  # in a row, of processes that a signal ended while they started
 _LINUX = sys.platform.startswith("linux")
-_PR_SET_PDEATHSIG = 1  # of its prctl
+_PR_SET_PDEATHSIG = 1  # option of prctl: signal to a process whose parent dies
 
 
 @dataclass(frozen=True, kw_only=True)
 class Died:
-    """Stand-in for a result: the exit code of the input's last process (-9: SIGKILL), and their number."""
+    """Stand-in for the result of an input whose process died.
+
+    code : exit code of the last process (-9: SIGKILL).  tries : number of processes that died.
+    """
 
     code: int
     tries: int
@@ -55,12 +58,12 @@ def map_on_workers(
     crashed: Callable[[int], _Output],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[_Output]:
-    """``function(shared, input)`` of every input, in the order of the inputs.
+    """Results ``function(shared, input)`` of all inputs, in their order.
 
-    function : of a module, and so are its results, as they go from process to process.
-    workers : processes; 1 computes here, where a crash takes all along.
-    crashed : the result of an input whose process died, from the exit code (-11: segmentation fault).
-    progress : called with how many are done, of how many.
+    function : defined at the top level of a module, with results that can be pickled.
+    workers : number of processes; 1 computes in this process, which a crash ends.
+    crashed : makes the result of an input whose process died, from the exit code (-11: segmentation fault).
+    progress : called with the number of finished inputs, and of all.
 
     Ctrl-C ends the processes and is raised here.
 
@@ -89,10 +92,10 @@ def each_on_workers(
     workers: int,
     again: Callable[[Died], bool] | None = None,
 ) -> Iterator[tuple[int, _Output | Died]]:
-    """Indices and results as they come, in any order; inputs are taken one by one, when a process is free.
+    """Yields indices and results as they come, in any order; takes an input when a process is free.
 
-    function : as of `map_on_workers`.  workers : processes, 1 or more.
-    again : whether an input whose process died is tried once more; None: never.
+    function : as in `map_on_workers`.  workers : number of processes, 1 or more.
+    again : decides if an input whose process died is tried once more; None: never.
 
     Closing the iterator ends the processes.
 
@@ -101,24 +104,24 @@ def each_on_workers(
     InputError : the processes do not start.
     """
     context = multiprocessing.get_context("spawn")
-    source, back = iter(inputs), list[_Task]()
+    source, returned = iter(inputs), list[_Task]()  # the latter are tried again
     pool: list[_Worker] = []
     failed = 0
 
     def task() -> _Task | None:
-        if back:
-            return back.pop()
+        if returned:
+            return returned.pop()
         given = next(source, None)
         return None if given is None else _Task(*given)
 
     try:
         waiting = task()
         while waiting is not None or pool:
-            # as many as there are inputs, at most; each is given its input when it says that it is ready
+            # at most as many processes as inputs; each receives its input once it is ready
             while waiting is not None and len(pool) < workers:
                 pool.append(_Worker(context, function, shared, waiting))
                 waiting = task()
-            pipes: Any = wait([worker.pipe for worker in pool], timeout=AWAKE)
+            pipes: Any = wait([worker.pipe for worker in pool], timeout=POLL)
             for worker in [w for w in pool if w.pipe in pipes]:
                 try:
                     index, result = worker.pipe.recv()
@@ -127,22 +130,23 @@ def each_on_workers(
                     code, mine = worker.end(), worker.task
                     if not worker.ready:
                         failed += 1
-                        if code >= 0 or failed >= STARTS:
+                        # an exit code >= 0 is an error in the script, which every process would repeat
+                        if code >= 0 or failed >= MAX_FAILED_STARTS:
                             raise InputError(
                                 f"the worker processes do not start (exit code {code}); put the call of your "
                                 'script under `if __name__ == "__main__":`, or ask for workers=1'
                             ) from None
-                        back.append(mine)
+                        returned.append(mine)
                     else:
                         mine.tries += 1
                         died = Died(code=code, tries=mine.tries)
                         if again is not None and again(died):
-                            back.append(mine)
+                            returned.append(mine)
                         else:
                             yield mine.index, died
                     waiting = task() if waiting is None else waiting
                     continue
-                if index is None:
+                if index is None:  # the process is ready
                     failed = 0
                     worker.give()
                     continue
@@ -160,7 +164,7 @@ def each_on_workers(
 
 @dataclass(kw_only=False)
 class _Task:
-    """An input, and how many processes died of it."""
+    """An input, and the number of processes that died of it."""
 
     index: int
     given: Any
@@ -168,7 +172,7 @@ class _Task:
 
 
 class _Worker:
-    """A process, the pipe to it, and its input; ``ready`` once it has said so."""
+    """A process, the pipe to it, and its input; ``ready`` once it has started."""
 
     def __init__(self, context: Any, function: Any, shared: Any, task: _Task) -> None:
         self.task, self.ready = task, False
@@ -176,20 +180,20 @@ class _Worker:
         self.process = context.Process(
             target=_serve, args=(theirs, function, shared, os.getpid()), daemon=True
         )
-        with _interrupts_held_back():
+        with _interrupts_blocked():
             self.process.start()
-        theirs.close()  # so that its end is seen here
+        theirs.close()  # so that reading the pipe fails when the process ends
 
     def give(self) -> None:
-        """Hand it its input; that it has died in the meantime shows when its answer is read."""
+        """Sends the input. If the process has died in the meantime, reading its result will fail."""
         self.ready = True
         with contextlib.suppress(OSError):
             self.pipe.send((self.task.index, self.task.given))
 
     def end(self) -> int:
-        """End the process; its exit code."""
+        """Ends the process, and returns its exit code."""
         self.pipe.close()
-        self.process.join(0.2)  # it ends by itself where it waits for input, or is dead already
+        self.process.join(0.2)  # a process that waits for input ends by itself
         if self.process.is_alive():
             self.process.terminate()
         self.process.join()
@@ -197,11 +201,9 @@ class _Worker:
 
 
 @contextmanager
-def _interrupts_held_back() -> Iterator[None]:
-    """Ctrl-C waits. Processes started here never see it, from their first instant on: who asked for them
-    does, and ends them.
-    """
-    resource_tracker.ensure_running()  # started with the first process, it would let SIGINT in again
+def _interrupts_blocked() -> Iterator[None]:
+    """Blocks Ctrl-C. Processes started meanwhile never receive it: the parent does, and ends them."""
+    resource_tracker.ensure_running()  # its start with the first process would unblock SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -210,24 +212,25 @@ def _interrupts_held_back() -> Iterator[None]:
 
 
 def _serve(pipe: Connection, function: Callable[[Any, Any], Any], shared: Any, parent: int) -> None:
+    """Main function of a worker process."""
     _end_with(parent)
     try:
         pipe.send((None, None))  # ready
         for done in itertools.count():
             index, given = pipe.recv()
             pipe.send((index, function(shared, given)))
-            if not done:  # what it loaded stays, and need not be gone through for garbage again and again
+            if not done:  # loaded modules stay: exclude them from garbage collection
                 gc.collect()
                 gc.freeze()
     except (EOFError, BrokenPipeError, ConnectionResetError):
-        return  # nobody asks any more
+        return  # the parent has closed the pipe
 
 
 def _end_with(parent: int) -> None:
-    """Let this process end when its parent does, even if that is killed while this one computes."""
-    if _LINUX:  # the kernel does it, in the middle of compiled code too
+    """Makes this process end when its parent does, even if the parent is killed while this one computes."""
+    if _LINUX:  # the kernel kills it, even within compiled code
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it was gone before
+        if os.getppid() != parent:  # it ended before the call
             os._exit(1)
         return
     process: Any = multiprocessing.parent_process()

@@ -17,7 +17,7 @@ from impactopt.collision.runge_kutta import rate_of_change
 from impactopt.simulation.mujoco_world import mujoco_module, no_log_file
 from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
-from impactopt.simulation.reference.mujoco_dynamics import HeldRobot, march
+from impactopt.simulation.reference.mujoco_dynamics import WeldedRobot, march
 
 __all__ = ["cvodes", "mujoco_loop", "mujoco_rollouts", "mujoco_steps", "pinocchio_calls"]
 
@@ -25,11 +25,11 @@ Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- MuJoCo
-def _world(setup: Setup, step: float) -> tuple[MujocoDynamics, HeldRobot]:
+def _world(setup: Setup, step: float) -> tuple[MujocoDynamics, WeldedRobot]:
     model = setup.model(MujocoDynamics, step=step)
-    robot, frames, _, striker = model._held
+    robot, frames, _, striker = model._body_arguments
     with no_log_file():
-        return model, HeldRobot(robot, frames, striker, step)
+        return model, WeldedRobot(robot, frames, striker, step)
 
 
 def mujoco_loop(setup: Setup, step: float) -> Callable[[], Collision]:
@@ -84,7 +84,7 @@ def mujoco_rollouts(
     return lambda: pool.rollout(world.world, data, many, nstep=count)
 
 
-def _steps_alone(setup: Setup, step: float) -> HeldRobot:
+def _steps_alone(setup: Setup, step: float) -> WeldedRobot:
     mujoco = mujoco_module()
     _, world = _world(setup, step)
     usual = mujoco.MjSpec().compile().opt
@@ -98,9 +98,9 @@ def pinocchio_calls(setup: Setup) -> dict[str, Callable[[], Any]]:
     case = setup.case
     robot, q, v = case.robot, case.q, case.v
     model, data = robot.model, robot.model.createData()
-    body = PinocchioBody(*setup.model(FullDynamics)._held, case.normal)
+    body = PinocchioBody(*setup.model(FullDynamics)._body_arguments, case.normal)
     torque = np.concatenate([np.zeros(robot.nv - robot.n), case.torque])
-    held = (body._constraints, body._found, body._proximal)
+    held = (body._constraints, body._constraint_data, body._proximal)
     pendulum = pin.Model()
     pendulum.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "pendulum")
     pendulum.appendBodyToJoint(1, pin.Inertia.Random(), pin.SE3.Identity())

@@ -72,7 +72,7 @@ def test_json_is_the_flat_report(saved: Path, punch: Solution, tmp_path: Path) -
 def test_held_soles_cannot_say_whether_it_stands(saved: Path) -> None:
     out, _ = run(saved / "solution.npz", "--engine", "pinocchio", "--json", "--step", "5e-4")
     report = json.loads(out)
-    assert report["standing"] is None and "held" in report["reason"]
+    assert report["standing"] is None and "fixed" in report["reason"]
     assert abs(report["impulse_error_pct"]) < 2
 
 

@@ -33,7 +33,7 @@ from impactopt.cli.app import app
 from impactopt.contact.laws import LAWS
 from impactopt.files.problem_file import problem_data, problem_from_data, read_toml
 from impactopt.files.problem_file.names import problem_file
-from impactopt.identification.fitting import Lump
+from impactopt.identification.fitting import TwoMassModel
 
 MASS = 3.0
 
@@ -56,9 +56,9 @@ def test_two_free_masses_collide_as_their_reduced_mass() -> None:
     row = np.array(normal) @ pin.getFrameJacobian(arm.model, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
     whole = model.collide(q, row / (row @ row))  # at 1 m/s
     numbers = {name: np.array([x]) for name, x in law.parameters.items()}
-    (course,) = Lump(law, 0.2).courses(numbers, np.array([1 / (1 / m + 1 / 2.0)]), np.ones(1))
-    np.testing.assert_allclose(course.impulse[-1], whole.impulse, rtol=1e-6)
-    np.testing.assert_allclose(course.time[-1], whole.duration, rtol=1e-6)
+    (history,) = TwoMassModel(law, 0.2).histories(numbers, np.array([1 / (1 / m + 1 / 2.0)]), np.ones(1))
+    np.testing.assert_allclose(history.impulse[-1], whole.impulse, rtol=1e-6)
+    np.testing.assert_allclose(history.time[-1], whole.duration, rtol=1e-6)
 
 
 @pytest.mark.parametrize("law", TRUE)
@@ -116,7 +116,7 @@ def test_what_a_log_does_not_determine_is_said() -> None:
 
 def test_a_law_that_does_not_fit_is_told() -> None:
     found = identify(log_of(TrueBlow("Hunt-Crossley")), laws=[SpringDamper])
-    assert any("no white noise" in caution for caution in found.cautions)
+    assert any("not white noise" in caution for caution in found.cautions)
 
 
 def test_a_law_of_ones_own() -> None:
@@ -273,7 +273,7 @@ def test_a_force_that_is_cut_off_is_left_out_and_told() -> None:
     found = identify(log, laws=["Kelvin-Voigt"])
     lost = int(np.sum(whole.force >= level))
     assert found.clipped == (lost, 0)
-    assert f"cut off at {level:.4g} N: {lost} samples of 1 of 2 blows" in found.cautions[0]
+    assert f"cut off at {level:.4g} N: {lost} samples of 1 of 2 impacts" in found.cautions[0]
     for name, true in (("stiffness", 1e5), ("damping", 150.0), ("effective_mass", MASS)):
         estimate = found.best.estimates[name]
         assert estimate.low <= true <= estimate.high, name

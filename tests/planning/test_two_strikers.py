@@ -22,7 +22,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import SecondStriker
 from impactopt.problem.terms import HitCone
 from impactopt.simulation.result import Scene
-from impactopt.simulation.target_dynamics import Struck
+from impactopt.simulation.target_dynamics import TargetContact
 
 Array = NDArray[np.float64]
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -181,8 +181,8 @@ def test_the_blow_alone_has_both_hands(problem: ImpactProblem) -> None:
     assert np.abs(places(problem, strike.strike.posture) - points).max() < 1e-5
 
 
-def scene(mass: float, *, second: bool) -> Struck:
-    return Struck(
+def scene(mass: float, *, second: bool) -> TargetContact:
+    return TargetContact(
         Scene(
             point=np.zeros(3),
             normal=np.array([1.0, 0.0, 0.0]),

@@ -128,7 +128,7 @@ def test_too_few_and_too_many_are_refused(records: dict[str, Record], count: int
 
 def test_the_command_prints_and_writes(saved: list[Path], tmp_path: Path) -> None:
     out, _ = run(*saved, "--out", tmp_path / "new" / "place")
-    for text in ("12.50", "target.mass_kg", "0.0.1", "<two>", "where the versions differ"):
+    for text in ("12.50", "target.mass_kg", "0.0.1", "<two>", "versions: differences"):
         assert text in out
     files = {path.name for path in (tmp_path / "new" / "place").iterdir()}
     assert files == {"compare.json", "compare.png", "compare.html"}

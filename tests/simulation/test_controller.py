@@ -30,8 +30,8 @@ from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.controller.clearance import Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
-from impactopt.simulation.controller.tracking_reference import Recovery, Target
-from impactopt.simulation.controller.whole_body import HeldDynamics, TorqueQP, cone_of
+from impactopt.simulation.controller.tracking_reference import Recovery, TrackingReference
+from impactopt.simulation.controller.whole_body import ConstrainedDynamics, TorqueQP, wrench_cone
 from impactopt.simulation.mujoco_engine import _Replay
 from impactopt.simulation.mujoco_world import MujocoOptions
 
@@ -83,8 +83,8 @@ def test_torques_move_a_held_robot_by_its_equation_of_motion() -> None:
     robot = biped()
     ref, where = still(robot)
     q = np.asarray(ref.q[0])
-    held = HeldDynamics(robot, where.soles, where.strikers, where.normal, q)
-    held.look(q, np.zeros(robot.nv), forces=40.0)
+    held = ConstrainedDynamics(robot, where.soles, where.strikers, where.normal, q)
+    held.update(q, np.zeros(robot.nv), forces=40.0)
     torque = 20 * np.sin(np.arange(robot.n))
     a, wrench = held.A @ torque + held.a0, held.B @ torque + held.b0
     model, data = robot.model, robot.model.createData()
@@ -106,7 +106,7 @@ def test_the_cone_holds_what_corners_can_bear(friction: float) -> None:
     _, where = still(biped())
     settings = replace(QUIET, friction=friction, cop_margin=0.0)
     random, corners = np.random.default_rng(1), where.corners[0]
-    cone = cone_of(corners, settings)
+    cone = wrench_cone(corners, settings)
     at = np.column_stack([corners, np.zeros(len(corners))])
     for _ in range(50):
         force = random.random((len(at), 3))
@@ -133,8 +133,8 @@ def test_the_state_is_known_exactly_without_errors_of_sensors() -> None:
     robot = biped()
     ref, where = still(robot)
     q0 = np.asarray(ref.q[0])
-    held = HeldDynamics(robot, where.soles, where.strikers, where.normal, q0)
-    held.look(q0, np.zeros(robot.nv))
+    held = ConstrainedDynamics(robot, where.soles, where.strikers, where.normal, q0)
+    held.update(q0, np.zeros(robot.nv))
     v = 0.1 * (
         held.A @ np.sin(np.arange(robot.n))
     )  # accelerations of a held robot are velocities of one, too
@@ -176,12 +176,12 @@ def test_the_motion_before_the_blow_coasts_on_until_the_hand_is_free() -> None:
         contact_start=0.5,
         contact_end=0.6,
     )
-    target = Target(robot, ref, ("striker:hand",), spread=True)
-    target.feel(0.55, True)  # later than planned
+    target = TrackingReference(robot, ref, ("striker:hand",), spread=True)
+    target.update_contact(0.55, True)  # later than planned
     late = target.at(0.64)
     np.testing.assert_allclose(late.v, v0)
     np.testing.assert_allclose(late.q, pin.integrate(robot.model, q0, 0.64 * v0), atol=1e-12)
-    target.feel(0.66, False)
+    target.update_contact(0.66, False)
     np.testing.assert_allclose(target.at(0.66).v, 0.0)
     assert target.clock(0.70)[0] == pytest.approx(0.64)
 
@@ -224,12 +224,12 @@ def test_a_recovery_slows_the_plan_down_without_a_jump() -> None:
     recovery = Recovery(robot, ref, where, replace(QUIET, recovery_pace=0.4))
     small = 1e-6
     for since in (0.01, 0.1, 0.3, 1.0):
-        gone, rate, gain = recovery.clock(since)
-        later = recovery.clock(since + small)
+        gone, rate, gain = recovery.progress(since)
+        later = recovery.progress(since + small)
         assert (later[0] - gone) / small == pytest.approx(rate, rel=1e-4)
         assert (later[1] - rate) / small == pytest.approx(gain, abs=1e-6)
-    assert recovery.clock(0.0)[:2] == (0.0, 1.0)
-    assert recovery.clock(1.0)[1] == pytest.approx(0.4)
+    assert recovery.progress(0.0)[:2] == (0.0, 1.0)
+    assert recovery.progress(1.0)[1] == pytest.approx(0.4)
 
 
 def test_the_recovery_begins_after_the_blow_and_goes_on_from_where_the_plan_is() -> None:
@@ -238,10 +238,10 @@ def test_the_recovery_begins_after_the_blow_and_goes_on_from_where_the_plan_is()
     ref = bowed(robot, where, still_ref)
     settings = replace(QUIET, recovery_start=0.1, recovery_margin=0.0)
     recovery = Recovery(robot, ref, where, settings)
-    target = Target(robot, ref, where.strikers, spread=True, recovery=recovery)
+    target = TrackingReference(robot, ref, where.strikers, spread=True, recovery=recovery)
     assert not target.recovers(5.0)  # nothing was hit
-    target.feel(0.2, True)
-    target.feel(0.4, False)  # 0.1 s later than planned
+    target.update_contact(0.2, True)
+    target.update_contact(0.4, False)  # 0.1 s later than planned
     assert not target.recovers(0.49)
     assert target.recovers(0.51)
     np.testing.assert_allclose(target.at(0.5 - 1e-9).q, target.at(0.5 + 1e-9).q, atol=1e-6)
@@ -325,8 +325,8 @@ def test_who_recovers_comes_late_through_what_is_planned_and_has_not_fallen() ->
     assert replay.wbc is not None
     replay.start(bow)
     assert replay.fallen(2.0).startswith("fell"), "nothing was hit: it is due upright"
-    replay.wbc.target.feel(0.55, True)
-    replay.wbc.target.feel(0.6, False)
+    replay.wbc.tracking.update_contact(0.55, True)
+    replay.wbc.tracking.update_contact(0.6, False)
     assert replay.fallen(2.0) == ""
     replay.start(back)
     assert replay.fallen(2.0).startswith("fell"), "nobody planned that"
@@ -350,7 +350,7 @@ def test_links_are_as_far_apart_as_their_hulls(monkeypatch: pytest.MonkeyPatch) 
         pin.forwardKinematics(model, data, posture)
         expected.append(np.linalg.norm(data.oMi[joints[0]].translation - data.oMi[joints[1]].translation))
     monkeypatch.setattr(collision_geometry, "NEAR", 10.0)  # [m]: feet are near each other
-    np.testing.assert_allclose(feet.apart(model, np.array([q, turned])), expected, atol=5e-5)
+    np.testing.assert_allclose(feet.least_distance(model, np.array([q, turned])), expected, atol=5e-5)
 
 
 def test_only_links_that_a_shift_brings_nearer_are_looked_at() -> None:

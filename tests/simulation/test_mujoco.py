@@ -152,7 +152,7 @@ def test_a_state_goes_to_mujoco_and_back(name: str, worlds: dict[str, _Replay], 
     pin.forwardKinematics(model, data, q, v)
     pin.updateFramePlacements(model, data)
     hand = model.getFrameId(replay.scene.striker)
-    np.testing.assert_allclose(replay.places()[0], data.oMf[hand].translation, atol=1e-9)
+    np.testing.assert_allclose(replay.striking_points()[0], data.oMf[hand].translation, atol=1e-9)
     speed = pin.getFrameVelocity(model, data, hand, pin.LOCAL_WORLD_ALIGNED).linear
     assert replay.hand_speeds()[0] == pytest.approx(float(replay.scene.normal @ speed), abs=1e-9)
     corners = [

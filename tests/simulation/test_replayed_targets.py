@@ -199,7 +199,7 @@ def test_draws_whose_steps_leave_the_impulse_uncertain_have_no_result() -> None:
     assert trusted.impulse == pytest.approx(integrated(law, target)[0], rel=1e-2)
     doubtful = robustness.replay(dataclasses.replace(shared, step=0.06), Perturbation())
     assert not doubtful.standing and np.isnan(doubtful.impulse)
-    assert "not to be trusted: steps of 0.06 s" in doubtful.reason
+    assert "not reliable: steps of 0.06 s" in doubtful.reason
 
 
 @ENGINES

@@ -333,6 +333,6 @@ def test_ctrl_c_ends_the_processes_and_is_raised(tmp_path: Path) -> None:
 
 
 def test_workers_do_not_see_ctrl_c() -> None:
-    with _workers._interrupts_held_back():
+    with _workers._interrupts_blocked():
         assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())

@@ -1,8 +1,7 @@
-"""Pictures of a record: force, ZMP, torque, poses and joint motion, planned beside simulated; the fist's
-effective mass, the solver's iterations, soles in a replay.
+"""Pictures of a record: force, ZMP, torque, poses, joint motion, effective mass, iterations, replayed soles.
 
-One picture a file, all in the style of `style.py`. `hierarchy.py` and `pareto.py` draw what is in no record:
-collision models beside each other.
+One picture a file, all in the style of `style.py`. `hierarchy.py`, `compare.py` and `sweep.py` draw several
+collisions, records or cases.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ __all__ = [
     "zero_moment_point",
 ]
 
-# file name without .png: what draws it, or gives None where there is nothing to draw
+# functions that draw a picture, by its file name without .png; they return None if there is nothing to draw
 PICTURES: Mapping[str, Callable[[Record], Picture | None]] = {
     "force": force,
     "zmp": zero_moment_point,
@@ -57,7 +56,7 @@ PICTURES: Mapping[str, Callable[[Record], Picture | None]] = {
     "iterations": iterations,
     "replay": _replay,
 }
-# the same, into a figure or a part of one
+# functions that draw the same into a figure or a part of one
 DRAWN: Mapping[str, Callable[[Any, Record], None]] = {
     "overview": draw_overview,
     "force": draw_force,
@@ -69,7 +68,7 @@ DRAWN: Mapping[str, Callable[[Any, Record], None]] = {
     "iterations": draw_iterations,
     "replay": draw_replay,
 }
-# why a picture may be None
+# reasons why a picture may be None
 _WHY = {
     "zmp": "the robot stands on no soles",
     "iterations": "the solver kept no history",
@@ -85,18 +84,18 @@ def plot(
     simulation: Any | None = None,
     replay: Any | None = None,
 ) -> Picture | Axes | list[Axes]:
-    """A picture of a solution, which a notebook shows, and ``savefig`` writes: ``Solution.plot``.
+    """Picture of a solution, which a notebook shows, and ``savefig`` writes: ``Solution.plot``.
 
-    what : "overview", the four that matter (poses, force, ZMP, torque), or one of PICTURES.
-    ax : matplotlib axes of your own figure to draw in; the panels of a picture that has several take their
-        place. Then the axes are returned, or the list of them.
-    simulation : of ``solution.validate()``, drawn beside the plan.  replay : of
-        ``solution.validate(engine="mujoco")``, which "replay" draws.
+    what : "overview" (poses, force, ZMP, torque), or one of PICTURES.
+    ax : matplotlib axes of your own figure to draw in; several panels replace them. Then the axes are
+        returned, or the list of them.
+    simulation : of ``solution.validate()``, drawn with the plan.
+    replay : of ``solution.validate(engine="mujoco")``, for the picture "replay".
 
     Raises
     ------
-    InputError : an unknown picture; one of what the solution has not, such as the ZMP of an arm; a plan whose
-        motion cannot be completed; axes that are no part of a grid, for several panels.
+    InputError : an unknown picture; one that the solution does not have, such as the ZMP of an arm; a plan
+        whose motion cannot be completed; axes that are no part of a grid, for several panels.
     """
     draws = {"overview": overview, **PICTURES}
     check_choice("there is no picture", what, draws)
@@ -111,7 +110,7 @@ def plot(
 
 @styled
 def _drawn_in(ax: Axes, what: str, record: Record) -> Axes | list[Axes]:
-    """The picture in the place of axes, and its own."""
+    """Draws a picture in the place of axes; returns its axes."""
     if what == "force":
         draw_force(ax, record)
         return ax
@@ -126,19 +125,19 @@ def _drawn_in(ax: Axes, what: str, record: Record) -> Axes | list[Axes]:
 
 
 def _panels(part: FigureBase) -> list[Axes]:
-    """Axes of a part of a figure and of its parts."""
-    whole: Any = part  # matplotlib has no type for what a part of a figure has
+    """Axes of a part of a figure, and of the parts in it."""
+    whole: Any = part  # matplotlib's types lack subfigs
     return [*whole.axes, *(axes for inner in whole.subfigs for axes in _panels(inner))]
 
 
 def save_pictures(record: Record, directory: Path, names: Iterable[str] = tuple(PICTURES)) -> list[Path]:
-    """Write the record's pictures as PNG into the directory; what an earlier record left there goes.
+    """Writes a record's pictures as PNG into a directory; deletes outdated ones of an earlier record.
 
-    names : of PICTURES; all of them if left out.
+    names : of PICTURES; default: all.
 
     Raises
     ------
-    InputError : they cannot be written.
+    InputError : a file cannot be written.
     """
     written = []
     for name in names:

@@ -1,4 +1,4 @@
-"""A replay as a moving picture: the robot as sticks, from its right and from behind, slow around contact."""
+"""Animated picture of a replay: the robot as sticks from three sides, slow around contact."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from impactopt.simulation.result import centre_of_pressure
 
 __all__ = ["save_animation", "shown_times"]
 
-FPS, SLOW = 20, 10  # pictures a second; how much slower time runs around contact
+FPS, SLOW = 20, 10  # frames a second; factor by which time is slower around contact
 AROUND = 0.05  # [s] before and after contact that are slow too
 AFTER = 0.6  # [s] shown beyond the end of the reference's motion
-REST = 1500  # [ms] that the last picture stays
-ARROW = 0.5  # [m] of the robot's weight, and of the largest contact force
-NEAR = 0.3  # [m] from the hand: farther than this the target may leave the picture
+REST = 1500  # [ms] duration of the last frame
+ARROW = 0.5  # [m] length of an arrow for the robot's weight, or for the largest contact force
+NEAR = 0.3  # [m] distance from the hand beyond which a target may leave the picture
 GREY, LIGHT = "#777777", "#dddddd"
 DRAWN = (BLACK, GREY, LIGHT, BLUE, GREEN, VERMILION)
 SIDE, BEHIND, ABOVE = (
@@ -46,21 +46,21 @@ SIDE, BEHIND, ABOVE = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Instant:
-    """Drawn state of one instant: places in the world and arrows [m]."""
+    """Drawn state of one instant: positions and arrows in the world [m]."""
 
     sticks: Array  # (links, 2, 3)
     soles: list[Array]  # (corners, 3) each
     hand: Array  # (3,)
-    world: list[Array]  # vertices (k, 3) of the target, of what holds it, and of obstacles
-    near: list[Array]  # those of them that the picture is to hold
-    face: Array | None  # (3,) where the target is hit, if it is there
+    world: list[Array]  # vertices (k, 3) of the target, its support, and obstacles
+    near: list[Array]  # those of them that must be in the picture
+    face: Array | None  # (3,) where the target is hit; None: there is no target
     push: Array  # (3,) arrow
     feet: list[tuple[Array, Array]]  # centre of pressure (3,) and arrow (3,)
     zmp: Array | None  # (3,)
 
 
 class _Drawing:
-    """The figure with its things, moved from instant to instant."""
+    """Figure of one frame, whose contents are drawn anew at each instant."""
 
     def __init__(self, done: Replay) -> None:
         self.done, self.sim = done, done.simulation
@@ -82,9 +82,7 @@ class _Drawing:
         self.canvas: Any = FigureCanvasAgg(self.figure)
         self.panels: list[Any] = []
         self.world = surroundings_of(done.planned.problem.world)
-        self.shift = (
-            self.scene.point - done.planned.problem.point
-        )  # of a target that is not where it should be
+        self.shift = self.scene.point - done.planned.problem.point  # of the target, by the perturbation
         self.head = self.figure.text(0.02, 0.93, "", fontsize=11, family="monospace")
         self.views = (SIDE, BEHIND, ABOVE)
 
@@ -103,8 +101,8 @@ class _Drawing:
         loaded = sim.sole_normal[k] >= BEARS * weight_of(self.robot)
         feet = [
             (np.array([*cop, 0.0]), self.per_newton * wrench[:3])
-            for cop, wrench, bears in zip(cops, ground, loaded, strict=True)
-            if bears
+            for cop, wrench, is_loaded in zip(cops, ground, loaded, strict=True)
+            if is_loaded
         ]
         world = [
             (part, part.placed(self.travel[k], scene.normal) + (part.kind != "obstacle") * self.shift)
@@ -125,7 +123,7 @@ class _Drawing:
         )
 
     def set_up(self, scenes: list[_Instant]) -> None:
-        """Panels that hold all that comes; the first two are of one scale."""
+        """Makes panels that contain all scenes; the first two have the same scale."""
         body = np.concatenate([s.sticks.reshape(-1, 3) for s in scenes])
         near = [vertices for s in scenes for vertices in s.near]
         low, high = _bounds(np.concatenate([body, *near, *scenes[0].soles]), 0.08)
@@ -162,7 +160,7 @@ class _Drawing:
             self.figure.legend(handles=key[:1], loc="upper right", fontsize=8)
 
     def draw(self, scene: _Instant, text: str) -> Image.Image:
-        """One picture."""
+        """Draws one frame."""
         self.head.set_text(text)
         moving: list[Any] = []
         for axes, view in zip(self.panels, self.views, strict=True):
@@ -203,7 +201,7 @@ class _Drawing:
             moving.append(_arrow(axes, view @ scene.hand, view @ scene.push, VERMILION))
 
     def _plane(self, axes: Any, view: Array, place: Array, moving: list[Any]) -> None:
-        """Draws the plane of contact if it is seen edge-on: a hand meets it beside the target too."""
+        """Draws the plane of contact, if it is seen edge-on: the hand touches it beside the target too."""
         normal = view @ self.scene.normal
         if np.linalg.norm(normal) > 0.9:
             face, way = view @ place, np.array([-normal[1], normal[0]])
@@ -221,11 +219,11 @@ def _bounds(points: Array, margin: float) -> tuple[Array, Array]:
 
 
 def save_animation(done: Replay, path: Path) -> Path:
-    """Write the replay as an animated GIF; around contact time runs ten times slower.
+    """Writes a replay as an animated GIF; around contact, time is ten times slower.
 
     Raises
     ------
-    InputError : the file cannot be written, or its name does not end in .gif.
+    InputError : the file cannot be written, or its name does not end with .gif.
     """
     if path.suffix.lower() != ".gif":
         raise InputError(f"an animation is a GIF: give {path.name!r} the ending .gif")
@@ -243,23 +241,24 @@ def save_animation(done: Replay, path: Path) -> Path:
             slow = f"   {pace} x slower" if pace > 1 else ""
             text = f"{sim.time[k]:6.3f} s   {PHASES[phase[k]]:<14}{sim.force[k]:4.0f} N on the target{slow}"
             pictures.append(stage.draw(scene, text))
-        verdict = _verdict(sim.fall) if scenes[-1].soles else ""
-        pictures.append(stage.draw(scenes[-1], f"{sim.time[instants[-1]]:6.3f} s   {verdict}"))
+        end = _end_text(sim.fall) if scenes[-1].soles else ""
+        pictures.append(stage.draw(scenes[-1], f"{sim.time[instants[-1]]:6.3f} s   {end}"))
     data = _gif(pictures)
     write_file(path, lambda file: file.write(data))
     return path
 
 
-def _verdict(fall: str | None) -> str:
+def _end_text(fall: str | None) -> str:
+    """Text of the last frame."""
     if fall is None:
-        return "the soles are held"
+        return "the soles are fixed"
     return fall or "stands"
 
 
 def _gif(pictures: list[Image.Image]) -> bytes:
-    """One palette for all pictures, so that only what moves is stored: shades of each colour on white."""
-    share = np.linspace(0.0, 1.0, 9)[:, None]
-    shades = [share * np.array(ImageColor.getrgb(colour)) + (1 - share) * 255 for colour in DRAWN]
+    """GIF with one palette for all frames, to store changes only: shades of each colour on white."""
+    fraction = np.linspace(0.0, 1.0, 9)[:, None]
+    shades = [fraction * np.array(ImageColor.getrgb(colour)) + (1 - fraction) * 255 for colour in DRAWN]
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.concatenate(shades).round().astype(np.uint8).tobytes())
     first, *rest = (p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
@@ -270,7 +269,7 @@ def _gif(pictures: list[Image.Image]) -> bytes:
 
 
 def shown_times(start: float, end: float, last: float) -> tuple[Array, NDArray[np.intp]]:
-    """Instants (k,) [s] of the pictures until `last`, and how much slower than in truth time runs at each."""
+    """Instants (k,) [s] of the frames until `last`, and the factor by which time is slower at each."""
     times, paces, t = [], [], 0.0
     while t <= last:
         slow = start - AROUND <= t < end + AROUND  # nan compares false: without contact nothing is slow

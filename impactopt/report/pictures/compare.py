@@ -11,8 +11,8 @@ from impactopt.report.pictures.style import PAGE, Picture, styled
 
 __all__ = ["comparison_picture"]
 
-AROUND = 0.25  # of the contact that is shown before and after it
-# which history, what it is, its limit, and whether it is shown near contact only
+AROUND = 0.25  # time shown before and after contact, over its duration
+# name of each history, its label, its limit, and whether it is shown near contact only
 PANELS = (
     ("force", "force on the target [N]", None, True),
     ("margin", "ZMP margin [mm]", 0.0, False),

@@ -1,4 +1,4 @@
-"""Effective mass of the fist at contact by the direction of the hit: the effective-mass ellipsoid."""
+"""Effective mass of the fist at contact over the direction: the effective-mass ellipsoid."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from impactopt.report.pictures.style import (
     title,
 )
 
-# what is drawn: axes across and up, from where it is seen
+# of each view: axes across and up, their labels, and its name
 VIEWS = (
     (np.array([[1.0, 0, 0], [0, 0, 1.0]]), "x [m]", "z [m]", "from its right"),
     (np.array([[0, -1.0, 0], [1.0, 0, 0]]), RIGHT, "x [m]", "from above"),
 )
 REACH = 0.35  # [m] of the largest effective mass in the picture
-MOST = 4.0  # times the mass along the blow that is drawn; beyond it the curve is open
+MAX_RATIO = 4.0  # of the drawn masses to that along the normal; beyond, the curve is open
 ANGLES = 181
 GREY = "#bbbbbb"
 
 
 @styled
 def ellipsoid(record: Record) -> Picture:
-    """The robot at contact with its fist's effective mass, from two sides, and in numbers over the direction.
+    """Robot at contact with its fist's effective mass, from two sides, and as a plot over the direction.
 
-    The curve's distance from the fist is the effective mass along that direction, 1 / (n' J P J' n): soles
-    held, joints free. (An ellipsoid proper has its square root for a radius; a mass is easier to read.) It is
-    open where the mass is beyond what the scale holds, as across an arm that moves in a plane.
+    The curve's distance from the fist is the effective mass along that direction, 1 / (n' J P J' n), with
+    soles fixed and joints free. (An ellipsoid proper has its square root for a radius; a mass is easier to
+    read.) The curve is open where the mass exceeds the scale, as across an arm that moves in a plane.
     """
     figure = Picture(PAGE, 2.8)
     draw_ellipsoid(figure, record)
@@ -47,11 +47,13 @@ def ellipsoid(record: Record) -> Picture:
 
 
 def draw_ellipsoid(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+    """Draws the picture into a figure, or a part of one."""
     a = record.arrays
     inverse, normal = a["pose_inverse_mass"], a["pose_normal"]
     mass = float(effective_masses(inverse, normal[None])[0])
-    largest = min(float(np.concatenate([_curve(inverse, view) for view, *_ in VIEWS]).max()), MOST * mass)
+    largest = min(
+        float(np.concatenate([_curve(inverse, view) for view, *_ in VIEWS]).max()), MAX_RATIO * mass
+    )
     views = [v for v in VIEWS if np.isfinite(_within(_curve(inverse, v[0]), largest)).any()]
     panels: Any = figure.subplots(1, len(views) + 1, width_ratios=[1.0] * len(views) + [1.2])
     for axes, (view, across, up, place) in zip(panels, views, strict=False):
@@ -64,7 +66,7 @@ def draw_ellipsoid(figure: FigureBase, record: Record) -> None:
 
 
 def _over_angle(axes: Any, inverse: Array, normal: Array, largest: float) -> None:
-    """Effective mass where the blow's direction is turned up and down, and from side to side."""
+    """Effective mass over the direction, turned up and down, and from side to side."""
     side = np.cross([0.0, 0.0, 1.0], normal)
     side = side / np.linalg.norm(side) if np.linalg.norm(side) > 1e-3 else np.array([0.0, 1.0, 0.0])
     up = np.cross(normal, side)
@@ -89,7 +91,7 @@ def _curve(inverse: Array, view: Array) -> Array:
 
 
 def _within(masses: Array, largest: float) -> Array:
-    """nan, a gap, where they are beyond the scale."""
+    """Masses, with nan (a gap) beyond the scale."""
     return np.where(masses <= 1.001 * largest, masses, np.nan)
 
 
@@ -100,7 +102,7 @@ def _circle(view: Array) -> Array:
 
 
 def _robot(axes: Any, record: Record, view: Array, largest: float) -> None:
-    """Sticks at contact, the curve about the fist, and the blow as an arrow of its mass."""
+    """Draws the robot at contact, the curve about the fist, and an arrow along the normal of its mass."""
     a = record.arrays
     inverse, normal = a["pose_inverse_mass"], a["pose_normal"]
     links = a["pose_links"][int(a["pose_contact"])] @ view.T
@@ -120,7 +122,7 @@ def _robot(axes: Any, record: Record, view: Array, largest: float) -> None:
         axes.annotate("", tip, fist, arrowprops=arrow, zorder=4)
     axes.margins(0.08)
     axes.set_aspect("equal")
-    # one length between ticks on both axes: those of a narrow view alone would run into each other
+    # the same spacing on both axes: in a narrow view, ticks with a spacing of its own would overlap
     largest_span = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
     spacing = np.diff(MaxNLocator(4).tick_values(0.0, largest_span))[0]
     for axis in (axes.xaxis, axes.yaxis):

@@ -23,14 +23,14 @@ def force(record: Record) -> Picture:
 
 
 def draw_force(place: FigureBase | Axes, record: Record) -> None:
-    """The same into a figure, a part of one, or axes."""
+    """Draws the picture into a figure, a part of one, or axes."""
     a, summary = record.arrays, record.summary
     axes: Any = place if isinstance(place, Axes) else place.subplots()
     label = f"planned: {_impulse(summary)}"
     style: Any = {"color": PLANNED, "markersize": 4, "label": label, "zorder": 3}
     axes.plot(1e3 * a["collision_time"], a["collision_force"], "o", **style)
     end = 1e3 * float(a["collision_time"][-1])
-    if not end:  # an impact without duration: the simulation's contact is all there is to see
+    if not end:  # an impact without duration: take the simulated contact
         end = 1e3 * float(a.get("simulated_contact_end", 0.0) - a.get("simulated_contact_start", 0.0))
         end = end if np.isfinite(end) else 0.0
     if record.simulated and np.isfinite(a["simulated_contact_start"]):
@@ -46,7 +46,7 @@ def draw_force(place: FigureBase | Axes, record: Record) -> None:
     if isinstance(place, Axes):
         place.legend(title="impulse")
         return
-    # below, as no corner of the axes is free of force for every contact
+    # below the axes: no corner is free of curves for every contact
     place.legend(title="impulse", loc="outside lower center", ncols=2)
 
 

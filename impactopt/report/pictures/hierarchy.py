@@ -1,4 +1,4 @@
-"""The contact force as every model of the hierarchy has it (the paper's Fig. 7)."""
+"""Contact force by every model of the hierarchy (the paper's Fig. 7)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from impactopt.collision import Collision
 from impactopt.errors import InputError
 from impactopt.report.pictures.style import MODELS, PAGE, Array, Picture, styled
 
-# in turn, from the coarsest model to the finest: a virtual mass, the paper's SDC, ours, and ours frozen again
-# in shades of one colour; what is beside the reference is drawn thin
+# from the coarsest model to the finest: virtual mass, the paper's SDC, ours, and ours frozen again in shades
+# of one colour
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": MODELS["virtual-mass"], "linestyle": ":", "linewidth": 1.8},
     {"color": MODELS["sdc-paper"], "linestyle": "--"},
@@ -23,27 +23,27 @@ STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#4DA3D4", "linestyle": (0, (4, 1)), "linewidth": 1.2},
     {"color": "#8CC4E6", "linestyle": (0, (1, 1)), "linewidth": 1.4},
 )
-LEAST = 1e-4  # of the impulse; what is off by less is off the picture
+MIN_ERROR = 1e-4  # of the impulse: lower end of the scale
 REFERENCE: dict[str, Any] = {"color": MODELS["full"], "linewidth": 3.2, "alpha": 0.35}
 
 
 @styled
 def hierarchy(blows: Mapping[str, Mapping[str, Collision]], *, reference: str = "full dynamics") -> Picture:
-    """Force histories on the left, how far the impulse so far is off on the right; a row a blow.
+    """Force histories on the left, and errors of the impulse so far on the right; one row for each impact.
 
-    blows : of each blow, by title, the :class:`impactopt.collision.Collision` of each model, by name, the
-        coarsest first. Their impulses are off by what the legends say.
-    reference : name of the model that the others are held against.
+    blows : of each impact, by title, the :class:`impactopt.collision.Collision` of each model, by name, the
+        coarsest first. The legends show the errors of their impulses.
+    reference : name of the model with which the others are compared.
 
     Raises
     ------
-    InputError : no blow; a blow without the reference; more models than can be told apart.
+    InputError : no impact; an impact without the reference; more models than styles.
     """
     names = list(dict.fromkeys(name for models in blows.values() for name in models if name != reference))
     if not blows or any(reference not in models for models in blows.values()):
-        raise InputError(f"every blow needs the model {reference!r}, which the others are held against")
+        raise InputError(f"every impact needs the model {reference!r}, with which the others are compared")
     if len(names) > len(STYLES):
-        raise InputError(f"at most {len(STYLES)} models beside the reference can be told apart: {names}")
+        raise InputError(f"at most {len(STYLES)} models besides the reference can be distinguished: {names}")
     styles = dict(zip(names, STYLES, strict=False))
     figure = Picture(PAGE, 2.0 * len(blows) + 0.9)
     grid = figure.subplots(len(blows), 2, sharex=True, squeeze=False, width_ratios=[1.15, 1.0])
@@ -59,7 +59,7 @@ def hierarchy(blows: Mapping[str, Mapping[str, Collision]], *, reference: str = 
         left.set_title(f"{heading}: {true.impulse:.2f} N s", loc="left")
         left.set(ylabel="force [N]", xlim=(-30 * last, 1060 * last))
         left.set_ylim(bottom=0.0)
-        right.set(yscale="log", ylabel="impulse off by [N s]", ylim=(LEAST * true.impulse, true.impulse))
+        right.set(yscale="log", ylabel="impulse off by [N s]", ylim=(MIN_ERROR * true.impulse, true.impulse))
         right.legend(title="in the end", loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.6)
     for axes in grid[-1]:
         axes.set_xlabel("time since contact [ms]")
@@ -70,20 +70,20 @@ def hierarchy(blows: Mapping[str, Mapping[str, Collision]], *, reference: str = 
 
 
 def _history(hit: Collision, last: float) -> tuple[Array, Array]:
-    """Time [ms] and force [N]: it begins with a jump, by the damper, and ends at separation."""
+    """Time [ms] and force [N], zero before and after contact."""
     time = 1e3 * np.concatenate([[-0.03 * last, 0.0], hit.time, [1.06 * last]])
     return time, np.concatenate([[0.0, 0.0], hit.force, [0.0]])
 
 
 def _difference(hit: Collision, true: Collision) -> tuple[Array, Array]:
-    """Time [ms] and how far the impulse delivered until then is from the true one's [N s]."""
+    """Time [ms], and error [N s] of the impulse until then."""
     time = np.union1d(hit.time, true.time)
     ours, theirs = (_delivered(one, time) for one in (hit, true))
     return 1e3 * time, np.abs(ours - theirs)
 
 
 def _delivered(hit: Collision, time: Array) -> Array:
-    """Impulse [N s] until each time, of which those of the force are a part: straight lines between those."""
+    """Impulse [N s] until each time, for a piecewise linear force."""
     force = np.interp(time, hit.time, hit.force, right=0.0)
     steps = np.diff(time) * (force[1:] + force[:-1]) / 2
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -8,12 +8,12 @@ from matplotlib.figure import FigureBase
 from impactopt.files.output import Record
 from impactopt.report.pictures.style import BLUE, COLUMN, GREEN, VERMILION, Array, Picture, styled, title
 
-LEAST = 1e-12  # drawn for what is smaller
+MIN_VALUE = 1e-12  # smaller values are drawn there
 
 
 @styled
 def iterations(record: Record) -> Picture | None:
-    """Objective (the impulse, less small prices) above; violation and stationarity below.
+    """Objective (the impulse, minus small penalties) above, violation and stationarity below.
 
     None without a history.
     """
@@ -26,23 +26,22 @@ def iterations(record: Record) -> Picture | None:
 
 
 def draw_iterations(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+    """Draws the picture into a figure, or a part of one."""
     a = record.arrays
     count = a["history_iteration"]
     top, bottom = figure.subplots(2, 1, sharex=True)
     gain = -a["history_objective"]
     top.plot(count, gain, color=BLUE)
-    # first iterates are far off: what they violate lets them promise anything
+    # the objective of the first, very infeasible iterates is meaningless
     top.set_ylim(*_middle_of(gain))
-    several = "objectives" in record.summary.get(
-        "problem", {}
-    )  # other than the impulse, in units of their own
+    # objectives other than the impulse have units of their own
+    several = "objectives" in record.summary.get("problem", {})
     top.set(ylabel="maximized [-]" if several else "maximized [N s]")
     for key, label, style, colour in (
         ("max_violation", "largest violation", "-", VERMILION),
         ("kkt", "stationarity", "--", GREEN),
     ):
-        values = np.maximum(a[f"history_{key}"], LEAST)
+        values = np.maximum(a[f"history_{key}"], MIN_VALUE)
         bottom.semilogy(count, values, style, color=colour, label=label)
     seconds = float(a["history_seconds"][-1])
     bottom.set(xlabel=f"iterations [-], {count[-1]} in {seconds:.1f} s", ylabel="violated, not optimal [-]")
@@ -50,7 +49,7 @@ def draw_iterations(figure: FigureBase, record: Record) -> None:
 
 
 def _middle_of(values: Array) -> tuple[float, float]:
-    """Limits that show the last half whole, and of the first what is within ten times its span."""
+    """Limits of an axis that contain the last half of the values, and ten times their span."""
     last = values[len(values) // 2 :]
     low, high = float(last.min()), float(last.max())
     pad = max(5 * (high - low), 0.05 * abs(values[-1]), 1e-9)

@@ -34,7 +34,7 @@ def motion(record: Record) -> Picture:
 
 
 def draw_motion(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+    """Draws the picture into a figure, or a part of one."""
     a = record.arrays
     names, time, angle = a["joints"], a["reference_time"], a["reference_angle"]
     until = float(a["reference_end"])

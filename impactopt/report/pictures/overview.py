@@ -1,4 +1,4 @@
-"""The four pictures that matter in one: poses, force, ZMP while in contact, torque."""
+"""Overview of a plan: poses, force, ZMP in contact, torque."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _heights(record: Record) -> list[float]:
 
 
 def draw_overview(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+    """Draws the picture into a figure, or a part of one."""
     parts: Any = figure.subfigures(3, 1, height_ratios=_heights(record))
     above, middle, below = parts
     draw_strobe(above, record)

@@ -1,4 +1,4 @@
-"""Contact of the soles in a replay: centre and size of the pressure, slip and lift."""
+"""Contact of the soles in a replay: centre of pressure, normal force, slip and lift."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def replay(record: Record) -> Picture | None:
 
 
 def draw_replay(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+    """Draws the picture into a figure, or a part of one."""
     a = record.arrays
     places: Any = figure.subplot_mosaic([["cop", "force"], ["cop", "move"]], width_ratios=[2, 3])
     _centres(figure, places["cop"], record)
@@ -65,17 +65,18 @@ def draw_replay(figure: FigureBase, record: Record) -> None:
     places["force"].tick_params(labelbottom=False)
     places["force"].set(ylabel="normal force [N]", title="force on each sole; grey: contact")
     places["move"].set(xlabel="time [s]", ylabel="slip, lift [mm]", title="the corner that moved most")
-    figure.suptitle(title(record, f"soles in the replay ({_verdict(record)})"))
+    figure.suptitle(title(record, f"soles in the replay ({_stands(record)})"))
 
 
-def _verdict(record: Record) -> str:
+def _stands(record: Record) -> str:
+    """Text about the robot at the end."""
     report = record.summary.get("replayed", {})
     stands, reason = report.get("standing"), report.get("reason", "")
     return "stands at the end" if stands else str(reason).split(":")[0] if stands is None else str(reason)
 
 
 def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
-    """Paths of the centres of pressure by phase, from above: forward is up, left is left."""
+    """Draws the paths of the centres of pressure by phase, from above; forward is up."""
     a = record.arrays
     time, start, end = a["replayed_time"], a["replayed_contact_start"], a["replayed_contact_end"]
     phase = (time >= start).astype(int) + (time >= end).astype(int)  # nan compares false
@@ -92,7 +93,8 @@ def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
         )
     normal = a["replayed_sole_ground"][:, :, 2]
     for k in range(normal.shape[1]):
-        loaded = normal[:, k] >= BEARS * np.median(normal.sum(axis=1))  # for most of it at rest
+        # the median is the weight, because most of the motion is slow
+        loaded = normal[:, k] >= BEARS * np.median(normal.sum(axis=1))
         for which, colour in enumerate(PHASE_COLOURS):
             keep = loaded & (phase == which)
             points: Array = zmp(a["replayed_sole_ground"][keep, k])

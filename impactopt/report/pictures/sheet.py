@@ -1,4 +1,4 @@
-"""Contact sheet of a motion: the robot's meshes from three sides at seven instants."""
+"""Contact sheet of a motion: the robot's meshes from three sides, at seven instants."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from impactopt.report.tracks import Track, tracks_of
 
 __all__ = ["sheet"]
 
-CELL = 0.015  # [m] that meshes are simplified to: a limb is 40 pixels wide
+CELL = 0.015  # [m] of the simplified meshes: a limb is 40 pixels wide
 WIDTH = 11.0  # [in]
-GONE = 0.6  # [m] farther off a target is not shown
+MAX_TRAVEL = 0.6  # [m] beyond which a target is not shown
 LIGHT = np.array([0.45, -0.35, 0.82])
-# name of each view, the world's directions to its right and up, and the direction to the viewer
+# of each view: name, and directions (3, 3) to the right, up, and to the viewer
 VIEWS = (
     ("front", np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])),
     ("right side", np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])),
@@ -36,7 +36,7 @@ Drawn = tuple[int, Array, Array, Array]  # joint, triangles (k, 3, 3) [m] in its
 def sheet(record: Record, problem: ImpactProblem) -> Picture:
     """The planned motion from the front, the right side and the top, at seven instants.
 
-    The limb that strikes is blue. The target, what holds it and obstacles are as large as they are.
+    The striking limb is blue. The target, its support and obstacles are drawn to scale.
     """
     track = tracks_of(record, problem)[0]
     chosen = _chosen(track)
@@ -82,7 +82,7 @@ def _around(track: Track, k: int, world: list[Part], normal: Array) -> list[Show
     shown = []
     for part in world:
         corners = part.placed(float(track.travel[k]), normal)[part.solid.triangles]
-        if abs(track.travel[k]) < GONE or not part.moves:
+        if abs(track.travel[k]) < MAX_TRAVEL or not part.moves:
             shown.append((corners, _normals(corners), np.tile(_rgb(PARTS[part.kind]), (len(corners), 1))))
     return shown
 

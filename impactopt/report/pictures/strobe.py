@@ -1,4 +1,4 @@
-"""The motion in a few poses, one beside the other, as under a strobe light."""
+"""Motion in a few poses side by side, as under a strobe light."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORLD = {"target": ("#dddddd", "target when contact begins"), "obstacles": ("#f2
 
 @styled
 def strobe(record: Record) -> Picture:
-    """The robot as sticks at a few instants, and the path of its striking point."""
+    """Robot as sticks at a few instants, and path of its striking point."""
     figure = Picture(PAGE, strobe_height(record) + 0.2)
     draw_strobe(figure, record)
     figure.suptitle(title(record, f"seen from {_view(record)[1]}"))
@@ -35,7 +35,7 @@ def strobe_height(record: Record) -> float:
 
 
 def draw_strobe(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+    """Draws the picture into a figure, or a part of one."""
     a = record.arrays
     view, _ = _view(record)
     low, high, width = _extent(record)
@@ -88,8 +88,9 @@ def _key(record: Record) -> list[Line2D | Patch]:
 
 
 def _view(record: Record) -> tuple[Array, str]:
-    """Projection of the world onto the picture (2, 3), and the side it is seen from: no blow goes to the
-    left.
+    """Projection (2, 3) of the world onto the picture, and the side from which it is seen.
+
+    The side is chosen so that no strike goes to the left.
     """
     n = record.arrays["pose_normal"]
     if abs(n[1]) > abs(n[0]):
@@ -100,25 +101,25 @@ def _view(record: Record) -> tuple[Array, str]:
 
 
 def _middle(record: Record) -> float:
-    """Across, between what is drawn of a pose [m]."""
+    """Centre [m] of a pose's drawing across the picture."""
     points = _drawn(record)[:, 0]
     return float(points.max() + points.min()) / 2
 
 
 def _extent(record: Record) -> tuple[float, float, float]:
-    """Lowest and highest point, and width, of all that is drawn of a pose [m]."""
+    """Lowest and highest point, and width, of a pose's drawing [m]."""
     points = _drawn(record)
     (low, high), width = (points[:, 1].min(), points[:, 1].max()), np.ptp(points[:, 0])
     return min([float(low), *_ground(record)]) - 0.05, float(high) + 0.05, float(width)
 
 
 def _ground(record: Record) -> Array:
-    """Height (1,) [m] of the ground, (0,) without one; results of old have it at 0."""
+    """Height (1,) [m] of the ground, (0,) without one; old results have none, and take 0."""
     return record.arrays.get("pose_ground", np.zeros(1))
 
 
 def _drawn(record: Record) -> Array:
-    """Points (k, 2) [m] of the picture: links, the striking point's way, the world's corners."""
+    """Points (k, 2) [m] of a drawing: links, path of the striking point, corners of the world's bodies."""
     a = record.arrays
     view, _ = _view(record)
     parts = [a["pose_links"].reshape(-1, 3), a["pose_path"]]
@@ -127,7 +128,7 @@ def _drawn(record: Record) -> Array:
 
 
 def _outlines(record: Record, kind: str) -> list[Array]:
-    """Corners (k, 2) [m] of each body of a kind, one after the other about it; none in results of old."""
+    """Outline (k, 2) [m] of each body of a kind; none in old results."""
     view, _ = _view(record)
     flat = [corners @ view.T for corners in record.arrays.get(f"pose_{kind}", ())]
     return [corners[ConvexHull(corners).vertices] for corners in flat]

@@ -1,7 +1,4 @@
-"""One style for all pictures.
-
-Okabe and Ito's colours, and cividis for scales: any kind of colour vision tells them apart.
-"""
+"""Style of all pictures: Okabe and Ito's colours, and cividis for scales, which suit any colour vision."""
 
 from __future__ import annotations
 
@@ -33,7 +30,7 @@ BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK = (
     "#000000",
 )
 
-# collision models, in all pictures: the SDC's equations are green whatever integrates them, frozen again blue
+# of collision models, in all pictures
 MODELS = {
     "virtual-mass": ORANGE,
     "sdc-paper": VERMILION,
@@ -44,15 +41,15 @@ MODELS = {
     "auto": PURPLE,
 }
 PLANNED, SIMULATED, OVER = BLUE, VERMILION, VERMILION
-RIGHT = "-y, to the right [m]"  # an axis of what is seen from above or from behind: y is to the left
+RIGHT = "-y, to the right [m]"  # axis label of views from above and behind, where y points left
 PHASES = ("swing", "collision", "follow-through")
 
-# [in] what a paper's column and its page are wide; a picture of that width needs no scaling in print
+# [in] widths of a paper's column and page; pictures of these widths are printed unscaled
 COLUMN, PAGE = 3.5, 7.2
 DPI = 200
 
 STYLE: Any = {
-    "text.usetex": False,  # a matplotlibrc in the working directory would have LaTeX run what it says
+    "text.usetex": False,  # safety: a matplotlibrc in the working directory could have LaTeX run commands
     "figure.dpi": DPI,
     "savefig.dpi": DPI,
     "figure.constrained_layout.use": True,
@@ -73,10 +70,7 @@ STYLE: Any = {
 
 
 class Picture(Figure):
-    """A figure in our style, however and wherever it is drawn; notebooks show it as it is.
-
-    No display is needed, and no global state is touched.
-    """
+    """Figure in our style, which notebooks show; needs no display and changes no global state."""
 
     def __init__(self, width: float, height: float) -> None:
         with matplotlib.rc_context(STYLE):
@@ -96,7 +90,7 @@ class Picture(Figure):
             super().draw(renderer)
 
     def write(self, file: IO[bytes]) -> None:
-        """Write the picture as PNG."""
+        """Writes the picture as PNG."""
         with matplotlib.rc_context(STYLE):
             self.savefig(file, format="png")
 
@@ -109,7 +103,7 @@ class Picture(Figure):
 
 
 def styled(draw: Callable[Given, Drawn]) -> Callable[Given, Drawn]:
-    """The function, in our style."""
+    """Function that draws in our style."""
 
     @wraps(draw)
     def in_style(*args: Given.args, **options: Given.kwargs) -> Drawn:
@@ -120,7 +114,7 @@ def styled(draw: Callable[Given, Drawn]) -> Callable[Given, Drawn]:
 
 
 def title(record: Record, what: str) -> str:
-    """The problem's name, and what is drawn."""
+    """Title with the problem's name."""
     name = record.summary.get("problem", {}).get("name", "")
     return f"{name}: {what}" if name else what
 
@@ -131,13 +125,14 @@ def model_colour(model: str, freezes: float = 0) -> str:
 
 
 def joint_label(name: object) -> str:
-    """A joint's name as a reader wants it."""
+    """Joint's name without "_joint" and underscores."""
     return str(name).removesuffix("_joint").replace("_", " ")
 
 
 def simulated_phases(record: Record) -> NDArray[np.intp]:
-    """Phase of the simulated instants (k,): 0 before, 1 in, 2 after contact; the planned one if there was
-    none.
+    """Phase of the simulated instants (k,): 0 before, 1 in, 2 after contact.
+
+    Without a simulated contact, the phases are those of the plan.
     """
     a = record.arrays
     kind = "simulated" if np.isfinite(a["simulated_contact_start"]) else "reference"

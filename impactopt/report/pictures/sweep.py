@@ -1,4 +1,4 @@
-"""The picture of a sweep, as its file's [figure] says: a heatmap, lines or a scatter of its table."""
+"""Picture of a sweep's table, by the [figure] of its file: a heatmap, lines or a scatter plot."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ Array = NDArray[np.float64]
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
-NOWHERE = "#d9d9d9"  # rows that are impossible
-FEW = 25  # points of a line, with marks
-MOST = 20_000  # points of a scatter: more are no clearer
+NO_RESULT = "#d9d9d9"  # colour of cases without a result
+MAX_MARKED = 25  # points of a line that are marked; longer lines have no marks
+MAX_POINTS = 20_000  # of a scatter plot: more are no clearer
 SCALE = "cividis"
 MODEL, FREEZES = "at_contact.model", "at_contact.freezes"
 DASHES: Any = ("-", "--", ":")  # of contours
@@ -56,11 +56,11 @@ _PLAIN = FuncFormatter(lambda x, _: _number(x))
 
 
 def save_sweep_picture(sweep: Sweep, table: Path) -> Path | None:
-    """Draw a sweep's table as its [figure] says, into ``figure.png`` beside it; None without [figure].
+    """Draws a sweep's table into ``figure.png`` beside it; None if the sweep has no [figure].
 
     Raises
     ------
-    InputError : as of `sweep_picture`; a column that there is not; a file that cannot be read or written.
+    InputError : as in `sweep_picture`; a missing column; a file that cannot be read or written.
     """
     if sweep.figure is None:
         return None
@@ -70,20 +70,20 @@ def save_sweep_picture(sweep: Sweep, table: Path) -> Path | None:
 
 
 def drawn_table(section: Section, table: Path) -> Picture:
-    """`sweep_picture` of a table's file."""
+    """Picture of a table's file, as `sweep_picture`."""
     return sweep_picture(section, read_columns(table, (*section.columns, "reason")))
 
 
 @styled
 def sweep_picture(section: Section, columns: Columns) -> Picture:
-    """The picture of a sweep's table.
+    """Picture of a sweep's table.
 
-    columns : of the table by name; with those that `section` names, and `reason`.
+    columns : of the table by name: those that `section` names, and `reason`.
 
     Raises
     ------
-    InputError : a heatmap of rows that are no grid; columns that are no numbers where they have to be; no
-        rows to hold others against.
+    InputError : a heatmap of cases that form no grid; columns that must be numbers and are not; no reference
+        cases for errors.
     """
     data = SweepColumns(section, columns)
     if section.drawn_as == "heatmap":
@@ -114,7 +114,7 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
         table = np.full((len(up), len(across)), np.nan)
         table[j, i] = data.results(name)
         table[~np.isfinite(table)] = np.nan
-        axes.set_facecolor(NOWHERE)
+        axes.set_facecolor(NO_RESULT)
         logarithmic = "colour" in section.log
         mesh = axes.pcolormesh(
             across, up, np.ma.masked_invalid(table), shading="nearest", cmap=SCALE, rasterized=True,
@@ -131,7 +131,7 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
     panels[0].set_ylabel(data.label(section.y[0]))
     handles: list[Any] = []
     if data.reasons:
-        handles.append(Patch(facecolor=NOWHERE, label=f"no collision: {data.note()}"))
+        handles.append(Patch(facecolor=NO_RESULT, label=f"no collision: {data.note()}"))
     for dashes, (column, level) in zip(DASHES, section.contour.items(), strict=False):
         what, _, unit = data.label(column).partition(" [")
         label = f"{what} {level:g} {unit.rstrip(']')}".rstrip()
@@ -162,7 +162,7 @@ def _lines(section: Section, data: SweepColumns) -> Picture:
     figure = Picture(PAGE, 0.7 + (1.6 if len(section.y) > 1 else 2.2) * len(section.y))
     grid = figure.subplots(len(section.y), len(titles), sharex=True, sharey="row", squeeze=False)
     scale = _shades(section, data, groups, names)
-    there: dict[str, Any] = {}  # lines by what they are called
+    legend: dict[str, Any] = {}  # lines by their labels
     for name, row in zip(section.y, grid, strict=True):
         values, label = data.results(name), data.label(name)
         if section.against:
@@ -173,19 +173,19 @@ def _lines(section: Section, data: SweepColumns) -> Picture:
                 order = chosen[np.argsort(x[chosen], kind="stable")]
                 if not np.isfinite(values[order]).any():
                     continue
-                mark = MARKS[g % len(MARKS)] if len(order) <= FEW else None
+                mark = MARKS[g % len(MARKS)] if len(order) <= MAX_MARKED else None
                 (line,) = axes.plot(x[order], values[order], color=scale[g], marker=mark, markersize=4)
-                there[section.labels.get(series, series)] = line
+                legend[section.labels.get(series, series)] = line
             _scales(axes, section)
         row[0].set_ylabel(label)
     for k, title in enumerate(titles):
         grid[0, k].set_title(title, loc="left")
         grid[-1, k].set_xlabel(data.label(section.x))
-    if len(there) > 1:
+    if len(legend) > 1:
         above = data.label(section.colour[0]) if len(section.colour) == 1 else None
-        handles = list(there.values())
+        handles = list(legend.values())
         figure.legend(
-            handles, list(there), loc="outside lower left", title=above, alignment="left", ncols=len(there)
+            handles, list(legend), loc="outside lower left", title=above, alignment="left", ncols=len(legend)
         )
     return figure
 
@@ -193,7 +193,7 @@ def _lines(section: Section, data: SweepColumns) -> Picture:
 def _shades(
     section: Section, data: SweepColumns, groups: NDArray[np.intp], names: Sequence[str]
 ) -> list[Any]:
-    """Numbers are shades of one scale, kinds are colours of their own; models have theirs in all pictures."""
+    """Colours of the groups: shades of one scale for numbers, else distinct ones; models have their own."""
     if MODEL in section.colour:
         again = data.numbers(FREEZES) if FREEZES in section.colour else np.zeros(len(groups))
         first = [int(np.argmax(groups == g)) for g in range(len(names))]
@@ -212,8 +212,8 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
     grid = figure.subplots(1, len(titles), sharex=True, sharey=True, squeeze=False)[0]
     shown = np.isfinite(x) & np.isfinite(y)
     drawn = np.flatnonzero(shown)
-    if len(drawn) > MOST:
-        drawn = np.random.default_rng(0).permutation(drawn)[:MOST]
+    if len(drawn) > MAX_POINTS:
+        drawn = np.random.default_rng(0).permutation(drawn)[:MAX_POINTS]
     size = 22.0 if len(drawn) < 500 else 9.0 if len(drawn) < 5000 else 3.0
     colour = section.colour[0] if section.colour else None
     numeric = colour is not None and data.values(colour).dtype != object
@@ -257,7 +257,7 @@ def _scales(axes: Any, section: Section) -> None:
 
 
 def _number(x: float) -> str:
-    """Number as it is written by hand; large and small powers of ten as such."""
+    """Number as text; large and small powers of ten as such."""
     power = round(np.log10(abs(x))) if x else 0
     if abs(power) >= 4 and np.isclose(abs(x), 10.0**power, rtol=1e-9):
         return f"${'-' if x < 0 else ''}10^{{{power}}}$"

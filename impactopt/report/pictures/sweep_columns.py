@@ -1,4 +1,4 @@
-"""A sweep's table as its picture takes it: numbers and texts by name, groups of rows, errors."""
+"""Columns of a sweep's table for its picture: numbers and texts by name, groups of cases, errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ Columns = Mapping[str, Sequence[Any] | NDArray[Any]]
 
 
 class SweepColumns:
-    """Columns as numbers, or as text."""
+    """Columns of a sweep's table, as numbers or as text.
+
+    good : mask of the cases with a result.  reasons : counts of the reasons why others have none.
+    """
 
     def __init__(self, section: Section, columns: Columns) -> None:
         self.section, self._columns = section, columns
@@ -30,36 +33,42 @@ class SweepColumns:
         self.good = np.array([not r for r in reasons], dtype=bool) if len(reasons) else None
 
     def values(self, name: str) -> NDArray[Any]:
-        """Numbers, nan in rows without any, or objects."""
+        """Numbers, nan without a value; or texts, of dtype object."""
         raw = self._columns[name]
         if not isinstance(raw, np.ndarray) or raw.dtype == object:
-            there = [x for x in raw if x is not None]
-            if any(not isinstance(x, (int, float, bool)) for x in there):
+            given = [x for x in raw if x is not None]
+            if any(not isinstance(x, (int, float, bool)) for x in given):
                 return np.array(["" if x is None else str(x) for x in raw], dtype=object)
-        array = np.array(raw, dtype=np.float64)
-        return array
+        return np.array(raw, dtype=np.float64)
 
     def numbers(self, name: str) -> Array:
+        """Numbers of a column.
+
+        Raises
+        ------
+        InputError : it is a column of texts.
+        """
         array = self.values(name)
         if array.dtype == object:
             raise InputError(f"[figure]: {name} is no column of numbers; take another one")
         return array
 
     def results(self, name: str) -> Array:
-        """Numbers, nan in rows that are impossible."""
+        """Numbers of a column, nan in cases without a result."""
         array = self.numbers(name)
         return array if self.good is None else np.where(self.good, array, np.nan)
 
     def label(self, name: str) -> str:
+        """Label of a column, with its unit."""
         return self.section.labels.get(name, _label(name))
 
     def note(self) -> str:
-        """Reasons why rows are impossible, most frequent first."""
+        """The two most frequent reasons why cases have no result."""
         return "; ".join(reason.partition(";")[0] for reason, _ in self.reasons.most_common(2))
 
 
 def _label(name: str) -> str:
-    """`target.mass_kg` as "target mass [kg]"."""
+    """Label of a column, such as "target mass [kg]" of `target.mass_kg`."""
     unit, parts = unit_of(name), without_unit(name).split(".")
     if parts[0] == "at_contact":
         parts = parts[1:]
@@ -73,45 +82,50 @@ def _label(name: str) -> str:
 
 
 def name_of_error(section: Section, data: SweepColumns, name: str) -> str:
+    """Label of the error of a column."""
     what = data.label(name).partition(" [")[0]
     given = section.labels.get(name)
     return given or f"{what}: {'size of the ' if 'y' in section.log else ''}error [%]"
 
 
 def errors_against(section: Section, data: SweepColumns, values: Array) -> Array:
-    """Deviations [%] from the rows with the same x, panel and all other keys but these."""
+    """Errors [%] against the reference cases, given by `section.against`, with the same x and panel."""
     keys = {name: data.values(name) for name in section.against}
     base = np.ones(len(values), dtype=bool)
     for name, wanted in section.against.items():
         base &= keys[name] == (str(wanted) if keys[name].dtype == object else wanted)
     if not base.any():
         raise InputError(f"[figure] against: no row has {section.against}")
-    rest = [section.x, *([section.panel] if section.panel else [])]
-    place = list(zip(*[data.values(name).tolist() for name in rest], strict=True))
-    true = {place[i]: values[i] for i in np.flatnonzero(base)}
-    of = np.array([true.get(p, np.nan) for p in place])
-    off = np.where(base, np.nan, 100 * (values / of - 1))
-    return np.abs(off) if "y" in section.log else off
+    shared = [section.x, *([section.panel] if section.panel else [])]
+    points = list(zip(*[data.values(name).tolist() for name in shared], strict=True))
+    reference = {points[i]: values[i] for i in np.flatnonzero(base)}
+    true = np.array([reference.get(point, np.nan) for point in points])
+    error = np.where(base, np.nan, 100 * (values / true - 1))
+    return np.abs(error) if "y" in section.log else error
 
 
 def combined(names: Sequence[str], data: SweepColumns) -> tuple[NDArray[np.intp], list[str]]:
-    """Combination of the columns' values in each row, by number, and the combinations' names."""
+    """Number of each case's combination of the columns' values, and names of the combinations."""
     if not names:
         return np.zeros(len(data.values(data.section.x)), dtype=np.intp), [""]
     columns = [data.values(name) for name in names]
-    rows = list(zip(*[column.tolist() for column in columns], strict=True))
-    found = list(dict.fromkeys(rows))
-    if all(isinstance(v, float) for row in found for v in row):
-        found.sort()
-    index = {row: k for k, row in enumerate(found)}
-    called = [", ".join(_shown(v, name, data) for v, name in zip(row, names, strict=True)) for row in found]
-    return np.array([index[row] for row in rows], dtype=np.intp), called
+    of_cases = list(zip(*[column.tolist() for column in columns], strict=True))
+    different = list(dict.fromkeys(of_cases))
+    if all(isinstance(v, float) for values in different for v in values):
+        different.sort()
+    number = {values: k for k, values in enumerate(different)}
+    labels = [
+        ", ".join(_shown(v, name, data) for v, name in zip(values, names, strict=True))
+        for values in different
+    ]
+    return np.array([number[values] for values in of_cases], dtype=np.intp), labels
 
 
 def _shown(value: Any, name: str, data: SweepColumns) -> str:
+    """Value as text, with the name of its column unless the legend's title has it."""
     if not isinstance(value, float):
         return str(value)
-    if data.section.colour == [name]:  # whose name stands above
+    if data.section.colour == [name]:  # the legend's title names it
         return f"{value:g}"
     label = data.label(name)
     what, _, unit = label.partition(" [")

@@ -1,4 +1,4 @@
-"""Torque demand over limit, joints by time; and torque through the gears in the blow."""
+"""Torque demand over limit, joints by time; and torque through the gears in contact."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from impactopt.report.pictures.style import (
     title,
 )
 
-ROW = 0.13  # [in] of a joint
-GEARS = 2.0  # [in] of the panel of gears
+JOINT_HEIGHT = 0.13  # [in]
+GEARS_HEIGHT = 2.0  # [in] of the panel of gears
 
 
 @styled
 def torque(record: Record) -> Picture:
     """Torque demand over limit, joints by time; contact has a panel of its own, at a larger scale."""
-    figure = Picture(PAGE, torque_height(record) + 0.2 + (GEARS if _gears(record) else 0.0))
+    figure = Picture(PAGE, torque_height(record) + 0.2 + (GEARS_HEIGHT if _gears(record) else 0.0))
     kind = "simulated, before saturation" if record.simulated else "planned"
     figure.suptitle(title(record, f"torque over limit ({kind})"))
     draw_torque_and_gears(figure, record)
@@ -39,12 +39,12 @@ def torque(record: Record) -> Picture:
 
 
 def draw_torque_and_gears(figure: FigureBase, record: Record) -> None:
-    """The same into a figure, or a part of one."""
+    """Draws the picture into a figure, or a part of one."""
     gears = _gears(record)
     if not gears:
         draw_torque(figure, record)
         return
-    parts: Any = figure.subfigures(2, 1, height_ratios=[torque_height(record) + 0.2, GEARS])
+    parts: Any = figure.subfigures(2, 1, height_ratios=[torque_height(record) + 0.2, GEARS_HEIGHT])
     above, below = parts
     draw_torque(above, record)
     _draw_gears(below, record, gears)
@@ -84,8 +84,8 @@ def _draw_gears(figure: FigureBase, record: Record, gears: dict[str, tuple[Array
 
 
 def torque_height(record: Record) -> float:
-    """Height [in] at which joints can be read."""
-    return 0.75 + ROW * max(len(record.arrays["joints"]), 8)
+    """Height [in] at which the joints' names are legible."""
+    return 0.75 + JOINT_HEIGHT * max(len(record.arrays["joints"]), 8)
 
 
 def draw_torque(figure: FigureBase, record: Record) -> None:
@@ -101,8 +101,8 @@ def draw_torque(figure: FigureBase, record: Record) -> None:
             axes.set_visible(False)
             continue
         edges, values = _binned(time, ratio)
-        rows = np.arange(len(names) + 1) - 0.5
-        mesh = axes.pcolormesh(edges, rows, values.T, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True)
+        joints = np.arange(len(names) + 1) - 0.5
+        mesh = axes.pcolormesh(edges, joints, values.T, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True)
         axes.grid(False)
         axes.set(
             xlabel="time since contact [ms]" if k == 1 else "time [s]",
@@ -133,7 +133,7 @@ def _demand(record: Record) -> list[tuple[Array, Array]]:
 
 
 def _binned(time: Array, values: Array, most: int = 500) -> tuple[Array, Array]:
-    """Edges and, between them, the largest of the values: no peak gets lost in a pixel."""
+    """Edges of bins, and the largest value in each, so that no peak is lost between pixels."""
     count = min(most, len(time))
     wanted = np.linspace(time[0], time[-1], count, endpoint=False)
     start = np.unique(np.searchsorted(time, wanted, side="right") - 1)

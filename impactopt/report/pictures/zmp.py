@@ -43,7 +43,7 @@ def zero_moment_point(record: Record) -> Picture | None:
 
 
 def draw_zmp(figure: FigureBase, record: Record, phases: Sequence[int] = (0, 1, 2)) -> None:
-    """The same into a figure, or a part of one; a panel for each of the phases."""
+    """Draws the picture into a figure, or a part of one, with a panel for each of the phases."""
     a = record.arrays
     paths = _zmp_paths(record)
     panels: Any = figure.subplots(1, len(phases), sharex=True, sharey=True, squeeze=False)[0]
@@ -116,12 +116,12 @@ def _span(time: Array, phase: int) -> tuple[float, float]:
 
 
 def _stations(time: Array, count: int) -> NDArray[np.intp]:
-    """Indices of instants about evenly spread over the time."""
+    """Indices of about evenly spaced instants."""
     return np.searchsorted(time, np.linspace(time[0], time[-1], count)).clip(0, len(time) - 1)
 
 
 def _ground(axes: Any, soles: Mapping[str, Array], polygon: Array) -> None:
-    """Soles and support polygon from above: forward is up, left is left."""
+    """Draws soles and support polygon from above; forward is up."""
     for name, corners in soles.items():
         axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
         middle = corners.mean(axis=0)
@@ -152,7 +152,7 @@ def _coloured_line(axes: Any, time: Array, points: Array, norm: Normalize) -> No
 
 
 def _margin(record: Record, phase: int) -> float | None:
-    """ZMP margin [m] of a phase, simulated where there is a simulation."""
+    """ZMP margin [m] of a phase, of the simulation if there is one."""
     source = record.summary.get("simulated", record.summary)
     value: float | None = source.get("zmp_margin_m", {}).get(("swing", "collision", "follow")[phase])
     return value

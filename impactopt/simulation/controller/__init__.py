@@ -1,10 +1,10 @@
-"""A whole-body controller for replays: what a laboratory has between a plan and its robot's drives.
+"""A whole-body controller for replays, between the plan and the robot's drives.
 
-* settings.py   its numbers
-* sensors.py    what encoders, inertial unit and the hand's force sensor tell it, and the state by that
-* tracking_reference.py   what it tracks, by what it has felt of the blow, and how it comes to rest after it
-* clearance.py  near bodies slow down before they touch
-* whole_body.py the controller: its QP, its tasks, and what wrenches soles can have
+* settings.py             its parameters
+* sensors.py              encoders, inertial unit and the hand's force sensor; state estimate
+* tracking_reference.py   reference, switched by the sensed impact, and the recovery after it
+* clearance.py            constraints that slow down bodies before they touch
+* whole_body.py           the controller: QP, tasks, and wrench cones of the soles
 """
 
 from impactopt.simulation.controller.settings import CONTROLLERS, ControllerSettings, controller_of

@@ -1,4 +1,4 @@
-"""The numbers of the whole-body controller, and the accuracy of its sensors."""
+"""Settings of the whole-body controller, and choice of a controller by name."""
 
 from __future__ import annotations
 
@@ -124,15 +124,15 @@ class ControllerSettings(Described):
     )
 
     def __post_init__(self) -> None:
-        for f, told in abouts(type(self)):
+        for f, description in abouts(type(self)):
             value = getattr(self, f.name)
             name = f"controller: {f.name}"
-            if told.choices:
-                check_choice(name, value, told.choices)
+            if description.choices:
+                check_choice(name, value, description.choices)
             elif f.name in ("seed", "iterations"):
-                check_whole(name, value, least=int(told.least or 0), most=10**9)
+                check_whole(name, value, least=int(description.least or 0), most=10**9)
             else:
-                told.checked(name, value)
+                description.checked(name, value)
 
     @property
     def period(self) -> float:
@@ -141,19 +141,21 @@ class ControllerSettings(Described):
 
     @property
     def projects(self) -> bool:
+        """True if velocity errors are projected about the impact."""
         return self.impact in ("project", "both", "planned")
 
     @property
     def spreads(self) -> bool:
+        """True if the reference is spread about the impact."""
         return self.impact in ("spread", "both", "planned")
 
 
 def controller_of(
     chosen: str | ControllerSettings | None, settings: ControllerSettings | None = None
 ) -> ControllerSettings | None:
-    """Settings of the whole-body controller; None: the joints' servo.
+    """Settings of the chosen whole-body controller; None: the joints' servo.
 
-    chosen : "servo" (or None), "wbc", which has `settings`, or settings themselves.
+    chosen : "servo" or None; "wbc", with `settings`, by default the standard ones; or settings themselves.
 
     Raises
     ------

@@ -1,10 +1,8 @@
-"""The whole-body controller: at every sample a QP for the torques that track the plan on its soles.
+"""Whole-body controller: at every sample a QP for the torques that track the plan on its soles.
 
-In y = L' x with P = L L', and with rows of length one, OSQP's steps converge some hundred times as fast as in
-x: thirty of them leave 0.03 % of the torque limits in the median.
-
-H a + h = S' tau + J' w and J a + dJ/dt v = 0 give a = A tau + a0 and w = B tau + b0. So a QP over
-accelerations and wrenches under the equation of motion has as many unknowns as there are torques.
+The equation of motion H a + h = S' tau + J' w with J a + dJ/dt v = 0 gives accelerations a = A tau + a0 and
+contact wrenches w = B tau + b0. The QP has the torques as its only unknowns (and two slacks), where one over
+accelerations and wrenches would need the equation of motion as a constraint.
 """
 
 from __future__ import annotations
@@ -23,43 +21,55 @@ from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
-from impactopt.simulation.controller.clearance import MOST, Clearance
+from impactopt.simulation.controller.clearance import MAX_CONSTRAINTS, Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
 from impactopt.simulation.controller.settings import ControllerSettings
-from impactopt.simulation.controller.tracking_reference import Aim, Recovery, Target
+from impactopt.simulation.controller.tracking_reference import Recovery, ReferenceSample, TrackingReference
 from impactopt.simulation.motors import Servo
 from impactopt.simulation.result import Scene, stance_at, stance_begins
 
-__all__ = ["Cones", "Footing", "HeldDynamics", "Tasks", "TorqueQP", "WholeBodyController", "cone_of"]
+__all__ = [
+    "ConstrainedDynamics",
+    "StanceProblem",
+    "Tasks",
+    "TorqueQP",
+    "WholeBodyController",
+    "WrenchCones",
+    "wrench_cone",
+]
 
 Array = NDArray[np.float64]
-RHO = 1.0  # of OSQP's ADMM, where P is the identity
-ENDLESS = 1e30  # OSQP's infinity
-LEAST = 1e-12  # of a row's length, which may be nothing
+ADMM_PENALTY = 1.0  # OSQP's rho: after the change of variables the Hessian is the identity
+OSQP_INFINITY = 1e30
+MIN_NORM = 1e-12  # avoids a division by zero for a constraint without coefficients
 
 
 class TorqueQP:
-    """min 1/2 x' P x + q' x  with  C x >= c,  low <= x <= high, for n unknowns and m rows C; P > 0.
+    """min 1/2 x' P x + q' x  with  C x >= c,  low <= x <= high;  P > 0 (n, n), C (m, n).
 
-    A fixed number of iterations from the answer to the QP before.
+    Runs a fixed number of OSQP iterations, warm-started from the previous solution. They are few, because
+    the problem is preconditioned: in y = L' x, where P = L L', the Hessian is the identity, and all
+    constraints are scaled to norm one. ADMM then converges some hundred times as fast as in x: thirty
+    iterations leave an error of 0.03 % of the torque limits in the median.
     """
 
     def __init__(self, n: int, m: int, *, iterations: int) -> None:
         self.n, self.m = n, m
-        # by columns, as OSQP has them; those of the bounds are an upper triangle
+        # the transpose of OSQP's matrix [C; I] L'^-1, because OSQP stores it by columns;
+        # the block of the bounds, I L'^-1, is upper triangular
         self._columns = np.zeros((n, m + n))
-        self._there = np.hstack([np.ones((n, m), dtype=bool), np.tril(np.ones((n, n), dtype=bool))])
-        self._lower, self._upper = np.zeros(m + n), np.full(m + n, ENDLESS)
+        self._nonzero = np.hstack([np.ones((n, m), dtype=bool), np.tril(np.ones((n, n), dtype=bool))])
+        self._lower, self._upper = np.zeros(m + n), np.full(m + n, OSQP_INFINITY)
         self._solver: Any = osqp.OSQP()
         self._solver.setup(
             sp.identity(n, format="csc"),
             np.zeros(n),
-            sp.csc_matrix(self._there.T.astype(float)),
-            np.full(m + n, -ENDLESS),
-            np.full(m + n, ENDLESS),
+            sp.csc_matrix(self._nonzero.T.astype(float)),
+            np.full(m + n, -OSQP_INFINITY),
+            np.full(m + n, OSQP_INFINITY),
             scaling=0,
             adaptive_rho=False,
-            rho=RHO,
+            rho=ADMM_PENALTY,
             max_iter=iterations,
             check_termination=0,
             polishing=False,
@@ -68,17 +78,17 @@ class TorqueQP:
         )
 
     def solve(self, P: Array, q: Array, C: Array, c: Array, low: Array, high: Array) -> Array:
-        """x (n,), inside its bounds."""
-        root, _ = dpotrf(P, lower=1, clean=1)
-        inverse, _ = dtrtri(root, lower=1)
+        """x (n,), clipped to its bounds."""
+        L, _ = dpotrf(P, lower=1, clean=1)
+        inverse, _ = dtrtri(L, lower=1)
         columns, m = self._columns, self.m
         np.matmul(inverse, C.T, out=columns[:, :m])
         columns[:, m:] = inverse
-        scale = 1.0 / np.maximum(np.sqrt(np.einsum("ij,ij->j", columns, columns)), LEAST)
+        scale = 1.0 / np.maximum(np.sqrt(np.einsum("ij,ij->j", columns, columns)), MIN_NORM)
         columns *= scale
         self._lower[:m], self._lower[m:] = c, low
         self._upper[m:] = high * scale[m:]
-        self._solver.update(Ax=columns[self._there], q=inverse @ q, l=self._lower * scale, u=self._upper)
+        self._solver.update(Ax=columns[self._nonzero], q=inverse @ q, l=self._lower * scale, u=self._upper)
         x = inverse.T @ self._solver.solve(raise_error=False).x
         return np.minimum(np.maximum(x, low), high)
 
@@ -86,15 +96,19 @@ class TorqueQP:
 _AXES = pin.LOCAL_WORLD_ALIGNED
 
 
-class HeldDynamics:
-    """A robot on soles, at a state; h points of it strike.
+class ConstrainedDynamics:
+    """Dynamics of a robot with its soles and gripping hands fixed, affine in the torques tau (n,).
 
-    A (nv, n), a0 (nv,) : accelerations.  B (6 a sole and a hand that holds on, n), b0 : wrenches of the
-    ground on the frames at their origins, in world axes.  places : of these frames.
-    hands (h, 3, nv) : Jacobians of the striking points.  hand_places (h, 3) [m] : where they are.
-    hand_drift (h, 3) [m/s^2] : their accelerations where joints have none.
-    back : the part of b0 that would bring soles back to where they stood.
-    recoil (nv, h) : how velocities change by a unit impulse against the normal at each.
+    frames = soles, then gripping hands; h = number of striking points.
+
+    A (nv, n), a0 (nv,) : accelerations A tau + a0
+    B (6 frames, n), b0 : wrenches of the ground on the frames at their origins, world axes
+    placements : of the frames
+    striking_points (h, 3) [m] : positions
+    striking_jacobians (h, 3, nv) : of their velocities
+    striking_drift (h, 3) [m/s^2] : their accelerations for a = 0
+    stabilizing_wrenches : part of b0 that returns the soles to their initial height and tilt
+    impulse_response (nv, h) : change of v by a unit impulse against the normal at each striking point
     """
 
     def __init__(
@@ -110,129 +124,140 @@ class HeldDynamics:
         self._robot, self.model, self.normal = robot, robot.model, normal
         self.data: Any = robot.model.createData()
         self._soles = [self.model.getFrameId(name) for name in soles]
-        self._held = [*self._soles, *(self.model.getFrameId(name) for name in holding)]
+        self._fixed = [*self._soles, *(self.model.getFrameId(name) for name in holding)]
         self._strikers = [self.model.getFrameId(name) for name in strikers]
-        nv, n, rows, h = robot.nv, robot.n, 6 * len(self._held), len(strikers)
+        nv, n, m, h = robot.nv, robot.n, 6 * len(self._fixed), len(strikers)
         self._n, self._nv = n, nv
-        # as LAPACK has them, by columns: torques, none, what brings soles back, unit forces at the hands
-        self._left = np.zeros((nv + rows, nv + rows), order="F")
-        self._right = np.zeros((nv + rows, n + 2 + h), order="F")
-        self.hands = np.zeros((h, 3, nv))
-        self.hand_places, self.hand_drift = np.zeros((2, h, 3))
+        # linear system [H, -J'; J, 0] [a; w] = right-hand sides, in LAPACK's column order. Columns of the
+        # right-hand side: each torque (n), no torque, stabilization of the soles, each striking force (h)
+        self._left = np.zeros((nv + m, nv + m), order="F")
+        self._right = np.zeros((nv + m, n + 2 + h), order="F")
+        self.striking_jacobians = np.zeros((h, 3, nv))
+        self.striking_points, self.striking_drift = np.zeros((2, h, 3))
         self._right[nv - n : nv, :n] = np.eye(n)
-        self._none = np.zeros(nv)
+        self._zero = np.zeros(nv)
         pin.framesForwardKinematics(self.model, self.data, q0)
-        self._stood = [self.data.oMf[i].copy() for i in self._soles]
+        self._initial = [self.data.oMf[i].copy() for i in self._soles]
 
-    def look(self, q: Array, v: Array, forces: Array | float = 0.0, bandwidth: float = 0.0) -> None:
-        """Go to q (nq), v (nv), with forces (h,) [N] on the striking points, against the normal."""
+    def update(self, q: Array, v: Array, forces: Array | float = 0.0, bandwidth: float = 0.0) -> None:
+        """Evaluates the dynamics at q (nq,), v (nv,).
+
+        forces : (h,) [N] on the striking points, against the normal.
+        bandwidth : [rad/s] of the stabilization of the soles (Baumgarte's, in height, roll and pitch).
+        """
         model, data, nv, n = self.model, self.data, self._nv, self._n
         left, right = self._left, self._right
-        pin.forwardKinematics(model, data, q, v, self._none)
+        pin.forwardKinematics(model, data, q, v, self._zero)
         pin.computeJointJacobians(model, data)
         left[:nv, :nv] = mass_matrix(model, data, q)
         right[:nv, n] = -self._robot.nonlinear_effects(data, q, v)
-        self.places = []
-        for k, i in enumerate(self._held):
+        self.placements = []
+        for k, i in enumerate(self._fixed):
             rows = slice(nv + 6 * k, nv + 6 * k + 6)
-            self.places.append(pin.updateFramePlacement(model, data, i).copy())
+            self.placements.append(pin.updateFramePlacement(model, data, i).copy())
             J = pin.getFrameJacobian(model, data, i, _AXES)
             left[rows, :nv], left[:nv, rows] = J, -J.T
             right[rows, n] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
-            if k >= len(self._soles):  # a grip holds by itself
+            if k >= len(self._soles):  # a grip needs no stabilization
                 continue
-            at, stood = self.places[-1], self._stood[k]
-            turned = pin.log3(at.rotation @ stood.rotation.T)
-            away = np.zeros(6)  # a sole that has slid stays where it is
-            away[2], away[3:5] = at.translation[2] - stood.translation[2], turned[:2]
-            right[rows, n + 1] = -(bandwidth**2) * away - 2 * bandwidth * (J @ v)
+            now, initial = self.placements[-1], self._initial[k]
+            rotation_error = pin.log3(now.rotation @ initial.rotation.T)
+            error = np.zeros(6)  # horizontal position and yaw stay zero: a sole that slid is not pulled back
+            error[2], error[3:5] = now.translation[2] - initial.translation[2], rotation_error[:2]
+            right[rows, n + 1] = -(bandwidth**2) * error - 2 * bandwidth * (J @ v)
         for k, i in enumerate(self._strikers):
-            self.hand_places[k] = pin.updateFramePlacement(model, data, i).translation
-            self.hands[k] = np.reshape(pin.getFrameJacobian(model, data, i, _AXES), (6, nv))[:3]
-            self.hand_drift[k] = pin.getFrameClassicalAcceleration(model, data, i, _AXES).linear
-            right[:nv, n + 2 + k] = -self.normal @ self.hands[k]
-        _, _, found, _ = dgesv(left, right)
-        push = found[:, n + 2 :] @ np.broadcast_to(forces, len(self._strikers))
-        self.A, self.a0 = found[:nv, :n], (found[:, n] + push + found[:, n + 1])[:nv]
-        self.recoil = found[:nv, n + 2 :]
-        self.B, self.b0 = found[nv:, :n], (found[:, n] + push + found[:, n + 1])[nv:]
-        self.back = found[nv:, n + 1]
+            self.striking_points[k] = pin.updateFramePlacement(model, data, i).translation
+            self.striking_jacobians[k] = np.reshape(pin.getFrameJacobian(model, data, i, _AXES), (6, nv))[:3]
+            self.striking_drift[k] = pin.getFrameClassicalAcceleration(model, data, i, _AXES).linear
+            right[:nv, n + 2 + k] = -self.normal @ self.striking_jacobians[k]
+        _, _, solved, _ = dgesv(left, right)
+        by_forces = solved[:, n + 2 :] @ np.broadcast_to(forces, len(self._strikers))
+        self.A, self.a0 = solved[:nv, :n], (solved[:, n] + by_forces + solved[:, n + 1])[:nv]
+        self.impulse_response = solved[:nv, n + 2 :]
+        self.B, self.b0 = solved[nv:, :n], (solved[:, n] + by_forces + solved[:, n + 1])[nv:]
+        self.stabilizing_wrenches = solved[nv:, n + 1]
 
-    def pulled(self, which: NDArray[np.bool_], torque: Array) -> None:
-        """Joints (n,) have torques (n,) [N m] that are no choice: springs'."""
-        pull = np.where(which, torque, 0.0)
-        self.a0, self.b0 = self.a0 + self.A @ pull, self.b0 + self.B @ pull
+    def fix_torques(self, which: NDArray[np.bool_], torque: Array) -> None:
+        """Moves the torques (n,) [N m] of some joints, as of springs, from the unknowns to a0 and b0."""
+        fixed = np.where(which, torque, 0.0)
+        self.a0, self.b0 = self.a0 + self.A @ fixed, self.b0 + self.B @ fixed
         self.A, self.B = self.A * ~which, self.B * ~which
 
 
-def cone_of(corners: Array, settings: ControllerSettings) -> Array:
-    """Rows (k, 6) that are >= 0 of a wrench that a sole with these corners (c, 2) [m] can have, in its frame.
+def wrench_cone(corners: Array, settings: ControllerSettings) -> Array:
+    """Matrix (k, 6) whose product with a wrench of a sole, in the sole's frame, is >= 0 if it is feasible.
 
-    Its edges' rows are its own; those of torsion are of the rectangle with its extents (Caron, Pham,
-    Nakamura, "Stability of surface contacts for humanoid robots", ICRA 2015).
+    corners (c, 2) [m] : of the sole, counter-clockwise.
+
+    Rows: unilateral force, linearized friction, torsion, centre of pressure inside each edge. The centre of
+    pressure is constrained by the sole's own edges; torsion by those of the rectangle with its extents
+    (Caron, Pham, Nakamura, "Stability of surface contacts for humanoid robots", ICRA 2015).
     """
-    s, mu = settings, settings.friction
+    mu = settings.friction
     edge = np.roll(corners, -1, axis=0) - corners
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-    least = (inward * corners).sum(axis=1) + s.cop_margin
+    offset = (inward * corners).sum(axis=1) + settings.cop_margin  # inward . cop >= offset
     (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
     X, Y, cx, cy = (x1 - x0) / 2, (y1 - y0) / 2, (x0 + x1) / 2, (y0 + y1) / 2
-    # the wrench at the rectangle's centre
+    # from a wrench about the frame's origin to one about the rectangle's centre
     shift = np.eye(6)
     shift[3:, :3] = -pin.skew(np.array([cx, cy, 0.0]))
     rows = [[0.0, 0, 1, 0, 0, 0]]
     rows += [[i * a, (1 - i) * a, mu, 0, 0, 0] for i in (0, 1) for a in (1, -1)]
+    # torsion: the eight combinations of signs of Caron's bounds on the yaw moment
     for turn in (1, -1):
         for a in (1, -1):
             for b in (1, -1):
                 f, m = [a * Y, b * X, mu * (X + Y)], [-turn * a * mu, -turn * b * mu, turn]
                 rows.append([*f, *m])
     out = np.array(rows, dtype=float) @ shift
-    edges = [[0, 0, -c, n[1], -n[0], 0] for n, c in zip(inward, least, strict=True)]
+    # cop = (-m_y, m_x) / f_z, multiplied by f_z
+    edges = [[0, 0, -c, n[1], -n[0], 0] for n, c in zip(inward, offset, strict=True)]
     return np.vstack([out, np.array(edges, dtype=float)])
 
 
-class Cones:
-    """Wrench cones of soles with corners (c, 2) [m] each, for a robot of n joints and a weight [N].
+class WrenchCones:
+    """Constraints that keep the wrenches of all soles inside their cones.
 
-    m : rows of all of them.
+    corners : (c, 2) [m] of each sole.  n : number of joints.  weight : [N] of the robot.
+    m : number of constraints.
     """
 
     def __init__(
         self, corners: tuple[Array, ...], settings: ControllerSettings, n: int, weight: float
     ) -> None:
-        cones = [cone_of(c, settings) for c in corners]
+        cones = [wrench_cone(c, settings) for c in corners]
         self.m = sum(len(cone) for cone in cones)
         self._weight, self._soles = weight, len(cones)
-        self._rows = block_diag(*cones) / weight if cones else np.zeros((0, 0))
-        self._least = np.zeros(self.m)  # of the normal force, which is each cone's first row
-        self._least[np.cumsum([0, *map(len, cones)])[:-1]] = settings.least_force / weight
+        self._matrix = block_diag(*cones) / weight if cones else np.zeros((0, 0))
+        self._lower = np.zeros(self.m)  # least normal force, on the first constraint of each cone
+        self._lower[np.cumsum([0, *map(len, cones)])[:-1]] = settings.least_force / weight
         self._low = np.array([[*c.min(axis=0), 0.0] for c in corners])
         self._high = np.array([[*c.max(axis=0), 0.0] for c in corners])
-        self._turn = np.zeros((6 * len(cones), 6 * len(cones)))  # from the world's axes to the soles'
-        # wrenches by torques over their limits, and at none: in the soles' axes
+        self._rotation = np.zeros((6 * len(cones), 6 * len(cones)))  # from world axes to those of the soles
+        # wrenches in the axes of the soles: coefficients of the n scaled torques, and the constant
         self._local = np.zeros((6 * len(cones), n + 1))
 
-    def look(self, places: list[Any], B: Array, b0: Array) -> tuple[Array, Array]:
-        """C (m, n + 1) and c (m,), C x >= c, of x: n torques over their limits, and what the cones may be
-        left by, over the weight.
+    def constraints(self, placements: list[Any], B: Array, b0: Array) -> tuple[Array, Array]:
+        """C (m, n + 1) and c (m,) with C x >= c; x: n torques over their limits, and a slack over the weight.
 
-        B (6 a frame, n), b0 : wrenches in world axes, B x + b0.  places : of the frames.  Those of the soles
-        come first, and are looked at alone.
+        B (6 frames, n), b0 : wrenches B x + b0 in world axes.  placements : of the frames.  The soles come
+        first; gripping hands, which come after them, have no cone.
         """
-        turn, local = self._turn, self._local
-        for k, place in enumerate(places[: self._soles]):
-            at, back = 6 * k, place.rotation.T
-            turn[at : at + 3, at : at + 3] = turn[at + 3 : at + 6, at + 3 : at + 6] = back
-        local[:, :-1], local[:, -1] = turn @ B[: len(turn)], turn @ b0[: len(turn)]
-        C = self._rows @ local
-        c = self._least - C[:, -1]
+        rotation, local = self._rotation, self._local
+        for k, placement in enumerate(placements[: self._soles]):
+            at, R = 6 * k, placement.rotation.T
+            rotation[at : at + 3, at : at + 3] = rotation[at + 3 : at + 6, at + 3 : at + 6] = R
+        local[:, :-1], local[:, -1] = rotation @ B[: len(rotation)], rotation @ b0[: len(rotation)]
+        C = self._matrix @ local
+        c = self._lower - C[:, -1]
         C[:, -1] = 1.0
         return C, c
 
-    def pressed(self, x: Array) -> tuple[Array, Array]:
-        """Normal forces (soles,) [N] and centres of pressure (soles, 3) [m], in the soles' frames, at torques
-        over their limits x (n,), where `look` was last.
+    def loads(self, x: Array) -> tuple[Array, Array]:
+        """Normal forces (soles,) [N] and centres of pressure (soles, 3) [m], in the frames of the soles.
+
+        x (n,) : torques over their limits, in the state of the last call of `constraints`.
         """
         wrench = self._local[:, :-1] @ x + self._local[:, -1]
         loads = np.maximum(wrench[2::6], 1e-3 * self._weight)
@@ -242,51 +267,57 @@ class Cones:
         return loads, points
 
 
-WINDOW = 0.01  # [s] about the blow in which velocity errors are projected
-FILTER = 3e-3  # [s] of the hand's force
-TOUCH = 20.0  # [N] that the hand feels as a touch
-LEVER = 0.1  # [m] by which moments of a sole are compared with its forces
-EFFORT = 1e-3  # weight of torques over their limits in the recovery, which has no feed-forward
-FEET = 40.0  # [rad/s] of the feedback of soles in the air
-FAST = 10.0  # [m/s^2] by which clearance constraints are scaled
-PRICE, SQUARE = 1e3, 1e3  # of leaving the cones, over the robot's weight, and those: linear, and of squares
+PROJECTION_WINDOW = 0.01  # [s] before and after the impact in which velocity errors are projected
+FORCE_FILTER = 3e-3  # [s] time constant of the low-pass filter of the striking force
+CONTACT_FORCE = 20.0  # [N] that counts as contact: ten times the noise of the sensor
+MOMENT_ARM = 0.1  # [m] that makes the moments of a sole comparable with its forces
+RECOVERY_TORQUE_WEIGHT = 1e-3  # of torques over their limits; the recovery has no feed-forward to follow
+SWING_FOOT_BANDWIDTH = 40.0  # [rad/s]
+CLEARANCE_SCALE = 10.0  # [m/s^2] over which clearance constraints are of order one
+# Weights of the slacks. The linear one is an exact penalty: cones are left only where they cannot be kept.
+SLACK_WEIGHT, SLACK_SQUARE_WEIGHT = 1e3, 1e3
+MAX_SLACK = 1e3  # no limit in practice
 
 
-class Footing:
-    """Parts of the controller that depend on the soles that stand.
+class StanceProblem:
+    """QP of the controller, and its data, for one set of standing soles.
 
-    frames : of these soles.  air : of the others, numbers in the model.  held : the robot on them.
-    cones, tasks, qp : of its wrenches.
-    share, lift : of wrenches, over the weight; and to what they make, the momentum's rate over the mass.
-    loads (soles,), points (soles, 3) [m] : where they are pressed.
+    frames : of these soles.  swing_feet : frame numbers of the other soles.
+    dynamics, cones, tasks, qp : parts of the QP.
+    wrench_scale (6 frames,) : 1 / weight for forces, 1 / (weight * MOMENT_ARM) for moments.
+    momentum_map (6, 6 frames) : from wrenches to the rate of the centroidal momentum, over the mass.
+    loads (soles,), points (soles, 3) [m] : predicted normal forces and centres of pressure.
     """
 
     def __init__(
-        self, robot: Robot, scene: Scene, on: NDArray[np.intp], settings: ControllerSettings, q0: Array
+        self, robot: Robot, scene: Scene, standing: NDArray[np.intp], settings: ControllerSettings, q0: Array
     ) -> None:
-        """on : indices of the scene's soles that stand.  q0 (nq,) : a configuration with them in place."""
-        self.frames = tuple(scene.soles[k] for k in on)
-        self.air = [robot.model.getFrameId(name) for name in scene.soles if name not in self.frames]
-        self.held = HeldDynamics(robot, self.frames, scene.strikers, scene.normal, q0, holding=scene.hands)
-        mass, n, held = float(pin.computeTotalMass(robot.model)), robot.n, len(on) + len(scene.hands)
+        """standing : indices of the scene's soles that stand.  q0 (nq,) : configuration with them placed."""
+        self.frames = tuple(scene.soles[k] for k in standing)
+        self.swing_feet = [robot.model.getFrameId(name) for name in scene.soles if name not in self.frames]
+        self.dynamics = ConstrainedDynamics(
+            robot, self.frames, scene.strikers, scene.normal, q0, holding=scene.hands
+        )
+        mass, n, fixed = float(pin.computeTotalMass(robot.model)), robot.n, len(standing) + len(scene.hands)
         weight = 9.81 * max(mass, 1e-9)
-        self.cones = Cones(tuple(scene.corners[k] for k in on), settings, n, weight)
-        balances = robot.floating and len(on) > 0
-        self.tasks = Tasks(n, robot.nv + 3 * len(scene.strikers) + 6 * (balances + held + len(self.air)))
-        # torques over their limits, and two slacks: of the cones, and of clearance constraints
-        self.qp = TorqueQP(n + 2, self.cones.m + MOST, iterations=settings.iterations)
-        # of a wrench's parts over the weight
-        self.share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), held) / weight
-        self.lift = np.tile(np.eye(6), held) / max(mass, 1e-9)
-        self.loads, self.points = np.ones(len(on)), np.zeros((len(on), 3))
+        self.cones = WrenchCones(tuple(scene.corners[k] for k in standing), settings, n, weight)
+        balances = robot.floating and len(standing) > 0
+        errors = robot.nv + 3 * len(scene.strikers) + 6 * (balances + fixed + len(self.swing_feet))
+        self.tasks = Tasks(n, errors)
+        # unknowns: torques over their limits, and two slacks: of the cones, and of clearance constraints
+        self.qp = TorqueQP(n + 2, self.cones.m + MAX_CONSTRAINTS, iterations=settings.iterations)
+        self.wrench_scale = np.tile(np.repeat([1.0, 1.0 / MOMENT_ARM], 3), fixed) / weight
+        self.momentum_map = np.tile(np.eye(6), fixed) / max(mass, 1e-9)
+        self.loads, self.points = np.ones(len(standing)), np.zeros((len(standing), 3))
 
 
 class WholeBodyController:
-    """Torques of a robot on a scene's soles that follows a reference, and its schedule of stance phases.
+    """Torques of a robot on a scene's soles that tracks a reference and its schedule of stance phases.
 
-    reference : as of :class:`impactopt.transcription.plan.Trajectory`.
-    kp, kd : factors of the feedback's stiffness and damping.  limit : of the torque limits, which it knows.
-    seconds : of processor time that each QP took.
+    reference : as :class:`impactopt.transcription.plan.Trajectory`.
+    kp, kd : factors of the feedback's stiffness and damping.
+    limit : factor of the torque limits, known to the controller.
+    seconds : processor time of each QP.
     """
 
     def __init__(
@@ -309,169 +340,200 @@ class WholeBodyController:
         self.balances = robot.floating and bool(scene.soles)
         self.clearance = Clearance(robot.model, scene.solids, period=settings.period)
         self.low, self.high = -np.ones(self.n + 2), np.ones(self.n + 2)
-        self.low[self.n :], self.high[self.n :] = 0.0, 1e3
-        self.moves = np.repeat([settings.com, settings.angular_momentum], 3)  # of rates of momentum
+        self.low[self.n :], self.high[self.n :] = 0.0, MAX_SLACK
+        self.momentum_weights = np.repeat([settings.com, settings.angular_momentum], 3)
         self.seconds: list[float] = []
-        steps_on = stance_at(reference, reference.contact_end) != stance_at(reference, np.inf)
-        stands = self.balances and settings.follow == "recover" and not steps_on
-        recovery = Recovery(robot, reference, scene, settings) if stands else None
-        self.target = Target(robot, reference, scene.strikers, spread=settings.spreads, recovery=recovery)
-        self.of_blow, self.planned, self.followed = self.target, reference, reference
+        # the recovery shifts the body over fixed soles: a plan that steps after the impact has none
+        steps_after = stance_at(reference, reference.contact_end) != stance_at(reference, np.inf)
+        recovers = self.balances and settings.follow == "recover" and not steps_after
+        recovery = Recovery(robot, reference, scene, settings) if recovers else None
+        self.planned = reference
+        self.planned_tracking = TrackingReference(
+            robot, reference, scene.strikers, spread=settings.spreads, recovery=recovery
+        )
+        self.reference, self.tracking = self.planned, self.planned_tracking
         q0 = np.asarray(reference.q[0])
-        self.stance, self.footing = 0, self._footing(0)
-        self.estimate = StateEstimate(robot, self.footing.frames, q0)
-        self.acceleration = np.zeros(robot.nv)
-        self.felt = np.zeros(len(scene.strikers))  # [N] at the hands, filtered
+        self.stance, self.stance_problem = 0, self._stance_problem(0)
+        self.estimate = StateEstimate(robot, self.stance_problem.frames, q0)
+        self.acceleration = np.zeros(robot.nv)  # predicted at the last sample
+        self.striking_force = np.zeros(len(scene.strikers))  # [N], filtered
         self.springs = Servo(robot, reference).springs
-        # what motors steer: springs are not followed, nor where a tool swings on them
-        self.passive, self.undriven = robot.passive, bool(robot.passive.any())
-        self.sprung = bool(robot.sprung.any())
-        self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)
+        # joints without a motor are not tracked: no torque moves them
+        self.passive, self.has_passive = robot.passive, bool(robot.passive.any())
+        self.has_soft_grip = bool(robot.sprung.any())
+        self.actuated: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)  # (nv,) 0 or 1
 
     def follow(self, missed: Any | None) -> None:
-        """Track from now on the plan's blow (None), or the reference of a robot that hits nothing."""
-        self.target, self.followed = self.of_blow, self.planned
+        """Tracks the plan from now on (None), or the reference after a missed impact."""
+        self.tracking, self.reference = self.planned_tracking, self.planned
         if missed is not None:
-            self.target, self.followed = Target(self.robot, missed, self.scene.strikers, spread=False), missed
+            self.reference = missed
+            self.tracking = TrackingReference(self.robot, missed, self.scene.strikers, spread=False)
 
-    def _footing(self, stance: int) -> Footing:
-        """Parts on the soles of a stance phase, which stand where the reference has them as it begins."""
+    def _stance_problem(self, stance: int) -> StanceProblem:
+        """QP of a stance phase, with its soles where the reference has them at the beginning of the phase."""
         scene = self.scene
-        on = np.flatnonzero(scene.standing[stance]) if scene.standing.size else np.arange(len(scene.soles))
-        q0 = np.asarray(self.followed.q[stance_begins(self.followed, stance)])
-        return Footing(self.robot, scene, on, self.settings, q0)
+        standing = scene.standing[stance] if scene.standing.size else np.ones(len(scene.soles), dtype=bool)
+        q0 = np.asarray(self.reference.q[stance_begins(self.reference, stance)])
+        return StanceProblem(self.robot, scene, np.flatnonzero(standing), self.settings, q0)
 
     def torque(self, t: float, angles: Array, v: Array, rotation: Array, forces: Array) -> Array:
-        """Torque demand (n,) [N m] at a time [s], from what the sensors make of the true state."""
+        """Torque demand (n,) [N m] at a time [s], from sensor readings of the true state.
+
+        angles (n,), v (nv,), rotation (3, 3) of the base, forces (h,) [N] : the true state and striking
+        forces, which the sensors disturb.
+        """
         s = self.settings
         measured = self.sensors.read(angles, v, rotation, forces)
-        q, rates = self.estimate.of(measured, self.footing.loads, self.footing.points)
-        stance = stance_at(self.followed, self.target.clock(t)[0])
-        if stance != self.stance:  # soles lift off, or are taken to stand where they are
-            self.stance, self.footing = stance, self._footing(stance)
-            self.estimate.stand(self.footing.frames, q)
-        ahead = s.delay
-        q = pin.integrate(self.robot.model, q, ahead * rates)
-        rates = rates + ahead * self.acceleration
-        self.felt += (1 - math.exp(-s.period / FILTER)) * (measured.forces - self.felt)
-        self.target.feel(t, bool((measured.forces > TOUCH).any()))
-        aim = self.target.at(t + ahead)
-        held = self.footing.held
-        held.look(q, rates, self.felt, s.sole_bandwidth)
-        if self.undriven:
+        q, rates = self.estimate.of(measured, self.stance_problem.loads, self.stance_problem.points)
+        stance = stance_at(self.reference, self.tracking.clock(t)[0])
+        if stance != self.stance:  # soles lift off; those that land are assumed to stand where they are now
+            self.stance, self.stance_problem = stance, self._stance_problem(stance)
+            self.estimate.stand(self.stance_problem.frames, q)
+        # predict the state at the time when the torque takes effect
+        delay = s.delay
+        q = pin.integrate(self.robot.model, q, delay * rates)
+        rates = rates + delay * self.acceleration
+        self.striking_force += (1 - math.exp(-s.period / FORCE_FILTER)) * (
+            measured.forces - self.striking_force
+        )
+        self.tracking.update_contact(t, bool((measured.forces > CONTACT_FORCE).any()))
+        aim = self.tracking.at(t + delay)
+        dynamics = self.stance_problem.dynamics
+        dynamics.update(q, rates, self.striking_force, s.sole_bandwidth)
+        if self.has_passive:
             angles = self.robot.joint_positions(q)
-            held.pulled(self.passive, self.springs(angles, rates[-self.n :]))
+            dynamics.fix_torques(self.passive, self.springs(angles, rates[-self.n :]))
         x = self._solve(t, q, rates, aim)[: self.n]
         torque = self.limit * x
-        # what is expected until the next sample: accelerations, and where the soles are pressed
-        self.acceleration = held.A @ torque + held.a0
+        # predictions for the next sample
+        self.acceleration = dynamics.A @ torque + dynamics.a0
         if self.balances:
-            self.footing.loads, self.footing.points = self.footing.cones.pressed(x)
+            self.stance_problem.loads, self.stance_problem.points = self.stance_problem.cones.loads(x)
         return torque
 
-    def _solve(self, t: float, q: Array, v: Array, aim: Aim) -> Array:
-        on, s, n = self.footing, self.settings, self.n
-        held, tasks = on.held, on.tasks
-        recovers = self.target.recovers(t + s.delay)
-        struck = s.impact == "planned" and self.target.struck and not recovers
-        off = pin.difference(self.robot.model, q, aim.q)
-        lag = aim.v - v
-        rate_error = lag[-n:]
-        if s.projects and self.target.near_blow(t, WINDOW):
-            rows = self.scene.normal @ held.hands
-            lag = lag - held.recoil @ dgesv(rows @ held.recoil, rows @ lag)[2]
-        A, B = held.A * self.limit, held.B * self.limit  # of torques over their limits
-        tasks.begin()
-        if not struck:
+    def _solve(self, t: float, q: Array, v: Array, aim: ReferenceSample) -> Array:
+        """x (n + 2,): torques over their limits, and the slacks, at q (nq,), v (nv,)."""
+        problem, s, n = self.stance_problem, self.settings, self.n
+        dynamics, tasks = problem.dynamics, problem.tasks
+        recovers = self.tracking.recovers(t + s.delay)
+        # in contact the plan's impulse relies on the servos: follow their torques instead of the tasks
+        servo_torques = s.impact == "planned" and self.tracking.in_contact and not recovers
+        q_error = pin.difference(self.robot.model, q, aim.q)
+        v_error = aim.v - v
+        rate_error = v_error[-n:]
+        if s.projects and self.tracking.near_impact(t, PROJECTION_WINDOW):
+            # remove the part of the error that an impulse at the striking points can explain (Yang and
+            # Posa 2021): an impact that comes early or late makes just such an error
+            J = self.scene.normal @ dynamics.striking_jacobians
+            response = dynamics.impulse_response
+            v_error = v_error - response @ dgesv(J @ response, J @ v_error)[2]
+        A, B = dynamics.A * self.limit, dynamics.B * self.limit  # of x
+        tasks.clear()
+        if not servo_torques:
             w = s.recovery_bandwidth if recovers else s.posture_bandwidth
-            wanted = aim.a + self.kp * w**2 * off + self.kd * 2 * w * lag
-            tasks.add(s.posture * self.steered, A, held.a0 - wanted)
-            self._feet(aim, v, A)
-        self._hands(off, lag, aim, A, recovers)
-        rate, lift = np.zeros(6), on.lift
+            wanted = aim.a + self.kp * w**2 * q_error + self.kd * 2 * w * v_error
+            tasks.add(s.posture * self.actuated, A, dynamics.a0 - wanted)
+            self._add_swing_feet(aim, v, A)
+        self._add_striking_points(q_error, v_error, aim, A, recovers)
+        momentum_rate, momentum_map = np.zeros(6), problem.momentum_map
         if self.balances:
-            rate = self._momentum(q, v, lag, aim, B, recovers)
+            momentum_rate = self._add_momentum(q, v, v_error, aim, B, recovers)
         feed = aim.torque
-        if struck:  # what the plan counts on in contact
-            feed = feed + self.kp * self.robot.kp * off[-n:] + self.kd * self.robot.kd * rate_error
+        if servo_torques:
+            feed = feed + self.kp * self.robot.kp * q_error[-n:] + self.kd * self.robot.kd * rate_error
         feed = feed / self.limit
-        if on.share.size:
-            now, goal = held.back, B @ feed
-            if recovers:  # what makes the momentum's rate with the least wrenches
-                spread = lift / on.share**2
-                now, goal = held.b0, spread.T @ dgesv(spread @ lift.T, rate)[2]
-            tasks.add(s.wrench, on.share[:, None] * B, on.share * (now - goal))
+        scale = problem.wrench_scale
+        if scale.size:
+            # wrenches of the feed-forward; constants that both sides share (gravity, drift) cancel
+            constant, goal = dynamics.stabilizing_wrenches, B @ feed
+            if recovers:  # without feed-forward: the least scaled wrenches that give the momentum's rate
+                weighted = momentum_map / scale**2
+                constant = dynamics.b0
+                goal = weighted.T @ dgesv(weighted @ momentum_map.T, momentum_rate)[2]
+            tasks.add(s.wrench, scale[:, None] * B, scale * (constant - goal))
         P, g = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
-        P[:n, :n], g[:n] = tasks.sums()
-        effort = s.blow if struck else (EFFORT if recovers else s.torque)
-        P.flat[: n * (n + 2) : n + 3] += effort
+        P[:n, :n], g[:n] = tasks.quadratic_form()
+        effort = s.blow if servo_torques else (RECOVERY_TORQUE_WEIGHT if recovers else s.torque)
+        P.flat[: n * (n + 2) : n + 3] += effort  # diagonal of the torques
         g[:n] -= effort * feed
-        P.flat[n * (n + 3) :: n + 3], g[n:] = SQUARE, PRICE
-        m = on.cones.m
-        C, c = np.zeros((m + MOST, n + 2)), np.full(m + MOST, -1.0)  # what there is no pair for holds
-        C[:m, : n + 1], c[:m] = on.cones.look(held.places, B, held.b0)
-        if recovers or self.target.bounced:  # up to the blow the plan keeps bodies apart, at speed
-            rows, least = self.clearance.constraints(held.data)
-            its = slice(m, m + len(least))
-            C[its, :n], C[its, n + 1] = rows @ A / FAST, 1.0
-            c[its] = (least - rows @ held.a0) / FAST
+        P.flat[n * (n + 3) :: n + 3], g[n:] = SLACK_SQUARE_WEIGHT, SLACK_WEIGHT  # diagonal of the slacks
+        m = problem.cones.m
+        # clearance constraints that no pair of bodies needs read 0 x >= -1, which always holds
+        C, c = np.zeros((m + MAX_CONSTRAINTS, n + 2)), np.full(m + MAX_CONSTRAINTS, -1.0)
+        C[:m, : n + 1], c[:m] = problem.cones.constraints(dynamics.placements, B, dynamics.b0)
+        if recovers or self.tracking.bounced:  # up to the impact the plan keeps bodies apart, at speed
+            J, lower = self.clearance.constraints(dynamics.data)
+            its = slice(m, m + len(lower))
+            C[its, :n], C[its, n + 1] = J @ A / CLEARANCE_SCALE, 1.0
+            c[its] = (lower - J @ dynamics.a0) / CLEARANCE_SCALE
         begun = time.process_time()
-        x = on.qp.solve(P, g, C, c, self.low, self.high)
+        x = problem.qp.solve(P, g, C, c, self.low, self.high)
         self.seconds.append(time.process_time() - begun)
         return x
 
-    def _hands(self, off: Array, lag: Array, aim: Aim, A: Array, recovers: bool) -> None:
-        """Rows of the striking points."""
-        held, s, w = self.footing.held, self.settings, self.settings.hand_bandwidth
-        back = self.sprung and self.target.bounced and not recovers
-        if not (self.target.before or back):
+    def _add_striking_points(
+        self, q_error: Array, v_error: Array, aim: ReferenceSample, A: Array, recovers: bool
+    ) -> None:
+        """Adds the task of the striking points: tracked until contact, and drawn back with a soft grip."""
+        dynamics, s, w = self.stance_problem.dynamics, self.settings, self.settings.hand_bandwidth
+        draws_back = self.has_soft_grip and self.tracking.bounced and not recovers
+        if not (self.tracking.before_contact or draws_back):
             return
-        for hand, place, drift, goal in zip(
-            held.hands, held.hand_places, held.hand_drift, aim.hands, strict=True
+        for J, point, drift, goal in zip(
+            dynamics.striking_jacobians,
+            dynamics.striking_points,
+            dynamics.striking_drift,
+            aim.striking_points,
+            strict=True,
         ):
-            away, gain = goal[0] - place, goal[2]
-            if self.sprung:
-                swing, hand = hand * (1.0 - self.steered), hand * self.steered
-                away, gain = away - swing @ off, gain - swing @ aim.a
-            if back:  # a tool swings on in a soft grip, and would touch again
-                away = away - s.draw_back * self.scene.normal
-            wanted = gain + self.kp * w**2 * away + self.kd * 2 * w * (hand @ lag)
-            self.footing.tasks.add(s.hand, hand @ A, hand @ held.a0 + drift - wanted)
+            error, acceleration = goal[0] - point, goal[2]
+            if (
+                self.has_soft_grip
+            ):  # no torque controls the tool's swing in the grip: take it out of the errors
+                swing, J = J * (1.0 - self.actuated), J * self.actuated
+                error, acceleration = error - swing @ q_error, acceleration - swing @ aim.a
+            if draws_back:  # the tool swings on in its grip, and would touch again
+                error = error - s.draw_back * self.scene.normal
+            wanted = acceleration + self.kp * w**2 * error + self.kd * 2 * w * (J @ v_error)
+            self.stance_problem.tasks.add(s.hand, J @ A, J @ dynamics.a0 + drift - wanted)
 
-    def _feet(self, aim: Aim, v: Array, A: Array) -> None:
-        """Rows of the soles in the air: posture alone would have them land at speed."""
-        model, of_aim, w = self.robot.model, self.data, FEET
-        held, air = self.footing.held, self.footing.air
-        if air:
-            pin.forwardKinematics(model, of_aim, aim.q, aim.v, aim.a)
-        for i in air:
-            goal, place = (
-                pin.updateFramePlacement(model, of_aim, i),
-                pin.updateFramePlacement(model, held.data, i),
+    def _add_swing_feet(self, aim: ReferenceSample, v: Array, A: Array) -> None:
+        """Adds the task of the soles in the air; with the posture's task alone they would land at speed."""
+        model, planned, w = self.robot.model, self.data, SWING_FOOT_BANDWIDTH
+        dynamics = self.stance_problem.dynamics
+        if self.stance_problem.swing_feet:
+            pin.forwardKinematics(model, planned, aim.q, aim.v, aim.a)
+        for i in self.stance_problem.swing_feet:
+            goal, now = (
+                pin.updateFramePlacement(model, planned, i),
+                pin.updateFramePlacement(model, dynamics.data, i),
             )
-            rows = np.array(pin.getFrameJacobian(model, held.data, i, _AXES))
-            drift = pin.getFrameClassicalAcceleration(model, held.data, i, _AXES).vector
-            lag = pin.getFrameVelocity(model, of_aim, i, _AXES).vector - rows @ v
-            off = np.append(goal.translation - place.translation, pin.log3(goal.rotation @ place.rotation.T))
-            wanted = pin.getFrameClassicalAcceleration(model, of_aim, i, _AXES).vector
-            wanted = wanted + self.kp * w**2 * off + self.kd * 2 * w * lag
-            self.footing.tasks.add(self.settings.hand, rows @ A, rows @ held.a0 + drift - wanted)
+            J = np.array(pin.getFrameJacobian(model, dynamics.data, i, _AXES))
+            drift = pin.getFrameClassicalAcceleration(model, dynamics.data, i, _AXES).vector
+            rate_error = pin.getFrameVelocity(model, planned, i, _AXES).vector - J @ v
+            error = np.append(goal.translation - now.translation, pin.log3(goal.rotation @ now.rotation.T))
+            wanted = pin.getFrameClassicalAcceleration(model, planned, i, _AXES).vector
+            wanted = wanted + self.kp * w**2 * error + self.kd * 2 * w * rate_error
+            self.stance_problem.tasks.add(self.settings.hand, J @ A, J @ dynamics.a0 + drift - wanted)
 
-    def _momentum(self, q: Array, v: Array, lag: Array, aim: Aim, B: Array, recovers: bool) -> Array:
-        """Rows of the centre of mass and of the angular momentum, whose rates are the soles' wrenches.
+    def _add_momentum(
+        self, q: Array, v: Array, v_error: Array, aim: ReferenceSample, B: Array, recovers: bool
+    ) -> Array:
+        """Adds the task of the centroidal momentum, whose rate the wrenches give.
 
-        What all wrenches are to make (6,), over the mass.
+        Returns the total wrench (6,) about the centre of mass, over the mass, that gives the wanted rate.
         """
-        held, lift = self.footing.held, self.footing.lift
+        dynamics, momentum_map = self.stance_problem.dynamics, self.stance_problem.momentum_map
         s, data, mass = self.settings, self.data, self.mass
         Ag = pin.ccrba(self.robot.model, data, q, v)
         com = np.array(data.com[0])
-        for k, place in enumerate(held.places):
-            lift[3:, 6 * k : 6 * k + 3] = pin.skew((place.translation - com) / mass)
-        # the divergent component of motion: com + rate / omega
+        for k, placement in enumerate(dynamics.placements):
+            momentum_map[3:, 6 * k : 6 * k + 3] = pin.skew((placement.translation - com) / mass)
+        # feedback on the divergent component of motion com + rate / omega: its error decays at `gain`
         gain, omega = s.capture_gain, math.sqrt(np.linalg.norm(self.gravity) / max(com[2], 0.1))
-        error = Ag @ lag
-        if recovers:  # the centre of mass has an aim of its own, the joints' motion does not bring it there
+        error = Ag @ v_error
+        if recovers:  # the reference of the centre of mass is no longer that of the joints
             error[:3] = mass * aim.com[1] - data.hg.linear
         wanted = np.zeros(6)
         wanted[:3] = (
@@ -480,33 +542,37 @@ class WholeBodyController:
             + self.kd * (omega + gain) * error[:3] / mass
             - self.gravity
         )
-        wanted[3:] = (aim.momentum[1] + s.momentum_gain * error[3:]) / mass
-        self.footing.tasks.add(self.moves, lift @ B, lift @ held.b0 - wanted)
+        wanted[3:] = (aim.angular_momentum[1] + s.momentum_gain * error[3:]) / mass
+        self.stance_problem.tasks.add(
+            self.momentum_weights, momentum_map @ B, momentum_map @ dynamics.b0 - wanted
+        )
         return wanted
 
 
 class Tasks:
-    """Sum of 1/2 weight (rows x + off)^2 over tasks, for n unknowns; one product for all of them.
+    """Sum of 1/2 weight (J x + offset)^2 over tasks, for x (n,).
 
-    most : rows of all tasks together.
+    Tasks are stacked in one array, so that a single matrix product gives the Hessian of all of them.
+
+    most : number of errors of all tasks together.
     """
 
     def __init__(self, n: int, most: int) -> None:
-        self._rows, self._off, self._weight = np.zeros((most, n)), np.zeros(most), np.zeros(most)
+        self._J, self._offset, self._weight = np.zeros((most, n)), np.zeros(most), np.zeros(most)
         self._used = 0
 
-    def begin(self) -> None:
-        """There is none."""
+    def clear(self) -> None:
+        """Removes all tasks."""
         self._used = 0
 
-    def add(self, weight: float | Array, rows: Array, off: Array) -> None:
-        """Rows (k, n) and off (k,), with one weight or (k,)."""
-        its = slice(self._used, self._used + len(off))
-        self._rows[its], self._off[its], self._weight[its] = rows, off, weight
+    def add(self, weight: float | Array, J: Array, offset: Array) -> None:
+        """Adds a task with J (k, n), offset (k,) and one weight or (k,)."""
+        its = slice(self._used, self._used + len(offset))
+        self._J[its], self._offset[its], self._weight[its] = J, offset, weight
         self._used = its.stop
 
-    def sums(self) -> tuple[Array, Array]:
-        """Hessian (n, n) and gradient (n,) at x = 0."""
-        rows = self._rows[: self._used]
-        weighted = rows.T * self._weight[: self._used]
-        return weighted @ rows, weighted @ self._off[: self._used]
+    def quadratic_form(self) -> tuple[Array, Array]:
+        """Hessian (n, n), and gradient (n,) at x = 0."""
+        J = self._J[: self._used]
+        weighted = J.T * self._weight[: self._used]
+        return weighted @ J, weighted @ self._offset[: self._used]

@@ -1,4 +1,4 @@
-"""Full dynamics of a collision, with nothing frozen: what the simplified models are measured against."""
+"""Reference models: full dynamics of a collision, against which the simplified models are measured."""
 
 from impactopt.simulation.reference.coasting import coasting_reference
 from impactopt.simulation.reference.full import FullDynamics

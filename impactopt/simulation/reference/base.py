@@ -1,4 +1,4 @@
-"""Base of the reference models: gains, friction, tolerance, and the search for the step that meets it."""
+"""Base class of the reference models: forces, tolerance, and refinement until the impulse converges."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 
 
 class Phase(NamedTuple):
-    """Branch of each law of force, on which it is smooth.
+    """Active branch of each piecewise smooth force law.
 
     touching, compressing : of the contact.
-    saturated, sliding : (n) -1, 0 or 1: at which torque limit, or in which direction out of the friction's
-        transition band.
-    switches : signs of the target's.
+    saturated (n,) : -1 or 1 at a torque limit, else 0.
+    sliding (n,) : -1 or 1 outside the friction's transition band, else 0.
+    switches : signs of the target's switches.
     """
 
     touching: bool
@@ -44,18 +44,20 @@ class Forces:
 
     Attributes
     ----------
-    law, target : with their numbers `law_numbers`, `target_numbers`.
-    kp, kd : (n) or (n, n) gains of the servo.
-    limit : (n) [N m].
-    viscous, coulomb, transition : joint friction, as of `JointFriction`.
-    feedforward, velocity : (n) [N m]; (n) [rad/s] at contact, at which the reference coasts.
-    reference, reference_until : (n, k) [rad/s^(k + 1)]; [s], what its joint velocities gain; see `Settings`.
+    law, target : with their parameters `law_parameters`, `target_parameters`.
+    kp, kd : (n,) or (n, n) gains of the servo.
+    limit : (n,) [N m].
+    viscous, coulomb, transition : joint friction, as in `JointFriction`.
+    feedforward : (n,) [N m].
+    velocity : (n,) [rad/s] at contact; the servo's reference starts with it.
+    reference, reference_until : (n, k) [rad/s^(k + 1)], [s]: polynomial by which the reference's joint
+        velocities change; see `Settings`.
     """
 
     law: ContactLaw
     target: Target
-    law_numbers: Mapping[str, Any]
-    target_numbers: Mapping[str, Any]
+    law_parameters: Mapping[str, Any]
+    target_parameters: Mapping[str, Any]
     kp: Array
     kd: Array
     limit: Array
@@ -69,47 +71,53 @@ class Forces:
 
     # ------------------------------------------------------------ joints
     def demand(self, time: float, moved: Array, velocity: Array) -> Array:
-        """Torque (n) [N m] of the servo before saturation; `moved` are the angles (n) [rad] since contact."""
+        """Torque (n,) [N m] of the servo before saturation; `moved`: angles (n,) [rad] since contact."""
         t, powers = min(time, self.reference_until), np.arange(1, self.reference.shape[1] + 1)
-        gained = self.reference * t**powers
-        further = gained @ (t / (powers + 1) + (time - t))
-        behind = self.velocity + gained.sum(axis=1) - velocity
-        deviation = self.velocity * time + further - moved
-        return self.feedforward + _times(self.kp, deviation) + _times(self.kd, behind)
+        # change of the reference's velocity up to t, after which it is constant, by powers; and its integral
+        velocity_change = self.reference * t**powers
+        angle_change = velocity_change @ (t / (powers + 1) + (time - t))
+        rate_error = self.velocity + velocity_change.sum(axis=1) - velocity
+        error = self.velocity * time + angle_change - moved
+        return self.feedforward + _times(self.kp, error) + _times(self.kd, rate_error)
 
     def torque(self, demand: Array, phase: Phase) -> Array:
+        """Torque (n,) [N m] after saturation, by the phase's branches."""
         return np.where(phase.saturated == 0, demand, phase.saturated * self.limit)
 
     def friction(self, velocity: Array, phase: Phase) -> Array:
+        """Friction torque (n,) [N m], by the phase's branches."""
         sign = np.where(phase.sliding == 0, velocity / self.transition, phase.sliding)
         return self.viscous * velocity + self.coulomb * sign
 
     # ------------------------------------------------------------ contact
     def target_speed(self, state: Array) -> float:
-        return float(self.target.velocity(state, self.target_numbers))
+        """Speed [m/s] of the hit surface along the normal."""
+        return float(self.target.velocity(state, self.target_parameters))
 
     def contact(self, penetration: float, rate: float, compressing: bool) -> float:
         """Force [N] of one branch of the law."""
-        return float(self.law.branch(penetration, rate, compressing, self.law_numbers))
+        return float(self.law.branch(penetration, rate, compressing, self.law_parameters))
 
     def contact_slopes(
-        self, penetration: float, rate: float, compressing: bool, way: float, speed: float
+        self, penetration: float, rate: float, compressing: bool, depth: float, speed: float
     ) -> tuple[float, float]:
-        """Stiffness [N/m] and damping [N s/m] of one branch of the law, by differences of that size."""
+        """Stiffness [N/m] and damping [N s/m] of one branch of the law, by differences of depth and speed."""
         here = self.contact(penetration, rate, compressing)
-        deeper = self.contact(penetration + way, rate, compressing)
+        deeper = self.contact(penetration + depth, rate, compressing)
         faster = self.contact(penetration, rate + speed, compressing)
-        return (deeper - here) / way, (faster - here) / speed
+        return (deeper - here) / depth, (faster - here) / speed
 
     def switches(self, state: Array, force: float) -> Array:
-        return np.array(self.target.switches(state, force, self.target_numbers), dtype=float)
+        """Values of the target's switches."""
+        return np.array(self.target.switches(state, force, self.target_parameters), dtype=float)
 
     def target_rates(self, state: Array, force: float) -> list[Any]:
-        return self.target.derivative(state, force, self.target_numbers)
+        """Time derivative of the target's state."""
+        return self.target.derivative(state, force, self.target_parameters)
 
     # ------------------------------------------------------------ phases
     def phase(self, demand: Array, velocity: Array, penetration: float, rate: float, target: Array) -> Phase:
-        """The phase of a state. Contact is over when, in restitution, no force is left."""
+        """Phase of a state. Contact ends when, in restitution, the force vanishes."""
         compressing = rate > 0
         force = self.contact(penetration, rate, compressing)
         return Phase(
@@ -121,17 +129,20 @@ class Forces:
         )
 
     def margins(self, phase: Phase, demand: Array, velocity: Array, penetration: float, rate: float) -> Array:
-        """Numbers of which none is negative as long as servo, friction and contact are in `phase`."""
+        """Event functions of servo, friction and contact: none is negative during `phase`."""
         saturated, sliding = phase.saturated, phase.sliding
+        # distance of each joint's demand from its limit, on its side of it; likewise of the transition band
         out = [np.where(saturated == 0, self.limit - np.abs(demand), saturated * demand - self.limit)]
         if self.coulomb.any():
             band = self.transition
             out.append(np.where(sliding == 0, band - np.abs(velocity), sliding * velocity - band))
-        if phase.compressing:
+        if phase.compressing:  # ends when the rate changes its sign
             return np.concatenate([*out, [rate]])
+        # restitution ends when the force vanishes, or the two approach again
         force = self.contact(penetration, rate, False)
         if force <= 0:
-            # a law may be flat at zero beyond separation
+            # Beyond separation a law may be constant at zero. A negative value makes it an event all the
+            # same.
             force = min(force, penetration, -1e-12)
         return np.concatenate([*out, [-rate, force]])
 
@@ -145,13 +156,14 @@ Outcome = TypeVar("Outcome", bound="_HasImpulse")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceModel(CollisionModel):
-    """A collision with nothing frozen, integrated until its impulse is known within a tolerance.
+    """Collision model without frozen quantities, refined until its impulse converges to a tolerance.
 
     Attributes
     ----------
-    friction : of the joints.  contact_friction : of the striking point on the target.
-    kp, kd : (n) or (n, n) gains in place of the robot's.
-    step : [s] the longest.
+    friction : of the joints.
+    contact_friction : of the striking point on the target.
+    kp, kd : (n,) or (n, n) gains in place of the robot's.
+    step : [s] at most.
     tolerance : relative, of the impulse.
     """
 
@@ -173,7 +185,7 @@ class ReferenceModel(CollisionModel):
     def _controlled(
         self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
     ) -> tuple[Collision, float]:
-        """(the collision, what is not known of its impulse [N s]), from checked numbers."""
+        """Collision, and uncertainty of its impulse [N s], from checked arguments."""
 
     def collide(
         self,
@@ -184,15 +196,15 @@ class ReferenceModel(CollisionModel):
         require_separation: bool = True,
         **overrides: ArrayLike,
     ) -> Collision:
-        """One collision, in numbers, as of `CollisionModel.collide`.
+        """Simulates one collision, as `CollisionModel.collide`.
 
-        `overrides` are normal, contact_<number of the law>, target_<number of the target>, kp, kd,
+        `overrides` are normal, contact_<parameter of the law>, target_<parameter of the target>, kp, kd,
         torque_limit, reference, reference_until, and with friction viscous, coulomb.
 
         Raises
         ------
         InputError : wrong shapes or NaN; torque missing; unknown overrides; a contact that does not end; an
-            impulse that is not found within the tolerance.
+            impulse that does not converge to the tolerance.
         """
         given: dict[str, Any] = {"require_separation": require_separation, **overrides}
         return self.converged(q, v, torque, **given)[0]
@@ -207,14 +219,13 @@ class ReferenceModel(CollisionModel):
         require_separation: bool = True,
         **overrides: Any,
     ) -> tuple[Collision, float]:
-        """(the collision as `collide` gives it; what its impulse changed by when it was integrated more
-        exactly [N s]).
+        """Collision as in `collide`, and change of its impulse [N s] by the last refinement.
 
         tolerance : relative, of the impulse; None: the model's.
 
         Raises
         ------
-        InputError : as of `collide`.
+        InputError : as in `collide`.
         """
         tolerance = check_positive("tolerance", self.tolerance if tolerance is None else tolerance)
         q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
@@ -225,13 +236,13 @@ class ReferenceModel(CollisionModel):
         return result, change
 
     @property
-    def _held(self) -> tuple[Robot, tuple[str, ...], Array, str]:
-        """Robot, constrained frames, their compliance, and striking frame."""
+    def _body_arguments(self) -> tuple[Robot, tuple[str, ...], Array, str]:
+        """Robot, fixed frames, their compliance, and striking frame: the first arguments of `Body`."""
         robot, held_by = self.robot, self.held_by
         striker = robot.striker(self.striker).model_frame
         return robot, held_by.constraint_frames(robot), held_by.compliance, striker
 
-    # ------------------------------------------------------------ numbers
+    # ------------------------------------------------------------ settings
     def _settings(self, kp: ArrayLike | None, kd: ArrayLike | None) -> Settings:
         effects = Effects(friction=self.friction is not None)
         servo = servo_settings(self.robot, effects, self._friction, kp, kd)
@@ -245,28 +256,28 @@ class ReferenceModel(CollisionModel):
     def _forces(
         self, v: Array, torque: ArrayLike | None, overrides: Mapping[str, ArrayLike]
     ) -> tuple[Forces, Array]:
-        """The forces, and the normal."""
+        """Forces with their overridden parameters, and the normal (3,)."""
         n = self.robot.n
         if torque is None:
             raise InputError(
-                "torque: give the feed-forward torque (n) [N m]; `holding_torque` has one that keeps the "
+                "torque: give the feed-forward torque (n,) [N m]; `holding_torque` has one that keeps the "
                 "robot's velocities, np.zeros(n) is none"
             )
-        # gains may change their shape too, from one a joint to a matrix
+        # overridden gains may have another shape: (n,) or (n, n)
         settings = self._settings(overrides.get("kp", self.kp), overrides.get("kd", self.kd))
-        rest = {name: x for name, x in overrides.items() if name not in ("kp", "kd")}
-        values = settings.override(rest)
-        none = np.zeros(n)
+        other = {name: x for name, x in overrides.items() if name not in ("kp", "kd")}
+        values = settings.override(other)
+        zero = np.zeros(n)
         forces = Forces(
             law=self.law,
             target=self.target,
-            law_numbers={name: float(values[f"contact_{name}"]) for name in self.law.parameters},
-            target_numbers={name: float(values[f"target_{name}"]) for name in self.target.parameters},
+            law_parameters={name: float(values[f"contact_{name}"]) for name in self.law.parameters},
+            target_parameters={name: float(values[f"target_{name}"]) for name in self.target.parameters},
             kp=values["kp"],
             kd=values["kd"],
             limit=values["torque_limit"],
-            viscous=values.get("viscous", none),
-            coulomb=values.get("coulomb", none),
+            viscous=values.get("viscous", zero),
+            coulomb=values.get("coulomb", zero),
             transition=self._friction.transition,
             feedforward=check_array("torque [N m]", torque, (n,)),
             velocity=v[-n:],
@@ -286,27 +297,35 @@ def converge(
     tolerance: float,
     *,
     levels: int,
-    better: Callable[[Outcome, Outcome], Outcome] | None = None,
+    extrapolate: Callable[[Outcome, Outcome], Outcome] | None = None,
 ) -> tuple[Outcome, float]:
-    """(outcome, what its impulse has changed by at last [N s]), when that is within a relative tolerance.
+    """Refines an outcome until the change of its impulse is within a relative tolerance.
 
-    at : the outcome of a level, which is more exact each time.
-    levels : the most of them.
-    better : makes an outcome of those of a level and of the one before; None: the first of them.
+    at : computes the outcome of a level of refinement, 0, 1, ...
+    levels : number of levels at most.
+    extrapolate : makes an outcome of those of a level and of the coarser one before; None: no extrapolation.
+
+    Returns
+    -------
+    The outcome, and the last change of its impulse [N s].
+
+    Raises
+    ------
+    InputError : the impulse does not converge.
     """
     runs = [at(0)]
-    found = [] if better else runs
+    outcomes = [] if extrapolate else runs
     change = np.inf
     for level in range(1, levels):
         runs.append(at(level))
-        if better:
-            found = [*found, better(runs[-1], runs[-2])]
-        if len(found) > 1:
-            change = abs(found[-1].impulse - found[-2].impulse)
-        if change <= tolerance * abs(found[-1].impulse):
-            return found[-1], float(change)
+        if extrapolate:
+            outcomes = [*outcomes, extrapolate(runs[-1], runs[-2])]
+        if len(outcomes) > 1:
+            change = abs(outcomes[-1].impulse - outcomes[-2].impulse)
+        if change <= tolerance * abs(outcomes[-1].impulse):
+            return outcomes[-1], float(change)
     raise InputError(
-        f"tolerance: {tolerance:g} is not met, the last time the impulse changed by {change:.2g} of "
-        f"{found[-1].impulse:.4g} N s: raise it; or the collision hangs on a hair, as where contact nearly "
-        "ends, or a board nearly breaks"
+        f"tolerance: {tolerance:g} is not met; the last refinement changed the impulse by {change:.2g} of "
+        f"{outcomes[-1].impulse:.4g} N s: raise it. Or the collision is close to a bifurcation, as where "
+        "contact nearly ends or a board nearly breaks"
     )

@@ -1,4 +1,4 @@
-"""Accelerations of a reference that coasts with its soles in place, as a plan's servo keeps it in contact."""
+"""Reference of the servo during contact: it coasts with the soles in place, as that of a plan."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from impactopt.kinematics.coordinates import StanceCoordinates, independent_rate
 __all__ = ["coasting_reference"]
 
 Array = NDArray[np.float64]
-_NODES = 3 * REFERENCE_ORDER
-_SHORTEST = 1e-3  # [s]
-_SHORTER = 0.9
-_OFF = 1e-4  # [rad/s] of a fit that is good
+_NODES = 3 * REFERENCE_ORDER  # of the fit
+_MIN_TIME = 1e-3  # [s] below which legs that do not reach are an error
+_SHRINK = 0.9  # of the fitted time, as long as the fit is not good
+_MAX_ERROR = 1e-4  # [rad/s] of a good fit
 
 
 def coasting_reference(
     coordinates: StanceCoordinates, q: ArrayLike, v: ArrayLike, *, until: float = 0.1
 ) -> dict[str, NDArray[np.float64]]:
-    """The settings of a collision whose servo's reference keeps the soles in place.
+    """Settings of a collision model in which the servo's reference keeps the soles in place.
 
     During contact a plan's reference keeps the rates ydot of its independent coordinates: the base's pose and
-    the joints outside the legs. The soles stay where they are, so the velocities of the leg joints change.
-    Their change is fitted by t, t^2, ... t^10. The fit is exact in the acceleration at contact, and best over
-    a time from half of `until` to `until`: the longest for which it is within 1e-4 rad/s. The time is shorter
-    for legs that are nearly straight, whose velocities grow without bound.
+    the joints outside the legs. The soles stay in place, so that the velocities of the leg joints change.
+    Their change is fitted by t, t^2, ... t^10. The fit is exact in the acceleration at contact. It covers the
+    longest time between half of `until` and `until` for which its error is below 1e-4 rad/s: less for legs
+    that are nearly straight, whose velocities grow without bound.
 
     Parameters
     ----------
-    coordinates : where the soles are held, such as `ImpactProblem.coordinates`.
-    q, v : (nq), (nv) at contact, Pinocchio's, with the soles in place and at rest.
+    coordinates : of the stance, such as `ImpactProblem.coordinates`.
+    q, v : (nq,), (nv,) at contact, Pinocchio's, with the soles in place and at rest.
     until : [s] since contact; twice the contact's duration is a good value.
 
     Returns
@@ -50,27 +50,27 @@ def coasting_reference(
         return no_bend(robot.n)
     y, legs = c.split(q)
     rates, shortest = independent_rates(c, y, v), until / 2
-    _, start, bend = c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, legs))
+    _, start, acceleration = c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, legs))
     orders = np.arange(2, REFERENCE_ORDER + 1)
     while True:
-        # Chebyshev's nodes: a fit at them is nearly the best at all times
+        # least squares at Chebyshev nodes are nearly the best uniform fit
         times = until * (1 - np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)) / 2
         try:
-            there = np.array([_at(c, y + rates * t, rates, legs) for t in times])
-        except InputError:
-            if until < _SHORTEST:
+            velocities = np.array([_velocity(c, y + rates * t, rates, legs) for t in times])
+        except InputError:  # the legs do not reach that far
+            if until < _MIN_TIME:
                 raise
         else:
-            left = (there - start - np.outer(times, bend))[:, -robot.n :]
-            share = (times / until)[:, None] ** orders
-            fitted = np.linalg.lstsq(share, left, rcond=None)[0]
-            if np.abs(share @ fitted - left).max() < _OFF or until * _SHORTER < shortest:
+            remainder = (velocities - start - np.outer(times, acceleration))[:, -robot.n :]
+            powers = (times / until)[:, None] ** orders
+            fitted = np.linalg.lstsq(powers, remainder, rcond=None)[0]
+            if np.abs(powers @ fitted - remainder).max() < _MAX_ERROR or until * _SHRINK < shortest:
                 break
-        until *= _SHORTER
-    reference = np.column_stack([bend[-robot.n :], fitted.T / until**orders])
+        until *= _SHRINK
+    reference = np.column_stack([acceleration[-robot.n :], fitted.T / until**orders])
     return {"reference": reference, "reference_until": np.array(until)}
 
 
-def _at(c: StanceCoordinates, y: Array, rates: Array, near: Array) -> Array:
-    """v (nv) there; `near` are leg joints that inverse kinematics begins with."""
-    return c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, near))[1]
+def _velocity(c: StanceCoordinates, y: Array, rates: Array, legs: Array) -> Array:
+    """v (nv,) at y (ny,) with rates (ny,); `legs` is the initial guess of the inverse kinematics."""
+    return c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, legs))[1]

@@ -1,4 +1,4 @@
-"""Full dynamics of a collision in MuJoCo: a second opinion, from other algorithms and another integrator."""
+"""Full dynamics of a collision in MuJoCo: a check by other algorithms and another integrator."""
 
 from __future__ import annotations
 
@@ -26,37 +26,37 @@ from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.reference.base import Forces, Phase, ReferenceModel, converge
 from impactopt.simulation.reference.equations_of_motion import Instant, Scales, collision_from, contact_scales
 
-__all__ = ["HeldRobot", "MujocoDynamics", "march"]
+__all__ = ["MujocoDynamics", "WeldedRobot", "march"]
 
 Array = NDArray[np.float64]
-_RECORD = 5e-5  # [s] between instants that are kept
-# step times the contact's fastest rate, with which it begins; times they are halved; steps of a run
-_RESOLVED, _LEVELS, _MOST_STEPS = 0.02, 9, 300_000
+_RECORD = 5e-5  # [s] between recorded instants
+_RESOLUTION = 0.02  # step of the first run, times the contact's fastest rate
+_RUNS, _MAX_STEPS = 9, 300_000  # with half the step each; of a run
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MujocoDynamics(ReferenceModel):
-    """A robot hits a target, in MuJoCo.
+    """Collision in MuJoCo, without frozen quantities.
 
-    The constrained frames are welded to the world, as hard as MuJoCo lets them be: their time constant is two
-    steps, so that they get rigid as the step goes to zero. Servo, friction and contact act as applied forces,
-    in MuJoCo's semi-implicit Euler steps. All this is of first order in the step: steps that resolve the
-    servo and the contact are halved until impulse, energy and velocity, extrapolated to steps without length
-    from the two shortest, are found. The histories, and the rest, are those of the shortest steps. The
-    contact's end is found to within a step.
+    The fixed frames are welded to the world, as hard as MuJoCo permits: the time constant is two steps, so
+    that welds become rigid as the step goes to zero. Servo, friction and contact act as applied forces, in
+    MuJoCo's semi-implicit Euler steps. All this is of first order in the step. Steps that resolve servo and
+    contact are halved until impulse, energy and velocity converge, extrapolated to zero step from the two
+    shortest (Richardson). Histories and other results are those of the shortest steps. The end of contact is
+    found to within a step.
 
     Attributes
     ----------
     friction : of the joints.
-    kp, kd : (n) or (n, n) gains in place of the robot's.
-    step : [s] the longest that it begins with.
+    kp, kd : (n,) or (n, n) gains in place of the robot's.
+    step : [s] of the first run, at most.
     tolerance : relative, of the impulse.
 
     Raises
     ------
-    InputError : as of `CollisionModel`; MuJoCo is not installed; a virtual base, which this has not; gains of
-        a wrong shape or sign; a step or a tolerance that is not positive; in `collide`, a contact that takes
-        too many steps.
+    InputError : as in `CollisionModel`; MuJoCo is not installed; a virtual base, which this model lacks;
+        gains of a wrong shape or sign; a step or a tolerance that is not positive; in `collide`, a contact
+        that takes too many steps.
     """
 
     step: float = 4e-5
@@ -67,44 +67,47 @@ class MujocoDynamics(ReferenceModel):
         mujoco_module()
         if np.any(self.held_by.compliance):
             raise InputError(
-                "MujocoDynamics holds soles exactly only: take FullDynamics for a virtual base, or a stance "
+                "MujocoDynamics fixes soles exactly only: take FullDynamics for a virtual base, or a stance "
                 "without base_mass and base_inertia"
             )
 
     def _controlled(
         self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
     ) -> tuple[Collision, float]:
-        body = DenseBody(*self._held, normal, self.contact_friction)
-        rate = body.look(q, v) - forces.target_speed(np.zeros(forces.target.n_states))
+        body = DenseBody(*self._body_arguments, normal, self.contact_friction)
+        rate = body.update(q, v) - forces.target_speed(np.zeros(forces.target.n_states))
         scales = contact_scales(body, forces, rate, self.horizon)
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
+        # steps that resolve servo and friction; halved until they resolve the contact too
         step = min(self.step, 1 / fastest) if fastest > 0 else self.step
         first = None
         while first is None:
             try:
                 first = self._run(step, q, v, forces, normal, scales)
             except _NotResolved as contact:
-                step = min(step / 2, _RESOLVED / contact.rate)
+                step = min(step / 2, _RESOLUTION / contact.rate)
         coarse = first
 
         def at(level: int) -> Collision:
             return self._run(step / 2**level, q, v, forces, normal) if level else coarse
 
-        return converge(at, tolerance, levels=_LEVELS, better=_extrapolated)
+        return converge(at, tolerance, levels=_RUNS, extrapolate=_extrapolated)
 
     def _run(
         self, step: float, q: Array, v: Array, forces: Forces, normal: Array, scales: Scales | None = None
     ) -> Collision:
-        robot, frames, _, striker = self._held
+        """Collision in steps of this length [s]; `scales` as in `march`."""
+        robot, frames, _, striker = self._body_arguments
         with no_log_file():
-            world = HeldRobot(robot, frames, striker, step, self.contact_friction)
+            world = WeldedRobot(robot, frames, striker, step, self.contact_friction)
             world.start(q, v)
             soles = len(self.held_by.sole_names(robot))
             return march(world, forces, normal, self.horizon, soles, scales)
 
 
 def _extrapolated(fine: Collision, coarse: Collision) -> Collision:
+    """Richardson extrapolation of a method of first order from two runs, the finer with half the step."""
     return replace(
         fine,
         impulse=2 * fine.impulse - coarse.impulse,
@@ -113,8 +116,8 @@ def _extrapolated(fine: Collision, coarse: Collision) -> Collision:
     )
 
 
-class HeldRobot(MujocoRobot):
-    """The robot with frames that are welded to where `start` finds them."""
+class WeldedRobot(MujocoRobot):
+    """Robot whose frames are welded where they are in `start`."""
 
     def __init__(
         self,
@@ -137,21 +140,22 @@ class HeldRobot(MujocoRobot):
         self.welds = Welds(self.world, frames)
 
     def start(self, q: Array, v: Array) -> None:
-        """Configuration and velocity at contact; the welds hold what they find."""
+        """Sets q (nq,), v (nv,) at contact, and the welds to the frames' placements."""
         self.put(q, v)
         self.mujoco.mj_kinematics(self.world, self.data)
         self.welds.put(self.data)
 
     def wrenches(self) -> tuple[Array, Array]:
-        """Wrenches of the ground on the welded frames (6 a frame), and their places, at the last step's
-        start.
+        """Wrenches (6 frames,) of the ground on the welded frames, and their origins (frames, 3) [m].
+
+        Both are those at the start of the last step.
         """
-        found, places = self.welds.wrenches(self.data)
-        return found.ravel(), places
+        wrenches, places = self.welds.wrenches(self.data)
+        return wrenches.ravel(), places
 
 
 class _NotResolved(Exception):
-    """Steps are too long for the contact, which changes at a rate of [1/s]."""
+    """Raised when steps are too long for the contact, which changes at this rate [1/s]."""
 
     def __init__(self, rate: float) -> None:
         super().__init__()
@@ -159,50 +163,56 @@ class _NotResolved(Exception):
 
 
 def march(
-    world: HeldRobot,
+    world: WeldedRobot,
     forces: Forces,
     normal: Array,
     horizon: float,
     soles: int,
     scales: Scales | None = None,
 ) -> Collision:
-    """The collision in the world's steps.
+    """Simulates a collision in the steps of a MuJoCo world, from its current state.
 
-    scales : of the contact; None: steps that do not resolve it are taken as they are.
+    scales : of the contact, to check that steps resolve it; None: no check.
+
+    Raises
+    ------
+    InputError : the simulation diverges, or takes too many steps.
+    _NotResolved : the steps do not resolve the contact.
     """
     data, step = world.data, world.step
     every = max(1, round(_RECORD / step))
     instants: list[Instant] = []
     impulse = travel = peak = 0.0
     target = np.zeros(forces.target.n_states)
-    angles = data.qpos[world.place].copy()
+    angles = data.qpos[world.qpos_index].copy()
     k = 0
     while True:
-        world.mujoco.mj_step1(world.world, data)
+        world.mujoco.mj_step1(world.world, data)  # up to velocities; forces are set before mj_step2
         speed = float(world.speeds_along(normal)[0])
         if k == 0:
-            start = float(normal @ world.places()[0])
+            start = float(normal @ world.striking_points()[0])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
             raise InputError(f"step [s]: {step:g} is unstable here; give MujocoDynamics a shorter one")
-        if k > _MOST_STEPS:
+        if k > _MAX_STEPS:
             raise InputError(
-                f"the contact is too fast to follow in MuJoCo: it takes steps of {step:.2g} s, and is not "
-                f"over after {_MOST_STEPS} of them; give a softer law or a heavier target, or take "
+                f"the contact is too fast for MuJoCo: it has not ended after {_MAX_STEPS} steps of "
+                f"{step:.2g} s; give a softer law or a heavier target, or take "
                 "FullDynamics"
             )
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)
         rate = speed - target_speed
-        depth = float(normal @ world.places()[0]) - start - travel
-        demand = forces.demand(time, data.qpos[world.place] - angles, velocity)
+        depth = float(normal @ world.striking_points()[0]) - start - travel
+        demand = forces.demand(time, data.qpos[world.qpos_index] - angles, velocity)
         phase: Phase = forces.phase(demand, velocity, depth, rate, target)
         force = forces.contact(depth, rate, phase.compressing) if phase.touching else 0.0
+        # the steps have to resolve the contact's fastest mode, with a factor of two of tolerance
         if scales is not None and phase.touching:
             fastest = _fastest(forces, depth, rate, phase.compressing, scales)
-            if fastest * step > 2 * _RESOLVED:
+            if fastest * step > 2 * _RESOLUTION:
                 raise _NotResolved(fastest)
         torque = forces.torque(demand, phase)
-        # hand and target that neither approach nor part: the next step decides
+        # a contact that begins with equal speeds of hand and target may still press: wait for the next step
         ends = (not phase.touching and (k > 0 or rate != 0)) or time >= horizon * (1 - 1e-9)
         if ends:
             end = world.state()
@@ -210,18 +220,21 @@ def march(
         world.mujoco.mj_step2(world.world, data)
         peak = max(peak, force)
         if ends or k % every == 0:
-            held = world.wrenches()
-            instants.append(Instant(time, force, depth, speed, target_speed, velocity, torque, demand, *held))
+            wrenches, places = world.wrenches()
+            instants.append(
+                Instant(time, force, depth, speed, target_speed, velocity, torque, demand, wrenches, places)
+            )
         if ends:
             return collision_from(instants, *end, impulse, peak, target, soles, forces, not phase.touching)
         impulse += step * force
+        # semi-implicit Euler as in MuJoCo: the travel follows from the new speed
         target = target + step * np.array(forces.target_rates(target, force), dtype=float)
         travel += step * forces.target_speed(target)
         k += 1
 
 
 def _fastest(forces: Forces, depth: float, rate: float, compressing: bool, scales: Scales) -> float:
-    """[1/s] of the contact's spring and damper, hand and target being free."""
-    way, speed = 1e-3 * scales.time * scales.speed, 1e-3 * scales.speed
-    stiffness, damping = forces.contact_slopes(depth, rate, compressing, way, speed)
-    return max(sqrt(max(stiffness, 0.0) * scales.mobility), abs(damping) * scales.mobility)
+    """Fastest rate [1/s] of the contact's spring and damper between free hand and target."""
+    depth_step, speed_step = 1e-3 * scales.time * scales.speed, 1e-3 * scales.speed
+    stiffness, damping = forces.contact_slopes(depth, rate, compressing, depth_step, speed_step)
+    return max(sqrt(max(stiffness, 0.0) * scales.inverse_mass), abs(damping) * scales.inverse_mass)

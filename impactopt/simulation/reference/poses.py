@@ -1,4 +1,4 @@
-"""Placements of a motion's links at some instants, and effective mass at contact, for pictures."""
+"""Poses of a motion's links at some instants, and effective mass at contact, for pictures."""
 
 from __future__ import annotations
 
@@ -18,18 +18,22 @@ from impactopt.transcription.plan import Trajectory
 __all__ = ["Poses", "inverse_mass", "poses_of"]
 
 Array = NDArray[np.float64]
-BEFORE, AFTER = 4, 2  # poses up to contact, and after the one at the contact's end
+POSES_BEFORE, POSES_AFTER = 4, 2  # up to contact, and after the end of contact
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Poses:
-    """A motion in a few poses, world frame.
+    """A motion in a few poses, in the world frame.
 
-    time (m,) [s]; links (m, l, 2, 3) [m], ends of each link; strikes (l,): whether a link is of the limb that
-    strikes; contact: which of the poses is the first in contact; path (k, 3) [m] of the striking point, at
-    the k instants of the reference; target, obstacles (b, c, 3) [m]: points about each body of the target at
-    contact, and of the user's; ground (1,) [m]: its height, (0,) if there is none; normal (3,) of the blow;
-    inverse_mass (3, 3) [1/kg] of the striking point at contact.
+    time (m,) [s]
+    links (m, l, 2, 3) [m] : ends of each link
+    strikes (l,) : whether a link belongs to the striking limb
+    contact : index of the first pose in contact
+    path (k, 3) [m] : of the striking point, at the k instants of the reference
+    target, obstacles (b, c, 3) [m] : corners of each body of the target at contact, and of the obstacles
+    ground (1,) [m] : height; (0,) without ground
+    normal (3,) : of the impact
+    inverse_mass (3, 3) [1/kg] : of the striking point at contact
     """
 
     time: Array
@@ -45,26 +49,26 @@ class Poses:
 
 
 def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
-    """Poses from the start over contact and its end to rest, and the striking point's way."""
+    """Poses from the start over contact to rest, and the striking point's path."""
     robot = problem.robot
     begin, end = reference.contact_start, reference.contact_end
-    after = np.linspace(end, reference.end, AFTER + 1)[1:]
-    wanted = np.concatenate([np.linspace(0.0, begin, BEFORE), [end] * (end > begin), after])
-    # the first of two instants at the same time is the one before the reference jumps
-    chosen = np.searchsorted(reference.time, wanted - 1e-9).clip(0, len(reference.time) - 1)
-    at_contact = reference.q[chosen[BEFORE - 1]]
-    names, seen = problem.strikers, [b for b in problem.world if not (b.core or b.ground)]
+    after = np.linspace(end, reference.end, POSES_AFTER + 1)[1:]
+    times = np.concatenate([np.linspace(0.0, begin, POSES_BEFORE), [end] * (end > begin), after])
+    # of two instants at the same time take the first, before the jump
+    chosen = np.searchsorted(reference.time, times - 1e-9).clip(0, len(reference.time) - 1)
+    at_contact = reference.q[chosen[POSES_BEFORE - 1]]
+    names, visible = problem.strikers, [b for b in problem.world if not (b.core or b.ground)]
     links = [_links(robot, names, reference.q[k]) for k in chosen]
     strikes = {j for name in names for j in robot.model.supports[_striker(robot, name).parentJoint]}
-    moved = [j in strikes for _, j in _bones(robot)]
+    of_limb = [j in strikes for _, j in _bones(robot)]
     return Poses(
         time=reference.time[chosen],
         links=np.array(links),
-        strikes=np.array([True] * len(names) + [*moved, *[False] * (2 * len(robot.soles))]),
-        contact=BEFORE - 1,
+        strikes=np.array([True] * len(names) + [*of_limb, *[False] * (2 * len(robot.soles))]),
+        contact=POSES_BEFORE - 1,
         path=np.array([_place(robot, problem.striker, q) for q in reference.q]),
-        target=_corners([b for b in seen if b.of_target]),
-        obstacles=_corners([b for b in seen if not b.of_target]),
+        target=_corners([b for b in visible if b.of_target]),
+        obstacles=_corners([b for b in visible if not b.of_target]),
         ground=np.array([z for z in [problem.ground_height] if z is not None]),
         normal=problem.normal,
         inverse_mass=inverse_mass(problem, at_contact),
@@ -72,7 +76,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
 
 
 def inverse_mass(problem: ImpactProblem, q: Array) -> Array:
-    """J P J' (3, 3) [1/kg] of the striking point, as of `impactopt.kinematics.operational_space.Held`."""
+    """J P J' (3, 3) [1/kg] of the striking point, as in `impactopt.kinematics.operational_space.Held`."""
     robot = problem.robot
     frames = problem.stance.constraint_frames(robot)
     return Held.at(robot.model, q, frames, robot.striker(problem.striker).model_frame).inverse_mass()
@@ -89,7 +93,7 @@ def _striker(robot: Robot, name: str) -> pin.Frame:
 
 
 def _links(robot: Robot, strikers: Sequence[str], q: Array) -> list[Array]:
-    """Ends (2, 3) of each link: to the striking points, between joints, then each sole's two."""
+    """Ends (2, 3) [m] of each link: to the striking points, between joints, then two of each sole."""
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, q)
     hands = [_striker(robot, name) for name in strikers]

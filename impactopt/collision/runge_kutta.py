@@ -1,6 +1,7 @@
-"""Steps 3b to 7b of the paper as fixed steps of the classical Runge-Kutta method, as in its section III.
+"""Fixed steps of the classical Runge-Kutta method (paper, steps 3b to 7b and section III).
 
-Phases are judged anew in each of the four stages, so a step across an event is of second order only.
+Each of the four stages evaluates the phase of contact by itself, so a step across an event is of second order
+only.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["BLOCK", "LEFT_OUT_BY_RK4", "rate_of_change", "rk4_step", "run"]
 
-# steps in a block: a block is skipped when the contact is over before it begins
+# steps in a block; a block is skipped if the contact is over before it begins
 BLOCK = 16
 
 
 def run(
     model: JointSpaceModel, step: Any, start: Any, steps: int, data: Sequence[Any], *, record: bool
 ) -> tuple[Any, Any]:
-    """(final state, states at all steps) from the state `start`, MX.
+    """Final state, and with `record` the states at all steps (n_states, steps + 1), else None, MX.
 
-    At least `steps` steps are made, rounded up to whole blocks; the states at all steps, (n_states, steps +
-    1), are in the graph only where `record` asks for them. After the end states repeat the last one.
+    The number of steps is rounded up to whole blocks. After the end of contact the states repeat the last
+    one.
     """
     block = _block(model, step, record)
     still = _still(model, record)
@@ -60,14 +61,15 @@ def _running(model: JointSpaceModel) -> Any:
     return ca.Function("running", [y, *data.values()], [model.running(y, data)])
 
 
-# of |f_2 - f_3| h, of the force at both of a step's middles, summed over steps, what is left out of the
-# impulse: where the force changes by x of itself within a step, half of x^2, as kinks cost. Friction counts
-# too: where it swings from stage to stage, as it does where steps are too long for a point that sticks
+# Error estimate of the impulse: this times |f_2 - f_3| h, summed over steps, of the forces f_2 and f_3 at the
+# two midpoint stages. If the force changes by the fraction x within a step, it is half of x^2, as much as a
+# kink costs. Friction is included: it oscillates from stage to stage if steps are too long for a sticking
+# point.
 LEFT_OUT_BY_RK4 = 2.0
 
 
 def rk4_step(model: JointSpaceModel, length: float) -> Any:
-    """ca.Function step(y, *data) -> y `length` [s] later; y itself after separation."""
+    """ca.Function (y, *data) -> state `length` [s] later; after separation y itself."""
     y, data, u = ca.SX.sym("y", model.n_states), model.small_symbols(), ca.SX.sym("u", model.n)
     rate = ca.Function("rate", [y, *data.values(), u], [rate_of_change(model, y, u, data)])
     time = model.longest(y, data, length) * model.running(y, data)
@@ -99,7 +101,7 @@ def rk4_step(model: JointSpaceModel, length: float) -> Any:
 
 
 def rate_of_change(model: JointSpaceModel, y: Any, u: Any, data: dict[str, Any]) -> Any:
-    """dy/dt, with every phase judged at y; u is the change of the joint velocities at y."""
+    """Time derivative dy/dt in the phase at y; u is the change of the joint velocities at y."""
     rate = model.rate(y, data)
     force = model.law.force(model.part(y, "penetration"), rate, model.law_numbers(data))
     tau = model.saturate(model.with_feedforward(model.servo(y, u, data), data), data)

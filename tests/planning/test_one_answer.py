@@ -25,7 +25,7 @@ from impactopt.codegen.compiler import find_compiler
 from impactopt.collide.contact_states import ContactStates, Posture
 from impactopt.collide.single_collision import collide_once, problem_of_result
 from impactopt.collision import SDC, Effects
-from impactopt.collision.settings import REFERENCE_ORDER, no_bend
+from impactopt.collision.settings import REFERENCE_ORDER, constant_reference
 from impactopt.contact import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.output import load_record, record_of, record_of_strike, save_record
@@ -223,7 +223,7 @@ def test_references_that_cannot_be() -> None:
     arm = robot_named("arm")
     on_base = StanceCoordinates(arm, (), arm.posture("start"))
     none = coasting_reference(on_base, arm.posture("start"), np.ones(arm.nv))
-    assert not none["reference"].any() and none.keys() == no_bend(arm.n).keys()
+    assert not none["reference"].any() and none.keys() == constant_reference(arm.n).keys()
 
 
 # ---------------------------------------------------------------- results of the problems that come with us

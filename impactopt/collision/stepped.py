@@ -46,8 +46,9 @@ _PARAMETER_SETS = 3
 
 
 def _sampled(parameters: Any, values: dict[str, float], f: Any, x: Any, seed: int) -> NDArray[np.float64]:
-    """Values of f at 132 random points (rows) of all magnitudes; parameters are `values`, or random if seed >
-    0.
+    """Values of f at 132 random points (rows) of all magnitudes.
+
+    The parameters are `values` for seed 0, else random ones.
     """
     rng, function = np.random.default_rng(seed), ca.Function("f", [parameters, x], [ca.densify(ca.vec(f))])
     own = np.array(list(values.values()))

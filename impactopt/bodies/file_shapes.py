@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class LinkShape:
-    """A shape of a link: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
+    """Shape of a link in a URDF: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
 
-    element : the URDF's <collision> or <visual>.
+    element : the <collision> or <visual>.
     """
 
     link: str
@@ -37,7 +37,7 @@ class LinkShape:
 
 
 def urdf_root(urdf: Path) -> ElementTree.Element | None:
-    """The root of a URDF; None if it cannot be read."""
+    """Root element of a URDF; None if it cannot be read."""
     try:
         return ElementTree.parse(urdf).getroot()
     except (OSError, ElementTree.ParseError):
@@ -47,10 +47,10 @@ def urdf_root(urdf: Path) -> ElementTree.Element | None:
 def shapes_of(
     model: Any, root: ElementTree.Element, urdf: Path, kind: str, *, without: Collection[str] = ()
 ) -> Iterator[LinkShape]:
-    """All readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
+    """Readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
 
-    without : names of links that are left out. So is what is malformed, and so are meshes that are missing or
-    damaged.
+    Malformed shapes, and meshes that are missing or damaged, are left out.  without : names of links to leave
+    out.
     """
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -63,7 +63,7 @@ def shapes_of(
                 place = frame.placement * origin
                 moved = solid.moved(place.rotation, place.translation)
                 if not (np.abs(moved.vertices) <= FARTHEST).all():
-                    continue  # it is nowhere, or no part of a robot
+                    continue  # not finite, or too far to be part of a robot
                 yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
 
 
@@ -72,7 +72,7 @@ def lost_meshes(
 ) -> dict[int, dict[str, str]]:
     """Meshes that are missing or unreadable, with the reason, by the joint that moves their link.
 
-    without : joints whose meshes are not looked at.
+    without : joints to leave out.
     """
     lost: dict[int, dict[str, str]] = {}
     for link in root.findall("link"):
@@ -90,7 +90,7 @@ def lost_meshes(
 
 
 def numbers(text: str, count: int = 3) -> Array:
-    """So many finite numbers in a text, apart by spaces; ValueError for anything else."""
+    """Finite numbers of a text, separated by spaces; ValueError unless there are `count` of them."""
     found = np.array([float(word) for word in text.split()])
     if len(found) != count or not np.all(np.isfinite(found)):
         raise ValueError(f"{text!r} are no {count} finite numbers")
@@ -98,7 +98,7 @@ def numbers(text: str, count: int = 3) -> Array:
 
 
 def _urdf_solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | None:
-    """The solid of a <geometry>; None if it is none, or its mesh cannot be read."""
+    """Solid of a <geometry>; None if it has none, or its mesh cannot be read."""
     for shape in geometry if geometry is not None else ():
         with contextlib.suppress(ValueError, RuntimeError, OSError, KeyError):
             if shape.tag == "box":
@@ -114,7 +114,7 @@ def _urdf_solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | Non
 
 
 def _origin(origin: ElementTree.Element | None) -> Any:
-    """The placement (pin.SE3) of an <origin>; None if it is none."""
+    """Placement (pin.SE3) of an <origin>, the identity without one; None if it is malformed."""
     if origin is None:
         return pin.SE3.Identity()
     try:
@@ -126,9 +126,9 @@ def _origin(origin: ElementTree.Element | None) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Geom:
-    """A geom of a body: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
+    """Geom of a body in an MJCF: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
 
-    collides : with anything; else it is there to be seen.  colour : red, green, blue.
+    collides : it is a collision geom, else a visual one.  colour : red, green, blue.
     """
 
     link: str
@@ -169,7 +169,7 @@ def _geoms(model: Any, mj: Any) -> Iterator[Geom]:
 
 
 def _mjcf_solid(mj: Any, g: int) -> Solid | None:
-    """A geom in its own frame; None for what is no solid."""
+    """Solid of a geom in its own frame; None for planes, height fields and signed distance fields."""
     import mujoco
 
     kind, kinds = int(mj.geom_type[g]), mujoco.mjtGeom

@@ -403,7 +403,7 @@ def test_the_command_shows_both(tmp_path: Path) -> None:
         return done.stdout
 
     shown = run()
-    for text in ("freezes = 16", "planned", "simulated", "its own error"):
+    for text in ("freezes = 16", "planned", "simulated", "errors of this model"):
         assert text in " ".join(shown.split()), text
     assert "trust the plan" in " ".join(run("--model", "virtual-mass").split())
     found = json.loads(run("--json"))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import coal
@@ -16,9 +14,8 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from impactopt.bodies.file_shapes import Geom, LinkShape, geoms_of, lost_meshes, shapes_of, urdf_root
-from impactopt.bodies.solids import Solid, cylinder, rounded_box
-from impactopt.codegen.files import kept
+from impactopt.bodies.file_shapes import Geom, LinkShape, geoms_of, lost_meshes, shapes_of
+from impactopt.bodies.solids import Solid, cached_arrays, cylinder, rounded_box
 from impactopt.robots.robot import Robot, Tool
 from impactopt.robots.tools import without
 
@@ -113,20 +110,12 @@ def file_pieces(robot: Robot) -> tuple[Piece, ...]:
 
 def bare_joints(robot: Robot, shown: Collection[int]) -> set[int]:
     """Joints whose shapes are all missing meshes; shown : joints with at least one shape."""
-    urdf = Path(robot.urdf) if robot.urdf is not None else None
-    root = urdf_root(urdf) if urdf is not None else None
-    if root is None or urdf is None:
-        return set()
-    return set(lost_meshes(robot.model, root, urdf, without=shown))
+    return set(lost_meshes(robot.model, robot.urdf, without=shown))
 
 
 def _from_urdf(robot: Robot) -> Iterator[Piece]:
-    urdf = Path(robot.urdf) if robot.urdf is not None else None
-    root = urdf_root(urdf) if urdf is not None else None
-    if root is None or urdf is None:
-        return
-    solid = list(shapes_of(robot.model, root, urdf, "collision"))
-    seen = shapes_of(robot.model, root, urdf, "visual", without={shape.link for shape in solid})
+    solid = list(shapes_of(robot.model, robot.urdf, "collision"))
+    seen = shapes_of(robot.model, robot.urdf, "visual", without={shape.link for shape in solid})
     yield from _hulls([*solid, *seen])
 
 
@@ -206,25 +195,18 @@ def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
     """Hull of a solid, cached on disk; None if it has no volume."""
     digest = hashlib.sha256(np.round(solid.vertices, 9).tobytes() + b"thinned").hexdigest()
 
-    def make() -> bytes:
-        file = io.BytesIO()
-        vertices, triangles = _hull_of(solid.vertices)
-        np.savez(file, vertices=vertices, triangles=triangles)
-        return file.getvalue()
-
-    with np.load(io.BytesIO(kept("hull", digest, make)), allow_pickle=False) as found:
-        vertices, triangles = found["vertices"], found["triangles"]
-    return Piece(link=link, joint=joint, vertices=vertices, triangles=triangles) if len(triangles) else None
+    hull = cached_arrays("hull", digest, lambda: _hull_of(solid.vertices))
+    return Piece(link=link, joint=joint, **hull) if len(hull["triangles"]) else None
 
 
-def _hull_of(points: Array) -> tuple[Array, NDArray[np.intp]]:
+def _hull_of(points: Array) -> dict[str, NDArray[Any]]:
     """Vertices and triangles of the hull of points (k, 3); empty if it has no volume."""
     near = _MERGE_DISTANCE
     while True:
         try:
             hull = ConvexHull(points)
         except (QhullError, ValueError):
-            return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp)
+            return {"vertices": np.zeros((0, 3)), "triangles": np.zeros((0, 3), dtype=np.intp)}
         if np.bincount(hull.simplices.ravel()).max() <= _MAX_NEIGHBOURS:
             break
         points = points[np.unique(np.round(points / near), axis=0, return_index=True)[1]]
@@ -237,7 +219,7 @@ def _hull_of(points: Array) -> tuple[Array, NDArray[np.intp]]:
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]
-    return vertices, triangles
+    return {"vertices": vertices, "triangles": triangles}
 
 
 # [m] A shape is far from its link if its distance exceeds this and the shape's own size.

@@ -18,7 +18,7 @@ from impactopt.bodies.solids import Solid, box, capsule, cylinder, find_mesh, la
 from impactopt.errors import FARTHEST
 from impactopt.robots.mjcf import compile_mjcf
 
-__all__ = ["Geom", "LinkShape", "geoms_of", "lost_meshes", "numbers", "shapes_of", "urdf_root"]
+__all__ = ["Geom", "LinkShape", "geoms_of", "lost_meshes", "numbers", "shapes_of", "urdf_elements"]
 
 Array = NDArray[np.float64]
 
@@ -36,29 +36,31 @@ class LinkShape:
     element: ElementTree.Element
 
 
-def urdf_root(urdf: Path) -> ElementTree.Element | None:
-    """Root element of a URDF; None if it cannot be read."""
+def urdf_elements(urdf: str | None, tag: str) -> list[ElementTree.Element]:
+    """Elements of a URDF with this tag; none without a URDF, or if it cannot be read."""
     try:
-        return ElementTree.parse(urdf).getroot()
+        return [] if urdf is None else ElementTree.parse(urdf).getroot().findall(tag)
     except (OSError, ElementTree.ParseError):
-        return None
+        return []
 
 
 def shapes_of(
-    model: Any, root: ElementTree.Element, urdf: Path, kind: str, *, without: Collection[str] = ()
+    model: Any, urdf: str | None, kind: str, *, without: Collection[str] = ()
 ) -> Iterator[LinkShape]:
     """Readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
 
-    Malformed shapes, and meshes that are missing or damaged, are left out.  without : names of links to leave
-    out.
+    Malformed shapes, and meshes that are missing or damaged, are left out.
+
+    without : names of links to leave out.
     """
-    for link in root.findall("link"):
+    for link in urdf_elements(urdf, "link"):
         name = link.get("name", "")
         if name in without or not model.existFrame(name, pin.FrameType.BODY):
             continue
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
         for element in link.findall(kind):
-            solid, origin = _urdf_solid(element.find("geometry"), urdf), _origin(element.find("origin"))
+            solid = _urdf_solid(element.find("geometry"), Path(str(urdf)))
+            origin = _origin(element.find("origin"))
             if solid is not None and origin is not None:
                 place = frame.placement * origin
                 moved = solid.moved(place.rotation, place.translation)
@@ -67,15 +69,13 @@ def shapes_of(
                 yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
 
 
-def lost_meshes(
-    model: Any, root: ElementTree.Element, urdf: Path, *, without: Collection[int] = ()
-) -> dict[int, dict[str, str]]:
-    """Meshes that are missing or unreadable, with the reason, by the joint that moves their link.
+def lost_meshes(model: Any, urdf: str | None, *, without: Collection[int] = ()) -> dict[int, dict[str, str]]:
+    """Missing or unreadable meshes of a URDF with the reason, by the joint that moves their link.
 
     without : joints to leave out.
     """
     lost: dict[int, dict[str, str]] = {}
-    for link in root.findall("link"):
+    for link in urdf_elements(urdf, "link"):
         name = link.get("name", "")
         if not model.existFrame(name, pin.FrameType.BODY):
             continue
@@ -84,8 +84,8 @@ def lost_meshes(
             continue
         for mesh in link.iterfind("*/geometry/mesh"):
             file = mesh.get("filename", "")
-            if lack := lack_of(file, urdf):
-                lost.setdefault(int(frame.parentJoint), {})[file] = lack
+            if reason := lack_of(file, Path(str(urdf))):
+                lost.setdefault(int(frame.parentJoint), {})[file] = reason
     return lost
 
 

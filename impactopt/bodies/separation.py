@@ -20,7 +20,6 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
-import io
 import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,9 +33,9 @@ from impactopt.bodies import separation_numpy
 from impactopt.bodies.convex_hulls import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies
 from impactopt.bodies.separation_numpy import ROUNDING
+from impactopt.bodies.solids import cached_arrays
 from impactopt.bodies.world import WorldBody
 from impactopt.codegen.compiler import address, native_library
-from impactopt.codegen.files import kept
 
 __all__ = ["ROUNDING", "THIN", "Looked", "Placed", "Separations", "Shapes", "packed", "thinned"]
 
@@ -279,14 +278,8 @@ def thinned(vertices: Array) -> Array:
     """
     if len(vertices) <= _SMALL_HULL:
         return vertices
-    digest = hashlib.sha256(f"1 {THIN}".encode() + np.round(vertices, 9).tobytes()).hexdigest()
-
-    def make() -> bytes:
-        file = io.BytesIO()
-        np.save(file, _chosen(vertices))
-        return file.getvalue()
-
-    return vertices[np.load(io.BytesIO(kept("thin", digest, make)), allow_pickle=False)]
+    digest = hashlib.sha256(f"2 {THIN}".encode() + np.round(vertices, 9).tobytes()).hexdigest()
+    return vertices[cached_arrays("thin", digest, lambda: {"chosen": _chosen(vertices)})["chosen"]]
 
 
 def _chosen(vertices: Array) -> Index:

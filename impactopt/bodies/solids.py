@@ -6,11 +6,12 @@ import contextlib
 import hashlib
 import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from typing import Any
 
 import coal
 import numpy as np
@@ -21,6 +22,7 @@ from impactopt.codegen.files import kept
 __all__ = [
     "Solid",
     "box",
+    "cached_arrays",
     "capsule",
     "cylinder",
     "find_mesh",
@@ -241,29 +243,29 @@ def _read(path: Path, scale: Array) -> Solid:
     if data.startswith(_LFS_POINTER):
         raise ValueError("it is a pointer to large-file storage; get the file itself by `git lfs pull`")
     count = int.from_bytes(data[80:84], "little")
-    if (
-        path.suffix.lower() == ".stl" and len(data) == 84 + 50 * count
-    ):  # binary STL, which coal reads in seconds
+    kind = path.suffix.lower()
+    if kind == ".stl" and len(data) == 84 + 50 * count:  # binary, for which coal takes seconds
         facets = np.frombuffer(data, offset=84, dtype=[("at", "<f4", (4, 3)), ("attribute", "<u2")])
         vertices = facets["at"][:, 1:].reshape(-1, 3).astype(float)
         return Solid(vertices=scale * vertices, triangles=np.arange(3 * count).reshape(-1, 3))
-    if path.suffix.lower() not in SELF_CONTAINED:  # not cached, as its geometry may be in other files
-        return _scaled(_loaded(path), scale)
-    digest = hashlib.sha256(data + b"coal").hexdigest()
-    archive = io.BytesIO(kept("mesh", digest, lambda: _saved(_loaded(path))))
-    with np.load(archive, allow_pickle=False) as found:
-        solid = Solid(vertices=found["vertices"], triangles=found["triangles"])
-    return _scaled(solid, scale)
-
-
-def _scaled(solid: Solid, scale: Array) -> Solid:
+    if kind not in SELF_CONTAINED:  # not cached, as its geometry may be in other files
+        solid = _loaded(path)
+    else:
+        digest = hashlib.sha256(data + b"coal").hexdigest()
+        solid = Solid(**cached_arrays("mesh", digest, lambda: vars(_loaded(path))))
     return Solid(vertices=scale * solid.vertices, triangles=solid.triangles)
 
 
-def _saved(solid: Solid) -> bytes:
-    file = io.BytesIO()
-    np.savez(file, vertices=solid.vertices, triangles=solid.triangles)
-    return file.getvalue()
+def cached_arrays(kind: str, digest: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, Any]:
+    """Arrays by name, from the cache on disk (`impactopt.codegen.files.kept`), or made and stored there."""
+
+    def archive() -> bytes:
+        file = io.BytesIO()
+        np.savez(file, **make())  # type: ignore[arg-type]  # of keywords that are not arrays
+        return file.getvalue()
+
+    with np.load(io.BytesIO(kept(kind, digest, archive)), allow_pickle=False) as found:
+        return dict(found)
 
 
 def _loaded(path: Path) -> Solid:

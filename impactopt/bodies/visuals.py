@@ -5,7 +5,6 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from impactopt.bodies.convex_hulls import ROD, bare_joints, inertia_box, is_too_large, tool_solids
-from impactopt.bodies.file_shapes import geoms_of, numbers, shapes_of, urdf_root
+from impactopt.bodies.file_shapes import geoms_of, numbers, shapes_of, urdf_elements
 from impactopt.bodies.solids import Solid, box, cylinder, sphere
 from impactopt.bodies.world import WorldBody
 from impactopt.robots.attachments import Tool
@@ -43,9 +42,7 @@ def visuals_of(robot: Robot) -> list[Visual]:
     Boxes of the links' inertia and bones between the joints replace shapes that are too large or whose meshes
     are missing, and all shapes of a robot without any.
     """
-    found = [] if robot.urdf is None else _from_urdf(robot, Path(robot.urdf))
-    if robot.mjcf is not None:
-        found = _from_mjcf(robot, robot.mjcf)
+    found = _from_urdf(robot) if robot.mjcf is None else _from_mjcf(robot, robot.mjcf)
     known = {visual.joint for visual in found}
     found = [v for v in found if not is_too_large(robot.model, v.joint, v.solid.vertices)]
     if not found:
@@ -55,13 +52,10 @@ def visuals_of(robot: Robot) -> list[Visual]:
     return [*found, *(visual for tool in robot.tools for visual in _of_tool(robot, tool))]
 
 
-def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
-    root = urdf_root(urdf)
-    if root is None:
-        return []
-    colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
+def _from_urdf(robot: Robot) -> list[Visual]:
+    colours = {m.get("name", ""): _colour(m) for m in urdf_elements(robot.urdf, "material")}
     found = []
-    for shape in shapes_of(robot.model, root, urdf, "visual"):
+    for shape in shapes_of(robot.model, robot.urdf, "visual"):
         material = shape.element.find("material")
         colour = None if material is None else _colour(material) or colours.get(material.get("name", ""))
         found.append(Visual(joint=shape.joint, solid=shape.solid, colour=colour or GREY))

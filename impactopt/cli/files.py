@@ -87,10 +87,9 @@ def _strength(problem: ImpactProblem) -> str:
 
 def _lost_meshes(robot: Robot) -> str:
     """Message about missing or unreadable meshes of a robot, and the consequences; "" if there are none."""
-    from impactopt.bodies.file_shapes import lost_meshes, urdf_root
+    from impactopt.bodies.file_shapes import lost_meshes
 
-    root = None if robot.urdf is None else urdf_root(Path(robot.urdf))
-    found = {} if root is None or robot.urdf is None else lost_meshes(robot.model, root, Path(robot.urdf))
+    found = lost_meshes(robot.model, robot.urdf)
     reasons = dict(sorted(pair for meshes in found.values() for pair in meshes.items()))
     if not reasons:
         return ""

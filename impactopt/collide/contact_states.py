@@ -306,7 +306,10 @@ class ContactStates:
         # P distinct postures, and the index (count,) of each case's; cases that differ in speed only share
         # one
         same = not changes.size or bool((changes == changes[0]).all())
-        kept, back = (changes[:1], np.zeros(count, dtype=np.intp)) if same else _distinct(changes)
+        kept, back = changes[:1], np.zeros(count, dtype=np.intp)
+        if not same:
+            kept, back = np.unique(changes, axis=0, return_inverse=True)
+            back = back.ravel()
         q, reason = self._moved(posture.q, tuple(joints), kept)
         robot, nv = self.robot, self.robot.nv
         B, G, J = self._mobility("least_energy", q)
@@ -400,11 +403,6 @@ class ContactStates:
             )
             out.append(function(filled)[: len(block)].copy())
         return np.concatenate(out)
-
-
-def _distinct(changes: Array) -> tuple[Array, NDArray[np.intp]]:
-    kept, back = np.unique(changes, axis=0, return_inverse=True)
-    return kept, back.ravel()
 
 
 def _set_reason(reason: Reasons, where: NDArray[np.bool_], text: str) -> None:

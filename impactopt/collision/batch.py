@@ -103,37 +103,35 @@ class Batch:
             _one_by_one(function, inputs, found)
         else:
             _in_threads(self._loop, function.sz_w(), inputs, found, cores)
-        names = function.name_out()
-        # Cases that `collide` refuses get NaN. First, those whose steps are too long or unstable.
-        if "step_error" in names:
-            error = found[names.index("step_error")]
+        by_name = dict(zip(function.name_out(), found, strict=True))
+
+        def clear(cases: Any, *kept: str) -> None:
+            """Sets the outputs of cases that `collide` refuses to NaN."""
+            for name, x in by_name.items():
+                if name not in ("step_error", *kept):
+                    x[cases] = np.nan
+
+        if "step_error" in by_name:  # steps that are too long or unstable
+            error = by_name["step_error"]
             if breaks(self.model):
-                impulse, results = (found[names.index(name)] for name in ("impulse", "target_result"))
+                impulse, results = by_name["impulse"][:, 0], by_name["target_result"]
                 force = given["target_breaking_force"][:, 0]
-                error[:, 0] += left_out_by_breaking(self.model, impulse[:, 0], results, force)
+                error[:, 0] += left_out_by_breaking(self.model, impulse, results, force)
             wrong = too_large(self.model.stepping, error[:, 0])
             if unstable is not None:
                 error[unstable] = np.nan
                 wrong |= unstable
-            for name, x in zip(names, found, strict=True):
-                if name != "step_error":
-                    x[wrong] = np.nan
-        impulse, duration = (found[names.index(name)][:, 0] for name in ("impulse", "duration"))
-        separated = found[names.index("separated")][:, 0] > 0.5
+            clear(wrong)
+        impulse, duration = by_name["impulse"][:, 0], by_name["duration"][:, 0]
+        separated = by_name["separated"][:, 0] > 0.5
         step = 0.0 if self.model.stepping == "implicit" else self.model.step_length
-        # then contacts that rounding hides
-        nothing = ~np.isfinite(impulse) | without_contact(impulse, duration, step * separated)
-        for name, x in zip(names, found, strict=True):
-            if name != "step_error":
-                x[nothing] = np.nan
-        # and those that need more steps than there are, because of their events
-        cut = ~separated & (duration < self.model.horizon * (1 - 1e-9))
-        for name, x in zip(names, found, strict=True):
-            if name not in ("separated", "step_error"):
-                x[cut] = np.nan
+        # contacts whose force rounding hides
+        clear(~np.isfinite(impulse) | without_contact(impulse, duration, step * separated))
+        # collisions with so many events that the steps are used up
+        clear(~separated & (duration < self.model.horizon * (1 - 1e-9)), "separated")
         return {
             name: self._shaped(name, x, shape)
-            for name, x, shape in zip(names, found, shapes, strict=True)
+            for (name, x), shape in zip(by_name.items(), shapes, strict=True)
             if name in self._returned
         }
 

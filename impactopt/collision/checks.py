@@ -37,11 +37,8 @@ __all__ = [
     "freeze_error",
     "ill_conditioned_cases",
     "left_out_by_breaking",
-    "longest_stable_step",
     "more_often",
-    "slope_function",
     "too_large",
-    "unstable_cases",
     "without_contact",
 ]
 
@@ -208,22 +205,6 @@ _STABILITY_LIMIT = 2.6
 _BALANCING_SWEEPS = 4  # of a matrix, before its norm is taken
 
 
-def slope_function(model: JointSpaceModel) -> Any:
-    """ca.Function (y, *data) -> Jacobian of dy/dt by y."""
-    y, data = ca.SX.sym("y", model.n_states), model.symbols()
-    rate = rate_of_change(model, y, model.velocity_change(y, data), data)
-    return ca.Function("slope", [y, *data.values()], [ca.jacobian(rate, y)])
-
-
-def longest_stable_step(model: JointSpaceModel, slope: Any, data: dict[str, Any]) -> float:
-    """Longest stable step [s], with no joint saturated and all joint friction in its transition band."""
-    rates = [1e-12]
-    for y, there in _fastest_states(model, data):
-        matrix = np.array(slope(y, *[there[name] for name in model.data]))
-        rates.append(float(np.abs(np.linalg.eigvals(matrix)).max()))
-    return _STABILITY_LIMIT / max(rates)
-
-
 def _fastest_states(model: JointSpaceModel, data: dict[str, Any]) -> Iterator[tuple[Array, dict[str, Any]]]:
     """States with the fastest modes, and the data there."""
     there = dict(data)
@@ -236,7 +217,7 @@ def _fastest_states(model: JointSpaceModel, data: dict[str, Any]) -> Iterator[tu
             yield y, there
 
 
-def unstable_cases(model: JointSpaceModel, slope: Any, data: dict[str, Array], step: float) -> Any:
+def _unstable_cases(model: JointSpaceModel, slope: Any, data: dict[str, Array], step: float) -> Any:
     """Mask (N) of the cases for which a step [s] is unstable; `data` have a first axis of N or 1.
 
     Eigenvalues take longer than a collision, and most cases are far from the limit. These are accepted by a
@@ -280,7 +261,7 @@ def _eigenvalue_bound(matrices: Array) -> Array:
 
 
 class Stability:
-    """Stable step lengths of a model, with its freezing functions cached."""
+    """Stable steps of a model, with no joint saturated and all joint friction in its transition band."""
 
     def __init__(self, collision: SteppedModel) -> None:
         self._collision, self._model = collision, joint_space_model(collision)
@@ -292,7 +273,10 @@ class Stability:
 
     @cached_property
     def _slope(self) -> Any:
-        return slope_function(self._model)
+        """ca.Function (y, *data) -> Jacobian of dy/dt by y."""
+        y, data = ca.SX.sym("y", self._model.n_states), self._model.symbols()
+        rate = rate_of_change(self._model, y, self._model.velocity_change(y, data), data)
+        return ca.Function("slope", [y, *data.values()], [ca.jacobian(rate, y)])
 
     def frozen(self, q: Array, values: dict[str, Array]) -> dict[str, Array]:
         """Frozen quantities at q (nq), by name; InputError if rounding dominates them."""
@@ -308,7 +292,11 @@ class Stability:
         data: dict[str, Any] = frozen | values
         drifts = {name for name in self._model.data if name not in data}
         data |= {name: np.zeros(self._model.data[name]) for name in drifts}
-        return longest_stable_step(self._model, self._slope, data)
+        rates = [1e-12]
+        for y, there in _fastest_states(self._model, data):
+            matrix = np.array(self._slope(y, *[there[name] for name in self._model.data]))
+            rates.append(float(np.abs(np.linalg.eigvals(matrix)).max()))
+        return _STABILITY_LIMIT / max(rates)
 
     def unstable(self, given: Mapping[str, Array]) -> NDArray[np.bool_]:
         """Mask (N) of the cases of a batch with an unstable step, or with dependent constraints.
@@ -327,5 +315,5 @@ class Stability:
         data: dict[str, Any] = frozen | {name: given[name] for name in collision.settings}
         own = {name: x for name, x in data.items() if name in self._model.data}
         own |= {name: np.zeros((1, *shape)) for name, shape in self._model.data.items() if name not in own}
-        step = collision.step_length
-        return np.asarray(unstable_cases(self._model, self._slope, own, step) | ill_conditioned_cases(frozen))
+        unstable = _unstable_cases(self._model, self._slope, own, collision.step_length)
+        return np.asarray(unstable | ill_conditioned_cases(frozen))

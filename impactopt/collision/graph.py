@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 
 from impactopt.collision.frozen import FrozenDynamics
-from impactopt.collision.implicit_numpy import implicit_loop
+from impactopt.collision.implicit_numpy import ImplicitLoop
 from impactopt.collision.model import JointSpaceModel, Loop, SegmentedCollision, shape_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, Outputs, frozen_for
 from impactopt.collision.runge_kutta import rk4_step, run
@@ -156,7 +156,7 @@ def _implicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Lo
 
     def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:
         recorded = record and every > 0
-        function = implicit_loop(
+        function = ImplicitLoop(
             model,
             tolerance=collision.tolerance,
             most_steps=MOST_STEPS,
@@ -292,20 +292,20 @@ def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, st
     if not held_by.soles(robot):
         out["wrenches and ZMP"] = "nothing holds the robot" if robot.floating else "the base is fixed"
     elif not wanted & {*OF_SOLES}:
-        out["wrenches and ZMP"] = "not asked for"
+        out["wrenches and ZMP"] = "not requested"
     elif not wanted & {"ground_wrench", "zmp"}:
-        out["ZMP"] = "not asked for"
+        out["ZMP"] = "not requested"
     free = [sole.name for sole in robot.soles if sole not in held_by.soles(robot)] if robot.floating else []
     if free:
         out["held soles"] = f"{', '.join(free)}: not held by the stance"
     if not wanted & {*HISTORIES}:
-        out["histories"] = "not asked for"
+        out["histories"] = "not requested"
     if "peak_force" not in wanted:
-        out["peak force"] = "not asked for"
+        out["peak force"] = "not requested"
     if "configuration" not in wanted and not collision.n_freezes:
-        out["second integrals"] = "no configuration asked for, nothing frozen again"
+        out["second integrals"] = "no configuration requested, no further freezes"
     if not wanted & {"configuration", "velocity"}:
-        out["motion of the whole robot"] = "not asked for"
+        out["motion of the whole robot"] = "not requested"
     if collision.contact_friction is None:
         out["friction at the hit"] = "not given (contact_friction)"
     out["derivatives"] = "in `gradient_function`, and in `graph`"

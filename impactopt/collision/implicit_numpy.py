@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 from impactopt.collision.implicit import STAGES, Contact, StateMaps, Step, first_negative, largest, tables
 from impactopt.collision.model import JointSpaceModel
 
-__all__ = ["implicit_loop"]
+__all__ = ["ImplicitLoop"]
 
 Array = NDArray[np.float64]
 
@@ -59,9 +59,7 @@ _LEFT_OUT = float(np.asarray(_TABLES["LEFT_OUT"]))
 _ALIVE: list[ca.Callback] = []
 
 
-def implicit_loop(
-    model: JointSpaceModel, *, tolerance: float, most_steps: int, spacing: float, columns: int
-) -> Any:
+class ImplicitLoop(ca.Callback):
     """ca.Function (y, *data) -> (final state; states (n_states, columns)).
 
     The final state is that at separation, or at the end of the freeze.
@@ -69,20 +67,16 @@ def implicit_loop(
     tolerance : see `SymbolicModel`.  most_steps : largest number of steps.  spacing [s] : of the states; the
     last one is repeated.
     """
-    loop = _Loop(model, tolerance, most_steps, spacing, columns)
-    _ALIVE.append(loop)
-    return loop
 
-
-class _Loop(ca.Callback):
     def __init__(
-        self, model: JointSpaceModel, tolerance: float, most_steps: int, spacing: float, columns: int
+        self, model: JointSpaceModel, *, tolerance: float, most_steps: int, spacing: float, columns: int
     ) -> None:
         ca.Callback.__init__(self)
         self.model, self.tolerance, self.most_steps = model, tolerance, most_steps
         self.spacing, self.columns = spacing, columns
         self.contact = Contact(model.law, model.target)
         self.construct("implicit_loop", {})
+        _ALIVE.append(self)
 
     def get_n_in(self) -> int:
         return 1 + len(self.model.data)
@@ -129,8 +123,8 @@ class _Instant:
 class _Run:
     """Integration of one collision, or of one freeze of it."""
 
-    def __init__(self, loop: _Loop, data: Mapping[str, Array]) -> None:
-        self.loop, self.model = loop, loop.model
+    def __init__(self, loop: ImplicitLoop, data: Mapping[str, Array]) -> None:
+        self.loop, self.model, self.is_nonlinear = loop, loop.model, loop.contact.is_nonlinear
         model, n = self.model, self.model.n
         self.parts, self.data = model.layout, data
 
@@ -281,10 +275,6 @@ class _Run:
         terms: Array = z @ by_z.T + np.outer(s.force, by_force)
         terms[0] = values
         return terms
-
-    @property
-    def is_nonlinear(self) -> bool:
-        return self.loop.contact.is_nonlinear
 
     def first_step(self, y: Array, now: _Instant, left: float) -> float:
         """Length [s] of the first step, at most the time that is left."""

@@ -27,10 +27,9 @@ def run(
     The number of steps is rounded up to whole blocks. After the end of contact the states repeat the last
     one.
     """
-    block = _block(model, step, record)
-    still = _still(model, record)
-    advance = ca.Function.if_else("advance", block, still)
-    running = _running(model)
+    advance = _skippable_block(model, step, record)
+    symbol, symbols = ca.SX.sym("y", model.n_states), model.small_symbols()
+    running = ca.Function("running", [symbol, *symbols.values()], [model.running(symbol, symbols)])
     small = [x for x, name in zip(data, model.data, strict=True) if name != "A"]
     y = ca.MX(start)
     history = [y]
@@ -41,24 +40,15 @@ def run(
     return y, ca.horzcat(*history) if record else None
 
 
-def _block(model: JointSpaceModel, step: Any, record: bool) -> Any:
+def _skippable_block(model: JointSpaceModel, step: Any, record: bool) -> Any:
+    """ca.Function (flag, y, *data) -> state after `BLOCK` steps[, all states]; y[, copies] if flag is 0."""
     y, data = ca.MX.sym("y", model.n_states), list(model.symbols(ca.MX).values())
     states = [y]
     for _ in range(BLOCK):
         states.append(step(states[-1], *data))
-    out = [states[-1], ca.horzcat(*states[1:])] if record else [states[-1]]
-    return ca.Function("block", [y, *data], out)
-
-
-def _still(model: JointSpaceModel, record: bool) -> Any:
-    y, data = ca.MX.sym("y", model.n_states), list(model.symbols(ca.MX).values())
-    out = [y, ca.repmat(y, 1, BLOCK)] if record else [y]
-    return ca.Function("still", [y, *data], out)
-
-
-def _running(model: JointSpaceModel) -> Any:
-    y, data = ca.SX.sym("y", model.n_states), model.small_symbols()
-    return ca.Function("running", [y, *data.values()], [model.running(y, data)])
+    steps, copies = [states[-1], ca.horzcat(*states[1:])], [y, ca.repmat(y, 1, BLOCK)]
+    block = ca.Function("block", [y, *data], steps[: 1 + record])
+    return ca.Function.if_else("advance", block, ca.Function("still", [y, *data], copies[: 1 + record]))
 
 
 # Error estimate of the impulse: this times |f_2 - f_3| h, summed over steps, of the forces f_2 and f_3 at the

@@ -325,8 +325,7 @@ class Step:
         self._J = slopes + np.outer(maps.penetration, rate) + np.outer(maps.impulse, force)
         self._J += maps.target.T @ target
         # columns of B: remainders of the force, of the target's rates, and of its velocity. The last one
-        # lowers
-        # the rate of penetration, and with it the damping force.
+        # lowers the rate of penetration, and with it the damping force.
         of_force = maps.impulse + maps.target.T @ G
         self._B = np.column_stack([of_force, maps.target.T, -maps.penetration - d * of_force])
         self._k, self._d, self._slopes, self._rates = k, d, (Z, G, velocity_by_z), law.rates(z, self._force)

@@ -25,14 +25,12 @@ __all__ = ["ImplicitLoop"]
 Array = NDArray[np.float64]
 
 _TERMS = STAGES + 1
-# The constants are those of native/implicit.h.
-# A step with an event ends beyond it by this part, so that the next step begins in the new phase. An event
-# before
-# this part of a step counts as immediate.
+# The constants are those of native/implicit.h. A step with an event ends beyond it by this part, so that the
+# next step begins in the new phase. An event before this part of a step counts as immediate.
 _OVERSHOOT, _IMMEDIATE = 1e-9, 1e-5
 # First step times the rate of the contact's fastest mode. With a nonlinear law instead: the change of speed
-# in the
-# first step, relative to the speed; the second value is for a force that begins without a slope, as x^1.5.
+# in the first step, relative to the speed; the second value is for a force that begins without a slope, as
+# x^1.5.
 _FIRST_STEP, _FIRST_SPEED_CHANGE, _FIRST_SPEED_CHANGE_WITHOUT_SLOPE = 0.5, 0.1, 3e-4
 # Errors are relative to the permitted one. Below the first value the next step is longer, for an error of
 # `_TARGET_ERROR`. That costs a factorization, which nonlinear laws and targets need at each step in any case.
@@ -40,14 +38,12 @@ _LENGTHEN_BELOW, _LENGTHEN_BELOW_IF_NONLINEAR, _TARGET_ERROR = 2e-3, 0.1, 0.2
 _MAX_TRIES = 200
 _SHORTEN_IF_DIVERGED = 0.3  # of a step for which Newton's method has not converged
 # In restitution with a nonlinear law, a step is at most this part of the time that is left to separation: a
-# force
-# that ends without a slope would need ever shorter steps, down to the first one's length.
+# force that ends without a slope would need ever shorter steps, down to the first one's length.
 _NEAR_SEPARATION = 0.6
 _DEMAND_ERROR = 1e-2  # permitted error of a servo torque, relative to its limit
 # Permitted error of a switch that depends on a position, relative to that of others. A position that changes
-# slowly
-# passes its switch too late by this error: a board bent slowly to its break was off by 1.1e-5 without the
-# factor.
+# slowly passes its switch too late by this error: a board bent slowly to its break was off by 1.1e-5 without
+# the factor.
 _POSITION_ERROR = 0.1
 
 _TABLES = tables()

@@ -90,7 +90,7 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
 def check_choice(what: str, given: object, known: Iterable[str]) -> None:
     """InputError for an unknown name.
 
-    what : begin of the message, such as "there is no picture".
+    what : start of the message, such as "there is no picture".
     """
     names = [*known]
     if not isinstance(given, str) or given not in names:

@@ -318,6 +318,7 @@ class ContactStates:
             # v = B x with G x = normal: the striking point has 1 m/s along the normal
             if velocity != "least energy":
                 B, G, J = self._mobility("least_rates", q)
+            # G is singular if the point cannot move in some direction
             x = np.linalg.pinv(G, rcond=1e-12, hermitian=True) @ normal
             stuck = np.abs(np.einsum("rij,rj->ri", G, x) - normal).max(axis=1) > _VELOCITY_ERROR
             _set_reason(reason, stuck, "the striking point cannot move along the normal here")

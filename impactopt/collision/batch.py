@@ -202,10 +202,11 @@ def _in_threads(loop: Any, work: int, inputs: list[Array], found: list[Array], t
 
 
 def _slices(count: int, threads: int) -> Iterator[tuple[int, int]]:
-    """Begins and ends of ever shorter slices: collisions differ in time, and threads should end together."""
+    """Starts and ends of ever shorter slices: collisions differ in time, and threads should end together."""
     ends = [0]
     while ends[-1] < count:
         left = count - ends[-1]
+        # half of an equal share of what is left, as in guided self-scheduling
         ends.append(ends[-1] + (left if threads == 1 else -(-left // (2 * threads))))
     return iter([*pairwise(ends)])
 

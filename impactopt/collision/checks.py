@@ -83,8 +83,7 @@ def caution(error: float, accuracy: float, freezes: int) -> str:
     often = f"at contact and {freezes} times during it" if freezes else "at contact only"
     return (
         f"the impulse may be off by {off}, more than the required {100 * accuracy:g} %, as H, J and the bias "
-        f"are frozen {often}: give freezes={more_often(freezes)} (--freezes) or more, or take the full "
-        f"dynamics"
+        f"are frozen {often}: give freezes={more_often(freezes)} (--freezes) or more, or take full dynamics"
     )
 
 

@@ -323,7 +323,7 @@ def _configuration(model: SteppedModel) -> tuple[Any, Any]:
 
 
 def _units(model: Any) -> list[tuple[int, int, slice]]:
-    """Unit-length parts of q, quaternions or (cosine, sine): begin and end in q, and the slice in v."""
+    """Unit-length parts of q, quaternions or (cosine, sine): start and end in q, and the slice in v."""
     found = []
     for joint in model.joints:
         if joint.nq == 7:

@@ -12,13 +12,13 @@ function R has R(infinity) = 0 and |R| <= 1 on the left half-plane: L-stability;
 A step that ends on an event, at theta < 1, amplifies the fastest modes by a third at most. The first
 neglected term, p_9(1) z^9, is smaller than that of the Taylor polynomial of degree eight.
 
-A nonlinear contact law or target is split: J has its derivatives at the begin of the step, and the remainder
+A nonlinear contact law or target is split: J has its derivatives at the start of the step, and the remainder
 n(theta) = sum of n_j p_j(theta) enters as an input through the matrix B,
 
     (I - gamma h J) w_(j+1) = h J w_j + h B (n_j + gamma n_(j+1)).
 
 The inputs n are scalars: the remainders of the contact force, of the target's rates and of the target's
-velocity. Each is a polynomial of degree seven, exact at the step's begin and at the seven other Lobatto
+velocity. Each is a polynomial of degree seven, exact at the step's start and at the seven other Lobatto
 nodes. Newton's method on their values at the nodes is cheap beside the stages, which are computed three
 times: without n, for unit inputs, and with n. If law and target are linear, n is zero.
 
@@ -125,7 +125,7 @@ def _halves(b: Array, s: float) -> tuple[Array, Array]:
 
 
 STAGES = 8
-# Lobatto nodes of a step, besides its begin, at which the nonlinear remainders are interpolated
+# Lobatto nodes of a step, besides its start, at which the nonlinear remainders are interpolated
 NODES = 7
 
 
@@ -154,7 +154,7 @@ def tables() -> dict[str, Array | float]:
     BOUND (9) : maximum of |p_j| on [0, 1].
     LEFT_OUT : |p_9(1)|, factor of the first neglected term.
     AT_NODES (7, 9) : p_j at the Lobatto nodes.  FROM_NODES (9, 7) : coefficients in the p_j of the polynomial
-        that is zero at the begin and has given values at the nodes.
+        that is zero at the start and has given values at the nodes.
     ANSWERS (8, 7, 7) : response at the nodes to inputs given at the nodes, as factors of (h J S)^k S h.
     """
     P, theta = polynomials(), np.linspace(0.0, 1.0, 2001)
@@ -353,7 +353,7 @@ class Step:
         return found
 
     def through_nodes(self, start: Any, function: Callable[[int], Any]) -> Array:
-        """Terms (9, ...) of a polynomial with these values at the begin and at node 0 ... 6."""
+        """Terms (9, ...) of a polynomial with these values at the start and at node 0 ... 6."""
         terms: Array = _FROM_NODES @ np.array([np.asarray(function(i)) - start for i in range(NODES)])
         terms[0] = start
         return terms

@@ -288,7 +288,7 @@ class _Run:
         return h
 
     def state_at(self, y: Array, s: Step, theta: float) -> Array:
-        """State at a fraction of the step, with peak force and second integrals as at its begin."""
+        """State at a fraction of the step, with peak force and second integrals as at its start."""
         p = _AT_ONE if theta == 1.0 else _powers(theta)
         moved: Array = p @ s.terms
         for name in ("peak", "torque2", "impulse2"):
@@ -375,6 +375,7 @@ class _Run:
                 error = self.error_of(now, s, scale, mobility)
                 if error <= 1.0 or (s.converged and np.isnan(error)):
                     break
+                # the neglected term is of order nine in h
                 h *= max(0.2, 0.9 * error ** (-1.0 / _TERMS)) if s.converged else _SHORTEN_IF_DIVERGED
             if not np.isfinite(error):
                 y = np.full_like(y, np.nan)

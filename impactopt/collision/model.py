@@ -52,10 +52,11 @@ class JointSpaceModel:
     The state y holds time integrals since the freeze. Integration methods conserve linear functions of the
     state exactly: so momentum, and the work of constraints. Its parts are
 
-        time [s]; penetration [m]; impulse [N s] = integral of f; target's state; and if requested or needed
-        peak force [N], left_out [N s] (estimated error of the impulse), torque (n) [N m s] = integral of tau
-        - F, deviation (n) [rad] = phi_ref - phi, sliding (3) [N s] = integral of the friction on the target,
-        torque2 (n), impulse2, sliding2 (3): second integrals.
+        time [s], penetration [m], impulse [N s] = integral of f, target's state; and if requested or needed
+        peak force [N], left_out [N s] = estimated error of the impulse,
+        torque (n) [N m s] = integral of tau - F, deviation (n) [rad] = phi_ref - phi,
+        sliding (3) [N s] = integral of the friction on the target,
+        torque2 (n), impulse2, sliding2 (3) = second integrals.
 
     Attributes
     ----------
@@ -143,7 +144,7 @@ class JointSpaceModel:
         return {name: kind.sym(name, *shape) for name, shape in self.data.items()}
 
     def small_symbols(self) -> dict[str, Any]:
-        """An SX symbol for each of the data except A."""
+        """An SX symbol for each of the data except A, the largest, which only `velocity_change` needs."""
         return {name: ca.SX.sym(name, *shape) for name, shape in self.data.items() if name != "A"}
 
     def start(self) -> NDArray[np.float64]:
@@ -232,12 +233,13 @@ class JointSpaceModel:
         """Flags (compressing, in contact), 0 or 1. Contact ends when the force of restitution is zero."""
         rate = self.rate(y, data)
         force = self.law.branch(self.part(y, "penetration"), rate, False, self.law_numbers(data))
+        # at equal speeds, the accelerations at the start of a freeze decide
         at_rest = ca.logic_and(rate == 0, self.part(y, "time") == 0)
         compressing = ca.logic_or(rate > 0, ca.logic_and(at_rest, self._closing(y, data) > 0))
         return compressing, ca.logic_or(compressing, force > 0)
 
     def _closing(self, y: Any, data: dict[str, Any]) -> Any:
-        """Acceleration [m/s2] of hand towards target, at the begin of a freeze and at equal speeds.
+        """Acceleration [m/s2] of hand towards target, at the start of a freeze and at equal speeds.
 
         It decides between compression and restitution if the rate of penetration is zero.
         """
@@ -324,7 +326,7 @@ class Segment:
     Attributes
     ----------
     data : of the model, and the requested outputs of FrozenDynamics.
-    since : [s] from contact to the segment's begin.
+    since : [s] from contact to the segment's start.
     final : state at its end.
     states : (n_states, k) recorded states, or None.
     v_after, q_after : velocity and configuration at its end; functions, as not all segments need them.
@@ -473,20 +475,20 @@ class SegmentedCollision:
         return self.model.part(y, "time")
 
     def _next_start(self, y: Any) -> Any:
-        """State at the begin of a segment, from the end of the one before; integrals restart at zero."""
+        """State at the start of a segment, from the end of the one before; integrals restart at zero."""
         kept = ("penetration", "target", "peak", "left_out", "deviation")
         parts = {name: self.model.part(y, name) for name in self.model.layout}
         return self.model.join({k: x if k in kept else ca.MX.zeros(*x.shape) for k, x in parts.items()})
 
     # ------------------------------------------------------------ whole motion
     def _moved(self, data: dict[str, Any], frozen_at: Any, q: Any, v: Any, y: Any) -> tuple[Any, Any]:
-        """Configuration and velocity at state y, from those at the begin of the segment."""
+        """Configuration and velocity at state y, from those at the start of the segment."""
         time = self._time(y)
         displacement = v * time + self._change(data, frozen_at, y, second=True)
         return self.frozen.integrate(q, displacement), v + self._change(data, frozen_at, y)
 
     def _change(self, data: dict[str, Any], frozen_at: Any, y: Any, *, second: bool = False) -> Any:
-        """Change of v (nv) since the begin of the segment; with `second` its time integral."""
+        """Change of v (nv) since the start of the segment; with `second` its time integral."""
         model = self.model
         names = ("torque2", "impulse2") if second else ("torque", "impulse")
         torque, impulse = (model.part(y, name) for name in names)

@@ -272,5 +272,5 @@ class Instants:
 
     @cached_property
     def zmp(self) -> Any:
-        w = self.ground_wrench
+        w = self.ground_wrench  # ZMP (-M_y, M_x) / F_z: paper, end of section II-B
         return ca.vertcat(-w[4, :] / w[2, :], w[3, :] / w[2, :])

@@ -138,7 +138,7 @@ def _target_part(target: Target) -> tuple[Any, tuple[Any, Any]]:
 
 # default step [s] by method: spacing of the histories of implicit steps; the paper's Runge-Kutta steps
 STEPS = {"implicit": 1e-3, "rk4": 1e-4}
-_MOST_STEPS = 50_000
+_MOST_STEPS = 50_000  # to the horizon
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -140,7 +140,7 @@ class Target(Described, ABC):
         return []
 
     def margin(self, phase: int, place: float) -> float:
-        """Lower bound of `invariant` at a place in a phase, from 0, its begin, to 1, its end.
+        """Lower bound of `invariant` at a place in a phase, from 0, its start, to 1, its end.
 
         With it a small error cannot cause the event that ends the phase to occur earlier.
         """

@@ -148,8 +148,11 @@ class SymbolicModel(SteppedModel):
         numbers = [name for name in SCALARS if name != "step_error"]
         if output not in numbers:
             raise InputError(f"gradient of {output!r}: only of a number: {', '.join(numbers)}")
-        whole = self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
-        return self._with_parameters(whole, parameters)
+        return self._with_parameters(self._gradient(output), parameters)
+
+    def _gradient(self, output: str) -> Any:
+        """Likewise, with all settings as inputs."""
+        return self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
 
     def jacobian_function(
         self,

@@ -60,7 +60,7 @@ def collide(
         typer.Option(
             metavar="N",
             min=0,
-            help=f"Further freezes of the sdc in contact (default: {RESULT_FREEZES} for a result, else 0).",
+            help=f"Further freezes of the sdc (default: {RESULT_FREEZES} for a result, else 0).",
         ),
     ] = None,
     accuracy: Annotated[

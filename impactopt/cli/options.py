@@ -118,8 +118,7 @@ TimeLimit = Annotated[
 Starts = Annotated[
     int,
     typer.Option(
-        min=1,
-        help="Multistart: number of initial guesses, random but for the first; the best result is kept.",
+        min=1, help="Multistart: initial guesses, all but the first random; the best result is kept."
     ),
 ]
 Workers = Annotated[int, typer.Option(min=1, help="Parallel processes, for starts, replays and a baseline.")]

@@ -116,10 +116,7 @@ TimeLimit = Annotated[
     typer.Option(metavar="SECONDS", help="Time limit of the solver, whose best iterate is kept."),
 ]
 Starts = Annotated[
-    int,
-    typer.Option(
-        min=1, help="Multistart: initial guesses, all but the first random; the best result is kept."
-    ),
+    int, typer.Option(min=1, help="Multistart: number of initial guesses; all but the first are random.")
 ]
 Workers = Annotated[int, typer.Option(min=1, help="Parallel processes, for starts, replays and a baseline.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the random starts.")]

@@ -202,7 +202,7 @@ def _node_responses(at: Array, back: Array) -> Array:
 _TABLES = tables()
 _AT_NODES, _FROM_NODES = np.asarray(_TABLES["AT_NODES"]), np.asarray(_TABLES["FROM_NODES"])
 # of Newton's method on the remainders: the last change, relative to what they are remainders of. Its error is
-# the square of that (native/implicit_bend.h).
+# the square of that (native/implicit_remainders.h).
 _MAX_NEWTON_ITERATIONS, _NEWTON_TOLERANCE = 12, 1e-6
 
 

@@ -1,5 +1,5 @@
-/* Sine and cosine at once, for the tree's functions: an angle takes a tenth of what two calls of the C library do.
-   Both are polynomials of the angle less its nearest multiple of pi / 2, within 2e-16 for angles below 1e6. */
+/* Sine and cosine together, for the functions of the kinematic tree: a tenth of the time of two calls of the C library.
+   Polynomials in the angle less its nearest multiple of pi / 2; the error is below 2e-16 for angles below 1e6. */
 #ifndef OTHER_WAY_ROUND
 #include <math.h>
 
@@ -12,12 +12,12 @@ typedef long long bits_of __attribute__((vector_size(16), may_alias));
 #endif
 
 static inline __attribute__((always_inline)) pair_of sine_and_cosine(double angle) {
-  /* added, it leaves the nearest whole number in the last bits */
-  const double shift = 6755399441055744.0, shifted = angle * 0.63661977236758134 + shift, n = shifted - shift;
-  /* the first two parts of pi / 2 end in zeros, so that products with them are exact */
+  /* adding 1.5 * 2^52 rounds to a whole number, which is left in the last bits */
+  const double shift = 6755399441055744.0, rounded = angle * 0.63661977236758134 + shift, n = rounded - shift;
+  /* pi / 2 in three parts (Cody and Waite); the first two end in zeros, so that their products are exact */
   const double near = (angle - n * 1.57079632673412561417) - n * 6.07710050630396597660e-11;
   const double x = near - n * 2.02226624879595063154e-21;
-  const pair_of z = {x * x, x * x}, first = {x, 1.0}, quarters = {shifted, shifted};
+  const pair_of z = {x * x, x * x}, first = {x, 1.0}, quarters = {rounded, rounded};
   pair_of p = {-7.586696997236634e-13, -1.1367998449407755e-11};
   p = p * z + (pair_of){1.6058531616942478e-10, 2.087588673457593e-09};
   p = p * z + (pair_of){-2.5052106232434684e-08, -2.755731556632e-07};

@@ -1,5 +1,5 @@
-/* Collisions one after the other, with no interpreter between them. Slices of a batch may run in threads, each with
-   work memory of its own. Inputs and outputs lie one after the other; a step of zero repeats an input. */
+/* Many collisions without the interpreter between them. Slices of a batch may run in threads, each with its own work
+   memory. Inputs and outputs of successive collisions are arg_step and res_step numbers apart; 0 repeats an input. */
 
 EXPORT void OF_NAME(batch)(Int begin, Int end, const double *const *arg, const Int *arg_step, double *const *res,
                            const Int *res_step, double *w) {

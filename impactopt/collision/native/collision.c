@@ -1,14 +1,14 @@
 /* A collision: (q, v[, feedforward], settings) -> outputs; see collision/outputs.py. */
 
 static void evaluate(const double **arg, double **res, Work *w) {
-  Course course;
-  collide(arg, res, w, &course);
+  Outcome outcome;
+  collide(arg, res, w, &outcome);
 #if !defined OUT_separated && !defined OUT_duration
-  /* nothing else would tell that it is not over */
-  if (course.in_contact) {
-    no_numbers(res);
+  /* no other output would show that the contact has not ended */
+  if (outcome.in_contact) {
+    fill_with_nan(res);
     return;
   }
 #endif
-  outputs_of(&course, w, res);
+  outputs_of(&outcome, w, res);
 }

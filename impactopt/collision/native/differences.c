@@ -1,23 +1,24 @@
-/* A collision's outputs by some of its inputs, by central differences of collisions whose steps leave out next to
-   nothing: (q, v[, feedforward], settings) -> of each output, by each of these inputs, its Jacobian: a row for each of
-   its entries column by column, a column for each of the input's; q's are in v's basis, as `integrate` moves it.
+/* Jacobians of a collision's outputs by some of its inputs, by central differences of collisions with a tight
+   tolerance:
+   (q, v[, feedforward], settings) -> for each output, by each of these inputs, its Jacobian; rows are the output's
+   entries, by columns; those of q are in v's basis, as `integrate` moves it.
 
-   For what tangents do not carry: freezes on the way, whose places depend on the segments before, and settings. Left
-   out is a sixth of the square of DIFFERENCE times the third derivative, and what rounding and the steps leave, over
-   DIFFERENCE. Where an output has a kink between the two ends, it is the mean of both slopes. */
+   For inputs without tangents: settings, and any input of a model with several freezes. The error is DIFFERENCE^2 / 6
+   times the third derivative, plus errors of rounding and of the steps over DIFFERENCE. At a kink of the output the
+   result is the mean of both slopes. */
 
-/* numbers of all outputs */
+/* Work memory; `ends` hold all outputs at both ends of a difference. */
 typedef struct {
   Work collision;
   double ends[2][ENTRIES];
   double input[LONGEST], there[NQ];
 } Differences;
-#define ROOM Differences
+#define WORK_TYPE Differences
 
 static void ends_at(const double **arg, int input, const double *x, int side, Differences *w) {
   const double *in[N_IN];
   double *values[N_VALUES], *to = w->ends[side];
-  Course c;
+  Outcome c;
   FOR(k, N_IN) in[k] = arg[k];
   in[input] = x;
   FOR(i, N_VALUES) {
@@ -34,22 +35,22 @@ static void evaluate(const double **arg, double **res, Differences *w) {
     int wanted = 0;
     FOR(i, N_VALUES) wanted |= res[i * N_BY + b] != 0;
     if (!wanted) continue;
-    load(arg[input], w->input, of_q ? NQ : count);
+    copy_or_zero(arg[input], w->input, of_q ? NQ : count);
     FOR(direction, count) {
-      double h = DIFFERENCE, way[NV] = {0}, *x = w->input + direction;
+      double h = DIFFERENCE, displacement[NV] = {0}, *x = w->input + direction;
       const double here = *x;
       if (!of_q) {
         const double size = fmax(fabs(here), SCALES[b]);
         if (size > 0.0) h *= size;
-        /* what is left of it when it is added */
+        /* the difference as it is represented, not as it was asked for; volatile keeps the compiler from undoing it */
         volatile double ahead = here + h;
         h = ahead - here;
       }
       FOR(side, 2) {
         const double shift = side ? -h : h;
         if (of_q) {
-          way[direction] = shift;
-          const double *in[] = {w->input, way};
+          displacement[direction] = shift;
+          const double *in[] = {w->input, displacement};
           double *out[] = {w->there};
           integrate(in, out, 0, 0, 0);
         } else *x = here + shift;

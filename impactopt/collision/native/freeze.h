@@ -1,8 +1,9 @@
-/* Steps 1b and 2b: what is computed once, at the moment of a freeze. Symbols as in collision/frozen.py.
+/* Model frozen at one instant (steps 1b and 2b). Symbols as in collision/frozen.py.
 
-   With roots W of joints and hand in one matrix B, and Z = R^-1 W_c' B,  Q = B' B - Z' Z = [A s; s' m]. A product
-   of Q with (integral of the torque, minus the impulse) gives the joints' velocity and the hand's speed. With
-   friction the same of the striking point's three rows: `of_point` are columns, m_point is between them. */
+   With roots W of joints and hand in one matrix B, and Z = R^-1 W_c' B,  Q = B' B - Z' Z = [A s; s' m]. Q times
+   (integral of the torque, minus the impulse) gives the joints' velocity and the hand's speed. With friction at the
+   contact, Q_point are further columns for the striking point's three coordinates, and m_point is the block between
+   these. */
 
 typedef struct {
   vec root[NV][VF];     /* D^-1/2 L^-T; columns: joints, hand, the other velocities */
@@ -13,27 +14,27 @@ typedef struct {
   vec wrench[N + 1][VC]; /* columns of L_tau, L_f */
   vec L_0[VC];
   double R[C1][C1];     /* with the reciprocal of its diagonal */
-  double push[C1];      /* R^-1 (acceleration of what is held if it were free) */
+  double free_acceleration[C1];      /* R^-1 (acceleration of the constrained frames if they were free) */
   double bias_root[NV];
   double drift_velocity[NV];
-  double hand_speed, closing; /* of the hand, and against the target, both along the normal */
+  double hand_speed, approach_speed; /* of the hand, and relative to the target, along the normal */
   double soles[AT_LEAST_1(3 * SOLES)];
   double unmodelled[6];
 #if SLIDES
   double point_root[3][NV], point_held[3][C1], m_point[3][3], point_velocity[3], e_point[3];
-  vec of_point[3][V], L_point[3][VC];
+  vec Q_point[3][V], L_point[3][VC];
 #endif
-  int spoiled;          /* whether rounding has spoilt it */
+  int ill_conditioned;          /* a pivot has lost all its digits */
 } Frozen;
 
-/* x := R^-1 x and x := R^-T x for vectors, a row each, or numbers */
+/* x := R^-1 x and x := R^-T x; T is double, or vec for several right-hand sides */
 #define SOLVE(F, x, T) \
   FOR(c, C) { T s_ = (x)[c]; FOR(k, c) s_ -= (F)->R[c][k] * (x)[k]; (x)[c] = s_ * (F)->R[c][c]; }
 #define SOLVE_TRANSPOSED(F, x, T) \
   for (int c = C - 1; c >= 0; c--) { \
     T s_ = (x)[c]; for (int k = c + 1; k < C; k++) s_ -= (F)->R[k][c] * (x)[k]; (x)[c] = s_ * (F)->R[c][c]; }
 
-static void roots(const double *q, const double *v, const double *normal, Frozen *F) {
+static void evaluate_tree(const double *q, const double *v, const double *normal, Frozen *F) {
   double root[ROOT_NONZEROS], held[AT_LEAST_1(HELD_NONZEROS)];
   const double *in[] = {q, v, normal};
   double *out[] = {
@@ -58,12 +59,12 @@ static void roots(const double *q, const double *v, const double *normal, Frozen
   FOR(i, HELD_NONZEROS) to[HELD_AT[i]] = held[i];
 }
 
-/* Cholesky's factor of the Delassus matrix, and Z: row by row, as U = D L' of G = L D L', so that only divisions,
-   and no roots, wait for one another */
-static void hold(Frozen *F) {
+/* Cholesky factor of the Delassus matrix, and Z. Row by row as U = D L' of G = L D L': so each row waits for a
+   division of the one before, and not for a square root. */
+static void factor_constraints(Frozen *F) {
   vec U[C1][VC];
   double inverse[C1];
-  F->spoiled = 0;
+  F->ill_conditioned = 0;
   FOR(c, C) {
     vec u[VC] = {0}, z[V] = {0};
     for (int k = HELD_ROWS[c]; k < HELD_ROWS[c + 1]; k++) {
@@ -81,7 +82,7 @@ static void hold(Frozen *F) {
     FOR(i, VC) U[c][i] = u[i];
     FOR(i, V) F->Z[c][i] = z[i];
     const double pivot = ((double *)U[c])[c] + GAMMA[c];
-    F->spoiled |= !(pivot > LEAST_PIVOT * whole);
+    F->ill_conditioned |= !(pivot > LEAST_PIVOT * whole);
     inverse[c] = 1.0 / pivot;
   }
   FOR(c, C) {
@@ -92,7 +93,7 @@ static void hold(Frozen *F) {
   }
 }
 
-/* rows of Q, from vector `first` on */
+/* Rows begin..end of Q, from vector `first` on. */
 INLINE void rows_of_inertia(Frozen *F, int first, int begin, int end) {
   for (int j = begin; j < end; j++) {
     vec s[V] = {0};
@@ -110,7 +111,7 @@ INLINE void rows_of_inertia(Frozen *F, int first, int begin, int end) {
   }
 }
 
-/* the upper triangle by vectors, and its mirror image */
+/* Q is symmetric: its upper triangle in whole vectors, then the mirror image. */
 static void inverse_inertia(Frozen *F) {
 #define ROWS_FROM(b, count) \
   if (V > b) rows_of_inertia(F, b, (b) * LANES, V > (b) + count ? ((b) + count) * LANES : N + 1);
@@ -124,7 +125,7 @@ static void inverse_inertia(Frozen *F) {
   }
 }
 
-/* s_point and m_point, by the columns of W and Z of the striking point */
+/* Q_point and m_point, from the striking point's columns of W and Z. */
 static void inertia_at_point(Frozen *F) {
 #if SLIDES
   FOR(k, 3) {
@@ -136,7 +137,7 @@ static void inertia_at_point(Frozen *F) {
     FOR(r, NV) FOR(i, V) s[i] += F->point_root[k][r] * F->root[r][i];
     FOR(c, C) FOR(i, V) s[i] -= z[c] * F->Z[c][i];
     s[V - 1] = to_hand(s[V - 1]);
-    FOR(i, V) F->of_point[k][i] = s[i];
+    FOR(i, V) F->Q_point[k][i] = s[i];
   }
   FOR(k, 3) FOR(l, 3) {
     double m = 0.0;
@@ -147,7 +148,7 @@ static void inertia_at_point(Frozen *F) {
 #endif
 }
 
-/* W of a vector over v, in `root`'s order of columns: a number a row; and its transpose */
+/* W x for x in `root`'s order of columns, and W' x. */
 static void times_root(const Frozen *F, const vec *x, double *out) {
   FOR(r, NV) out[r] = dot(F->root[r], x, VF);
 }
@@ -157,17 +158,18 @@ static void times_root_transposed(const Frozen *F, const double *x, double *out)
   FOR(i, NV) out[i] = ((double *)s)[COLUMN(i)];
 }
 
-static void meeting(const double *v, double yields, Frozen *F) {
+static void plastic_velocity(const double *v, double target_mobility, Frozen *F) {
   memcpy(F->drift_velocity, v, NV * sizeof(double));
 #if BIAS || JDOT
-  /* P j' is in Q for the joints, and the other velocities have no roots but their own */
+  /* The change of velocity by a plastic touch: P j' is in Q for the joints. The other velocities come first in v, and
+   their roots are triangular. */
   double y[C1], inner[AT_LEAST_1(NV - N)];
   FOR(c, C) y[c] = ((double *)F->Z[c])[N];
   SOLVE_TRANSPOSED(F, y, double)
   vec held_y[VC];
   pad(held_y, VC, y, C, 0.0);
   const double *of_hand = (const double *)F->Q[N];
-  const double impulse = (F->closing < 0.0 ? 0.0 : F->closing) / (of_hand[N] + yields);
+  const double impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / (of_hand[N] + target_mobility);
   FOR(r, NV - N) inner[r] = ((double *)F->root[r])[N] - dot(F->held[r], held_y, VC);
   FOR(i, NV - N) FOR(r, i + 1) F->drift_velocity[i] -= ((double *)F->root[r])[COLUMN(i)] * inner[r] * impulse;
   FOR(j, N) F->drift_velocity[NV - N + j] -= of_hand[j] * impulse;
@@ -175,7 +177,7 @@ static void meeting(const double *v, double yields, Frozen *F) {
 }
 
 static void drifts(const double *q, const double *normal, Frozen *F) {
-  double push[C1] = {0};
+  double free_acceleration[C1] = {0};
   memset(F->bias_root, 0, sizeof F->bias_root);
   FOR(i, V) F->drift[i] = (vec){0};
 #if SLIDES
@@ -197,34 +199,34 @@ static void drifts(const double *q, const double *normal, Frozen *F) {
   };
   drift(in, out, 0, 0, 0);
 #if BIAS
-  vec x[VF] = {0}, pushed[VC] = {0}, sum_of[V] = {0};
+  vec x[VF] = {0}, by_constraints[VC] = {0}, sum_of[V] = {0};
   FOR(i, NV) ((double *)x)[COLUMN(i)] = bias[i];
   FOR(r, NV) {
     const double b = F->bias_root[r] = dot(F->root[r], x, VF);
     FOR(i, V) sum_of[i] -= b * F->root[r][i];
-    FOR(i, VC) pushed[i] += b * F->held[r][i];
+    FOR(i, VC) by_constraints[i] += b * F->held[r][i];
   }
   FOR(i, V) F->drift[i] = sum_of[i];
-  FOR(c, C) push[c] = ((double *)pushed)[c];
+  FOR(c, C) free_acceleration[c] = ((double *)by_constraints)[c];
 #endif
 #if JDOT
-  FOR(c, C) push[c] -= of_held[c];
+  FOR(c, C) free_acceleration[c] -= of_held[c];
 #endif
-  SOLVE(F, push, double)
-  memcpy(F->push, push, sizeof push);
-  FOR(c, C) FOR(i, V) F->drift[i] += push[c] * F->Z[c][i];
+  SOLVE(F, free_acceleration, double)
+  memcpy(F->free_acceleration, free_acceleration, sizeof free_acceleration);
+  FOR(c, C) FOR(i, V) F->drift[i] += free_acceleration[c] * F->Z[c][i];
   for (int i = N + 1; i < V * LANES; i++) ((double *)F->drift)[i] = 0.0;
   ((double *)F->drift)[N] += of_hand;
 #if SLIDES
   FOR(k, 3) {
     FOR(r, NV) F->e_point[k] -= F->bias_root[r] * F->point_root[k][r];
-    FOR(c, C) F->e_point[k] += F->push[c] * F->point_held[k][c];
+    FOR(c, C) F->e_point[k] += F->free_acceleration[c] * F->point_held[k][c];
   }
 #endif
 #endif
 #if WRENCHES
-  SOLVE_TRANSPOSED(F, push, double)
-  pad(F->L_0, VC, push, C, 0.0);
+  SOLVE_TRANSPOSED(F, free_acceleration, double)
+  pad(F->L_0, VC, free_acceleration, C, 0.0);
 #endif
 }
 
@@ -258,28 +260,28 @@ static void no_number_of_spoiled(Frozen *F) {
   double whole = 0.0;
   FOR(r, NV) whole += ((double *)F->root[r])[N] * ((double *)F->root[r])[N];
   const double left = ((double *)F->Q[N])[N];
-  if (C) F->spoiled |= !(left > LEAST_PIVOT * whole) && left != 0.0;
-  if (!F->spoiled) return;
+  if (C) F->ill_conditioned |= !(left > LEAST_PIVOT * whole) && left != 0.0;
+  if (!F->ill_conditioned) return;
   F->hand_speed = NAN;
   FOR(j, N + 1) FOR(i, V) F->Q[j][i] = (vec){0} + NAN;
 }
 
-static void freeze(const double *q, const double *v, const double *normal, double yields, double before,
+static void freeze(const double *q, const double *v, const double *normal, double target_mobility, double target_speed,
                    Frozen *F) {
-  roots(q, v, normal, F);
-  F->closing = F->hand_speed - before;
-  hold(F);
+  evaluate_tree(q, v, normal, F);
+  F->approach_speed = F->hand_speed - target_speed;
+  factor_constraints(F);
   inverse_inertia(F);
   inertia_at_point(F);
   no_number_of_spoiled(F);
-  meeting(v, yields, F);
+  plastic_velocity(v, target_mobility, F);
   drifts(q, normal, F);
   wrenches(F);
 }
 
 /* wrench of all that is held for a torque, a force at the hand, its friction (3), and the drift's weight */
-static void wrench_of(const Frozen *F, const double *torque, double force, const double *sliding, double weight,
-                      vec *out) {
+static void wrench_of(const Frozen *F, const double *torque, double force, const double *sliding, double weight, vec
+                      *out) {
   FOR(i, VC) out[i] = weight * F->L_0[i] - force * F->wrench[N][i];
 #if SLIDES
   FOR(k, 3) FOR(i, VC) out[i] -= sliding[k] * F->L_point[k][i];

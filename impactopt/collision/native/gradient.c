@@ -1,8 +1,9 @@
-/* A scalar output of a collision and its gradients: (q, v[, feedforward], settings) -> value, d/dq (nv), d/dv (nv),
-   both in v's basis. */
+/* Gradient of a scalar output of a collision: (q, v[, feedforward], settings) -> value, d/dq (nv), d/dv (nv), both in
+   v's
+   basis. */
 
-/* its value, and its derivatives by the final state */
-static double final_value(const Data *d, const Course *c, State *y_) {
+/* Value of the output (returned), and its derivatives by the final state. */
+static double final_value(const Data *d, const Outcome *c, State *y_) {
   memset(y_, 0, sizeof *y_);
 #if defined(OUT_impulse)
   y_->impulse = 1.0;
@@ -17,7 +18,7 @@ static double final_value(const Data *d, const Course *c, State *y_) {
   double rest[NZ1] = {0}, one = 1.0;
   const double *in[] = {c->final.target, d->target, &one};
   double *out[] = {y_->target};
-  target_energy_back(in, out, 0, 0, 0);
+  target_energy_adjoint(in, out, 0, 0, 0);
   return call(target_energy, c->final.target, d->target, 0) - call(target_energy, rest, d->target, 0);
 #else
   return 1.0 - c->in_contact;
@@ -25,11 +26,12 @@ static double final_value(const Data *d, const Course *c, State *y_) {
 }
 
 #if FREEZES
-/* By differences of collisions, of whose steps the tolerance is far below: a segment's length, and where it is frozen,
-   depend on the one before. */
+/* With several freezes by central differences, at a far smaller tolerance of the steps: the length of a segment, and
+   the
+   posture that it is frozen at, depend on the segment before. */
 static double value_at(const double **arg, const double *q, const double *v, Work *w) {
   const double *in[N_IN];
-  Course c;
+  Outcome c;
   State unused;
   FOR(k, N_IN) in[k] = arg[k];
   in[ARG_q] = q, in[ARG_v] = v;
@@ -38,21 +40,21 @@ static double value_at(const double **arg, const double *q, const double *v, Wor
 }
 
 static void evaluate(const double **arg, double **res, Work *w) {
-  double q[NQ], v[NV], there[NQ], way[NV] = {0}, ends[2];
-  load(arg[ARG_q], q, NQ);
-  load(arg[ARG_v], v, NV);
+  double q[NQ], v[NV], there[NQ], displacement[NV] = {0}, ends[2];
+  copy_or_zero(arg[ARG_q], q, NQ);
+  copy_or_zero(arg[ARG_v], v, NV);
   if (res[0]) *res[0] = value_at(arg, q, v, w);
   FOR(i, NV) {
     FOR(side, 2) {
       if (!res[1]) break;
-      way[i] = side ? -DIFFERENCE : DIFFERENCE;
-      const double *in[] = {q, way};
+      displacement[i] = side ? -DIFFERENCE : DIFFERENCE;
+      const double *in[] = {q, displacement};
       double *out[] = {there};
       integrate(in, out, 0, 0, 0);
       ends[side] = value_at(arg, there, v, w);
     }
     if (res[1]) res[1][i] = (ends[0] - ends[1]) / (2 * DIFFERENCE);
-    way[i] = 0.0;
+    displacement[i] = 0.0;
     const double here = v[i];
     FOR(side, 2) {
       if (!res[2]) break;
@@ -65,8 +67,8 @@ static void evaluate(const double **arg, double **res, Work *w) {
 }
 #else
 static void evaluate(const double **arg, double **res, Work *w) {
-  Course c;
-  Back all;
+  Outcome c;
+  FrozenAdjoint all;
   State y_;
   const Data *d = &w->data;
   collide(arg, 0, w, &c);
@@ -74,15 +76,15 @@ static void evaluate(const double **arg, double **res, Work *w) {
   if (res[0]) *res[0] = value;
   if (!res[1] && !res[2]) return;
   memset(&all, 0, sizeof all);
-  run_back(d, &w->tape, c.in_contact != 0.0, &y_, &all);
+  run_adjoint(d, &w->tape, c.in_contact != 0.0, &y_, &all);
 
-  FreezeBack room;
+  FreezeAdjoint work;
   double by_q[NV], by_v[NV];
-  const double *q = filled(arg[ARG_q], w->q, NQ), *v = filled(arg[ARG_v], w->v, NV);
-  const double *normal = filled(arg[ARG_normal], w->normal, 3);
-  freeze_back(q, v, normal, call(target_yield, d->target, 0, 0), &w->frozen, &all, &room, by_q, by_v);
+  const double *q = or_zeros(arg[ARG_q], w->q, NQ), *v = or_zeros(arg[ARG_v], w->v, NV);
+  const double *normal = or_zeros(arg[ARG_normal], w->normal, 3);
+  freeze_adjoint(q, v, normal, call(target_yield, d->target, 0, 0), &w->frozen, &all, &work, by_q, by_v);
   FOR(i, N) by_v[NV - N + i] += ((const double *)all.joint_velocity)[i];
-  /* no number in, none out */
+  /* a value that is NaN has gradients that are NaN */
   FOR(i, NV) {
     if (res[1]) res[1][i] = by_q[i] + 0.0 * value;
     if (res[2]) res[2][i] = by_v[i] + 0.0 * value;

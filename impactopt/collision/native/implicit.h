@@ -1,46 +1,53 @@
 /* Implicit steps that end on events; see collision/implicit.py for the method and its symbols.
 
-   With v = Q (T, -p) + drift t the joints' velocity and the hand's speed, and D = kd + g kp of the joints that are
-   not saturated (plus the slope of their friction), g = gamma h, a stage needs v of S r: v = X (rho, -p), where
-   X = Q (I + g D Q)^-1 and rho = r_T + g kp r_deviation. Gains of one number a joint have X symmetric. Force,
-   penetration and the target are scalars beside that. What law and target have beyond their slopes at the step's begin
-   acts as inputs n of these scalars, polynomials as the state is one; see implicit_bend.h, which finds
-   them. */
+   The joints' velocity and the hand's speed are v = Q (T, -p) + drift t. With g = gamma h and D = kd + g kp of the
+       joints
+   that are not saturated (plus the slope of their friction), a stage solves v = X (rho, -p), where
+   X = Q (I + g D Q)^-1 and rho = r_T + g kp r_deviation. X is symmetric where gains are one number a joint. Force,
+   penetration and the target are scalar equations beside that. Nonlinear parts of law and target (remainders beyond
+       their
+   slopes at the step's begin) act as inputs n of these equations, polynomials as the state is one; see
+   implicit_remainders.h. */
 
 #define TERMS (STAGES + 1)
-/* of a step up to an event, by which one goes on beyond it, so that the next begins in the new phase; and of a full
-   step, below which an event comes at once */
-#define JUST_BEYOND 1e-9
-#define AT_ONCE 1e-5
-/* of the stiffest of contact's modes, the first step; how much an error has to be below what is allowed for longer
-   steps; error of a joint's demand, of its limit; and
-   what is allowed of a place at which the target changes, of what is allowed else */
-#define FIRST_STEP 0.5
-#define WORTH_LONGER 2e-3
-#define AIMED_AT 0.2
-/* likewise where law or target bend, which costs a factor anew in any case; the first step's change of speed, of the
-   speed; and a step that Newton's method has not found, once more */
-#define BENT_WORTH_LONGER 0.1
-#define LITTLE 0.1
-#define SHORTER 0.3
-/* of a force that begins without a slope, as x^1.5, the first step's change of speed; and of the time that is left to
-   separation, a step that comes near it: a force that ends so is followed by ever shorter ones, down to the first's */
-#define LITTLE_OF_FLAT 3e-4
-#define NEAR_SEPARATION 0.6
-#define OF_LIMIT 1e-2
-#define OF_PLACE 0.1
-#define MOST_TRIES 200
+/* A step passes an event by this part of its length, so that the next step begins in the new phase. */
+#define EVENT_OVERSHOOT 1e-9
+/* An event before this part of a step is immediate: rounding may have hidden that the last one is over. */
+#define IMMEDIATE_EVENT 1e-5
+/* [rad] phase of the stiffest contact mode in the first step */
+#define FIRST_STEP_PHASE 0.5
+/* Errors are relative to the tolerance. A step gets longer only below this error, as another length costs another X;
+   it then aims at AIMED_ERROR. Where law or target are nonlinear, the step is factored anew in any case. */
+#define LENGTHEN_BELOW 2e-3
+#define LENGTHEN_BELOW_NONLINEAR 0.1
+#define AIMED_ERROR 0.2
+/* Relative change of the hand's speed in the first step under a nonlinear law; the second where the force begins
+   without
+   a slope, as x^1.5 */
+#define FIRST_SPEED_CHANGE 0.1
+#define FIRST_SPEED_CHANGE_FLAT 3e-4
+/* Shorter step where Newton's method has not converged */
+#define RETRY_FACTOR 0.3
+/* Near separation a step takes at most this part of the time that is left, as a force like x^1.5 has no Taylor series
+   there: steps get shorter, down to the first one's length */
+#define SEPARATION_FRACTION 0.6
+/* Allowed error of a joint's demand, relative to its torque limit */
+#define ERROR_OF_LIMIT 1e-2
+/* Allowed error of a target's switch by position, relative to other errors */
+#define ERROR_OF_SWITCH 0.1
+#define MAX_TRIES 200
 
-/* law and target in the piece where the step begins, and the inverse of I - g dz'/dz */
+/* Law and target linearized where the step begins, and the inverse of I - g dz'/dz. */
 typedef struct {
-  double force, k, d;              /* at the begin, and its slopes by penetration and rate */
+  double force, k, d;              /* force, and its slopes by penetration and rate */
   double rates[NZ1];               /* dz/dt at the begin */
-  double Z[NZ1][NZ1], G[NZ1], at[NZ1]; /* of dz/dt by z and force; of velocity by z */
-  double inverse[NZ1][NZ1], moved[NZ1], mobility;
-  double yields;                   /* mobility [1/kg] without what holds within a step */
+  double Z[NZ1][NZ1], G[NZ1], at[NZ1]; /* slopes of dz/dt by z and by force; of the velocity by z */
+  double inverse[NZ1][NZ1], state_by_force[NZ1], mobility;
+  double bare_mobility;                   /* mobility [1/kg] of hand and target without servo and damping within a step
+      */
 } Contact;
 
-/* `rows` are those of X, which is by columns; of gains that are matrices D is by columns too */
+/* X by columns, `rows` by rows. With matrices of gains D is by columns too. */
 #define GAIN_MATRIX (KD_MATRIX || KP_MATRIX)
 typedef struct {
   double h, g;
@@ -53,27 +60,28 @@ typedef struct {
   Contact contact;
 } Resolvent;
 
-/* additional inputs of a stage: of the force, the target's rates and its velocity */
-#define BENDS (LAW_BENDS || TARGET_BENDS)
-#define INPUTS (1 + (TARGET_BENDS ? NZ + 1 : 0))
-typedef double Inputs[BENDS ? TERMS : 1][INPUTS];
+/* Inputs of a stage: remainders of the force, of the target's rates and of its velocity. */
+#define NONLINEAR (LAW_NONLINEAR || TARGET_NONLINEAR)
+#define INPUTS (1 + (TARGET_NONLINEAR ? NZ + 1 : 0))
+typedef double Inputs[NONLINEAR ? TERMS : 1][INPUTS];
 
-/* w_j, and what depends on it; the first of each is the value at the begin. `speeds` have the hand's in their last
-   lane used, but for the first */
+/* Coefficients w_j of the step's polynomials; the first is the value at the begin. `speeds` are followed by the hand's
+   speed, but for the first coefficient. */
 typedef struct {
   vec torque[TERMS][V], deviation[TERMS][V], speeds[TERMS][V], demand[TERMS][V];
   double impulse[TERMS], penetration[TERMS], rate[TERMS], force[TERMS], target[NZ1][TERMS];
 } Series;
 
-enum { OF_NONE, OF_RATE, OF_FORCE, OF_DEMAND, OF_SLIDING, OF_SWITCH, OF_SEPARATION };
+enum { EVENT_NONE, EVENT_RATE, EVENT_FORCE, EVENT_DEMAND, EVENT_SLIDING, EVENT_SWITCH, EVENT_SEPARATION };
 
 typedef struct {
   double at;
   int kind, number;
 } Event;
 
-/* of each step what those who go back need: the state at its begin, its length, the part of it that was gone, and the
-   event that this depends on */
+/* Record of the steps for derivatives: the state at the begin of each, its length, the part of it that was taken, and
+   the
+   event that ended it. */
 typedef struct {
   int made;
   State states[GRADIENT ? STEPS_AT_ALL + 1 : 1];
@@ -146,7 +154,7 @@ INLINE double bernstein(const double *b, double t, double *slope) {
   return x[0] + t * (x[1] - x[0]);
 }
 
-/* the root of one that falls once from above zero to below it: Newton's iterations, held between two bounds */
+/* Root of a polynomial with exactly one sign change, from above to below zero: Newton's method within a bracket. */
 static double falling_root(const double *b) {
   double low = 0.0, high = 1.0, t = b[0] / (b[0] - b[STAGES]);
   FOR(tries, 60) {
@@ -155,15 +163,17 @@ static double falling_root(const double *b) {
     if (x > 0.0) low = t;
     else high = t;
     const double next = t - x / slope;
-    /* the error goes with the square of the way made last; beyond a bound is what rounding has left */
+    /* the error is the square of the last change; where the root lies beyond the bracket that is rounding */
     if (slope < 0.0 && fabs(next - t) <= 1e-10 * fmax(t, 1e-4)) return fmin(fmax(next, low), high);
     t = next > low && next < high ? next : (low + high) / 2;
   }
   return t;
 }
 
-/* Where a polynomial, given by its Bernstein coefficients, falls below zero first; beyond 1: nowhere. It has no more
-   roots than they have changes of sign (Lane and Riesenfeld): parts are halved until that decides. */
+/* First place where a polynomial, given by its Bernstein coefficients, falls below zero; above 1: nowhere. It has at
+   most as
+   many roots as its coefficients have changes of sign (Lane and Riesenfeld 1981): parts are halved until that decides.
+       */
 #define HALVINGS 40
 static double first_below(const double *given) {
   double parts[HALVINGS + 1][TERMS], begins[HALVINGS + 1], lengths[HALVINGS + 1];
@@ -199,7 +209,7 @@ static double first_below(const double *given) {
   return 2.0;
 }
 
-/* the largest of a polynomial's values on [0, end], and where; or `most`, where that is more */
+/* Maximum of a polynomial on [0, end], and its place; or `most` where that is larger. */
 static double largest(const double *w, double end, double most, double *where) {
   double b[TERMS], p[TERMS], c[TERMS] = {w[0]}, best = 0.0, high = -INFINITY;
   hull(w, b);
@@ -213,7 +223,7 @@ static double largest(const double *w, double end, double most, double *where) {
     for (int k = STAGES - 1; k >= 0; k--) x = x * t + c[k];
     if (x > high) high = x, best = t;
   }
-  /* from an end too: the largest may lie between it and its neighbour */
+  /* Newton's method from the best sample, also from an end: the maximum may lie between it and its neighbour */
   FOR(tries, 5) {
     double slope = 0.0, bend = 0.0;
     for (int k = STAGES; k >= 1; k--) slope = slope * best + k * c[k];

@@ -1,7 +1,7 @@
-/* What ends a step before its end, and the state where it ends. */
+/* Events that end a step before its end, and the state there. */
 
-/* what falls below zero before the first event so far takes its place */
-static void look_at(const double *b, double sign, double level, int kind, int number, Event *e) {
+/* Takes sign b + level as the first event where it falls below zero before the one so far. */
+static void check_event(const double *b, double sign, double level, int kind, int number, Event *e) {
   double mine[TERMS], lowest = INFINITY;
   FOR(i, TERMS) {
     mine[i] = sign * b[i] + level;
@@ -12,41 +12,42 @@ static void look_at(const double *b, double sign, double level, int kind, int nu
   if (at < e->at) *e = (Event){.at = at, .kind = kind, .number = number};
 }
 
-/* a joint's series against a level: stays within it, or beyond */
-static void look_at_joint(const vec (*w)[V], int i, double offset, double level, int kind, Event *e) {
+/* Event where a joint's series leaves |x| <= level, or returns into it. */
+static void check_joint_events(const vec (*w)[V], int i, double offset, double level, int kind, Event *e) {
   double mine[TERMS], b[TERMS];
   FOR(j, TERMS) mine[j] = ((const double *)w[j])[i];
   mine[0] += offset;
   hull(mine, b);
-  if (fabs(mine[0]) <= level) { /* as what is at its level counts elsewhere */
-    look_at(b, 1.0, level, kind, i, e);
-    look_at(b, -1.0, level, kind, i, e);
+  if (fabs(mine[0]) <= level) { /* a value at its level counts as within, as elsewhere */
+    check_event(b, 1.0, level, kind, i, e);
+    check_event(b, -1.0, level, kind, i, e);
   } else {
-    look_at(b, mine[0] < 0.0 ? -1.0 : 1.0, -level, kind, i, e);
+    check_event(b, mine[0] < 0.0 ? -1.0 : 1.0, -level, kind, i, e);
   }
 }
 
-/* whether a joint's series may cross the level in this step, a joint a lane: from its terms' sizes, and where these
-   leave it open from its hull */
+/* Whether a joint's series may cross the level in this step, one joint per lane: by the size of its coefficients, and
+   where
+   these do not decide by its Bernstein hull. */
 INLINE bits may_cross(const vec (*w)[V], int i, vec offset, vec level) {
   vec reach = BOUND[1] * magnitude(w[1][i]);
   for (int j = 2; j < TERMS; j++) reach += BOUND[j] * magnitude(w[j][i]);
   const vec start = w[0][i] + offset, size = magnitude(start);
   const bits open = magnitude(size - level) <= reach;
   if (!any(open)) return open;
-  const bits within = size <= level, sign = (bits)start & SIGN_BIT;
+  const bits instant_within = size <= level, sign = (bits)start & SIGN_BIT;
   bits crosses = {0};
   for (int k = 1; k < TERMS; k++) {
     vec b = start;
     for (int j = 1; j < TERMS; j++) b += HULL[j][k] * w[j][i];
     const vec out = magnitude(b) - level, in = level - (vec)((bits)b ^ sign);
-    crosses |= choose(within, out, in) > 0.0;
+    crosses |= choose(instant_within, out, in) > 0.0;
   }
   return crosses & open;
 }
 
-#if LAW_BENDS
-/* what falls through zero at separation, and its slopes by penetration and rate */
+#if LAW_NONLINEAR
+/* Separation function, which falls through zero at the event, and its slopes by penetration and rate. */
 static void separation_at(const Data *d, const Series *s, double theta, double *found) {
   double p[TERMS];
   powers(theta, p);
@@ -55,8 +56,8 @@ static void separation_at(const Data *d, const Series *s, double theta, double *
   double *out[] = {found};
   separation(in, out, 0, 0, 0);
 }
-/* where a polynomial through its values at the nodes says, and then itself */
-static void look_at_separation(const Data *d, const Series *s, Event *e) {
+/* Event of separation: first of a polynomial through the function's values at the nodes, then by Newton's method. */
+static void check_separation(const Data *d, const Series *s, Event *e) {
   double w[TERMS], b[TERMS], at[3], before = 0.0, beyond = 1.0;
   double first[3];
   separation_at(d, s, 0.0, first);
@@ -70,7 +71,7 @@ static void look_at_separation(const Data *d, const Series *s, Event *e) {
   }
   Event found = {.at = e->at};
   hull(w, b);
-  look_at(b, 1.0, 0.0, OF_FORCE, 0, &found);
+  check_event(b, 1.0, 0.0, EVENT_FORCE, 0, &found);
   if (!found.kind) return;
   double t = found.at;
   FOR(tries, 60) {
@@ -86,11 +87,11 @@ static void look_at_separation(const Data *d, const Series *s, Event *e) {
     }
     t = next > before && next < beyond ? next : (before + beyond) / 2;
   }
-  if (t < e->at) *e = (Event){.at = t, .kind = OF_FORCE};
+  if (t < e->at) *e = (Event){.at = t, .kind = EVENT_FORCE};
 }
 #endif
 
-/* switches of the target, and their slopes by state and force */
+/* Switching functions of the target, and their slopes by state and force. */
 #if SWITCHES
 typedef struct {
   double values[SWITCHES], by_z[SWITCHES * NZ1], by_force[SWITCHES];
@@ -100,16 +101,16 @@ static void switches_at(const Data *d, const double *z, double force, Switch *x)
   double *out[] = {x->values, x->by_z, x->by_force};
   switch_slopes(in, out, 0, 0, 0);
 }
-/* the slopes of those that a step ends on */
+/* Switching functions at the place where a step ends. */
 static void switch_in(const Data *d, const Series *s, double theta, Switch *x) {
   double p[TERMS], z[NZ1];
-  powers(TARGET_BENDS ? theta : 0.0, p);
+  powers(TARGET_NONLINEAR ? theta : 0.0, p);
   FOR(i, NZ) z[i] = value(s->target[i], p);
   switches_at(d, z, value(s->force, p), x);
 }
 #endif
 
-/* the switches in a step, in the polynomials of the step's other series */
+/* Switching functions in a step, as polynomials. */
 typedef struct {
 #if SWITCHES
   Switch begin;
@@ -126,12 +127,12 @@ static void switching_of(const Data *d, const State *y, const Series *s, Switchi
     w[0] = x->begin.values[k];
     for (int j = 1; j < TERMS; j++) {
       w[j] = 0.0;
-      if (TARGET_BENDS) continue;
+      if (TARGET_NONLINEAR) continue;
       w[j] = x->begin.by_force[k] * s->force[j];
       FOR(i, NZ) w[j] += x->begin.by_z[k + SWITCHES * i] * s->target[i][j];
     }
   }
-#if TARGET_BENDS
+#if TARGET_NONLINEAR
   FOR(i, NODES) {
     double z[NZ1];
     Switch there;
@@ -143,10 +144,11 @@ static void switching_of(const Data *d, const State *y, const Series *s, Switchi
 #endif
 #endif
 }
-/* what a further term would add to the switches, of what is allowed: of the parts that they are made of, or what the
-   speed's error makes of it. A board that swings slowly against the hand has a deflection that the hand's speed and
-   the impulse hardly know of, and it is this that says at which of its swings it breaks. A place that is come to slowly
-   is passed that much too late: of a place less is allowed */
+/* Error of the switching functions relative to the tolerance, which `error_of` may not see: the deflection of a board
+   that
+   vibrates slowly hardly changes the hand's speed, but decides at which vibration the board breaks. Errors are relative
+   to the parts that a switch is made of. A switch by position allows less, as one that is approached slowly is passed
+   much too late. */
 INLINE double error_of_switches(const Resolvent *r, const Series *s, const Switching *x, double scale) {
   double error = 0.0;
 #if SWITCHES
@@ -159,46 +161,47 @@ INLINE double error_of_switches(const Resolvent *r, const Series *s, const Switc
       by_speed += by_z * r->contact.at[i];
     }
     const double rest = fmax(fabs(by_force * s->force[0]), fabs(by_speed) * scale);
-    const double size = fmax(fmax(OF_PLACE * place, rest), fabs(w[1]));
+    const double size = fmax(fmax(ERROR_OF_SWITCH * place, rest), fabs(w[1]));
     if (size > 0.0) error = fmax(error, fabs(w[STAGES]) / size);
   }
 #endif
   return error * (LEFT_OUT / TOLERANCE);
 }
 
-static void find_event(const Data *d, const Instant *now, const Series *s, const Switching *switching, double end,
-                       Event *e) {
+static void find_event(const Data *d, const Instant *now, const Series *s, const Switching *switching, double end, Event
+                       *e) {
   double b[TERMS];
   *e = (Event){.at = end};
   hull(s->rate, b);
-  look_at(b, now->compressing ? 1.0 : -1.0, 0.0, OF_RATE, 0, e);
+  check_event(b, now->compressing ? 1.0 : -1.0, 0.0, EVENT_RATE, 0, e);
   if (!now->compressing) {
-#if LAW_BENDS
-    look_at_separation(d, s, e);
+#if LAW_NONLINEAR
+    check_separation(d, s, e);
 #else
-    hull(s->force, b), look_at(b, 1.0, 0.0, OF_FORCE, 0, e);
+    hull(s->force, b), check_event(b, 1.0, 0.0, EVENT_FORCE, 0, e);
 #endif
   }
 #if SATURATION
   FOR(i, V) {
-    const bits may = may_cross(s->demand, i, (vec){0}, d->limit[i]) & (bits)(d->kept[i] > 0.0);
+    const bits may = may_cross(s->demand, i, (vec){0}, d->limit[i]) & (bits)(d->joint_mask[i] > 0.0);
     if (any(may)) FOR(l, LANES) if (may[l])
-      look_at_joint(s->demand, i * LANES + l, 0.0, d->limit[i][l], OF_DEMAND, e);
+      check_joint_events(s->demand, i * LANES + l, 0.0, d->limit[i][l], EVENT_DEMAND, e);
   }
 #endif
 #if FRICTION
   FOR(i, V) {
-    const bits may = may_cross(s->speeds, i, d->joint_velocity[i], (vec){0} + TRANSITION) & (bits)(d->kept[i] > 0.0);
+    const bits may = may_cross(s->speeds, i, d->joint_velocity[i], (vec){0} + TRANSITION) & (bits)(d->joint_mask[i] >
+        0.0);
     if (any(may)) FOR(l, LANES) if (may[l])
-      look_at_joint(s->speeds, i * LANES + l, d->joint_velocity[i][l], TRANSITION, OF_SLIDING, e);
+      check_joint_events(s->speeds, i * LANES + l, d->joint_velocity[i][l], TRANSITION, EVENT_SLIDING, e);
   }
 #endif
 #if SWITCHES
   FOR(k, SWITCHES) {
     hull(switching->terms[k], b);
-    if (b[0] != 0.0) look_at(b, b[0] < 0.0 ? -1.0 : 1.0, 0.0, OF_SWITCH, k, e);
-    /* a tie: the target goes by the piece that zero belongs to, which may not be the one that comes */
-    else FOR(i, TERMS) if (b[i] != 0.0) *e = (Event){.at = 0.0, .kind = OF_SWITCH, .number = k};
+    if (b[0] != 0.0) check_event(b, b[0] < 0.0 ? -1.0 : 1.0, 0.0, EVENT_SWITCH, k, e);
+    /* exactly at the switch: the target uses the piece that includes zero, which may not be the next one */
+    else FOR(i, TERMS) if (b[i] != 0.0) *e = (Event){.at = 0.0, .kind = EVENT_SWITCH, .number = k};
   }
 #endif
 }

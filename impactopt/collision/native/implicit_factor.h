@@ -1,14 +1,14 @@
-/* The servo within a step, and the factor X that steps of one length share; law and target where a step begins. */
+/* Servo within a step: the factor X that steps of one length share. Law and target, linearized where a step begins. */
 
-/* out = D x, and its transposed */
-INLINE void damped(const Resolvent *r, const vec *x, vec *out) {
+/* out = D x, and out = D' x */
+INLINE void apply_damping(const Resolvent *r, const vec *x, vec *out) {
 #if GAIN_MATRIX
   times_matrix(r->D, x, out);
 #else
   FOR(i, V) out[i] = r->D[i] * x[i];
 #endif
 }
-INLINE void damped_back(const Resolvent *r, const vec *x, vec *out) {
+INLINE void apply_damping_transposed(const Resolvent *r, const vec *x, vec *out) {
 #if GAIN_MATRIX
   FOR(i, V) out[i] = (vec){0};
   FOR(j, N) ((double *)out)[j] = dot(r->D[j], x, V);
@@ -17,8 +17,8 @@ INLINE void damped_back(const Resolvent *r, const vec *x, vec *out) {
 #endif
 }
 #if STIFFNESS
-/* kp x of the joints that are not saturated, and its transposed */
-INLINE void sprung(const Data *d, const Resolvent *r, const vec *x, vec *out) {
+/* out = kp x for the joints that are not saturated, and its transposed */
+INLINE void apply_stiffness(const Data *d, const Resolvent *r, const vec *x, vec *out) {
 #if KP_MATRIX
   times_matrix(d->kp, x, out);
   FOR(i, V) out[i] *= r->free[i];
@@ -28,22 +28,23 @@ INLINE void sprung(const Data *d, const Resolvent *r, const vec *x, vec *out) {
   FOR(i, V) out[i] = r->kp[i] * x[i];
 #endif
 }
-INLINE void sprung_back(const Data *d, const Resolvent *r, const vec *x, vec *out) {
+INLINE void apply_stiffness_transposed(const Data *d, const Resolvent *r, const vec *x, vec *out) {
 #if KP_MATRIX
   vec of[V];
   FOR(i, V) of[i] = r->free[i] * x[i], out[i] = (vec){0};
   FOR(j, N) ((double *)out)[j] = dot(d->kp[j], of, V);
 #else
-  sprung(d, r, x, out);
+  apply_stiffness(d, r, x, out);
 #endif
 }
 #endif
 
-/* joints that are taken in at once: as many of their columns as registers hold */
+/* joints per block: as many columns as registers hold */
 #define BLOCK (LANES < 4 ? LANES : 4)
 #define BLOCKS ((N + BLOCK - 1) / BLOCK)
 
-/* X from Q and D: with columns x of some joints, X - x (1 + g D x_own)^-1 g D x' takes their dampers in */
+/* X from Q and D, a block of joints at a time, by the Woodbury formula: X := X - x (1 + g D x_own)^-1 g D x' with the
+   columns x of the block. */
 static void sweep_all(const vec (*Q)[V], Resolvent *r) {
   const vec(*from)[V] = Q;
   if (!BLOCKS) memcpy(r->X, Q, sizeof r->X);
@@ -77,7 +78,7 @@ static void sweep_all(const vec (*Q)[V], Resolvent *r) {
   }
 }
 
-/* D to D + change at joint i alone */
+/* X for D + change at joint i (Sherman-Morrison). */
 INLINE void sweep(Resolvent *r, int i, double change) {
   const double pivot = ((double *)r->X[i])[i], factor = r->g * change / (1.0 + r->g * change * pivot);
   vec x[V];
@@ -88,7 +89,7 @@ INLINE void sweep(Resolvent *r, int i, double change) {
   }
 }
 
-/* friction's slope, of the joints as they are now */
+/* slope of joint friction by velocity */
 INLINE vec friction_slope(const Data *d, const Instant *now, int i) {
 #if FRICTION
   const bits slides = magnitude(d->joint_velocity[i] + now->u[i]) > TRANSITION;
@@ -100,7 +101,7 @@ INLINE vec friction_slope(const Data *d, const Instant *now, int i) {
 INLINE bits not_saturated(const Instant *now, int i) { return now->torque[i] == now->demand[i]; }
 
 #if GAIN_MATRIX
-/* X by rows from (I + g Q D) X = Q, by Gauss's elimination with pivots */
+/* Rows of X from (I + g Q D) X = Q, by Gauss-Jordan elimination with row pivots. */
 static void factor(const vec (*Q)[V], Resolvent *r) {
   vec M[N + 1][V];
   int of[N + 1];
@@ -160,7 +161,7 @@ static void factor_servo(const Data *d, const Instant *now, double h, Resolvent 
   factor((const vec(*)[V])d->frozen->Q, r);
 }
 #else
-/* D of the joints, as far as they are not saturated now */
+/* D of the joints that are not saturated. */
 INLINE void dampers(const Data *d, const Instant *now, double g, vec *D, vec *kp) {
   FOR(i, V) {
     const bits free_ = not_saturated(now, i);
@@ -184,19 +185,19 @@ static void factor_servo(const Data *d, const Instant *now, double h, Resolvent 
   const double *is = (const double *)D;
   if (r->h == h)
     FOR(i, N) if (is[i] != was[i]) change[changes++] = i;
-  int anew = r->h != h || changes > N / 4;
-  FOR(k, anew ? 0 : changes) {
+  int refactor = r->h != h || changes > N / 4;
+  FOR(k, refactor ? 0 : changes) {
     const int i = change[k];
     const double more = is[i] - was[i];
-    /* taking a stiff damper away again would leave rounding errors */
+    /* removing a stiff damper by an update would leave rounding errors */
     if (1.0 + g * more * ((double *)r->X[i])[i] < 1e-3) {
-      anew = 1;
+      refactor = 1;
       break;
     }
     sweep(r, i, more);
   }
   memcpy(r->D, D, sizeof D);
-  if (anew) {
+  if (refactor) {
     r->h = h, r->g = g;
     sweep_all((const vec(*)[V])d->frozen->Q, r);
   }
@@ -204,9 +205,9 @@ static void factor_servo(const Data *d, const Instant *now, double h, Resolvent 
 }
 #endif
 
-/* force [N] of the phase, and its slopes by penetration and rate */
-INLINE void law_here(const Data *d, double x, double rate, int compressing, double *found) {
-#if LAW_BENDS
+/* Force [N] in this phase, and its slopes by penetration and rate. */
+INLINE void law_and_slopes(const Data *d, double x, double rate, int compressing, double *found) {
+#if LAW_NONLINEAR
   const double *in[] = {&x, &rate, d->law};
   double *out[] = {found};
   if (compressing) law_compressing(in, out, 0, 0, 0);
@@ -221,12 +222,13 @@ INLINE void law_here(const Data *d, double x, double rate, int compressing, doub
 #endif
 }
 
-static void contact_here(const Data *d, const State *y, const Instant *now, double g, double mobility, Contact *c) {
+static void linearize_contact(const Data *d, const State *y, const Instant *now, double g, double mobility, Contact *c)
+                              {
   double law[3];
-  law_here(d, y->penetration, now->rate, now->compressing, law);
+  law_and_slopes(d, y->penetration, now->rate, now->compressing, law);
   c->force = law[0], c->k = law[1], c->d = law[2];
   c->mobility = mobility;
-  c->yields = ((const double *)d->frozen->Q[N])[N];
+  c->bare_mobility = ((const double *)d->frozen->Q[N])[N];
 #if NZ
   const double *at[] = {y->target, &c->force, d->target};
   double Z[NZ * NZ], *slopes[] = {Z, c->G, c->at}, *rates[] = {c->rates};
@@ -247,16 +249,16 @@ static void contact_here(const Data *d, const State *y, const Instant *now, doub
     }
   }
   FOR(i, NZ) {
-    c->moved[i] = 0.0;
-    FOR(j, NZ) c->moved[i] += c->inverse[i][j] * c->G[j];
-    c->mobility += c->at[i] * c->moved[i];
-    c->yields += c->at[i] * c->G[i];
+    c->state_by_force[i] = 0.0;
+    FOR(j, NZ) c->state_by_force[i] += c->inverse[i][j] * c->G[j];
+    c->mobility += c->at[i] * c->state_by_force[i];
+    c->bare_mobility += c->at[i] * c->G[i];
   }
 #endif
 }
 
-/* for the phase that begins now, and steps of length h */
-static void prepare(const Data *d, const State *y, const Instant *now, double h, Resolvent *r) {
+/* Linearizes servo, law and target for a step of length h. */
+static void linearize_step(const Data *d, const State *y, const Instant *now, double h, Resolvent *r) {
   factor_servo(d, now, h, r);
-  contact_here(d, y, now, r->g, ((double *)r->X[N])[N], &r->contact);
+  linearize_contact(d, y, now, r->g, ((double *)r->X[N])[N], &r->contact);
 }

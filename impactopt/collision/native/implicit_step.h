@@ -3,26 +3,26 @@
 typedef struct {
   vec torque[V], deviation[V];
   double impulse, penetration, time, target[NZ1];
-} Right;
+} StageInput;
 
 typedef struct {
   vec speeds[V];
   double impulse, penetration, rate, force, target[NZ1];
-} Left;
+} StageSolution;
 
-/* S r with a stage's inputs, as far as it is needed */
-INLINE void solve(const Data *d, const Resolvent *r, const Right *b, const double *inputs, Left *x) {
+/* Solves one stage: the parts of S r that the series needs. */
+INLINE void solve(const Data *d, const Resolvent *r, const StageInput *b, const double *inputs, StageSolution *x) {
   const Contact *c = &r->contact;
   vec rho[V], a[V], held[V];
   FOR(i, V) rho[i] = b->torque[i], a[i] = (vec){0};
 #if STIFFNESS
-  sprung(d, r, b->deviation, held);
+  apply_stiffness(d, r, b->deviation, held);
   FOR(i, V) rho[i] += r->g * held[i];
 #endif
 #if BIAS || JDOT
   if (b->time != 0.0) {
     FOR(i, V) a[i] = d->frozen->drift[i] * b->time;
-    damped(r, a, held);
+    apply_damping(r, a, held);
     FOR(i, V) rho[i] -= r->g * held[i];
   }
 #endif
@@ -32,27 +32,27 @@ INLINE void solve(const Data *d, const Resolvent *r, const Right *b, const doubl
   double rate = a[N / LANES][N % LANES] - own * b->impulse, of_target[NZ1];
   FOR(i, NZ) {
     of_target[i] = 0.0;
-    FOR(k, NZ) of_target[i] += c->inverse[i][k] * (b->target[k] + (TARGET_BENDS ? r->g * inputs[1 + k] : 0.0));
+    FOR(k, NZ) of_target[i] += c->inverse[i][k] * (b->target[k] + (TARGET_NONLINEAR ? r->g * inputs[1 + k] : 0.0));
     rate -= c->at[i] * of_target[i];
   }
-  if (TARGET_BENDS) rate -= inputs[INPUTS - 1];
-  const double slope = c->k * r->g + c->d, more = BENDS ? inputs[0] : 0.0;
+  if (TARGET_NONLINEAR) rate -= inputs[INPUTS - 1];
+  const double slope = c->k * r->g + c->d, more = NONLINEAR ? inputs[0] : 0.0;
   x->force = (c->k * b->penetration + slope * rate + more) / (1.0 + slope * r->g * c->mobility);
   x->impulse = b->impulse + r->g * x->force;
   x->rate = rate - r->g * c->mobility * x->force;
   x->penetration = b->penetration + r->g * x->rate;
-  FOR(i, NZ) x->target[i] = of_target[i] + r->g * c->moved[i] * x->force;
+  FOR(i, NZ) x->target[i] = of_target[i] + r->g * c->state_by_force[i] * x->force;
   FOR(i, V) x->speeds[i] = a[i] - r->X[N][i] * x->impulse;
 }
 
-/* the terms of a step but the first, from the right-hand side of the first stage, and inputs n */
-INLINE void make_terms(const Data *d, const Resolvent *r, Right *b, const Inputs n, Series *s) {
+/* Coefficients 1.. of a step's polynomials, from the right-hand side of the first stage and inputs n. */
+INLINE void make_terms(const Data *d, const Resolvent *r, StageInput *b, const Inputs n, Series *s) {
   const double h = r->h, by_gamma = 1.0 / GAMMA_OF_STEPS;
   double inputs[INPUTS] = {0};
-  Left x;
+  StageSolution x;
   vec net[V], held[V];
   FOR(j, STAGES) {
-    if (BENDS) FOR(k, INPUTS) inputs[k] = j ? n[j][k] + GAMMA_OF_STEPS * n[j + 1][k] : n[1][k];
+    if (NONLINEAR) FOR(k, INPUTS) inputs[k] = j ? n[j][k] + GAMMA_OF_STEPS * n[j + 1][k] : n[1][k];
     if (j) {
       b->impulse = s->impulse[j];
       b->penetration = s->penetration[j];
@@ -61,10 +61,10 @@ INLINE void make_terms(const Data *d, const Resolvent *r, Right *b, const Inputs
       FOR(i, V) b->torque[i] = s->torque[j][i], b->deviation[i] = s->deviation[j][i];
     }
     solve(d, r, b, inputs, &x);
-    damped(r, x.speeds, net);
+    apply_damping(r, x.speeds, net);
     FOR(i, V) net[i] = -net[i];
 #if STIFFNESS
-    sprung(d, r, b->deviation, held);
+    apply_stiffness(d, r, b->deviation, held);
     FOR(i, V) net[i] += held[i];
 #endif
     (void)held;
@@ -82,10 +82,11 @@ INLINE void make_terms(const Data *d, const Resolvent *r, Right *b, const Inputs
   }
 }
 
-static void make_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, const Inputs n, Series *s) {
+static void make_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, const Inputs n, Series
+                        *s) {
   const Contact *c = &r->contact;
   const double h = r->h;
-  Right b;
+  StageInput b;
   s->impulse[0] = y->impulse;
   s->penetration[0] = y->penetration;
   s->rate[0] = now->rate;
@@ -105,14 +106,16 @@ static void make_series(const Data *d, const State *y, const Instant *now, const
   make_terms(d, r, &b, n, s);
 }
 
-/* what a further term would add to the hand's speed and the joints' demands, of what is allowed. A speed that swings
-   has terms that swing: one of them may be next to nothing while the penetration's is not, two in a row are not */
+/* Error of a step relative to the tolerance: the size of the next coefficient of hand speed, impulse and joint demands.
+   The coefficients of a speed that oscillates change sign, so one of them may be nearly zero by chance; hence the
+       larger
+   of the last two. */
 INLINE double error_of(const Data *d, const Resolvent *r, const Series *s, double scale) {
   const double speed = fmax(fabs(s->rate[STAGES]), fabs(s->rate[STAGES - 1]));
   double error = speed / fmax(scale, fabs(s->rate[1]));
   double impulse = fmax(s->impulse[0], fabs(s->impulse[1]));
-  /* a force that bends where it begins is never that exact by its own measure, but soon by that of a plastic blow */
-  if (BENDS) impulse = fmax(impulse, scale / r->contact.yields);
+  /* the impulse of a plastic impact: a force like x^1.5 starts with an impulse too small to measure errors by */
+  if (NONLINEAR) impulse = fmax(impulse, scale / r->contact.bare_mobility);
   error = fmax(error, fabs(s->impulse[STAGES]) / impulse);
   error *= LEFT_OUT / TOLERANCE;
 #if SATURATION
@@ -121,7 +124,7 @@ INLINE double error_of(const Data *d, const Resolvent *r, const Series *s, doubl
     const vec of = magnitude(s->demand[STAGES][i]) / d->limit[i];
     most = choose(of > most, of, most);
   }
-  FOR(l, LANES) error = fmax(error, most[l] * (LEFT_OUT / OF_LIMIT));
+  FOR(l, LANES) error = fmax(error, most[l] * (LEFT_OUT / ERROR_OF_LIMIT));
 #endif
   return error;
 }

@@ -1,11 +1,11 @@
-/* State of the collision in joint space, and the forces in it at one instant; see collision/model.py. */
+/* State of the collision in joint space, and forces at one instant; see collision/model.py. */
 
 typedef struct {
   vec torque[V], deviation[V], torque2[V];
-  double time, penetration, impulse, peak, impulse2, left_out;
+  double time, penetration, impulse, peak, impulse2, error_estimate;
   double target[NZ1];
 #if SLIDES
-  double sliding[3], sliding2[3]; /* integrals of the friction on the target */
+  double sliding[3], sliding2[3]; /* first and second integral of the friction on the target */
 #endif
 } State;
 #if SLIDES
@@ -16,13 +16,13 @@ typedef struct {
 #define SLIDING2(y) 0
 #endif
 
-/* what is constant during a segment of the collision */
+/* Constants of a segment. */
 typedef struct {
   const Frozen *frozen;
   double hand_speed, until;
-  vec kept[V];          /* 1 at the joints, else 0 */
-  vec bend[V], led[V];  /* the servo's reference: its acceleration, and what its velocities had gained before */
-  vec joint_velocity[V], before[V], feedforward[V], limit[V], viscous[V], coulomb[V];
+  vec joint_mask[V];          /* 1 at the joints, 0 in the lanes behind them */
+  vec reference_acceleration[V], reference_change[V];  /* of the servo's reference: see freeze_reference */
+  vec joint_velocity[V], velocity_before[V], feedforward[V], limit[V], viscous[V], coulomb[V];
 #if KD_MATRIX
   vec kd[N1][V];
 #else
@@ -40,13 +40,13 @@ typedef struct {
 } Data;
 
 typedef struct {
-  vec u[V], demand[V], torque[V], net[V]; /* net: less friction */
+  vec u[V], demand[V], torque[V], net[V]; /* net: torque less joint friction */
   double speed, target_speed, rate;
   int compressing, contact;
 } Instant;
 
-INLINE double call(int (*f)(const double **, double **, long long *, double *, int), const double *a,
-                   const double *b, const double *c) {
+INLINE double call(int (*f)(const double **, double **, long long *, double *, int), const double *a, const double *b,
+                   const double *c) {
   double out = 0.0;
   const double *in[] = {a, b, c};
   double *to[] = {&out};
@@ -54,7 +54,7 @@ INLINE double call(int (*f)(const double **, double **, long long *, double *, i
   return out;
 }
 
-/* a plus the first columns of a matrix times x, in two chains of sums */
+/* a += M x, over M's first columns. Two chains of sums, as one would wait for each addition. */
 INLINE void add_columns(const vec (*M)[V], int columns, const double *x, vec *a) {
   vec b[V];
   FOR(i, V) b[i] = (vec){0};
@@ -67,8 +67,8 @@ INLINE void add_columns(const vec (*M)[V], int columns, const double *x, vec *a)
   FOR(i, V) a[i] += b[i];
 }
 
-/* u, relative to the servo's reference, and the hand's speed, from integrals of torque, force and friction, and time;
-   or from derivatives of them */
+/* Joint velocities u relative to the servo's reference, and the hand's speed (returned), both as changes since contact,
+   from the integrals of torque, force and friction, and time. Linear: rates of the integrals give accelerations. */
 INLINE double velocity(const Data *d, const vec *torque, double impulse, const double *sliding, double time, vec *u) {
   const Frozen *F = d->frozen;
   AFRESH(F);
@@ -81,10 +81,10 @@ INLINE double velocity(const Data *d, const vec *torque, double impulse, const d
   add_columns(F->Q, N, (const double *)torque, a);
   FOR(i, V) u[i] = a[i] - F->Q[N][i] * impulse;
 #if SLIDES
-  FOR(k, 3) FOR(i, V) u[i] -= F->of_point[k][i] * sliding[k];
+  FOR(k, 3) FOR(i, V) u[i] -= F->Q_point[k][i] * sliding[k];
 #endif
   const double speed = u[N / LANES][N % LANES];
-  u[V - 1] *= d->kept[V - 1];
+  u[V - 1] *= d->joint_mask[V - 1];
   return speed;
 }
 
@@ -93,7 +93,7 @@ INLINE void times_matrix(const vec (*m)[V], const vec *x, vec *out) {
   FOR(j, N) FOR(i, V) out[i] += m[j][i] * ((const double *)x)[j];
 }
 
-/* the servo's torque from joint velocity and deviation, both less those at contact */
+/* Servo torque from the changes of joint velocity and deviation since contact. */
 INLINE void servo(const Data *d, const vec *u, const vec *deviation, vec *out) {
 #if KD_MATRIX
   times_matrix(d->kd, u, out);
@@ -115,7 +115,7 @@ INLINE void servo(const Data *d, const vec *u, const vec *deviation, vec *out) {
 INLINE vec clipped(vec x, vec limit) { return choose(x > limit, limit, choose(x < -limit, -limit, x)); }
 INLINE vec magnitude(vec x) { return (vec)((bits)x & ~SIGN_BIT); }
 
-/* what of its demand the servo gives, and what the joints get */
+/* Torques of saturated servos, and less joint friction. */
 INLINE void torques(const Data *d, Instant *now) {
 #if SATURATION
   FOR(i, V) now->torque[i] = clipped(now->demand[i], d->limit[i]);
@@ -124,7 +124,7 @@ INLINE void torques(const Data *d, Instant *now) {
 #endif
 #if FRICTION
   FOR(i, V) {
-    const vec one = d->kept[0] * 0.0 + 1.0, rate = d->joint_velocity[i] + now->u[i];
+    const vec one = d->joint_mask[0] * 0.0 + 1.0, rate = d->joint_velocity[i] + now->u[i];
     const vec sign = clipped(rate / TRANSITION, one);
     now->net[i] = now->torque[i] - (d->viscous[i] * rate + d->coulomb[i] * sign);
   }
@@ -133,13 +133,14 @@ INLINE void torques(const Data *d, Instant *now) {
 #endif
 }
 
-/* friction on the target (3) at a state, under a contact force: see contact/friction.py; without, nothing is set */
+/* Friction on the target (3) under a contact force; see contact/friction.py. Sets nothing in models without friction.
+   */
 INLINE void friction_at(const Data *d, const State *y, double force, double *out) {
 #if SLIDES
   const Frozen *F = d->frozen;
   double velocity[3], along = 0.0, square = d->slip_speed * d->slip_speed, slide[3];
   FOR(k, 3) {
-    velocity[k] = d->point_velocity[k] + F->e_point[k] * y->time + dot(F->of_point[k], y->torque, V);
+    velocity[k] = d->point_velocity[k] + F->e_point[k] * y->time + dot(F->Q_point[k], y->torque, V);
     FOR(l, 3) velocity[k] -= F->m_point[k][l] * (d->normal[l] * y->impulse + y->sliding[l]);
   }
   FOR(k, 3) along += d->normal[k] * velocity[k];
@@ -149,14 +150,14 @@ INLINE void friction_at(const Data *d, const State *y, double force, double *out
 #endif
 }
 
-/* velocities, rate of penetration and servo at a state */
-INLINE void look(const Data *d, const State *y, Instant *now) {
+/* Velocities, rate of penetration and servo torques at a state. */
+INLINE void evaluate_instant(const Data *d, const State *y, Instant *now) {
   AFRESH(d);
   now->speed = velocity(d, y->torque, y->impulse, SLIDING(y), y->time, now->u) + d->hand_speed;
   now->target_speed = call(target_velocity, y->target, d->target, 0);
   now->rate = now->speed - now->target_speed;
 #if FREEZES
-  FOR(i, V) now->u[i] += d->before[i];
+  FOR(i, V) now->u[i] += d->velocity_before[i];
 #endif
   servo(d, now->u, y->deviation, now->demand);
 #if FEEDFORWARD
@@ -165,19 +166,19 @@ INLINE void look(const Data *d, const State *y, Instant *now) {
   torques(d, now);
 }
 
-/* no number in, none out */
-static void no_number(const Data *d, State *y, Instant *now) {
+/* A NaN in the rate of penetration makes the whole state NaN: no output may look like a number. */
+static void spread_nan(const Data *d, State *y, Instant *now) {
   if (now->rate == now->rate) return;
-  y->impulse = y->time = y->penetration = y->peak = y->left_out = NAN;
+  y->impulse = y->time = y->penetration = y->peak = y->error_estimate = NAN;
   FOR(i, V) y->torque[i] = y->torque2[i] = (vec){0} + NAN;
   FOR(i, NZ) y->target[i] = NAN;
   y->impulse2 = NAN;
-  look(d, y, now);
+  evaluate_instant(d, y, now);
   now->contact = 1;
 }
 
-/* whether hand and target, which neither approach nor part, are about to approach */
-static int closing(const Data *d, const State *y, const Instant *now) {
+/* Whether hand and target are about to approach, where their relative speed is zero. */
+static int will_approach(const Data *d, const State *y, const Instant *now) {
   vec u[V];
   double rates[NZ1], then[NZ1], force;
   force = call(contact_force, &y->penetration, &now->rate, d->law);
@@ -191,8 +192,8 @@ static int closing(const Data *d, const State *y, const Instant *now) {
   return velocity(d, now->net, force, friction, 1.0, u) > gained;
 }
 
-/* phase: contact is over when, in restitution, no force is left */
-INLINE void judge(const Data *d, const State *y, Instant *now) {
-  now->compressing = now->rate > 0.0 || (now->rate == 0.0 && closing(d, y, now));
+/* Phase of the contact: it ends in restitution, where no force is left. */
+INLINE void update_phase(const Data *d, const State *y, Instant *now) {
+  now->compressing = now->rate > 0.0 || (now->rate == 0.0 && will_approach(d, y, now));
   now->contact = now->compressing || call(left_force, &y->penetration, &now->rate, d->law) > 0.0;
 }

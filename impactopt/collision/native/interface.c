@@ -1,9 +1,11 @@
-/* CasADi's interface of external functions. All memory is the caller's work vector, so that threads do not meet.
+/* CasADi's interface of external functions. All memory is in the caller's work vector, so that calls from several
+   threads
+   are safe.
 
    One library has one of these functions under NAME, with the same inputs in the same order: q, v[, feedforward] and
    the settings (NAMES_IN, SHAPES_IN).
 
-     collision           value: the outputs asked for (collision.c); collision_batch beside it runs many (batch.c)
+     collision           values of the requested outputs (collision.c); collision_batch runs many (batch.c)
      collision_gradient  adjoint: a scalar output, d/dq (nv), d/dv (nv) (gradient.c); a null result is not computed
      collision_jacobian  tangents: of each output its value, d/dq and d/dv (entries, nv)[, d/dfeedforward (entries, n)]
                          (jacobian.c); likewise
@@ -12,13 +14,13 @@
    Derivatives by q are in the basis of v: d/dq (nv) is its tangent map's transposed times them. Wrapped as one
    differentiable function: collision/derivatives.py. */
 
-#ifndef ROOM
-#define ROOM Work
+#ifndef WORK_TYPE
+#define WORK_TYPE Work
 #endif
 #define EXPORT __attribute__((visibility("default")))
 typedef long long Int;
 
-/* Whether an input is no number. Comparisons with one are false, so that a collision might end before it begins. */
+/* Whether an input has a NaN. Comparisons with NaN are false, so that a collision might end before it begins. */
 static int has_nan(const double **arg) {
   FOR(k, N_IN) {
     if (!arg[k]) continue;
@@ -28,13 +30,13 @@ static int has_nan(const double **arg) {
 }
 
 EXPORT int NAME(const double **arg, double **res, Int *iw, double *w, int mem) {
-  ROOM *room = (ROOM *)(((size_t)w + 63) & ~(size_t)63);
+  WORK_TYPE *work = (WORK_TYPE *)(((size_t)w + 63) & ~(size_t)63);
   if (!has_nan(arg)) {
-    evaluate(arg, res, room);
-    /* a collision's work is what every room begins with */
-    if (!((const Work *)room)->frozen.spoiled) return 0;
+    evaluate(arg, res, work);
+    /* every kind of work begins with that of a collision */
+    if (!((const Work *)work)->frozen.ill_conditioned) return 0;
   }
-  no_numbers(res);
+  fill_with_nan(res);
   return 0;
 }
 EXPORT void OF_NAME(incref)(void) {}
@@ -54,6 +56,6 @@ EXPORT int OF_NAME(work)(Int *sz_arg, Int *sz_res, Int *sz_iw, Int *sz_w) {
   if (sz_arg) *sz_arg = N_IN;
   if (sz_res) *sz_res = N_OUT;
   if (sz_iw) *sz_iw = 0;
-  if (sz_w) *sz_w = sizeof(ROOM) / sizeof(double) + 8;
+  if (sz_w) *sz_w = sizeof(WORK_TYPE) / sizeof(double) + 8;
   return 0;
 }

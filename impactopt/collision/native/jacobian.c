@@ -1,17 +1,18 @@
-/* A collision's outputs and their Jacobians: (q, v[, feedforward], settings) -> of each output its value and, for all
-   of its entries column by column, a row each, d/dq (nv) and d/dv (nv), both in v's basis[, d/dfeedforward (n)]. */
+/* Outputs of a collision and their Jacobians: (q, v[, feedforward], settings) -> for each output its value, d/dq (nv),
+   d/dv (nv), both in v's basis[, and d/dfeedforward (n)]; rows of a Jacobian are the output's entries, by columns. */
 
 typedef struct {
   Work collision;
-  FreezeForward freeze;
+  FreezeTangent freeze;
   RecordTangent record;
-  ForwardRoom run;
-} Whole;
-#define ROOM Whole
+  RunTangent run;
+} JacobianWork;
+#define WORK_TYPE JacobianWork
 
-/* of a vector of directions */
-static void scalars_forward(const Course *c, const Data *d, int k, const StateTangent *dy, const RecordTangent *record) {
-#define PUT_NUMBER(name, x) put(x, 1, 0, record->to[OUT_##name] + k * LANES)
+/* Tangents of the scalar outputs, for the k-th vector of directions. */
+static void scalars_tangent(const Outcome *c, const Data *d, int k, const StateTangent *dy, const RecordTangent *record)
+                            {
+#define PUT_NUMBER(name, x) write_entries(x, 1, 0, record->to[OUT_##name] + k * LANES)
 #ifdef OUT_impulse
   PUT_NUMBER(impulse, &dy->impulse);
 #endif
@@ -29,15 +30,15 @@ static void scalars_forward(const Course *c, const Data *d, int k, const StateTa
   double slope[NZ1] = {0}, one = 1.0;
   const double *in[] = {c->final.target, d->target, &one};
   double *out[] = {slope};
-  target_energy_back(in, out, 0, 0, 0);
+  target_energy_adjoint(in, out, 0, 0, 0);
   vec sum = {0};
   FOR(i, NZ) sum += slope[i] * dy->target[i];
   PUT_NUMBER(energy, &sum);
 #endif
 }
 
-static void evaluate(const double **arg, double **res, Whole *w) {
-  Course c;
+static void evaluate(const double **arg, double **res, JacobianWork *w) {
+  Outcome c;
   Work *own = &w->collision;
   RecordTangent *record = &w->record;
   const Data *d = &own->data;
@@ -59,13 +60,13 @@ static void evaluate(const double **arg, double **res, Whole *w) {
   collide(arg, values, own, &c);
   outputs_of(&c, own, values);
 
-  const double *q = filled(arg[ARG_q], own->q, NQ), *v = filled(arg[ARG_v], own->v, NV);
-  const double *normal = filled(arg[ARG_normal], own->normal, 3);
-  freeze_forward(q, v, normal, call(target_yield, d->target, 0, 0), &own->frozen, wanted,
+  const double *q = or_zeros(arg[ARG_q], own->q, NQ), *v = or_zeros(arg[ARG_v], own->v, NV);
+  const double *normal = or_zeros(arg[ARG_normal], own->normal, 3);
+  freeze_tangent(q, v, normal, call(target_yield, d->target, 0, 0), &own->frozen, wanted,
                  &w->freeze);
-  run_forward(d, &w->freeze.frozen, &own->tape, HISTORIES ? record : 0, wanted, &w->run);
-  FOR(k, ALL_VECTORS) if (wanted[k]) scalars_forward(&c, d, k, &w->run.states[k], record);
-  /* no number in, none out */
+  run_tangent(d, &w->freeze.frozen, &own->tape, HISTORIES ? record : 0, wanted, &w->run);
+  FOR(k, ALL_VECTORS) if (wanted[k]) scalars_tangent(&c, d, k, &w->run.states[k], record);
+  /* a collision that is NaN has Jacobians that are NaN */
   if (c.final.impulse != c.final.impulse) FOR(i, N_VALUES) FOR(direction, ALL_VECTORS * LANES)
     FOR(k, ROWS[i] ? ROWS[i] * N_COLUMNS[0] : 1) if (record->to[i][direction]) record->to[i][direction][k] = NAN;
 }

@@ -1,4 +1,4 @@
-/* Fixed steps of the classical Runge-Kutta method; see collision/runge_kutta.py. */
+/* Steps of the classical Runge-Kutta method; see collision/runge_kutta.py. */
 
 typedef struct {
   vec torque[V], deviation[V], torque2[V];
@@ -27,7 +27,7 @@ INLINE void slope_at(const Data *d, const State *y, const Instant *now, Slope *s
 }
 
 /* y := x + h s */
-INLINE void shifted(const State *x, const Slope *s, double h, State *y) {
+INLINE void add_slope(const State *x, const Slope *s, double h, State *y) {
   FOR(i, V) {
     y->torque[i] = x->torque[i] + h * s->torque[i];
     if (STIFFNESS) y->deviation[i] = x->deviation[i] + h * s->deviation[i];
@@ -53,9 +53,9 @@ INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
   State x;
   Instant then;
   slope_at(d, y, now, &k1);
-  shifted(y, &k1, h / 2, &x), look(d, &x, &then), slope_at(d, &x, &then, &k2);
-  shifted(y, &k2, h / 2, &x), look(d, &x, &then), slope_at(d, &x, &then, &k3);
-  shifted(y, &k3, h, &x), look(d, &x, &then), slope_at(d, &x, &then, &k4);
+  add_slope(y, &k1, h / 2, &x), evaluate_instant(d, &x, &then), slope_at(d, &x, &then, &k2);
+  add_slope(y, &k2, h / 2, &x), evaluate_instant(d, &x, &then), slope_at(d, &x, &then, &k3);
+  add_slope(y, &k3, h, &x), evaluate_instant(d, &x, &then), slope_at(d, &x, &then, &k4);
   FOR(i, V) {
     k1.torque[i] = MEAN(torque[i]);
     if (STIFFNESS) k1.deviation[i] = MEAN(deviation[i]);
@@ -65,9 +65,9 @@ INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
   y->peak = y->peak < k1.impulse ? k1.impulse : y->peak;
 #endif
 #if STEP_ERROR
-  y->left_out += LEFT_OUT_BY_RK4 * fabs(k2.impulse - k3.impulse) * h;
+  y->error_estimate += LEFT_OUT_BY_RK4 * fabs(k2.impulse - k3.impulse) * h;
 #if SLIDES
-  FOR(i, 3) y->left_out += LEFT_OUT_BY_RK4 * fabs(k2.sliding[i] - k3.sliding[i]) * h;
+  FOR(i, 3) y->error_estimate += LEFT_OUT_BY_RK4 * fabs(k2.sliding[i] - k3.sliding[i]) * h;
 #endif
 #endif
   k1.penetration = MEAN(penetration);
@@ -77,7 +77,7 @@ INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
 #if SLIDES
   FOR(i, 3) k1.sliding[i] = MEAN(sliding[i]), k1.sliding2[i] = MEAN(sliding2[i]);
 #endif
-  shifted(y, &k1, h, y);
+  add_slope(y, &k1, h, y);
 }
 
-INLINE void stand_still(const Data *d, State *y, const Instant *now) {}
+INLINE void repeat_at_rest(const Data *d, State *y, const Instant *now) {}

@@ -1,8 +1,8 @@
-"""Sizes, switches and generated C of a model: macros, tables, tree, law and target, derivatives in lanes.
+"""Generated C of a collision model: macros and tables, functions of tree, law and target, SIMD tangents.
 
-Most of what CasADi's forward mode writes does not depend on the direction. That part becomes a function of
-its own, called once; the rest is linear, and is written here with a vector of directions where CasADi has a
-number.
+Most of the code that CasADi's forward mode generates does not depend on the direction. That part becomes a
+function of its own, called once. The rest is linear in the direction and is written here for a vector of
+directions, where CasADi has one.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ __all__ = [
     "shapes_in",
     "shapes_out",
     "shapes_table",
-    "simd_forward",
+    "simd_tangent",
     "simd_tree",
     "sizes",
-    "tangent_back",
+    "to_velocity_basis",
     "tree_functions",
     "with_derivatives",
     "with_jacobians",
@@ -57,15 +57,16 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class TreeFunctions:
-    """Functions of the robot's tree, and where their sparse results go.
+    """Functions of the kinematic tree, and the places of their nonzeros.
 
     Attributes
     ----------
-    functions : `tree` (q, v, normal) -> nonzeros of the roots W of all velocities and the hand, of those of
-        what is held, hand speed, and further ones; `drift` (q, v, normal) -> bias force, drifts of the hand
-        and of what is held, as far as they act; `integrate` (q, d) and `hand_speed_at` (q, v, normal). With
-        friction also the striking point's root, velocity and drift.
-    root, held : (row, column) of the nonzeros. Columns of `root` are joints, hand, other velocities.
+    functions : `tree` (q, v, normal) -> nonzeros of the roots W of all velocities and the hand, nonzeros of
+        the roots of the constraints, hand speed, and optional outputs; `drift` (q, v, normal) -> bias force
+        and drifts of hand and constraints, as far as the model has them; `integrate` (q, d) and
+        `hand_speed_at` (q, v, normal). With friction also the striking point's root, velocity and drift.
+    root, held : (row, column) of the nonzeros. Columns of `root` are joints, hand, other velocities; those
+        of `held` are the constraints.
     """
 
     functions: list[Any]
@@ -74,8 +75,10 @@ class TreeFunctions:
 
 
 def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool, slides: bool = False) -> TreeFunctions:
-    """Functions of the robot's tree, with those for the ground's wrench, and for friction at the striking
-    point, on request; n is the number of servos.
+    """Functions of the kinematic tree.
+
+    n : number of servos.  ground, slides : with outputs for the ground's wrench, and for friction at the
+    striking point.
     """
     tree, robot = frozen._tree, frozen.robot
     rb, normal = tree.rb, tree.normal
@@ -113,19 +116,19 @@ def _nonzeros(matrix: Any) -> list[tuple[int, int]]:
 
 
 def gamma_of(stance: Stance, held: int) -> list[float]:
-    """Compliance of each row of what is held."""
+    """Compliance of each constraint of soles and hands (6 per frame)."""
     return [float(x) for x in stance.compliance] * held
 
 
 def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
     """Law and target as SX functions; with implicit steps also their values and slopes (`contact_functions`).
 
-    `law` and `target` are the numbers of both, z the target's state:
+    `law` and `target` are the vectors of their parameters, z is the target's state:
 
         left_force (x, rate, law) : above zero while contact lasts in restitution
         contact_force (x, rate, law) -> force
         target_velocity (z, target), target_rates (z, force, target), target_energy, target_result (z, target)
-        target_yield, target_before (target): the numbers of `target_start`
+        target_yield, target_before (target) : the results of `target_start`
     """
     law_numbers, target_numbers = list(model.law.parameters), list(model.target.parameters)
     law, target = ca.SX.sym("law", len(law_numbers)), ca.SX.sym("target", len(target_numbers))
@@ -162,31 +165,31 @@ def _number(expression: Any) -> Any:
     return ca.densify(ca.SX(expression))
 
 
-# of each function, the inputs that it is differentiated by
-_BACK: dict[str, tuple[int, ...]] = {"contact_force": (0, 1), "target_rates": (0, 1)}
-_BACK |= {"target_velocity": (0,), "target_energy": (0,), "tree": (0, 1), "drift": (0, 1)}
+# numbers of the inputs that a function's adjoint is taken by
+_DIFFERENTIATED_BY: dict[str, tuple[int, ...]] = {"contact_force": (0, 1), "target_rates": (0, 1)}
+_DIFFERENTIATED_BY |= {"target_velocity": (0,), "target_energy": (0,), "tree": (0, 1), "drift": (0, 1)}
 
 
 def backwards(functions: list[Any]) -> list[Any]:
-    """<name>_back (inputs, derivatives by the outputs) -> derivatives by some of the inputs, where used."""
+    """Adjoints <name>_adjoint (inputs, derivatives by the outputs) -> derivatives by some of the inputs."""
     made = []
     for function in functions:
-        if function.name() in _BACK:
+        if function.name() in _DIFFERENTIATED_BY:
             x = [ca.SX.sym(name, *function.size_in(name)) for name in function.name_in()]
             y = function.call(x)
             seeds = [ca.SX.sym("seed", *part.shape) for part in y]
-            by = [x[i] for i in _BACK[function.name()]]
+            by = [x[i] for i in _DIFFERENTIATED_BY[function.name()]]
             (out,) = ca.reverse(y, by, [seeds])
             out = [ca.densify(part) for part in out]
-            made.append(ca.Function(f"{function.name()}_back", [*x, *seeds], out))
+            made.append(ca.Function(f"{function.name()}_adjoint", [*x, *seeds], out))
     return made
 
 
-def tangent_back(frozen: FrozenDynamics) -> Any:
-    """ca.Function tangent_back (q, derivatives by q (nq)) -> the same in v's basis (nv)."""
+def to_velocity_basis(frozen: FrozenDynamics) -> Any:
+    """ca.Function to_velocity_basis (q, derivatives by q (nq)) -> the same in v's basis (nv)."""
     rb = frozen._tree.rb
     by_q = ca.SX.sym("by_q", rb.q.size1())
-    return ca.Function("tangent_back", [rb.q, by_q], [ca.densify(ca.mtimes(rb.tangent_map().T, by_q))])
+    return ca.Function("to_velocity_basis", [rb.q, by_q], [ca.densify(ca.mtimes(rb.tangent_map().T, by_q))])
 
 
 def c_code(name: str, functions: list[Any]) -> str:
@@ -213,31 +216,31 @@ _LINEAR = {
 
 
 def simd_tree(frozen: FrozenDynamics, tree: TreeFunctions, *, ground: bool) -> list[tuple[Any, str]]:
-    """`simd_forward` of `tree` by q, of `approach`, which is what of it depends on v, by v, and of
-    `drift` by both; q's directions are in the basis of v."""
+    """Tangents (`simd_tangent`) of `tree` by q, of its outputs that depend on v (`approach`) by v, and of
+    `drift` by both; directions of q are in the basis of v."""
     parts = frozen._tree
     known = [parts.rb.q, parts.rb.v, parts.normal]
     basis = ca.Function("basis", [parts.rb.q], [parts.rb.tangent_map()])
     out = [parts.hand_speed] + ([parts.carrying_wrench] if ground and not frozen.bias else [])
     whole, drift, *_ = tree.functions
-    made = [simd_forward(whole, {0: basis})]
-    made.append(simd_forward(ca.Function("approach", known, out), {1: None}))
+    made = [simd_tangent(whole, {0: basis})]
+    made.append(simd_tangent(ca.Function("approach", known, out), {1: None}))
     if drift.n_out():
-        made.append(simd_forward(drift, {0: basis, 1: None}))
+        made.append(simd_tangent(drift, {0: basis, 1: None}))
     return made
 
 
-def simd_forward(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
-    """(ca.Function <name>_parts, C of <name>_forward) of an SX function with dense outputs.
+def simd_tangent(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
+    """(ca.Function <name>_parts, C of <name>_tangent) of an SX function with dense outputs.
 
-    <name>_parts (the function's inputs) -> the numbers that its derivatives need, <NAME>_PARTS of them.
-    <name>_forward (parts, seeds, out) : seeds[i] has a vector of seed directions for each entry of the i-th
-    input that moves; out[i] gets one for each entry of the i-th output.
+    <name>_parts (the function's inputs) -> the <NAME>_PARTS intermediate values that its tangents need.
+    <name>_tangent (parts, seeds, out) : seeds[i] has a vector of directions for each entry of the i-th seeded
+    input; out[i] becomes one for each entry of the i-th output.
 
     Parameters
     ----------
-    seeds : by number of an input that moves: ca.Function of the input to the matrix that takes directions to
-        its changes; or None, where they are the same.
+    seeds : seeded inputs by number: ca.Function from the input to the matrix that maps directions to its
+        changes, or None for the identity.
     """
     name, inputs = function.name(), function.sx_in()
     directions, changes = [], []
@@ -251,7 +254,7 @@ def simd_forward(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
     registers = sorted({line.split(" ", 1)[0] for line in lines if line.startswith("a")})
     code = [
         f"#define {name.upper()}_PARTS {max(len(numbers), 1)}",
-        f"static void {name}_forward(",
+        f"static void {name}_tangent(",
         "  const double *c, const vec *const *seeds, vec *const *out) {",
         f"  vec {', '.join(registers or ['a'])};",
         *[f"  {line};" for line in lines],
@@ -261,14 +264,15 @@ def simd_forward(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
 
 
 def _split(whole: Any, n_given: int) -> tuple[list[Any], list[str]]:
-    """Part that does not depend on the directions, as far as the rest needs it; and the rest's lines of C.
+    """Split of a function's instructions: values that do not depend on the directions but are needed with
+    them, and lines of C for the instructions that do.
 
     The inputs from `n_given` on are directions.
     """
     expressions = whole.instructions_sx()
-    held: dict[int, str] = {}  # by register: what it holds, in C; or
-    since: dict[int, int] = {}  # the instruction that it has a number from
-    places: dict[int, int] = {}  # by instruction: where that number is kept
+    held: dict[int, str] = {}  # register -> its C expression, where it depends on the directions; else
+    since: dict[int, int] = {}  # register -> the instruction that set it
+    places: dict[int, int] = {}  # instruction -> index of its value in `numbers`
     numbers: list[Any] = []
     lines: list[str] = []
 
@@ -335,8 +339,9 @@ def directions(collision: SteppedModel) -> dict[str, int]:
 def with_derivatives(
     shapes: dict[str, tuple[int, int]], by: Mapping[str, int], *, values: bool = False
 ) -> dict[str, tuple[int, int]]:
-    """Outputs with their Jacobians by inputs, of which `by` has the number of directions; each output
-    itself first if with `values`.
+    """Shapes of the outputs' Jacobians, each after its output if with `values`.
+
+    by : number of directions of each input.
     """
     made: dict[str, tuple[int, int]] = {}
     for name, (rows, columns) in shapes.items():
@@ -346,7 +351,7 @@ def with_derivatives(
 
 
 def with_jacobians(shapes: dict[str, tuple[int, int]], by: Mapping[str, int]) -> dict[str, tuple[int, int]]:
-    """Each output followed by its Jacobians by what tangents carry."""
+    """Shapes of each output followed by those of its Jacobians by the inputs that have tangents."""
     carried = {name: by[name] for name in ("q", "v", "feedforward") if name in by}
     return with_derivatives(shapes, carried, values=True)
 
@@ -364,7 +369,7 @@ def _ends(collision: SteppedModel) -> list[float]:
 
 
 def _blocks(collision: SteppedModel, fraction: float) -> int:
-    """Steps for a fraction of the horizon, in whole blocks; or the most, where they find their own length."""
+    """Largest number of steps in a fraction of the horizon, in whole blocks."""
     if collision.stepping == "implicit":
         return MOST_STEPS
     return -(-number_of_steps(collision, fraction) // BLOCK) * BLOCK
@@ -384,7 +389,7 @@ def _columns(collision: SteppedModel, every: int) -> list[int]:
 
 
 def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: TreeFunctions) -> str:
-    """Everything that the kernel has to know of the model, as macros and tables."""
+    """Macros and tables of the model, for the kernel."""
     robot, effects, settings, n = collision.robot, collision.effects, collision.settings, collision.n_servos
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     held = collision.held_by.constraint_frames(robot)
@@ -411,8 +416,8 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         "LENGTH": repr(float(collision.step_length)),
         "STAGES": STAGES,
         "NODES": NODES,
-        "LAW_BENDS": int(not law_is_linear(collision.law)),
-        "TARGET_BENDS": int(not target_is_linear(collision.target)),
+        "LAW_NONLINEAR": int(not law_is_linear(collision.law)),
+        "TARGET_NONLINEAR": int(not target_is_linear(collision.target)),
         "TOLERANCE": repr(float(collision.tolerance)),
         "GAMMA_OF_STEPS": repr(gamma()),
         "GIVES_WAY": repr(GIVES_WAY),
@@ -474,7 +479,7 @@ def _places(name: str, places: list[tuple[int, int]]) -> str:
 
 
 def _rows_of_columns(name: str, places: list[tuple[int, int]], columns: int) -> list[str]:
-    """Tables of the rows of each column's nonzeros, and of where they begin."""
+    """Rows of the nonzeros by columns, and the begin of each column (compressed sparse columns)."""
     rows = [[r for r, c in places if c == column] for column in range(columns)]
     starts = [0, *(int(x) for x in np.cumsum([len(x) for x in rows]))]
     return [
@@ -500,5 +505,5 @@ def names_table(name: str, values: Iterable[str]) -> str:
 
 
 def shapes_table(name: str, shapes: Iterable[tuple[int, int]]) -> str:
-    # a 1 after the shape says dense
+    # a 1 after the shape means dense, in CasADi's C interface
     return f"static const long long {name}[][3] = {{{', '.join(f'{{{a}, {b}, 1}}' for a, b in shapes)}}};"

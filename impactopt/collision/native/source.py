@@ -1,4 +1,4 @@
-"""The C of one collision model: its sizes and switches, CasADi's functions, and the kernel."""
+"""C source of a collision model: macros and tables, generated functions, and the kernel's files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from impactopt.collision.native.sizes import (
     shapes_table,
     simd_tree,
     sizes,
-    tangent_back,
+    to_velocity_basis,
     tree_functions,
     with_derivatives,
     with_jacobians,
@@ -33,33 +33,33 @@ from impactopt.errors import InputError
 
 __all__ = ["least_size", "native_collision", "native_differences", "native_gradient", "native_jacobian"]
 
-# the kernel's files of the steps, and of the way back
-_IMPLICIT = ("implicit", *(f"implicit_{part}" for part in ("factor", "step", "bend", "events", "run")))
+# files of the time stepping, and of its discrete adjoint
+_IMPLICIT = ("implicit", *(f"implicit_{part}" for part in ("factor", "step", "remainders", "events", "run")))
 _STEPS = {"rk4": ("rk4.h", "steps.h"), "implicit": tuple(f"{name}.h" for name in _IMPLICIT)}
-_BACK = {"rk4": ("rk4_back.h", "steps_back.h"), "implicit": ("implicit_back.h",)}
-# The tree's code is long and straight: this makes it a sixth faster than -Og, for half a second more of the
-# compiler; -O2 takes as much again and gains no more. Its angles' sines and cosines are our own
+_ADJOINT = {"rk4": ("rk4_adjoint.h", "steps_adjoint.h"), "implicit": ("implicit_adjoint.h",)}
+# The generated code of the tree is long and without branches. These options make it a sixth faster than -Og
+# for half a second more of the compiler; -O2 takes another half and gains nothing.
 _TREE, _QUICK_TREE = '"O1", "expensive-optimizations", "reciprocal-math", "schedule-insns2"', '"O0"'
 _OF_DIFFERENCES = 1e-12
-# length of differences by method, of an input's size: what implicit steps leave out changes between two;
-# Runge-Kutta's do not, but end in whole numbers
+# Relative length of central differences. The error of implicit steps differs between two collisions, and a
+# longer difference divides it by more; the error of steps of constant length does not.
 _DIFFERENCE = {"implicit": 5e-5, "rk4": 1e-6}
-# least size of an input that may well be zero, or nearly; others have their own, or 1 where they are zero
+# Least magnitude that a difference is relative to, for inputs that are often zero; of others it is 1 at zero.
 _LEAST_SIZES = {"q": 1.0, "v": 1.0, "normal": 1.0, "feedforward": 1e1, "reference": 1e2}
 _LEAST_SIZES |= {"viscous": 1e1, "coulomb": 1e1}
 _NEEDS_COMPILER = (
     "{}: derivatives need a C compiler that works: install gcc or clang, or name one in "
     "the environment variable CC{}"
 )
-# with a direction a lane, without anything but sums and products: there only the time to compile it counts
+# Tangents are sums and products of whole vectors, where optimization gains nothing: compile them fast.
 _LANES = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")
 
 
 def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
-    """C code of the function that `collision_graph` gives, with the same inputs and outputs.
+    """C code of the function that `collision_graph` builds, with the same inputs and outputs.
 
-    Its numbers agree with the graph's to rounding, but for implicit steps, which the graph has not. It has no
-    derivatives. Where there is no compiler, the graph takes its place; for implicit steps, one that has them.
+    Values agree with the graph's to rounding; the graph has no implicit steps, though. The C function has no
+    derivatives. Without a compiler the graph, or one with implicit steps, is used in its place.
     """
     code = _code(collision, "collision", outputs, every)
     return NativeCode(
@@ -68,11 +68,11 @@ def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every
 
 
 def native_gradient(collision: SteppedModel, output: str) -> NativeCode | ca.Function:
-    """C code of the function that `gradient_graph` gives.
+    """C code of the function that `gradient_graph` builds.
 
-    Where there is no compiler, the graph takes its place, but not that of implicit steps or several freezes:
-    its own steps are Runge-Kutta's, which a stiff contact or servo spoils without a word, and which say
-    nothing of how the contact's duration changes.
+    Without a compiler the graph is used in its place, but not for implicit steps or several freezes: its
+    Runge-Kutta steps diverge under stiff contacts or servos without an error, and have no derivative of the
+    contact's duration.
     """
 
     def graph() -> Any:
@@ -92,7 +92,7 @@ def native_gradient(collision: SteppedModel, output: str) -> NativeCode | ca.Fun
 
 
 def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
-    """C code of what `SteppedModel.jacobian_function` gives, for implicit steps and one freeze."""
+    """C code of `SteppedModel.jacobian_function`, for implicit steps and one freeze."""
 
     def none() -> Any:
         raise InputError(_NEEDS_COMPILER.format("jacobian_function", ""))
@@ -103,15 +103,17 @@ def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every:
 
 
 def least_size(name: str) -> float:
-    """Least size of an input's numbers for the steps of differences; 0: 1 if they are zero."""
+    """Least magnitude that the differences by an input are relative to; 0: the input's own, or 1 at zero."""
     return _LEAST_SIZES.get(name, 0.0)
 
 
 def native_differences(
     collision: SteppedModel, outputs: tuple[str, ...], by: tuple[str, ...], *, every: int = 1
 ) -> NativeCode:
-    """C code of a function with the inputs of `native_collision`, to `<output>_by_<input>` (number of its
-    entries, the input's numbers, of q nv) of each output and each input of `by`; for any model."""
+    """C code of the Jacobians `<output>_by_<input>` (entries of the output, entries of the input; nv for q).
+
+    One for each output and each input of `by`. Its inputs are those of `native_collision`; for any model.
+    """
 
     def none() -> Any:
         raise InputError(_NEEDS_COMPILER.format("function", "; or differentiate what `graph` gives"))
@@ -121,7 +123,7 @@ def native_differences(
 
 
 def _over(collision: SteppedModel, outputs: tuple[str, ...], every: int) -> ca.Function:
-    """The graph, without numbers where the contact is not over and no output says so, as C code has it."""
+    """The graph, with NaN where the contact has not ended and no output shows that, as in C."""
     named = outputs if {"separated", "duration"} & {*outputs} else (*outputs, "separated")
     graph = collision_graph(collision, named, every=every, as_compiled=True)
     if named is outputs:
@@ -133,15 +135,14 @@ def _over(collision: SteppedModel, outputs: tuple[str, ...], every: int) -> ca.F
 
 
 def _guarded(collision: SteppedModel, graph: ca.Function) -> ca.Function:
-    """A function that gives no numbers where an input is none, or rounding spoils what is frozen, as C code
-    does."""
+    """A function with NaN outputs where an input is NaN or the frozen model is ill-conditioned, as in C."""
     inputs = [ca.MX.sym(graph.name_in(k), graph.sparsity_in(k)) for k in range(graph.n_in())]
-    # a comparison with none is false; x == x would be simplified
+    # a comparison with NaN is false; CasADi would simplify x == x
     finite = ca.mmin(ca.vertcat(1, *[ca.vec(ca.densify(x)) >= -np.inf for x in inputs]))
     q, v, normal = (inputs[graph.name_in().index(name)] for name in ("q", "v", "normal"))
     frozen = frozen_dynamics(collision).function("frozen", ("pivots", "freedom", "m"))
     pivots, freedom, m = frozen.call([q, v, normal, 0.0])
-    # as `check_frozen` has it
+    # the same condition as in `check_frozen`
     known = ca.logic_or(freedom > LEAST_PIVOT, m == 0)
     sound = ca.logic_and(known, ca.mmin(ca.vertcat(1, pivots)) > LEAST_PIVOT)
     out = [ca.if_else(ca.logic_and(finite, sound), x, np.nan) for x in graph.call(inputs)]
@@ -160,11 +161,11 @@ def _code(
     shapes, of_tree = shapes_out(collision, outputs, every), tree.functions
     differs = name == "collision_differences"
     if differs or (gradient and collision.n_freezes):
-        # differences are of collisions with steps that do not count beside them
+        # errors of the steps have to be small beside the differences
         collision = replace(collision, tolerance=min(collision.tolerance, _OF_DIFFERENCES))
     of_differences = [f"#define DIFFERENCE {_DIFFERENCE[collision.stepping]}"]
     if gradient:
-        of_tree = [*of_tree, *backwards(of_tree), tangent_back(frozen)]
+        of_tree = [*of_tree, *backwards(of_tree), to_velocity_basis(frozen)]
         scalars += backwards(scalars)
         by_both = (f"{outputs[0]}_by_q", f"{outputs[0]}_by_v")
         shapes |= dict.fromkeys(by_both, (collision.robot.nv, 1))
@@ -211,14 +212,17 @@ def _code(
         *of_differences,
     ]
     method = collision.stepping
-    files_used = ["freeze.h", "instant.h", "outputs.h", *_STEPS[method], "course.h"]
+    files_used = ["freeze.h", "instant.h", "histories.h", *_STEPS[method], "segments.h"]
     if gradient:
-        files_used += ["results.h"] if collision.n_freezes else ["back.h", *_BACK[method], "freeze_back.h"]
+        files_used += (
+            ["final_outputs.h"]
+            if collision.n_freezes
+            else ["adjoint.h", *_ADJOINT[method], "freeze_adjoint.h"]
+        )
         files_used += ["gradient.c"]
     elif jacobian:
-        parts_of_way = ("freeze", "implicit", "outputs", "course")
-        forward = ["forward.h", *(f"{name}_forward.h" for name in parts_of_way)]
-        files_used += ["results.h", *forward, "jacobian.c"]
+        tangents = [f"{name}_tangent.h" for name in ("freeze", "implicit", "histories", "run")]
+        files_used += ["final_outputs.h", "tangent.h", *tangents, "jacobian.c"]
     else:
-        files_used += ["results.h", "differences.c" if differs else "collision.c"]
+        files_used += ["final_outputs.h", "differences.c" if differs else "collision.c"]
     return "\n".join([*parts, *text(*files_used, "interface.c")])

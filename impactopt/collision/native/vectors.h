@@ -1,4 +1,4 @@
-/* Vectors as wide as the machine's, and arrays padded to them: wider ones a compiler would take apart badly. */
+/* SIMD vectors of the machine's width, and sizes of arrays padded to them. Compilers split wider vectors badly. */
 #include <math.h>
 #include <string.h>
 
@@ -15,17 +15,17 @@ typedef long long bits __attribute__((vector_size(8 * LANES), may_alias));
 #define AT_LEAST_1(n) ((n) > 0 ? (n) : 1)
 #define INLINE static inline __attribute__((always_inline))
 
-/* joints, then the hand */
+/* vectors of the joints, then the hand */
 #define V VECTORS(N + 1)
-/* joints, hand, and the other velocities */
+/* vectors of joints, hand, and the other velocities */
 #define VF VECTORS(NV + 1)
-/* rows of what is held */
+/* vectors of the constraints */
 #define VC AT_LEAST_1(VECTORS(C))
 #define C1 AT_LEAST_1(C)
 #define N1 AT_LEAST_1(N)
 #define NZ1 AT_LEAST_1(NZ)
 
-/* where entries of matrices with such rows lie */
+/* indices of entries in matrices with such rows */
 #define OF_ROOT(r, c) ((r) * VF * LANES + (c))
 #define OF_HELD(r, c) ((r) * VC * LANES + (c))
 
@@ -76,7 +76,7 @@ INLINE int any(bits x) {
   return found != 0;
 #endif
 }
-/* a square of numbers, a row a vector, to its transpose: halves change places, then halves of these */
+/* Transposes a square matrix, one row per vector: halves change places, then halves of these. */
 INLINE void transpose(vec *x) {
 #ifdef __clang__
   vec y[LANES];
@@ -95,12 +95,13 @@ INLINE void transpose(vec *x) {
   }
 #endif
 }
-/* of a row's vector V - 1: zeros beyond the hand, where other velocities may lie */
+/* Clears the lanes of vector V - 1 beyond the hand, where `root` has other velocities. */
 #define to_hand(x) ((vec)((bits)(x) & ((bits){LANE_NUMBERS} <= (long long)(N % LANES))))
-/* Through a pointer of which the compiler knows nothing: where it knows that what lies behind has not changed, it
-   keeps hundreds of vectors for the next time, which are copies on the stack, made and read again. */
+/* Hides a pointer's origin from the compiler. Where it knows that the data behind have not changed, it keeps hundreds
+   of
+   vectors for the next call: copies on the stack, which cost more than loading the data again. */
 #define AFRESH(pointer) __asm__ volatile("" : "+r"(pointer))
-/* numbers into the first lanes, and `rest` into the others */
+/* Copies n numbers into the first lanes, and `rest` into the others. */
 INLINE void pad(vec *to, int count, const double *from, int n, double rest) {
   double *x = (double *)to;
   FOR(i, n) x[i] = from ? from[i] : 0.0;

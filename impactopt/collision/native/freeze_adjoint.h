@@ -1,23 +1,24 @@
-/* From derivatives by what is frozen back to q and v; see freeze.h. With Y = W_c' B, P = G^-1 Y and
-   p = G^-1 push, where G is the Delassus matrix, Q = B' B - Y' P and the drifts are Y' p - B' (root of bias). */
+/* From derivatives by the frozen model to those by q and v; see freeze.h. With Y = W_c' B, P = G^-1 Y and
+   p = G^-1 (free acceleration of the constraints), G the Delassus matrix, Q = B' B - Y' P, and the drifts are
+   Y' p - B' (root of bias). */
 
 typedef struct {
   vec root[NV][VF], held[NV][VC], Y[C1][V], G[C1][VC];
   double q[NQ], v[NV];
-} FreezeBack;
+} FreezeAdjoint;
 
 INLINE void add_to(vec *x, double factor, const vec *y, int count) { FOR(i, count) x[i] += factor * y[i]; }
 
-/* numbers in the order of v, to lanes in the order of `root`'s columns */
+/* From the order of v to that of `root`'s columns. */
 static void to_columns(const double *x, vec *out) {
   FOR(i, VF) out[i] = (vec){0};
   FOR(i, NV) ((double *)out)[COLUMN(i)] = x[i];
 }
 
 #if BIAS || JDOT
-/* drifts, and the velocity that they are frozen at */
-static void drifts_back(const double *q, const double *normal, double yields, const Frozen *F, Back *all,
-                        FreezeBack *b) {
+/* Adjoint of the drifts, and of the velocity that they are evaluated at. */
+static void drifts_adjoint(const double *q, const double *normal, double target_mobility, const Frozen *F, FrozenAdjoint
+                           *all, FreezeAdjoint *b) {
   double bias[NV] = {0}, of_hand, of_held[C1], p[C1] = {0}, by_push[C1] = {0}, by_bias_root[NV], by_bias[NV] = {0};
   double by_hand = ((double *)all->drift)[N], by_held[C1], by_q[NQ], by_v[NV];
   const double *in[] = {q, F->drift_velocity, normal,
@@ -36,7 +37,7 @@ static void drifts_back(const double *q, const double *normal, double yields, co
     &of_hand, of_held
 #endif
   };
-  FOR(c, C) p[c] = F->push[c], by_push[c] = dot(F->Z[c], all->drift, V);
+  FOR(c, C) p[c] = F->free_acceleration[c], by_push[c] = dot(F->Z[c], all->drift, V);
   SOLVE_TRANSPOSED(F, p, double)
   SOLVE_TRANSPOSED(F, by_push, double)
   FOR(c, C) {
@@ -46,23 +47,23 @@ static void drifts_back(const double *q, const double *normal, double yields, co
   }
 #if BIAS
   drift(in, out, 0, 0, 0);
-  vec x[VF], pushed[VC];
-  pad(pushed, VC, by_push, C, 0.0);
+  vec x[VF], by_constraints[VC];
+  pad(by_constraints, VC, by_push, C, 0.0);
   to_columns(bias, x);
   FOR(r, NV) {
-    by_bias_root[r] = dot(F->held[r], pushed, VC) - dot(F->root[r], all->drift, V);
-    add_to(b->held[r], F->bias_root[r], pushed, VC);
+    by_bias_root[r] = dot(F->held[r], by_constraints, VC) - dot(F->root[r], all->drift, V);
+    add_to(b->held[r], F->bias_root[r], by_constraints, VC);
     add_to(b->root[r], -F->bias_root[r], all->drift, V);
     add_to(b->root[r], by_bias_root[r], x, VF);
   }
   times_root_transposed(F, by_bias_root, by_bias);
 #endif
   double *back[] = {by_q, by_v};
-  drift_back(in, back, 0, 0, 0);
+  drift_adjoint(in, back, 0, 0, 0);
   FOR(i, NQ) b->q[i] += by_q[i];
   FOR(i, NV) b->v[i] += by_v[i];
 
-  /* the velocity of meeting */
+  /* the velocity after a plastic touch */
   double y[C1] = {0}, by_y[C1] = {0}, inner[NV], change[NV];
   vec by_change[VF], held_y[VC];
   FOR(c, C) y[c] = ((double *)F->Z[c])[N];
@@ -70,11 +71,11 @@ static void drifts_back(const double *q, const double *normal, double yields, co
   pad(held_y, VC, y, C, 0.0);
   FOR(r, NV) inner[r] = ((double *)F->root[r])[N] - dot(F->held[r], held_y, VC);
   times_root_transposed(F, inner, change);
-  const double yielding = ((double *)F->Q[N])[N] + yields;
-  const double impulse = (F->closing >= 0.0 ? F->closing : 0.0) / yielding;
+  const double yielding = ((double *)F->Q[N])[N] + target_mobility;
+  const double impulse = (F->approach_speed >= 0.0 ? F->approach_speed : 0.0) / yielding;
   double by_impulse = 0.0, by_inner[NV];
   FOR(i, NV) by_impulse -= change[i] * by_v[i], by_v[i] *= -impulse;
-  if (F->closing >= 0.0) all->hand_speed += by_impulse / yielding;
+  if (F->approach_speed >= 0.0) all->hand_speed += by_impulse / yielding;
   ((double *)all->Q[N])[N] -= by_impulse * impulse / yielding;
   to_columns(by_v, by_change);
   times_root(F, by_change, by_inner);
@@ -93,13 +94,13 @@ static void drifts_back(const double *q, const double *normal, double yields, co
 }
 #endif
 
-/* by_q, by_v (nv), the former in v's basis; overwrites `all` */
-static void freeze_back(const double *q, const double *v, const double *normal, double yields, const Frozen *F,
-                        Back *all, FreezeBack *b, double *by_q, double *by_v) {
+/* Sets by_q and by_v (nv), by_q in v's basis; overwrites `all`. */
+static void freeze_adjoint(const double *q, const double *v, const double *normal, double target_mobility, const Frozen
+                           *F, FrozenAdjoint *all, FreezeAdjoint *b, double *by_q, double *by_v) {
   memset(b, 0, sizeof *b);
 #if BIAS || JDOT
   for (int i = N + 1; i < V * LANES; i++) ((double *)all->drift)[i] = 0.0;
-  drifts_back(q, normal, yields, F, all, b);
+  drifts_adjoint(q, normal, target_mobility, F, all, b);
 #endif
 
   /* Q, symmetric */
@@ -142,9 +143,9 @@ static void freeze_back(const double *q, const double *v, const double *normal, 
   FOR(i, HELD_NONZEROS) held[i] = ((double *)b->held)[HELD_AT[i]];
   const double *in[] = {q, v, normal, root, held, &all->hand_speed};
   double *out[] = {q_, v_};
-  tree_back(in, out, 0, 0, 0);
+  tree_adjoint(in, out, 0, 0, 0);
   FOR(i, NQ) b->q[i] += q_[i];
   FOR(i, NV) by_v[i] = b->v[i] + v_[i];
   const double *to_tangent[] = {q, b->q};
-  tangent_back(to_tangent, &by_q, 0, 0, 0);
+  to_velocity_basis(to_tangent, &by_q, 0, 0, 0);
 }

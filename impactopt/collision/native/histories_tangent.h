@@ -1,6 +1,6 @@
-/* Tangents of the histories, a column an instant; see outputs.h. */
+/* Tangents of the histories; see histories.h. */
 
-/* where each output's derivatives by each direction go, column by column; null where nobody asks */
+/* Destination of each output's derivatives by each direction; null where they are not requested. */
 typedef struct {
   double *to[N_VALUES][ALL_VECTORS * LANES];
 } RecordTangent;
@@ -11,17 +11,17 @@ typedef struct {
 #define SPEEDS_OF_COLUMNS 0
 #endif
 
-/* rows of each wrench that columns need: of a ZMP alone its force down and two moments */
+/* Entries of a wrench that are needed: for a ZMP alone the vertical force and two moments. */
 #if defined(OUT_zmp) && !defined(OUT_ground_wrench) && !HELD_ASKED
 #define ROWS_ASKED(i) for (int i = 2; i < 5; i++)
 #else
 #define ROWS_ASKED(i) FOR(i, SIX)
 #endif
 
-/* an instant, and what tangents there are made with */
+/* An instant, and the values that tangents there depend on. */
 typedef struct {
   int number;
-  Place place;
+  StepPoint place;
   Instant at;
   Contact contact;
   double force, ground[SIX];
@@ -36,26 +36,26 @@ static void column_of(const Data *d, double penetration, Column *c) {
 #endif
 }
 
-/* rows of a vector of directions, to a place in the output of each */
-typedef vec anywhere __attribute__((aligned(8)));
-INLINE void put(const vec *x, int rows, long place, double *const *to) {
+/* Writes rows of a vector of directions to the output of each direction. */
+typedef vec unaligned_vec __attribute__((aligned(8)));
+INLINE void write_entries(const vec *x, int rows, long place, double *const *to) {
   if (rows < LANES) {
     FOR(l, LANES) if (to[l]) FOR(i, rows) to[l][place + i] = x[i][l];
     return;
   }
-  /* the last square has some rows of the one before */
+  /* the last square overlaps the one before */
   for (int begin = 0; begin < rows; begin += LANES) {
     const int i = begin + LANES <= rows ? begin : rows - LANES;
     vec square[LANES];
     FOR(a, LANES) square[a] = x[i + a];
     transpose(square);
-    FOR(l, LANES) if (to[l]) *(anywhere *)(to[l] + place + i) = square[l];
+    FOR(l, LANES) if (to[l]) *(unaligned_vec *)(to[l] + place + i) = square[l];
   }
 }
-#define PUT(name, rows, x) put(x, rows, (long)(rows) * c->number, record->to[OUT_##name] + k * LANES)
+#define PUT(name, rows, x) write_entries(x, rows, (long)(rows) * c->number, record->to[OUT_##name] + k * LANES)
 
-static void write_tangent(const Data *d, const FrozenTangent *t, int k, const Column *c, const StateTangent *x,
-                          const RecordTangent *record) {
+static void write_tangent(const Data *d, const FrozenTangent *t, int k, const Column *c, const StateTangent *x, const
+                          RecordTangent *record) {
 #ifdef OUT_time
   PUT(time, 1, &x->time);
 #endif
@@ -77,7 +77,7 @@ static void write_tangent(const Data *d, const FrozenTangent *t, int k, const Co
   memcpy(velocity, x->speeds, sizeof velocity);
   FOR(i, N) add_to_direction(&velocity[i], k, FIRST_OF(BY_V) + NV - N + i, 1.0);
 #if REFERENCE
-  FOR(i, N) velocity[i] += ((const double *)d->bend)[i] * x->time;
+  FOR(i, N) velocity[i] += ((const double *)d->reference_acceleration)[i] * x->time;
 #endif
   PUT(joint_velocity, N, velocity);
 #endif
@@ -85,7 +85,7 @@ static void write_tangent(const Data *d, const FrozenTangent *t, int k, const Co
   PUT(demand, N, x->demand);
 #endif
 #if defined(OUT_torque) || HELD_HISTORY
-  /* with the hand's force, negative, in the last row: what wrenches are of */
+  /* net torques and, last, minus the hand's force: wrenches are linear in these */
   vec net[N + 1];
   FOR(i, N) {
     const double held = ((const double *)c->at.torque)[i] == ((const double *)c->at.demand)[i];
@@ -130,14 +130,15 @@ static void write_tangent(const Data *d, const FrozenTangent *t, int k, const Co
 #ifdef OUT_zmp
   const double *sum = c->ground;
   const vec *total = wrenches[WRENCHES_ASKED - 1];
-  const vec place[2] = {(-total[4] + sum[4] / sum[2] * total[2]) / sum[2], (total[3] - sum[3] / sum[2] * total[2]) / sum[2]};
+  const vec place[2] = {(-total[4] + sum[4] / sum[2] * total[2]) / sum[2],
+      (total[3] - sum[3] / sum[2] * total[2]) / sum[2]};
   PUT(zmp, 2, place);
 #endif
 #endif
 }
 
-/* the memory of the columns that come next, of a vector of directions: it is much, and far away */
-static void fetch(const RecordTangent *record, int k, int column, int count) {
+/* Prefetches the memory of the next columns: the outputs do not fit into a cache. */
+static void prefetch(const RecordTangent *record, int k, int column, int count) {
   FOR(i, N_VALUES) if (ROWS[i]) FOR(l, LANES) {
     const char *to = (const char *)record->to[i][k * LANES + l];
     const long begin = (long)ROWS[i] * column * sizeof(double), end = begin + (long)ROWS[i] * count * sizeof(double);
@@ -145,7 +146,7 @@ static void fetch(const RecordTangent *record, int k, int column, int count) {
   }
 }
 
-/* the columns after `column` repeat it: as many again each time as there are */
+/* Fills the columns after `column` with its values, twice as many at each copy. */
 static void repeat_tangent(const RecordTangent *record, int column) {
   FOR(i, N_VALUES) FOR(direction, ALL_VECTORS * LANES) {
     const long rows = ROWS[i], wanted = rows * (N_COLUMNS[0] - column);

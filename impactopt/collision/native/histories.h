@@ -1,6 +1,6 @@
-/* Histories, a column an instant, straight into the outputs; see collision/outputs.py. */
+/* Histories: one column per instant, written straight into the outputs; see collision/outputs.py. */
 
-static void no_numbers(double **res) {
+static void fill_with_nan(double **res) {
   FOR(k, N_OUT) if (res[k]) FOR(i, SHAPES_OUT[k][0] * SHAPES_OUT[k][1]) res[k][i] = __builtin_nan("");
 }
 
@@ -8,14 +8,14 @@ typedef struct {
   double **out;
   const double *v; /* at contact */
   double since;
-  int column, columns; /* of the present segment: the first, and how many */
+  int column, columns; /* of this segment: its first column, and their number */
 } Record;
 
-/* outputs that are no derivatives */
+/* outputs without their derivatives */
 #define N_VALUES ((int)(sizeof ROWS / sizeof *ROWS))
 #define COLUMN_OF(name, rows) (out[OUT_##name] + (long)(rows) * column)
 
-/* of the ground on the robot about the world's origin, from the wrenches at the soles */
+/* Wrench of the ground on the robot about the world's origin, from the wrenches at the soles. */
 static void ground_wrench_of(const Frozen *F, const double *w, double *total) {
   memcpy(total, F->unmodelled, sizeof F->unmodelled);
   FOR(s, SOLES) {
@@ -47,7 +47,7 @@ static void write_column(const Data *d, const State *y, const Instant *now, cons
     double *to = COLUMN_OF(joint_velocity, N) + i;
     *to = record->v[NV - N + i] + ((const double *)now->u)[i];
 #if REFERENCE
-    *to += ((const double *)d->led)[i] + ((const double *)d->bend)[i] * y->time;
+    *to += ((const double *)d->reference_change)[i] + ((const double *)d->reference_acceleration)[i] * y->time;
 #endif
   }
 #endif
@@ -92,7 +92,7 @@ static void write_column(const Data *d, const State *y, const Instant *now, cons
 #endif
 }
 
-/* the columns after `column` repeat it */
+/* Fills the columns after `column` with its values. */
 static void repeat_column(const Record *record, int column) {
   const int begin = record->column + column, end = record->column + record->columns;
   FOR(i, N_VALUES) {

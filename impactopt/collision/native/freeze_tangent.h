@@ -1,4 +1,5 @@
-/* Tangents of what is frozen, of a vector of directions after the other; see freeze.h and forward.h. With B the roots of
+/* Tangents of the frozen model, one vector of directions after the other; see freeze.h and tangent.h. With B the roots
+   of
    joints and hand, U = B - W_c P and E = dB - dW_c P,
 
        dQ = U' E + E' U,    dP = G^-1 (dW_c' U + W_c' E),    G the Delassus matrix, P = G^-1 W_c' B */
@@ -7,24 +8,24 @@ typedef struct {
   FrozenTangent frozen;
   vec U[NV][V], P[C1][V];
   double tree_parts[TREE_PARTS], approach_parts[APPROACH_PARTS];
-  /* of the meeting, and of the drifts there */
+  /* of the velocity after a plastic touch, and of the drifts there */
   double impulse, yielding, inner[NV], change[NV], bias[NV], L_0[C1], rest[NV];
 #if BIAS || JDOT
   double drift_parts[DRIFT_PARTS];
 #endif
-  /* of a vector: directions of q and of v, derivatives of the roots, E, and of P and of the soles */
+  /* for one vector of directions: seeds of q and v, tangents of the roots, E, tangents of P and of the soles */
   vec by_q[NV], by_v[NV], root[ROOT_NONZEROS], held[AT_LEAST_1(HELD_NONZEROS)];
   vec E[NV][COLUMNS_OF_V], P_by[C1][N + 1], soles[AT_LEAST_1(3 * SOLES)], unmodelled[SIX], L_0_by[C1];
-} FreezeForward;
+} FreezeTangent;
 
 #define ROW_OF_ROOT(i) (ROOT_AT[i] / (VF * LANES))
 #define COLUMN_OF_ROOT(i) (ROOT_AT[i] % (VF * LANES))
 #define ROW_OF_HELD(i) (HELD_AT[i] / (VC * LANES))
 #define COLUMN_OF_HELD(i) (HELD_AT[i] % (VC * LANES))
-/* which of v a column of `root` is of; the hand's is none */
+/* index in v of a column of `root`; the hand's has none */
 #define VELOCITY(c) ((c) < N ? (c) + NV - N : (c) - N - 1)
 
-/* x := G^-1 x, rows of directions */
+/* x := G^-1 x, `width` right-hand sides */
 static void by_delassus(const Frozen *F, vec *x, int width) {
   FOR(c, C) FOR(j, width) {
     vec s = x[c * width + j];
@@ -38,8 +39,8 @@ static void by_delassus(const Frozen *F, vec *x, int width) {
   }
 }
 
-/* ------------------------------------------------------------ what all directions share */
-static void roots_shared(const Frozen *F, FreezeForward *w) {
+/* ------------------------------------------------------------ parts that all directions share */
+static void tree_shared(const Frozen *F, FreezeTangent *w) {
   memcpy(w->P, F->Z, sizeof w->P);
   FOR(i, V) for (int c = C - 1; c >= 0; c--) {
     vec s = w->P[c][i];
@@ -53,10 +54,11 @@ static void roots_shared(const Frozen *F, FreezeForward *w) {
   }
 }
 
-static void drifts_shared(const double *q, const double *normal, double yields, const Frozen *F, FreezeForward *w) {
+static void drifts_shared(const double *q, const double *normal, double target_mobility, const Frozen *F, FreezeTangent
+                          *w) {
 #if BIAS || JDOT
-  w->yielding = ((double *)F->Q[N])[N] + yields;
-  w->impulse = (F->closing < 0.0 ? 0.0 : F->closing) / w->yielding;
+  w->yielding = ((double *)F->Q[N])[N] + target_mobility;
+  w->impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / w->yielding;
   FOR(r, NV) w->inner[r] = ((const double *)w->U[r])[N];
   times_root_transposed(F, w->inner, w->change);
   double at_hand, at_held[C1];
@@ -71,7 +73,7 @@ static void drifts_shared(const double *q, const double *normal, double yields, 
   };
   drift(in, out, 0, 0, 0);
   drift_parts(in, to, 0, 0, 0);
-  memcpy(w->L_0, F->push, sizeof w->L_0);
+  memcpy(w->L_0, F->free_acceleration, sizeof w->L_0);
   SOLVE_TRANSPOSED(F, w->L_0, double)
   FOR(r, NV) {
     w->rest[r] = -F->bias_root[r];
@@ -82,7 +84,7 @@ static void drifts_shared(const double *q, const double *normal, double yields, 
 #endif
 }
 
-static void reactions_shared(const Frozen *F, FreezeForward *w) {
+static void reactions_shared(const Frozen *F, FreezeTangent *w) {
 #if HELD_HISTORY
   memset(w->frozen.by, 0, sizeof w->frozen.by);
   FOR(j, N + 1) {
@@ -104,8 +106,8 @@ static void reactions_shared(const Frozen *F, FreezeForward *w) {
 #endif
 }
 
-/* ------------------------------------------------------------ of a vector of directions */
-static void roots_forward(int k, FreezeForward *w) {
+/* ------------------------------------------------------------ for one vector of directions */
+static void tree_derivatives(int k, FreezeTangent *w) {
   FrozenTangent *t = &w->frozen;
   vec speed, wrench[SIX] = {0};
   const vec *moves[] = {w->by_v};
@@ -115,7 +117,7 @@ static void roots_forward(int k, FreezeForward *w) {
   if (k < VECTORS_OF_Q) {
     const vec *turns[] = {w->by_q};
     vec *by_q[] = {w->root, w->held, &t->hand_speed[k], w->soles, w->unmodelled};
-    tree_forward(w->tree_parts, turns, by_q);
+    tree_tangent(w->tree_parts, turns, by_q);
     memset(w->E, 0, sizeof w->E);
     FOR(i, ROOT_NONZEROS) if (COLUMN_OF_ROOT(i) <= N) w->E[ROW_OF_ROOT(i)][COLUMN_OF_ROOT(i)] += w->root[i];
     FOR(i, HELD_NONZEROS) {
@@ -123,12 +125,12 @@ static void roots_forward(int k, FreezeForward *w) {
       FOR(j, N + 1) w->E[ROW_OF_HELD(i)][j] -= P[j] * w->held[i];
     }
   }
-  approach_forward(w->approach_parts, moves, by_v);
+  approach_tangent(w->approach_parts, moves, by_v);
   t->hand_speed[k] += speed;
   FOR(i, SIX) w->unmodelled[i] += wrench[i];
 }
 
-static void inverse_inertia_forward(int k, const Frozen *F, FreezeForward *w) {
+static void inverse_inertia_tangent(int k, const Frozen *F, FreezeTangent *w) {
   vec(*Q)[COLUMNS_OF_V] = w->frozen.Q[k];
   FOR(j, N + 1) {
     vec column[NV], sum[ROWS_OF_V];
@@ -137,7 +139,7 @@ static void inverse_inertia_forward(int k, const Frozen *F, FreezeForward *w) {
     FOR(i, ROWS_OF_V) Q[i][j] = sum[i];
   }
   FOR(i, N + 1) FOR(j, i + 1) Q[i][j] = Q[j][i] = Q[i][j] + Q[j][i];
-  /* without wrenches, the hand's column alone */
+  /* without wrenches only the hand's column is needed */
   const int first = HELD_HISTORY ? 0 : N;
   memset(w->P_by, 0, sizeof w->P_by);
   FOR(i, HELD_NONZEROS) {
@@ -149,10 +151,10 @@ static void inverse_inertia_forward(int k, const Frozen *F, FreezeForward *w) {
 }
 
 #if BIAS || JDOT
-/* the velocity that drifts are frozen at */
-static void meeting_forward(int k, const Frozen *F, const FreezeForward *w, vec *velocity) {
+/* Tangent of the velocity that the drifts are evaluated at. */
+static void plastic_velocity_tangent(int k, const Frozen *F, const FreezeTangent *w, vec *velocity) {
   const FrozenTangent *t = &w->frozen;
-  vec more = either(F->closing < 0.0, (vec){0}, t->hand_speed[k] / w->yielding);
+  vec more = either(F->approach_speed < 0.0, (vec){0}, t->hand_speed[k] / w->yielding);
   memcpy(velocity, w->by_v, sizeof w->by_v);
   if (k < VECTORS_OF_Q) {
     vec hand[NV];
@@ -173,13 +175,13 @@ static void meeting_forward(int k, const Frozen *F, const FreezeForward *w, vec 
 }
 #endif
 
-static void drifts_forward(int k, const Frozen *F, FreezeForward *w) {
+static void drifts_tangent(int k, const Frozen *F, FreezeTangent *w) {
   FrozenTangent *t = &w->frozen;
-  vec *sum = t->drift[k], *push = w->L_0_by;
-  memset(push, 0, sizeof w->L_0_by);
+  vec *sum = t->drift[k], *free_acceleration = w->L_0_by;
+  memset(free_acceleration, 0, sizeof w->L_0_by);
 #if BIAS || JDOT
   vec velocity[NV], of_bias[NV], of_hand, of_held[C1], root[NV];
-  meeting_forward(k, F, w, velocity);
+  plastic_velocity_tangent(k, F, w, velocity);
   const vec *seed[] = {w->by_q, velocity};
   vec *moved[] = {
 #if BIAS
@@ -189,7 +191,7 @@ static void drifts_forward(int k, const Frozen *F, FreezeForward *w) {
     &of_hand, of_held
 #endif
   };
-  drift_forward(w->drift_parts, seed, moved);
+  drift_tangent(w->drift_parts, seed, moved);
   memset(root, 0, sizeof root);
 #if BIAS
   FOR(i, ROOT_NONZEROS) {
@@ -199,34 +201,34 @@ static void drifts_forward(int k, const Frozen *F, FreezeForward *w) {
     if (k < VECTORS_OF_Q) root[r] += w->bias[VELOCITY(c)] * w->root[i];
   }
 #endif
-  /* less dW_c L_0: then the wrenches have G^-1 W_c' of it */
+  /* less dW_c L_0, so that G^-1 W_c' of it is the tangent of the wrenches */
   if (k < VECTORS_OF_Q) {
     FOR(i, HELD_NONZEROS) {
       const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
       root[r] -= w->L_0[c] * w->held[i];
-      push[c] -= w->rest[r] * w->held[i];
+      free_acceleration[c] -= w->rest[r] * w->held[i];
     }
     FOR(r, NV) FOR(j, N + 1) sum[j] += w->rest[r] * w->E[r][j];
   }
   FOR(i, HELD_NONZEROS) {
     const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
-    push[c] += ((const double *)F->held[r])[c] * root[r];
+    free_acceleration[c] += ((const double *)F->held[r])[c] * root[r];
   }
   FOR(r, NV) root[r] = -root[r];
   add_product((const vec(*)[V])w->U, NV, root, sum, sum);
 #if JDOT
   FOR(c, C) {
-    push[c] -= of_held[c];
+    free_acceleration[c] -= of_held[c];
     FOR(j, N + 1) sum[j] -= ((const double *)w->P[c])[j] * of_held[c];
   }
   sum[N] += of_hand;
 #endif
-  by_delassus(F, push, 1);
+  by_delassus(F, free_acceleration, 1);
 #endif
 }
 
-/* of the wrenches that columns ask for */
-static void reactions_forward(int k, const Frozen *F, FreezeForward *w) {
+/* Tangents of the wrenches that the histories need. */
+static void reactions_tangent(int k, const Frozen *F, FreezeTangent *w) {
 #if HELD_HISTORY
   FrozenTangent *t = &w->frozen;
   const int moves = k < VECTORS_OF_Q;
@@ -259,9 +261,9 @@ static void reactions_forward(int k, const Frozen *F, FreezeForward *w) {
 #endif
 }
 
-/* of the vectors that are wanted */
-static void freeze_forward(const double *q, const double *v, const double *normal, double yields, const Frozen *F,
-                           const int *wanted, FreezeForward *w) {
+/* Tangents of the frozen model for the requested vectors. */
+static void freeze_tangent(const double *q, const double *v, const double *normal, double target_mobility, const Frozen
+                           *F, const int *wanted, FreezeTangent *w) {
   const double *in[] = {q, v, normal};
   double *tree_out[] = {w->tree_parts}, *approach_out[] = {w->approach_parts};
   tree_parts(in, tree_out, 0, 0, 0);
@@ -269,8 +271,8 @@ static void freeze_forward(const double *q, const double *v, const double *norma
   memset(w->frozen.drift, 0, sizeof w->frozen.drift);
   memset(w->frozen.hand_speed, 0, sizeof w->frozen.hand_speed);
   memset(w->frozen.wrench_begin, 0, sizeof w->frozen.wrench_begin);
-  roots_shared(F, w);
-  drifts_shared(q, normal, yields, F, w);
+  tree_shared(F, w);
+  drifts_shared(q, normal, target_mobility, F, w);
   reactions_shared(F, w);
   FOR(k, VECTORS_OF_V) {
     if (!wanted[k]) continue;
@@ -281,9 +283,9 @@ static void freeze_forward(const double *q, const double *v, const double *norma
       if (direction < NV) ((double *)&w->by_q[direction])[l] = 1.0;
       else if (direction < 2 * NV) ((double *)&w->by_v[direction - NV])[l] = 1.0;
     }
-    roots_forward(k, w);
-    if (k < VECTORS_OF_Q) inverse_inertia_forward(k, F, w);
-    drifts_forward(k, F, w);
-    reactions_forward(k, F, w);
+    tree_derivatives(k, w);
+    if (k < VECTORS_OF_Q) inverse_inertia_tangent(k, F, w);
+    drifts_tangent(k, F, w);
+    reactions_tangent(k, F, w);
   }
 }

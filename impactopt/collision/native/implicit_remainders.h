@@ -1,23 +1,25 @@
-/* What bends in law and target, within a step; see collision/implicit.py.
+/* Nonlinear laws and targets within a step; see collision/implicit.py.
 
-   Beyond their slopes at the step's begin, force, target's rates and target's velocity have remainders n of the second
-   order. Each is a polynomial that is right at NODES places of the step, and acts on the linear rest as an input. What
-   is seen at these places, o = (penetration, rate, target), answers n with a matrix K, which a series from rest gives.
-   So n = R(o(n)) are a few scalar equations, for Newton's method, however many joints there are. */
-#if BENDS
-#define SEEN (2 + (TARGET_BENDS ? NZ : 0))
+   Force, target rates and target velocity have remainders n of second order beyond their slopes at the step's begin.
+   Each
+   is a polynomial that interpolates them at NODES places, and an input of the linear model. Observations at these
+   places,
+   o = (penetration, rate, target), are linear in n with a matrix K, which the series of a model at rest give. So
+   n = R(o(n)) are a few scalar equations for Newton's method, whose number does not depend on that of the joints. */
+#if NONLINEAR
+#define OBSERVED (2 + (TARGET_NONLINEAR ? NZ : 0))
 #define UNKNOWNS (NODES * INPUTS)
-/* iterations, and of its size the last one's change */
-#define MOST_ITERATIONS 12
-#define CONVERGED (0.03 * sqrt(TOLERANCE)) /* its error is the square of that */
+/* Newton's method: iterations, and the largest relative change of the last one */
+#define MAX_NEWTON_ITERATIONS 12
+#define CONVERGED (0.03 * sqrt(TOLERANCE)) /* its error is about the square of that */
 
 typedef struct {
   Inputs n;
-  double seen[SEEN][NODES], K[SEEN][INPUTS][NODES][NODES];
-  double by[NODES][INPUTS][SEEN];       /* slopes of R */
-  double matrix[UNKNOWNS][UNKNOWNS];    /* I - dR K, and its factors */
+  double observed[OBSERVED][NODES], K[OBSERVED][INPUTS][NODES][NODES];
+  double by[NODES][INPUTS][OBSERVED];       /* slopes of R at the nodes */
+  double matrix[UNKNOWNS][UNKNOWNS];    /* I - dR K, then its LU factors */
   int pivots[UNKNOWNS];
-} Bend;
+} Remainders;
 
 INLINE double at_node(const double *w, int node) {
   double x = AT_NODES[node][0] * w[0];
@@ -25,51 +27,52 @@ INLINE double at_node(const double *w, int node) {
   return x;
 }
 
-static void see(const Series *s, double (*seen)[NODES]) {
+static void observe(const Series *s, double (*observed)[NODES]) {
   FOR(i, NODES) {
-    seen[0][i] = at_node(s->penetration, i);
-    seen[1][i] = at_node(s->rate, i);
-    for (int z = 0; z < SEEN - 2; z++) seen[2 + z][i] = at_node(s->target[z], i);
+    observed[0][i] = at_node(s->penetration, i);
+    observed[1][i] = at_node(s->rate, i);
+    for (int z = 0; z < OBSERVED - 2; z++) observed[2 + z][i] = at_node(s->target[z], i);
   }
 }
 
-/* how a node sees an input that acts as n_1 = 1 / gamma alone, and that is taken on by each stage */
-static void answers(const Data *d, const Resolvent *r, Series *s, Bend *b) {
+/* K: the response of each node to each input. An input n_1 = 1 / gamma acts on the first stage alone, as later terms
+   cancel it; its response gives those to all other terms, by the table ANSWERS. */
+static void node_responses(const Data *d, const Resolvent *r, Series *s, Remainders *b) {
   FOR(a, INPUTS) {
     Inputs unit = {{0}};
-    Right none;
+    StageInput none;
     memset(&none, 0, sizeof none);
     memset(s->torque[0], 0, sizeof s->torque[0]), memset(s->deviation[0], 0, sizeof s->deviation[0]);
     memset(s->speeds[0], 0, sizeof s->speeds[0]), memset(s->demand[0], 0, sizeof s->demand[0]);
     s->impulse[0] = s->penetration[0] = s->rate[0] = s->force[0] = 0.0;
     FOR(i, NZ) s->target[i][0] = 0.0;
     unit[1][a] = 1.0 / GAMMA_OF_STEPS;
-    /* the stage after the first takes n_1 + gamma n_2 = 0 */
+    /* stages after the first see n_j + gamma n_(j+1) = 0 */
     unit[2][a] = -1.0 / (GAMMA_OF_STEPS * GAMMA_OF_STEPS);
     for (int j = 3; j < TERMS; j++) unit[j][a] = -unit[j - 1][a] / GAMMA_OF_STEPS;
     make_terms(d, r, &none, (const double(*)[INPUTS])unit, s);
-    if (a == INPUTS - 1 && TARGET_BENDS) for (int j = 1; j < TERMS; j++) s->rate[j] += unit[j][a];
-    FOR(o, SEEN) {
+    if (a == INPUTS - 1 && TARGET_NONLINEAR) for (int j = 1; j < TERMS; j++) s->rate[j] += unit[j][a];
+    FOR(o, OBSERVED) {
       const double *w = o == 0 ? s->penetration : o == 1 ? s->rate : s->target[o - 2];
       FOR(i, NODES) FOR(l, NODES) b->K[o][a][i][l] = 0.0;
       FOR(k, STAGES) FOR(i, NODES) FOR(l, NODES) b->K[o][a][i][l] += w[k + 1] * ANSWERS[k][i][l];
     }
-    if (a == INPUTS - 1 && TARGET_BENDS) FOR(i, NODES) b->K[1][a][i][i] -= 1.0;
+    if (a == INPUTS - 1 && TARGET_NONLINEAR) FOR(i, NODES) b->K[1][a][i][i] -= 1.0;
   }
 }
 
-/* the remainders at a node, and their slopes; `size` gets what they are remainders of */
-static void remainders(const Data *d, const State *y, const Instant *now, const Contact *c, int node, Bend *b,
+/* Remainders R at a node, and their slopes; `size` becomes the magnitude of the functions themselves. */
+static void remainders(const Data *d, const State *y, const Instant *now, const Contact *c, int node, Remainders *b,
                        double *R, double *size) {
-  double o[SEEN], law[3];
-  FOR(k, SEEN) o[k] = b->seen[k][node];
+  double o[OBSERVED], law[3];
+  FOR(k, OBSERVED) o[k] = b->observed[k][node];
   const double x = o[0] - y->penetration, rate = o[1] - now->rate;
-  law_here(d, o[0], o[1], now->compressing, law);
+  law_and_slopes(d, o[0], o[1], now->compressing, law);
   R[0] = law[0] - (c->force + c->k * x + c->d * rate);
   size[0] = fmax(size[0], fabs(law[0]));
-  FOR(a, INPUTS) FOR(k, SEEN) b->by[node][a][k] = 0.0;
+  FOR(a, INPUTS) FOR(k, OBSERVED) b->by[node][a][k] = 0.0;
   b->by[node][0][0] = law[1] - c->k, b->by[node][0][1] = law[2] - c->d;
-#if TARGET_BENDS
+#if TARGET_NONLINEAR
   double rates[NZ1], Z[NZ * NZ], G[NZ1], at[NZ1];
   const double *in[] = {o + 2, law, d->target};
   double *out[] = {rates}, *slopes_[] = {Z, G, at};
@@ -93,11 +96,11 @@ static void remainders(const Data *d, const State *y, const Instant *now, const 
 #endif
 }
 
-/* I - dR K, and its LU factors; unknowns are node by node of the first input, then of the next */
-static void factor_bend(Bend *b) {
+/* I - dR K and its LU factors; unknowns are the first input's nodes, then the next one's. */
+static void factor_remainders(Remainders *b) {
   FOR(a, INPUTS) FOR(i, NODES) FOR(e, INPUTS) FOR(l, NODES) {
     double x = a == e && i == l;
-    FOR(o, SEEN) x -= b->by[i][a][o] * b->K[o][e][i][l];
+    FOR(o, OBSERVED) x -= b->by[i][a][o] * b->K[o][e][i][l];
     b->matrix[a * NODES + i][e * NODES + l] = x;
   }
   FOR(c, UNKNOWNS) {
@@ -114,7 +117,7 @@ static void factor_bend(Bend *b) {
     }
   }
 }
-static void solve_bend(const Bend *b, double *x) {
+static void solve_remainders(const Remainders *b, double *x) {
   FOR(c, UNKNOWNS) {
     const double y = x[b->pivots[c]];
     x[b->pivots[c]] = x[c], x[c] = y;
@@ -125,7 +128,7 @@ static void solve_bend(const Bend *b, double *x) {
     x[c] /= b->matrix[c][c];
   }
 }
-static void solve_bend_transposed(const Bend *b, double *x) {
+static void solve_remainders_transposed(const Remainders *b, double *x) {
   FOR(c, UNKNOWNS) {
     FOR(k, c) x[c] -= b->matrix[k][c] * x[k];
     x[c] /= b->matrix[c][c];
@@ -137,7 +140,7 @@ static void solve_bend_transposed(const Bend *b, double *x) {
   }
 }
 
-/* coefficients of polynomials from their values at the nodes */
+/* Coefficients of polynomials from their values at the nodes. */
 INLINE void from_nodes(const double *at, Inputs n) {
   FOR(j, TERMS) FOR(a, INPUTS) {
     n[j][a] = 0.0;
@@ -145,26 +148,28 @@ INLINE void from_nodes(const double *at, Inputs n) {
   }
 }
 
-/* slopes and factors at what a series has at the nodes */
-static void settle(const Data *d, const State *y, const Instant *now, const Resolvent *r, const Series *s, Bend *b) {
+/* Slopes of the remainders and factors at a solved series, for derivatives. */
+static void relinearize(const Data *d, const State *y, const Instant *now, const Resolvent *r, const Series *s,
+                        Remainders *b) {
   double R[INPUTS], size[INPUTS] = {0};
-  see(s, b->seen);
+  observe(s, b->observed);
   FOR(i, NODES) remainders(d, y, now, &r->contact, i, b, R, size);
-  factor_bend(b);
+  factor_remainders(b);
 }
 
-/* the series of a step of law and target as they are; whether Newton's method has found it */
-static int bent_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, Bend *b, Series *s) {
+/* Series of a step with nonlinear law or target; returns whether Newton's method has converged. */
+static int nonlinear_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, Remainders *b, Series
+                            *s) {
   static const Inputs none;
-  double base[SEEN][NODES], n[UNKNOWNS] = {0}, change[UNKNOWNS], largest_[INPUTS];
+  double base[OBSERVED][NODES], n[UNKNOWNS] = {0}, change[UNKNOWNS], largest_[INPUTS];
   int found = 0;
-  answers(d, r, s, b);
+  node_responses(d, r, s, b);
   make_series(d, y, now, r, none, s);
-  see(s, base);
-  for (int tries = 0; tries < MOST_ITERATIONS && !found; tries++) {
-    FOR(o, SEEN) FOR(i, NODES) {
-      b->seen[o][i] = base[o][i];
-      FOR(a, INPUTS) FOR(l, NODES) b->seen[o][i] += b->K[o][a][i][l] * n[a * NODES + l];
+  observe(s, base);
+  for (int tries = 0; tries < MAX_NEWTON_ITERATIONS && !found; tries++) {
+    FOR(o, OBSERVED) FOR(i, NODES) {
+      b->observed[o][i] = base[o][i];
+      FOR(a, INPUTS) FOR(l, NODES) b->observed[o][i] += b->K[o][a][i][l] * n[a * NODES + l];
     }
     FOR(a, INPUTS) largest_[a] = 0.0;
     FOR(i, NODES) {
@@ -172,8 +177,8 @@ static int bent_series(const Data *d, const State *y, const Instant *now, const 
       remainders(d, y, now, &r->contact, i, b, R, largest_);
       FOR(a, INPUTS) change[a * NODES + i] = R[a] - n[a * NODES + i];
     }
-    factor_bend(b);
-    solve_bend(b, change);
+    factor_remainders(b);
+    solve_remainders(b, change);
     found = 1;
     FOR(a, INPUTS) FOR(i, NODES) {
       const double by = change[a * NODES + i];
@@ -188,13 +193,14 @@ static int bent_series(const Data *d, const State *y, const Instant *now, const 
 #else
 typedef struct {
   int none;
-} Bend;
+} Remainders;
 #endif
 
-/* the series of a step; whether it has been found */
-static int series_of(const Data *d, const State *y, const Instant *now, const Resolvent *r, Bend *b, Series *s) {
-#if BENDS
-  return bent_series(d, y, now, r, b, s);
+/* Series of a step; returns whether it has converged. */
+static int step_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, Remainders *b, Series *s)
+                       {
+#if NONLINEAR
+  return nonlinear_series(d, y, now, r, b, s);
 #else
   make_series(d, y, now, r, 0, s);
   return 1;

@@ -1,61 +1,62 @@
-/* Tangents of the implicit steps, one step after the other: the same stages with what J changes by on their right-hand
-   side. Lengths and phases are constants; where an event ends the step, the part of it that was gone is a root of the
-   series, and moves with it. All are of one vector of
-   directions, k. A name that begins with d is the tangent of what has the rest for its name. */
+/* Tangents of the implicit steps, for the k-th vector of directions: the same stages, with the change of J on their
+   right-hand side. Lengths and phases are constants; an event that ends a step is a root of the series, and its place
+       has
+   a tangent too. A name that begins with d is the tangent of what has the rest for its name. */
 
-/* of Series, without what only the state needs, and what follows from the speeds; the terms of a number lie side by side */
+/* Tangent of Series, without torques, deviations and demands, which follow from the speeds. */
 typedef vec Terms[TERMS];
 typedef struct {
   Terms speeds[ROWS_OF_V], impulse, penetration, rate, force, target[NZ1];
 } SeriesTangent;
 
-/* of a state, and what one sees of it; in columns no impulse, and of speeds only those that are asked for, and the hand's */
+/* Tangent of a state and of its instant. For columns of histories the impulse is not set, and speeds only as needed. */
 typedef struct {
   vec speeds[ROWS_OF_V], demand[N1], target[NZ1];
   vec impulse, penetration, time, peak, rate, force, target_speed;
 } StateTangent;
 
-/* of the right-hand side of a stage, and what it gives */
+/* tangents of a stage's right-hand side and of its solution */
 typedef struct {
   vec torque[N1], deviation[N1], impulse, penetration, target[NZ1];
-} RightTangent;
+} StageInputTangent;
 
 typedef struct {
   vec speeds[ROWS_OF_V], impulse, penetration, rate, force, target[NZ1];
-} LeftTangent;
+} StageSolutionTangent;
 
-/* of a step: what it is made of */
+/* A step and its linearization. */
 typedef struct {
   const Data *d;
   const FrozenTangent *frozen;
   const Series *series;
   const Resolvent *resolvent;
-  const Bend *bend;
+  const Remainders *remainders;
   const State *begin;
-  double x[N + 1][STAGES];         /* (T, -p) of the two terms that each stage is made of */
-  /* of the joints: 1 but for saturated ones; friction's slope */
+  double x[N + 1][STAGES];         /* (T, -p) at which each stage evaluates the slope */
+  /* per joint: 1, or 0 where saturated; slope of friction */
   double free[ROWS_OF_V] __attribute__((aligned(64))), slide[ROWS_OF_V] __attribute__((aligned(64)));
-  vec known[STAGES][ROWS_OF_V]; /* of a vector of directions: speeds that dQ and the drift add in each stage */
+  vec model_change[STAGES][ROWS_OF_V]; /* speeds that the tangents of Q and of the drift add in each stage */
 } Linear;
 
-/* a place in a step: the polynomials there, what the terms of speeds add to the way back from there, and how fast what
-   the series make changes */
+/* A place in a step: polynomials and their slopes there, rates of speeds and demands, and `back`: the weight of each
+   coefficient of the speeds in the deviation, their integral. */
 typedef struct {
   double p[TERMS], back[TERMS], slope[TERMS];
 #if !GAIN_MATRIX
-  double demand_by[N1][TERMS]; /* what the terms of its own speed add to a joint's demand */
+  double demand_by[N1][TERMS]; /* weight of each coefficient of a joint's own speed in its demand */
 #endif
   vec speeds[V], demand[V];
-} Place;
+} StepPoint;
 
-static void place_of(const Data *d, const Series *s, double h, double theta, Place *at) {
+static void step_point(const Data *d, const Series *s, double h, double theta, StepPoint *at) {
   powers(theta, at->p);
   slopes(theta, at->slope);
   FOR(i, V) {
     at->speeds[i] = changes(s->speeds, i, at->slope);
     at->demand[i] = changes(s->demand, i, at->slope);
   }
-  /* stage j goes back by the speeds w_j + gamma w_(j+1), but the first by that at the begin and gamma w_1 */
+  /* deviation is minus the integral of the speed; stage j adds w_j + gamma w_(j+1), the first the begin and gamma w_1
+   */
   FOR(j, TERMS) {
     at->back[j] = j ? -h * GAMMA_OF_STEPS * at->p[j] : 0.0;
     if (j < STAGES) at->back[j] -= h * at->p[j + 1];
@@ -69,8 +70,8 @@ static void place_of(const Data *d, const Series *s, double h, double theta, Pla
 #endif
 }
 
-/* `known`; of how many stages there is any. dQ is symmetric */
-static int known_of(Linear *l, int k) {
+/* Sets `model_change`; returns the number of stages that have one. dQ is symmetric. */
+static int add_model_change(Linear *l, int k) {
   const FrozenTangent *t = l->frozen;
   const double h = l->resolvent->h;
   const int stages = k < VECTORS_OF_Q ? STAGES : k < VECTORS_OF_V ? 2 : 0;
@@ -81,13 +82,13 @@ static int known_of(Linear *l, int k) {
     FOR(b, 2) FOR(a, STAGES) s[b][a] = either(a < 2, h * drift[i + b], (vec){0});
     if (k < VECTORS_OF_Q)
       FOR(j, N + 1) FOR(a, STAGES) FOR(b, 2) s[b][a] += l->x[j][a] * Q[i + b][j];
-    FOR(b, 2) FOR(a, STAGES) l->known[a][i + b] = s[b][a];
+    FOR(b, 2) FOR(a, STAGES) l->model_change[a][i + b] = s[b][a];
   }
   return stages;
 }
 
-/* what comes with a state, in the piece of law and target that it is in */
-static void rates_forward(const FrozenTangent *t, int k, const Contact *c, StateTangent *x) {
+/* Tangents of rate and force at a state, by the linearized law and target there. */
+static void rates_tangent(const FrozenTangent *t, int k, const Contact *c, StateTangent *x) {
   x->target_speed = (vec){0};
   FOR(i, NZ) x->target_speed += c->at[i] * x->target[i];
   x->rate = x->speeds[N] + t->hand_speed[k] - x->target_speed;
@@ -99,16 +100,16 @@ INLINE void add_gain(const vec *gain, double factor, const vec *x, vec *out) {
   const double *g = (const double *)gain;
   FOR(i, N) FOR(j, N) out[i] += factor * g[j * V * LANES + i] * x[j];
 }
-/* out += factor times gains, one number a joint, times x */
+/* out += factor times diagonal gains times x */
 INLINE void add_gains(const vec *gain, double factor, const vec *x, vec *out) {
   FOR(i, N) out[i] += factor * ((const double *)gain)[i] * x[i];
 }
 #define ADD_KD(factor, x, out) (KD_MATRIX ? add_gain : add_gains)((const vec *)l->d->kd, factor, x, out)
 #define ADD_KP(factor, x, out) (KP_MATRIX ? add_gain : add_gains)((const vec *)l->d->kp, factor, x, out)
 
-/* out = torque + factor times what dampers and springs, of joints that are not saturated, make of speeds and deviations */
-INLINE void with_servo(const Linear *l, const vec *torque, double factor, const vec *speeds, const vec *deviation,
-                       vec *out) {
+/* out = torque + factor (kp deviation - D speeds), for the joints that are not saturated. */
+INLINE void with_servo(const Linear *l, const vec *torque, double factor, const vec *speeds, const vec *deviation, vec
+                       *out) {
 #if GAIN_MATRIX
   vec held[N1];
   memset(held, 0, sizeof held);
@@ -128,22 +129,22 @@ INLINE void with_servo(const Linear *l, const vec *torque, double factor, const 
 #endif
 }
 
-/* tangents of n, term by term */
-typedef vec InputsTangent[BENDS ? TERMS : 1][INPUTS];
+/* tangents of the inputs n, by coefficients */
+typedef vec InputsTangent[NONLINEAR ? TERMS : 1][INPUTS];
 
-/* S b, with `known` on the right-hand side */
-INLINE void solve_forward(const Linear *l, int stage, int known, const RightTangent *b, const InputsTangent n,
-                          LeftTangent *x) {
+/* Solution of a stage, with `model_change` on the right-hand side. */
+INLINE void solve_tangent(const Linear *l, int stage, int model_change, const StageInputTangent *b, const InputsTangent
+                          n, StageSolutionTangent *x) {
   const Resolvent *r = l->resolvent;
   const Contact *c = &r->contact;
   const double *X = (const double *)r->X[N];
   vec rho[N1], inputs[INPUTS];
-#if BENDS
+#if NONLINEAR
   FOR(a, INPUTS) inputs[a] = either(stage, n[stage][a] + GAMMA_OF_STEPS * n[stage + 1][a], n[1][a]);
 #else
   memset(inputs, 0, sizeof inputs);
 #endif
-  const vec *of = known ? l->known[stage] : 0;
+  const vec *of = model_change ? l->model_change[stage] : 0;
   with_servo(l, b->torque, r->g, of, b->deviation, rho);
   add_product(r->X, N, rho, of, x->speeds);
   const double slope = c->k * r->g + c->d;
@@ -151,26 +152,26 @@ INLINE void solve_forward(const Linear *l, int stage, int known, const RightTang
   FOR(i, NZ) {
     held[i] = (vec){0};
     FOR(j, NZ) held[i] += c->inverse[i][j] * b->target[j];
-    if (TARGET_BENDS) FOR(j, NZ) held[i] += c->inverse[i][j] * r->g * inputs[1 + j];
+    if (TARGET_NONLINEAR) FOR(j, NZ) held[i] += c->inverse[i][j] * r->g * inputs[1 + j];
     rate -= c->at[i] * held[i];
   }
-  if (TARGET_BENDS) rate -= inputs[INPUTS - 1];
+  if (TARGET_NONLINEAR) rate -= inputs[INPUTS - 1];
   x->force = (c->k * b->penetration + slope * rate + inputs[0]) / (1.0 + slope * r->g * c->mobility);
   const vec impulse = x->impulse = b->impulse + r->g * x->force;
   x->rate = rate - r->g * c->mobility * x->force;
   x->penetration = b->penetration + r->g * x->rate;
-  FOR(i, NZ) x->target[i] = held[i] + r->g * c->moved[i] * x->force;
+  FOR(i, NZ) x->target[i] = held[i] + r->g * c->state_by_force[i] * x->force;
   FOR(i, N + 1) x->speeds[i] -= X[i] * impulse;
 }
 
-/* the tangents of all terms, from that of the state at the begin */
-static void terms_forward(const Linear *l, int k, int stages, const StateTangent *dy, const InputsTangent n,
+/* Tangents of all coefficients, from that of the state at the begin. */
+static void terms_tangent(const Linear *l, int k, int stages, const StateTangent *dy, const InputsTangent n,
                           SeriesTangent *s) {
   const Resolvent *r = l->resolvent;
   const Contact *c = &r->contact;
   const double h = r->h, by_gamma = 1.0 / GAMMA_OF_STEPS;
-  RightTangent b;
-  LeftTangent x;
+  StageInputTangent b;
+  StageSolutionTangent x;
   FOR(i, N + 1) s->speeds[i][0] = dy->speeds[i];
   FOR(i, N) {
     b.torque[i] = h * (l->free[i] * dy->demand[i] - l->slide[i] * dy->speeds[i]);
@@ -190,8 +191,8 @@ static void terms_forward(const Linear *l, int k, int stages, const StateTangent
     b.target[i] = h * rate;
   }
   FOR(j, STAGES) {
-    solve_forward(l, j, j < stages, &b, n, &x);
-    /* the first stage adds to its right-hand side what others take in its place */
+    solve_tangent(l, j, j < stages, &b, n, &x);
+    /* the first stage keeps its right-hand side and adds to it; others replace it */
     const double by = j ? h : r->g, before = j != 0, of = j ? by_gamma : 1.0;
     if (j) memset(b.torque, 0, sizeof b.torque);
     with_servo(l, b.torque, by, x.speeds, b.deviation, b.torque);
@@ -208,55 +209,55 @@ static void terms_forward(const Linear *l, int k, int stages, const StateTangent
   }
 }
 
-#if BENDS
-/* of n, from tangents of the series at n as it is */
-static void bend_forward(const Bend *b, const SeriesTangent *s, InputsTangent n) {
+#if NONLINEAR
+/* Tangents of n, from those of the series for a fixed n. */
+static void remainders_tangent(const Remainders *b, const SeriesTangent *s, InputsTangent n) {
   double at[LANES][UNKNOWNS];
   FOR(i, NODES) {
-    vec seen[SEEN];
-    FOR(o, SEEN) {
-      seen[o] = (vec){0};
+    vec observed[OBSERVED];
+    FOR(o, OBSERVED) {
+      observed[o] = (vec){0};
       FOR(j, TERMS) {
         const vec w = o == 0 ? s->penetration[j] : o == 1 ? s->rate[j] : s->target[(o - 2) % NZ1][j];
-        seen[o] += AT_NODES[i][j] * w;
+        observed[o] += AT_NODES[i][j] * w;
       }
     }
     FOR(lane, LANES) FOR(a, INPUTS) {
       double x = 0.0;
-      FOR(o, SEEN) x += b->by[i][a][o] * seen[o][lane];
+      FOR(o, OBSERVED) x += b->by[i][a][o] * observed[o][lane];
       at[lane][a * NODES + i] = x;
     }
   }
   memset(n, 0, sizeof(InputsTangent));
   FOR(lane, LANES) {
-    solve_bend(b, at[lane]);
+    solve_remainders(b, at[lane]);
     FOR(j, TERMS) FOR(a, INPUTS) FOR(i, NODES)
       n[j][a][lane] += FROM_NODES[j][i] * at[lane][a * NODES + i];
   }
 }
 #endif
 
-static void series_forward(Linear *l, int k, const StateTangent *dy, SeriesTangent *s) {
+static void series_tangent(Linear *l, int k, const StateTangent *dy, SeriesTangent *s) {
   InputsTangent n;
   memset(n, 0, sizeof n);
-  const int stages = known_of(l, k);
-  terms_forward(l, k, stages, dy, (const vec(*)[INPUTS])n, s);
-#if BENDS
-  bend_forward(l->bend, s, n);
-  terms_forward(l, k, stages, dy, (const vec(*)[INPUTS])n, s);
+  const int stages = add_model_change(l, k);
+  terms_tangent(l, k, stages, dy, (const vec(*)[INPUTS])n, s);
+#if NONLINEAR
+  remainders_tangent(l->remainders, s, n);
+  terms_tangent(l, k, stages, dy, (const vec(*)[INPUTS])n, s);
 #endif
 }
 
 /* ------------------------------------------------------------ places within a step */
-/* law and target in their piece, at an instant within a step */
+/* Law and target, linearized at an instant within a step. */
 static void contact_within(const Linear *l, const State *then, const Instant *now, const Instant *at, Contact *c) {
   *c = l->resolvent->contact;
-#if LAW_BENDS
+#if LAW_NONLINEAR
   double law[3];
-  law_here(l->d, then->penetration, at->rate, now->compressing, law);
+  law_and_slopes(l->d, then->penetration, at->rate, now->compressing, law);
   c->k = law[1], c->d = law[2];
 #endif
-#if TARGET_BENDS
+#if TARGET_NONLINEAR
   double Z[NZ * NZ], G[NZ1];
   const double force = 0.0, *in[] = {then->target, &force, l->d->target};
   double *out[] = {Z, G, c->at};
@@ -270,12 +271,12 @@ INLINE vec along(const Terms w, const double *p) {
   return s;
 }
 
-/* demands of the joints at places, from those at the begin; all places move by `moved` */
-static void demands_forward(const Linear *l, int count, const Place *const *places, vec moved,
-                            const SeriesTangent *t, const vec *begin, StateTangent *x) {
+/* Tangents of the demands at places, from those at the begin; all places move by `moved`. */
+static void demands_tangent(const Linear *l, int count, const StepPoint *const *places, vec moved, const SeriesTangent
+                            *t, const vec *begin, StateTangent *x) {
 #if GAIN_MATRIX
   FOR(a, count) {
-    const Place *at = places[a];
+    const StepPoint *at = places[a];
     vec speeds[N1], deviation[N1], *demand = x[a].demand;
     FOR(i, N) {
       speeds[i] = along(t->speeds[i], at->p) - t->speeds[i][0];
@@ -302,31 +303,31 @@ static void demands_forward(const Linear *l, int count, const Place *const *plac
 #endif
 }
 
-/* how the event's place moves */
-static vec event_forward(const Linear *l, int k, const Event *e, const SeriesTangent *t, const StateTangent *dy) {
+/* Tangent of the event's place in the step. */
+static vec event_tangent(const Linear *l, int k, const Event *e, const SeriesTangent *t, const StateTangent *dy) {
   const Series *s = l->series;
   const int i = e->number;
   double p[TERMS], slope[TERMS], along_step = 0.0, by_force = 0.0;
   powers(e->at, p);
   slopes(e->at, slope);
   vec moved = {0};
-  if (e->kind == OF_RATE) {
+  if (e->kind == EVENT_RATE) {
     along_step = change(s->rate, slope);
     moved = along(t->rate, p);
-  } else if (e->kind == OF_DEMAND) {
+  } else if (e->kind == EVENT_DEMAND) {
     for (int j = 1; j < TERMS; j++) along_step += slope[j] * ((const double *)s->demand[j])[i];
     StateTangent there;
-    Place place;
-    const Place *places[] = {&place};
-    place_of(l->d, s, l->resolvent->h, e->at, &place);
-    demands_forward(l, 1, places, moved, t, dy->demand, &there);
+    StepPoint place;
+    const StepPoint *places[] = {&place};
+    step_point(l->d, s, l->resolvent->h, e->at, &place);
+    demands_tangent(l, 1, places, moved, t, dy->demand, &there);
     moved = there.demand[i];
-  } else if (e->kind == OF_SLIDING) {
+  } else if (e->kind == EVENT_SLIDING) {
     for (int j = 1; j < TERMS; j++) along_step += slope[j] * ((const double *)s->speeds[j])[i];
     moved = along(t->speeds[i], p);
     add_to_direction(&moved, k, FIRST_OF(BY_V) + NV - N + i, 1.0);
-  } else if (e->kind == OF_FORCE) {
-#if LAW_BENDS
+  } else if (e->kind == EVENT_FORCE) {
+#if LAW_NONLINEAR
     double at[3];
     separation_at(l->d, s, e->at, at);
     along_step = at[1] * change(s->penetration, slope) + at[2] * change(s->rate, slope);
@@ -336,7 +337,7 @@ static vec event_forward(const Linear *l, int k, const Event *e, const SeriesTan
 #endif
   }
 #if SWITCHES
-  if (e->kind == OF_SWITCH) {
+  if (e->kind == EVENT_SWITCH) {
     Switch x;
     switch_in(l->d, s, e->at, &x);
     by_force = x.by_force[i];
@@ -354,14 +355,15 @@ static vec event_forward(const Linear *l, int k, const Event *e, const SeriesTan
   return either(along_step != 0.0, -moved / along_step, (vec){0});
 }
 
-/* states at places of the step that all move by `moved`, with speeds from row `first` on; impulse, time and peak stay */
-INLINE void state_forward(const Linear *l, int count, const Place *const *places, vec moved, const SeriesTangent *t,
+/* Tangents of the states at places that all move by `moved`; speeds from joint `first` on; not of impulse, time and
+   peak. */
+INLINE void state_tangent(const Linear *l, int count, const StepPoint *const *places, vec moved, const SeriesTangent *t,
                           int first, const vec *demand, StateTangent *x) {
 #define ALONG(row, by) { \
     vec w_[TERMS]; \
     memcpy(w_, t->row, sizeof w_); \
     FOR(a, count) { \
-      const Place *at = places[a]; \
+      const StepPoint *at = places[a]; \
       vec s_ = w_[0] + (by) * moved; \
       for (int j = 1; j < TERMS; j++) s_ += at->p[j] * w_[j]; \
       x[a].row = s_; \
@@ -371,11 +373,11 @@ INLINE void state_forward(const Linear *l, int count, const Place *const *places
   ALONG(penetration, change(l->series->penetration, at->slope))
   FOR(i, NZ) ALONG(target[i], change(l->series->target[i], at->slope))
 #undef ALONG
-  demands_forward(l, count, places, moved, t, demand, x);
+  demands_tangent(l, count, places, moved, t, demand, x);
 }
 
 #if PEAK
-static void peak_forward(const Linear *l, double theta, vec moved, const SeriesTangent *t, StateTangent *dy) {
+static void peak_tangent(const Linear *l, double theta, vec moved, const SeriesTangent *t, StateTangent *dy) {
   double p[TERMS], slope[TERMS], place;
   if (!(l->begin->peak < largest(l->series->force, theta, l->begin->peak, &place))) return;
   powers(place, p);

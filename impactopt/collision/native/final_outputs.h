@@ -1,13 +1,13 @@
-/* Outputs that are numbers of the final state, or vectors; see collision/outputs.py. */
+/* Outputs that depend on the final state; see collision/outputs.py. */
 
-static void outputs_of(const Course *c, Work *w, double **res) {
+static void outputs_of(const Outcome *c, Work *w, double **res) {
   const State *y = &c->final;
   (void)y;
 #ifdef OUT_impulse
   if (res[OUT_impulse]) *res[OUT_impulse] = c->impulse;
 #endif
 #ifdef OUT_step_error
-  if (res[OUT_step_error]) *res[OUT_step_error] = y->left_out / fmax(c->impulse, 1e-300);
+  if (res[OUT_step_error]) *res[OUT_step_error] = y->error_estimate / fmax(c->impulse, 1e-300);
 #endif
 #ifdef OUT_peak_force
   if (res[OUT_peak_force]) *res[OUT_peak_force] = y->peak;
@@ -39,10 +39,10 @@ static void outputs_of(const Course *c, Work *w, double **res) {
 #endif
 #ifdef OUT_configuration
   if (res[OUT_configuration]) {
-    double way[NV];
-    velocity_change(&w->frozen, y->torque2, y->impulse2, SLIDING2(y), y->time * y->time / 2, way);
-    FOR(i, NV) way[i] = c->v[i] * y->time + way[i];
-    const double *in[] = {c->q, way};
+    double displacement[NV];
+    velocity_change(&w->frozen, y->torque2, y->impulse2, SLIDING2(y), y->time * y->time / 2, displacement);
+    FOR(i, NV) displacement[i] = c->v[i] * y->time + displacement[i];
+    const double *in[] = {c->q, displacement};
     integrate(in, &res[OUT_configuration], 0, 0, 0);
   }
 #endif

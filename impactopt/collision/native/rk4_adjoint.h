@@ -1,20 +1,20 @@
-/* Runge-Kutta's steps backwards: the discrete adjoint, for phases that stay as they are. */
+/* Discrete adjoint of the Runge-Kutta steps, for fixed phases of the contact. */
 
-/* from a slope back to the state that it was taken at (added) */
-static void slope_back(const Data *d, const State *y, const Instant *now, double force, const Slope *s_,
-                       State *y_, Back *all) {
+/* Adds to y_ the derivatives by the state that a slope was evaluated at. */
+static void slope_adjoint(const Data *d, const State *y, const Instant *now, double force, const Slope *s_, State *y_,
+                          FrozenAdjoint *all) {
   double by_z[NZ1], force_, x_, rate_, by_state[NZ1];
   const double *in[] = {y->target, &force, d->target, s_->target};
   double *out[] = {by_z, &force_};
-  target_rates_back(in, out, 0, 0, 0);
+  target_rates_adjoint(in, out, 0, 0, 0);
   force_ += s_->impulse;
   const double *of_law[] = {&y->penetration, &now->rate, d->law, &force_};
   double *by_law[] = {&x_, &rate_};
-  contact_force_back(of_law, by_law, 0, 0, 0);
+  contact_force_adjoint(of_law, by_law, 0, 0, 0);
   rate_ += s_->penetration;
   const double *of_target[] = {y->target, d->target, &rate_};
   double *by_target[] = {by_state};
-  target_velocity_back(of_target, by_target, 0, 0, 0);
+  target_velocity_adjoint(of_target, by_target, 0, 0, 0);
   FOR(i, NZ) y_->target[i] += by_z[i] - by_state[i];
   y_->penetration += x_;
 
@@ -32,10 +32,10 @@ static void slope_back(const Data *d, const State *y, const Instant *now, double
     demand_[i] = SATURATION ? (vec)((bits)net_ & (now->torque[i] == now->demand[i])) : net_;
     torque_[i] = y_->torque[i];
   }
-  back_of_servo(d, demand_, u_, deviation_);
+  servo_adjoint(d, demand_, u_, deviation_);
   if (STIFFNESS) FOR(i, V) y_->deviation[i] += deviation_[i];
-  put_speed(u_, rate_);
-  y_->impulse -= back_of_velocity(d, u_, torque_);
+  set_hand_speed(u_, rate_);
+  y_->impulse -= velocity_adjoint(d, u_, torque_);
   FOR(i, V) y_->torque[i] = torque_[i];
 #if BIAS || JDOT
   y_->time += dot(d->frozen->drift, u_, V);
@@ -85,7 +85,7 @@ INLINE void add(State *y_, const State *more) {
   FOR(i, NZ) y_->target[i] += more->target[i];
 }
 
-static void step_back(const Data *d, const State *y, int moves, State *y_, Back *all) {
+static void step_adjoint(const Data *d, const State *y, int moves, State *y_, FrozenAdjoint *all) {
   if (!moves) return;
   const double left = d->until - y->time, h = fmin(LENGTH, left);
   const double shares[] = {0.0, h / 2, h / 2, h}, weights[] = {h / 6, h / 3, h / 3, h / 6};
@@ -94,8 +94,8 @@ static void step_back(const Data *d, const State *y, int moves, State *y_, Back 
   Instant now[4];
   at[0] = *y;
   FOR(i, 4) {
-    if (i) shifted(y, &k[i - 1], shares[i], &at[i]);
-    look(d, &at[i], &now[i]);
+    if (i) add_slope(y, &k[i - 1], shares[i], &at[i]);
+    evaluate_instant(d, &at[i], &now[i]);
     slope_at(d, &at[i], &now[i], &k[i]);
   }
   double h_ = 0.0;
@@ -107,7 +107,7 @@ static void step_back(const Data *d, const State *y, int moves, State *y_, Back 
   State total = *y_;
   for (int i = 3; i >= 0; i--) {
     memset(&at_, 0, sizeof at_);
-    slope_back(d, &at[i], &now[i], k[i].impulse, &k_[i], &at_, all);
+    slope_adjoint(d, &at[i], &now[i], k[i].impulse, &k_[i], &at_, all);
     add(&total, &at_);
     if (i) {
       add_scaled(&at_, shares[i], &k_[i - 1]);

@@ -1,4 +1,4 @@
-/* The course of a collision over its freezes; see collision/model.py. */
+/* One collision: the model frozen at contact, and frozen again in each segment; see collision/model.py. */
 
 typedef struct {
   Frozen frozen;
@@ -11,14 +11,14 @@ typedef struct {
   double q[NQ], v[NV], normal[3];
 } Work;
 
-static void load(const double *from, double *to, int n) {
+static void copy_or_zero(const double *from, double *to, int n) {
   FOR(i, n) to[i] = from ? from[i] : 0.0;
 }
 
 static void load_data(const double **arg, Data *d) {
   double ones[V * LANES];
   FOR(i, V * LANES) ones[i] = 1.0;
-  pad(d->kept, V, ones, N, 0.0);
+  pad(d->joint_mask, V, ones, N, 0.0);
 #if N
 #if KD_MATRIX
   FOR(j, N) pad(d->kd[j], V, arg[ARG_kd] ? arg[ARG_kd] + N * j : 0, N, 0.0);
@@ -45,78 +45,80 @@ static void load_data(const double **arg, Data *d) {
   pad(d->feedforward, V, arg[ARG_feedforward], N, 0.0);
 #endif
 #if SLIDES
-  load(arg[ARG_friction_coefficient], &d->coefficient, 1);
-  load(arg[ARG_friction_slip_speed], &d->slip_speed, 1);
-  load(arg[ARG_normal], d->normal, 3);
+  copy_or_zero(arg[ARG_friction_coefficient], &d->coefficient, 1);
+  copy_or_zero(arg[ARG_friction_slip_speed], &d->slip_speed, 1);
+  copy_or_zero(arg[ARG_normal], d->normal, 3);
 #endif
-  FOR(i, N_LAW) load(arg[ARG_law + i], d->law + i, 1);
-  FOR(i, N_TARGET) load(arg[ARG_target + i], d->target + i, 1);
+  FOR(i, N_LAW) copy_or_zero(arg[ARG_law + i], d->law + i, 1);
+  FOR(i, N_TARGET) copy_or_zero(arg[ARG_target + i], d->target + i, 1);
 }
 
-/* the servo's reference: frozen at a time since contact, and what its velocities had gained at the begin; see
-   collision/model.py */
-static void follow(const double **arg, double time, double begin, Work *w) {
+/* Freezes the servo's reference, a polynomial in time: its acceleration at `time` since contact, and the change of its
+   velocity from contact to `begin`. Velocities are relative to the reference from here on; see collision/model.py. */
+static void freeze_reference(const double **arg, double time, double begin, Work *w) {
 #if REFERENCE
   const double *given = arg[ARG_reference], until = arg[ARG_reference_until] ? *arg[ARG_reference_until] : 0.0;
-  double bend[N1], led[N1];
-  const int bends = time < until;
+  double reference_acceleration[N1], reference_change[N1];
+  const int ends_later = time < until;
   begin = fmin(begin, until);
   FOR(j, N) {
-    bend[j] = led[j] = 0.0;
+    reference_acceleration[j] = reference_change[j] = 0.0;
     for (int k = REFERENCE - 1; k >= 0; k--) {
       const double x = given ? given[N * k + j] : 0.0;
-      bend[j] = bend[j] * time + (bends ? (k + 1) * x : 0.0);
-      led[j] = (led[j] + x) * begin;
+      reference_acceleration[j] = reference_acceleration[j] * time + (ends_later ? (k + 1) * x : 0.0);
+      reference_change[j] = (reference_change[j] + x) * begin;
     }
   }
-  pad(w->data.bend, V, bend, N, 0.0);
-  pad(w->data.led, V, led, N, 0.0);
-  FOR(i, V) w->frozen.drift[i] -= w->data.bend[i];
+  pad(w->data.reference_acceleration, V, reference_acceleration, N, 0.0);
+  pad(w->data.reference_change, V, reference_change, N, 0.0);
+  FOR(i, V) w->frozen.drift[i] -= w->data.reference_acceleration[i];
 #endif
 }
 
-static const double *filled(const double *given, double *room, int n) {
+static const double *or_zeros(const double *given, double *zeros, int n) {
   if (given) return given;
-  load(0, room, n);
-  return room;
+  copy_or_zero(0, zeros, n);
+  return zeros;
 }
 
 #if FREEZES
-/* configuration and velocity at state y, from those at the begin of the segment */
-static void moved(const Frozen *F, const double *q, const double *v, const State *y, double *q_then,
-                  double *v_then) {
-  double way[NV], change[NV], from[NQ];
+/* Configuration and velocity at state y, from those at the begin of the segment. */
+static void advance_posture(const Frozen *F, const double *q, const double *v, const State *y, double *q_then, double
+                            *v_then) {
+  double displacement[NV], change[NV], from[NQ];
   memcpy(from, q, sizeof from);
-  velocity_change(F, y->torque2, y->impulse2, SLIDING2(y), y->time * y->time / 2, way);
+  velocity_change(F, y->torque2, y->impulse2, SLIDING2(y), y->time * y->time / 2, displacement);
   velocity_change(F, y->torque, y->impulse, SLIDING(y), y->time, change);
-  FOR(i, NV) way[i] = v[i] * y->time + way[i];
-  const double *in[] = {from, way};
+  FOR(i, NV) displacement[i] = v[i] * y->time + displacement[i];
+  const double *in[] = {from, displacement};
   double *out[] = {q_then};
   integrate(in, out, 0, 0, 0);
   FOR(i, NV) v_then[i] = v[i] + change[i];
 }
 #endif
 
-/* what the collision has led to */
+/* Result of a collision. */
 typedef struct {
   State final;
   double impulse, duration, in_contact;
   double q[NQ], v[NV]; /* at the begin of the last segment */
-} Course;
+} Outcome;
 
 #if FREEZES
-/* from contact, over n segments of about that duration at all; the freeze at contact is in w */
-static void segments(const double **arg, Work *w, Course *c, double duration, int n, Record *recorded) {
+/* Integrates n segments from contact on, which together take about `duration`; w holds the model frozen at contact.
+   A segment is integrated twice: to its middle with the last frozen model, where the model is frozen anew, and then
+   whole with that one. */
+static void run_segments(const double **arg, Work *w, Outcome *c, double duration, int n, Record *recorded) {
   Frozen *F = &w->frozen;
   Data *d = &w->data;
-  const double *q = filled(arg[ARG_q], w->q, NQ), *v = filled(arg[ARG_v], w->v, NV);
-  const double *normal = filled(arg[ARG_normal], w->normal, 3);
-  const int whole = n == FREEZES; /* else the one segment of a trial */
+  const double *q = or_zeros(arg[ARG_q], w->q, NQ), *v = or_zeros(arg[ARG_v], w->v, NV);
+  const double *normal = or_zeros(arg[ARG_normal], w->normal, 3);
+  const int whole = n == FREEZES; /* else a trial with one segment, which finds the duration */
   State start = {0}, reached = {0}, middle;
   double q_middle[NQ], v_middle[NV], q_then[NQ], v_then[NV];
   memcpy(c->q, q, sizeof c->q);
   memcpy(c->v, v, sizeof c->v);
-  FOR(i, V) d->before[i] = (vec){0};
+  FOR(i, V) d->velocity_before[i] = (vec){0};
   c->impulse = c->duration = 0.0;
   c->in_contact = 1.0;
   FOR(i, n) {
@@ -125,14 +127,14 @@ static void segments(const double **arg, Work *w, Course *c, double duration, in
     middle = reached;
     d->until = reached.time + duration * share / 2;
     run(d, &middle, whole ? STEPS_TO_MIDDLE[i] : STEPS_AT_ALL, 0, &w->tape);
-    moved(F, c->q, c->v, &middle, q_middle, v_middle);
+    advance_posture(F, c->q, c->v, &middle, q_middle, v_middle);
     if (i) {
-      moved(F, c->q, c->v, &reached, q_then, v_then);
+      advance_posture(F, c->q, c->v, &reached, q_then, v_then);
       memcpy(c->q, q_then, sizeof c->q);
       memcpy(c->v, v_then, sizeof c->v);
     }
     freeze(q_middle, v_middle, normal, GIVES_WAY, 0.0, F);
-    follow(arg, duration * (begin + end) / 2, duration * begin, w);
+    freeze_reference(arg, duration * (begin + end) / 2, duration * begin, w);
     const double *in[] = {c->q, c->v, normal};
     double *out[] = {
       &d->hand_speed,
@@ -143,9 +145,9 @@ static void segments(const double **arg, Work *w, Course *c, double duration, in
     hand_speed_at(in, out, 0, 0, 0);
     double before[NV];
     FOR(k, NV) before[k] = c->v[k] - v[k];
-    pad(d->before, V, before + NV - N, N, 0.0);
+    pad(d->velocity_before, V, before + NV - N, N, 0.0);
 #if REFERENCE
-    FOR(k, V) d->before[k] -= d->led[k];
+    FOR(k, V) d->velocity_before[k] -= d->reference_change[k];
 #endif
     d->until = c->in_contact ? (last ? HORIZON - duration * begin : duration * share) : -1.0;
     if (recorded) {
@@ -170,16 +172,16 @@ static void segments(const double **arg, Work *w, Course *c, double duration, in
 }
 #endif
 
-static void collide(const double **arg, double **res, Work *w, Course *c) {
+static void collide(const double **arg, double **res, Work *w, Outcome *c) {
   Frozen *F = &w->frozen;
   Data *d = &w->data;
-  const double *q = filled(arg[ARG_q], w->q, NQ), *v = filled(arg[ARG_v], w->v, NV);
-  const double *normal = filled(arg[ARG_normal], w->normal, 3);
+  const double *q = or_zeros(arg[ARG_q], w->q, NQ), *v = or_zeros(arg[ARG_v], w->v, NV);
+  const double *normal = or_zeros(arg[ARG_normal], w->normal, 3);
   Record recorded = {.out = res, .v = v, .columns = N_COLUMNS[0]};
   Record *record = HISTORIES ? &recorded : 0;
   load_data(arg, d);
   freeze(q, v, normal, call(target_yield, d->target, 0, 0), call(target_before, d->target, 0, 0), F);
-  follow(arg, 0.0, 0.0, w);
+  freeze_reference(arg, 0.0, 0.0, w);
   d->frozen = F;
   d->hand_speed = F->hand_speed;
 #if SLIDES
@@ -195,13 +197,13 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
   c->duration = c->final.time;
 #else
   State reached = {0};
-  FOR(i, V) d->before[i] = (vec){0};
+  FOR(i, V) d->velocity_before[i] = (vec){0};
   run(d, &reached, STEPS_AT_ALL, 0, &w->tape);
   w->frozen_at_contact = *F;
   w->data_at_contact = *d;
-  segments(arg, w, c, reached.time, 1, 0);
+  run_segments(arg, w, c, reached.time, 1, 0);
   *F = w->frozen_at_contact;
   *d = w->data_at_contact;
-  segments(arg, w, c, c->duration, FREEZES, record);
+  run_segments(arg, w, c, c->duration, FREEZES, record);
 #endif
 }

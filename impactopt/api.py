@@ -1,4 +1,4 @@
-"""Public functions that plan, of a problem or of the file that describes it, and the `Solution` they give."""
+"""Public planning functions, for a problem or its file, and their result, `Solution`."""
 
 from __future__ import annotations
 
@@ -25,67 +25,71 @@ from impactopt.problem.problem import ImpactProblem
 __all__ = ["Solution", "drive_nail", "moved_solution", "optimize_strike", "solve"]
 
 R = TypeVar("R")
-GROUND = ("fx", "fy", "fz", "mx", "my", "mz")  # of the ground's wrench
+GROUND = ("fx", "fy", "fz", "mx", "my", "mz")  # components of the ground's wrench
 
-_log = logging.getLogger("impactopt")  # its lines are seen by who asks for level INFO
+_log = logging.getLogger("impactopt")
 
+# parts of the docstrings of the public functions
 _GIVEN = """problem : an :class:`impactopt.ImpactProblem`; or the path of a problem file, or the name of one
-    that comes with the package (`impactopt problems`), whose [solver] section then holds where nothing else
-    is given.
-report : where it is None, its lines go to the logger "impactopt", with level INFO.
+    that comes with the package (`impactopt problems`), whose [solver] section then has the
+    default options.
+report : if it is None, its lines go to the logger "impactopt", with level INFO.
 
 """
 _WARNS = """
 
 Warns
 -----
-NotSolvedWarning : the result is no solution; it is of the best iterate.
+NotSolvedWarning : the result is not a solution, but the best iterate.
 """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Solution(solution.Solution):
-    """A solved (or stopped) impact problem, and what can be made of it.
+    """Result of a solved (or stopped) impact problem, with methods for re-planning, pictures and exports.
 
     Its attributes are those of :class:`impactopt.planning.solution.Solution`.
     """
 
     @classmethod
     def of(cls, found: solution.Solution) -> Solution:
-        """A planner's solution with all that can be made of it."""
+        """A planner's solution with these methods."""
         return cls(**{f.name: getattr(found, f.name) for f in fields(found)})
 
     def moved(self, *, polish: bool = True, **changes: Any) -> Solution:
-        """The plan bent for another ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` or
-        ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
+        """Re-planned solution for changed parameters.
 
-        The solver goes on from this plan, with its mesh, and with new constraints where bodies come into each
-        other that have none. ``polish=False``: quadratic programs about this plan in its place, which find
-        constraints that begin and cease to hold. They are quick and within a thousandth of the constraints
-        where status says "acceptable"; other plans of theirs are none. ``refine=True`` refines the mesh too,
+        Parameters are ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` and
+        ``damping`` of the contact (the law's units), and ``margin`` of the centres of pressure [m].
+
+        The solver starts from this plan, on its mesh, and adds clearance constraints for bodies that would
+        penetrate. ``polish=False`` solves quadratic programs about this plan instead, which find the changes
+        of the active set. These are quick; constraints then hold to a thousandth if the status is
+        "acceptable", and with another status the result is not usable. ``refine=True`` also refines the mesh,
         as `impactopt.solve` does. ``callback``, ``options`` and ``time_limit`` are those of
         `impactopt.solve`.
 
         Raises
         ------
-        InputError : this is no solution; nothing is changed, or what target and law do not have; the program
-            has other constraints or bodies then.
+        InputError : this is not a solution; no change is given, or one that target or law do not have; the
+            changed program has other constraints or bodies.
         """
         return Solution.of(replanning.moved_solution(self, polish=polish, **changes))
 
     def sensitivity(self, parameter: str) -> Sensitivity:
-        """Derivatives of impulse and objective by a parameter of the problem, such as ``"target.mass"``,
-        ``"contact.stiffness"``, ``"point.x"`` or ``"terms.torque_limit.fraction"``, and the active
-        constraints with their shadow prices.
+        """Derivatives of impulse and objective by a parameter, and shadow prices of the active constraints.
+
+        parameter : such as ``"target.mass"``, ``"contact.stiffness"``, ``"point.x"`` or
+            ``"terms.torque_limit.fraction"``.
 
         Raises
         ------
-        InputError : there is no such number; this is no solution, or its KKT system is singular.
+        InputError : an unknown parameter; this is not a solution, or its KKT system is singular.
         """
         return sensitivity_of(self, parameter)
 
     def animate(self, *, simulation: Any | None = None, replay: Any | None = None) -> Any:
-        """The motion in 3D, in a notebook or as a file: ``solution.animate().save("punch.html")``.
+        """Animation of the motion in 3D, for a notebook or a file: ``solution.animate().save("punch.html")``.
 
         simulation, replay : as of :func:`impactopt.animate`.
         """
@@ -96,7 +100,7 @@ class Solution(solution.Solution):
     def report(
         self, path: str | PathLike[str], *, simulation: Any | None = None, replay: Any | None = None
     ) -> Path:
-        """Write the page of `impactopt show`; simulation, replay : as of :func:`impactopt.animate`.
+        """Writes the page of `impactopt show`; simulation, replay : as of :func:`impactopt.animate`.
 
         Raises
         ------
@@ -114,7 +118,7 @@ class Solution(solution.Solution):
         simulation: Any | None = None,
         replay: Any | None = None,
     ) -> Any:
-        """Poses, contact force, ZMP and torque as one picture, or another one by name; a matplotlib figure.
+        """Picture of poses, contact force, ZMP and torque, or another one by name; a matplotlib figure.
 
         what, ax, simulation, replay : as of :func:`impactopt.plot`, such as ``solution.plot("strobe")``, or
         ``solution.plot("force", ax=ax)``, which draws in your axes and returns them.
@@ -124,16 +128,17 @@ class Solution(solution.Solution):
         return plot(self, what, ax=ax, simulation=simulation, replay=replay)
 
     def to_frame(self, *, missed: bool = False) -> Any:
-        """The planned motion as a pandas table, by time [s]: ``solution.to_frame()["q leg_left_4_joint"]``.
+        """Planned motion as a pandas table, by time [s]: ``solution.to_frame()["q leg_left_4_joint"]``.
 
-        Columns are phase (0 swing, 1 collision, 2 follow-through); of every joint its position q [rad],
-        velocity v, acceleration a and torque [N m]; and of the ground its force fx, fy, fz [N] and moment
-        mx, my, mz [N m] about the world's origin.
-        missed : the motion that follows a blow that has hit nothing.
+        Columns are phase (0 swing, 1 collision, 2 follow-through); position q [rad], velocity v, acceleration
+        a and torque [N m] of each joint; and force fx, fy, fz [N] and moment mx, my, mz [N m] of the ground
+        about the world's origin.
+
+        missed : the motion for a missed target, with the abort motion.
 
         Raises
         ------
-        InputError : pandas is not installed; of a missed blow, the plan has no such motion.
+        InputError : pandas is not installed; with `missed`, the plan has no abort motion.
         """
         try:
             import pandas
@@ -141,14 +146,14 @@ class Solution(solution.Solution):
             raise missing_package("a table of a motion", "pandas", "frame") from error
         if missed and self.plan.abort is None:
             raise InputError("the plan has no motion that follows a missed blow; leave `missed` out")
-        way, robot = self.missed_trajectory if missed else self.trajectory, self.problem.robot
-        angles = np.array([robot.joint_positions(q) for q in way.q])
-        columns: dict[str, Any] = {"phase": way.phase}
-        joints = {"q": angles, "v": way.v[:, -robot.n :], "a": way.a[:, -robot.n :], "torque": way.torque}
+        t, robot = self.missed_trajectory if missed else self.trajectory, self.problem.robot
+        angles = np.array([robot.joint_positions(q) for q in t.q])
+        columns: dict[str, Any] = {"phase": t.phase}
+        joints = {"q": angles, "v": t.v[:, -robot.n :], "a": t.a[:, -robot.n :], "torque": t.torque}
         for what, values in joints.items():
             columns |= {f"{what} {n}": c for n, c in zip(robot.joint_names, values.T, strict=True)}
-        columns |= {f"ground {n}": c for n, c in zip(GROUND, way.ground.T, strict=True)}
-        return pandas.DataFrame(columns, index=pandas.Index(way.time, name="time [s]"))
+        columns |= {f"ground {n}": c for n, c in zip(GROUND, t.ground.T, strict=True)}
+        return pandas.DataFrame(columns, index=pandas.Index(t.time, name="time [s]"))
 
     def export(
         self,
@@ -160,7 +165,7 @@ class Solution(solution.Solution):
         gravity: bool = True,
         smooth: tuple[float, float] | None = None,
     ) -> list[Path]:
-        """Write the plan for other programs: ``solution.export("csv", "results/csv")``; the files.
+        """Writes the plan for other programs, ``solution.export("csv", "results/csv")``; returns the files.
 
         to, directory, rate, joints, gravity, smooth : as of :func:`impactopt.export`.
         """
@@ -170,6 +175,8 @@ class Solution(solution.Solution):
 
 
 def _or_file(run: Callable[..., R]) -> Callable[..., R]:
+    """Public form of a planning function, which also takes a problem file, and warns if it is not solved."""
+
     @functools.wraps(run)
     def of_either(problem: ImpactProblem | str | os.PathLike[str], *args: Any, **options: Any) -> R:
         if options.get("report") is None:
@@ -193,9 +200,7 @@ def _or_file(run: Callable[..., R]) -> Callable[..., R]:
 
 
 def _public(found: R) -> R:
-    """Planner's result as users get it; a warning with a result that is no solution: its numbers look
-    like those of one.
-    """
+    """Planner's result with the public `Solution`; warns if it is not solved."""
     if isinstance(found, solution.Solved) and not found.status.usable:
         warnings.warn(
             f"not solved, so its numbers are those of no plan: {found.result.message}",
@@ -212,7 +217,7 @@ def _public(found: R) -> R:
 
 
 def moved_solution(plan: solution.Solution, **changes: Any) -> Solution:
-    """The plan for a problem with other parameters: `Solution.moved`."""
+    """Re-planned solution for changed parameters: `Solution.moved`."""
     return Solution.of(replanning.moved_solution(plan, **changes))
 
 

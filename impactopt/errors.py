@@ -1,4 +1,4 @@
-"""Errors and warnings that users see, and the small checks that raise them."""
+"""Errors and warnings that users see, and checks that raise them."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ __all__ = [
     "printable",
 ]
 
-FARTHEST = 1e3  # [m] from the origin of a frame or the world; micrometres still count there
-# of any other number that is given, in SI units: products of a few such ones are still finite
+FARTHEST = 1e3  # [m] from the origin of a frame or the world; micrometres are still resolved there
+# largest magnitude of other inputs, in SI units: products of a few of them are still finite
 MOST = 1e15
-# a terminal obeys them, and half of a pair (a surrogate) cannot be written in UTF-8
+# characters that control a terminal, and surrogates, which cannot be written in UTF-8
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class InputError(ValueError):
-    """Bad input. The message names what is wrong, where, and how to correct it.
+    """Bad input. The message names the mistake, its place, and its correction.
 
-    mistakes : each of them, where the message has several.
+    mistakes : all of them, if the message has several.
     """
 
     def __init__(self, message: str = "", mistakes: Iterable[str] = ()) -> None:
@@ -45,13 +45,13 @@ class InputError(ValueError):
 
 
 class Mistakes:
-    """Gathers what several checks find, so that all of it can be said at once."""
+    """Collects the mistakes that several checks find, for one message."""
 
     def __init__(self) -> None:
         self.found: list[str] = []
 
     def attempt(self, check: Callable[[], object]) -> bool:
-        """True if a check passes; its InputError is kept."""
+        """True if a check passes; else its mistakes are recorded."""
         try:
             check()
         except InputError as error:
@@ -60,12 +60,12 @@ class Mistakes:
         return True
 
     def raise_if_any(self, what: str) -> None:
-        """One InputError for all mistakes of `what`."""
+        """Raises one InputError for all mistakes of `what`."""
         if len(self.found) == 1:
             raise InputError(self.found[0])
         if self.found:
-            rows = "".join(f"\n  {mistake}" for mistake in self.found)
-            raise InputError(f"{what} has {len(self.found)} mistakes:{rows}", self.found)
+            lines = "".join(f"\n  {mistake}" for mistake in self.found)
+            raise InputError(f"{what} has {len(self.found)} mistakes:{lines}", self.found)
 
 
 class NoCompilerWarning(UserWarning):
@@ -77,23 +77,20 @@ class CacheWarning(UserWarning):
 
 
 class NotSolvedWarning(UserWarning):
-    """A result that is no solution: its numbers are those of the best iterate, which is no plan."""
+    """The result is not a solution: its numbers are those of the best iterate, which violates constraints."""
 
 
 def did_you_mean(name: str, options: Iterable[str]) -> str:
-    """The option nearest to a misspelt name, as the tail of a message.
-
-    Returns " (did you mean 'x'?)", or "" when nothing is near.
-    """
+    """Suggestion for a misspelt name, for the end of a message: " (did you mean 'x'?)", or ""."""
     candidates = {str(option).casefold(): str(option) for option in options}
     near = difflib.get_close_matches(str(name).casefold(), list(candidates), n=1, cutoff=0.6)
     return f" (did you mean {candidates[near[0]]!r}?)" if near else ""
 
 
 def check_choice(what: str, given: object, known: Iterable[str]) -> None:
-    """InputError for a name that is none of those known.
+    """InputError for an unknown name.
 
-    what : begins the message, as "there is no picture".
+    what : start of the message, such as "there is no picture".
     """
     names = [*known]
     if not isinstance(given, str) or given not in names:
@@ -102,9 +99,9 @@ def check_choice(what: str, given: object, known: Iterable[str]) -> None:
 
 
 def missing_package(what: str, package: str, extra: str) -> InputError:
-    """The error for a package that is not installed, and how to get it: this one is on no index.
+    """Error for a package that is not installed, with the command that installs it; impactopt is on no index.
 
-    what : that needs it, as "a sweep's table".  extra : of ours that brings it.
+    what : user of the package, such as "a sweep's table".  extra : of impactopt that includes it.
     """
     return InputError(
         f"{what} needs the package {package}; "
@@ -113,19 +110,19 @@ def missing_package(what: str, package: str, extra: str) -> InputError:
 
 
 def printable(text: str) -> str:
-    """Text for a terminal: control characters but new lines are shown by their codes, not obeyed."""
+    """Text for a terminal: control characters except new lines are replaced by their codes."""
     return "".join(c if c == "\n" or c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def has_control(text: str) -> bool:
-    """True if a text has control characters besides tabs and new lines: no file, name or result may."""
+    """True if a text has control characters other than tabs and new lines; no file, name or result may."""
     return _CONTROL.search(text) is not None
 
 
 def check_name(what: str, name: object, *, empty: bool = False) -> None:
-    """InputError if reports cannot call a thing so: it is no text, it is empty, or a terminal would obey it.
+    """InputError if a name cannot be printed in reports: it is no text, is empty, or has control characters.
 
-    what : that is called so, as "a scenario".  empty : may the name be.
+    what : the named thing, such as "a scenario".  empty : an empty name is permitted.
     """
     if not isinstance(name, str) or not (empty or name.strip()):
         raise InputError(f"{what}'s name is {shortened(repr(name))}; give a word that reports can call it by")
@@ -141,22 +138,22 @@ def check_array(
     finite: bool = True,
     most: float | None = None,
 ) -> NDArray[np.float64]:
-    """A float64 copy of `value`, known to have the given shape.
+    """Checked float64 copy of an array.
 
     Parameters
     ----------
-    name : what messages call the value, for example "q [rad]".
-    value : anything NumPy can turn into numbers.
-    shape : the wanted shape; None stands for any length, () for a single number.
-    finite : refuse NaN and infinity when True, NaN alone when False.
-    most : the largest magnitude, if there is one.
+    name : name of the value in messages, for example "q [rad]".
+    value : anything that NumPy can convert to numbers.
+    shape : required shape; None stands for any length, () for a single number.
+    finite : refuse NaN and infinity if True, NaN alone if False.
+    most : the largest permitted magnitude; None: any.
 
     Raises
     ------
-    InputError : not numbers, another shape, or NaN, infinity or too large a number at a named place.
+    InputError : not numbers, another shape, or NaN, infinity or too large a number, with its index.
     """
     try:
-        # NumPy would read text as numbers, and leave out the imaginary part of complex ones
+        # NumPy would convert text to numbers, and drop the imaginary part of complex ones
         if np.asarray(value).dtype.kind in "USc":
             raise TypeError
         array = np.array(value, dtype=np.float64)
@@ -188,12 +185,12 @@ def raw_array(name: str, value: object) -> NDArray[Any]:
 
 
 def check_number(name: str, value: object, *, finite: bool = True, most: float | None = None) -> float:
-    """A single number as a float; InputError as of `check_array`."""
+    """Checked number as a float; InputError as of `check_array`."""
     return float(check_array(name, value, (), finite=finite, most=most))  # type: ignore[arg-type]
 
 
 def check_positive(name: str, value: object, *, most: float | None = None) -> float:
-    """A number above zero as a float; InputError if it is none, or as of `check_array`."""
+    """Checked positive number as a float; InputError if it is not positive, or as of `check_array`."""
     number = check_number(name, value, most=most)
     if not number > 0:
         raise InputError(f"{name}: {number:g}; give a number > 0")
@@ -201,7 +198,7 @@ def check_positive(name: str, value: object, *, most: float | None = None) -> fl
 
 
 def check_whole(name: str, value: object, *, least: int, most: int) -> int:
-    """A whole number as an int; InputError if it is none, or out of its range."""
+    """Checked whole number as an int; InputError if it is not whole, or out of its range."""
     number = check_number(name, value)
     if number != round(number) or not least <= number <= most:
         raise InputError(f"{name}: {number:g}; give a whole number from {least} to {most:g}")
@@ -209,12 +206,12 @@ def check_whole(name: str, value: object, *, least: int, most: int) -> int:
 
 
 def shortened(text: str, most: int = 80) -> str:
-    """Text with its middle left out where it is long."""
+    """Text, with its middle left out if it is long."""
     return text if len(text) <= most else f"{text[: most - 20]} ... {text[-10:]}"
 
 
 def check_direction(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """A float64 copy of a unit vector (3,); InputError as of `check_array`, or for another length."""
+    """Checked float64 copy of a unit vector (3,); InputError as of `check_array`, or for another length."""
     array = check_array(name, value, (3,))
     length = float(np.linalg.norm(array))
     if abs(length - 1.0) > 1e-6:

@@ -1,4 +1,4 @@
-"""Clearances of all bodies of a scene: lower bounds by smooth distances, exact ones by convex hulls."""
+"""Clearances of all bodies of a scene: lower bounds by smooth distances, exact values by convex hulls."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ __all__ = ["SLACK", "Bodies", "Places", "Survey", "Touch"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-MISSED = 3  # phase in which there is no target
-FAR = 1.0  # [m] no clearance beyond this is asked for
+MISSED = 3  # phase without a target
+FAR = 1.0  # [m] clearance that stands for all larger ones
 _REQUEST = coal.DistanceRequest()
-SHALLOW, EVERY = 2e-3, 5e-3  # [m] deeper bodies are looked at once in so long [s]
-CLOSE = 2e-2  # [m] that is looked at first
-DEEPEST = -1e-6  # [m] what is deeper is a touch
-SLACK = 2 * THIN  # [m] by which bodies may be nearer than smooth distances of their thinned hulls
-CHUNK = 256  # instants whose distances are looked at together: memory is theirs times the pairs
+# [m], [s] Two bodies that penetrate by more than the first are evaluated once in the second.
+_SHALLOW, _DEEP_INTERVAL = 2e-3, 5e-3
+_CLOSE = 2e-2  # [m] clearance up to which a survey is tried first
+DEEPEST = -1e-6  # [m] distance below which bodies penetrate
+SLACK = 2 * THIN  # [m] by which bodies may be nearer than the smooth distances of their thinned hulls
+_CHUNK = 256  # instants that are evaluated together; memory is proportional to them times the pairs
 
 
 class Touch(NamedTuple):
-    """Penetration of two bodies: names, from when till when [s], and how deep [m] at most."""
+    """Penetration of two bodies: their names, start and end [s], and largest depth [m]."""
 
     one: str
     other: str
@@ -44,9 +45,7 @@ class Touch(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """Clearance of a motion's bodies: the least distance [m], its time [s], the two bodies, and the
-    contacts, deepest first.
-    """
+    """Least distance [m] in a motion, its time [s] and bodies; and the penetrations, deepest first."""
 
     clearance: float
     time: float
@@ -58,8 +57,9 @@ class Survey(NamedTuple):
 class Places:
     """Placements of the bodies at k instants.
 
-    rotation (k, joints, 3, 3), translation (k, joints, 3) [m] : of the model's joints.  travel (k,) [m] : of
-    the target along its normal.  phase (k,) : 0 before, 1 in, 2 after contact; 3: none.
+    rotation (k, joints, 3, 3), translation (k, joints, 3) [m] : of the model's joints.
+    travel (k,) [m] : of the target along its normal.
+    phase (k,) : 0 before, 1 in, 2 after contact; 3: without a target.
     """
 
     rotation: Array
@@ -77,7 +77,7 @@ class Places:
         return len(self.travel)
 
     def part(self, first: int, last: int) -> Places:
-        """Instants from the first up to the last."""
+        """Placements at the instants first, ..., last - 1."""
         chosen = slice(first, last)
         return Places(
             rotation=self.rotation[chosen],
@@ -88,13 +88,16 @@ class Places:
 
     @cached_property
     def transforms(self) -> dict[tuple[int, int], Any]:
-        """Transforms by instant and body, for exact distances: those computed so far."""
+        """Cache of transforms by instant and body, for exact distances."""
         return {}
 
 
 class Closest(NamedTuple):
-    """Distance [m] of two bodies, < 0 for penetration; the points (3,) [m] of both there, in the world; the
-    direction (3,) from the one to the other; and the pieces of the one that may meet the other's there.
+    """Closest points of two bodies.
+
+    distance [m] : < 0 for penetration.  one, other (3,) [m] : points of both, in the world.  normal (3,) :
+        direction
+    from the one to the other.  pieces : of the first body, that may touch the nearest piece of the other.
     """
 
     distance: float
@@ -105,7 +108,7 @@ class Closest(NamedTuple):
 
 
 class Bodies:
-    """All bodies of a scene, and which pairs of them are not to touch."""
+    """Bodies of a scene, and their pairs that must not touch."""
 
     def __init__(
         self,
@@ -118,10 +121,10 @@ class Bodies:
         standing: tuple[int, ...],
         strict: bool,
     ) -> None:
-        """start (nq,) : the posture in which what touches may touch for good.  normal (3,) : the blow's.
+        """start (nq,) : posture; pairs that touch in it are not checked.  normal (3,) : of the target.
 
-        strict : whether a start in a body of the world is refused.  striking, standing : joints of the links
-        that strike, and of the soles that are held.
+        strict : refuse a start posture that penetrates a body of the world.
+        striking, standing : joints of the striking links, and of the fixed soles.
         """
         self.robot, self.world, self.normal, self.striking = robot, world, normal, striking
         self.start, self.standing = start, standing
@@ -134,9 +137,10 @@ class Bodies:
             for j in self.links.joints:
                 rooted = j in standing or (not robot.floating and parent_body(robot.model, j) == 0)
                 on_ground = body.ground and rooted
-                mine = j in striking
-                core = mine and not self._strikes_from_inside(j)
-                if on_ground or (mine and body.strikable) or (body.core and not core):
+                strikes = j in striking
+                # only striking links are checked against a core; all others keep off the target itself
+                core = strikes and not self._strikes_from_inside(j)
+                if on_ground or (strikes and body.strikable) or (body.core and not core):
                     continue
                 if strict and not body.ground and self.exact(at, 0, (j, -1 - w)) < 0:
                     raise InputError(
@@ -150,7 +154,7 @@ class Bodies:
 
     @cached_property
     def shapes(self) -> Shapes:
-        """Shapes of all pairs that must not touch, for smooth distances."""
+        """Shapes of the pairs that must not touch, for smooth distances."""
         return Shapes(self.links, self.world, self.pairs, self.world_pairs)
 
     def placed(self, at: Places) -> Placed:
@@ -166,10 +170,9 @@ class Bodies:
         return Placed(np.ascontiguousarray(joints), world, present)
 
     def _strikes_from_inside(self, joint: int) -> bool:
-        """True if a link's body surrounds its strikers by more than the depth of a target's core behind the
-        face.
+        """True if a link's body extends beyond all its strikers by more than `BEHIND`.
 
-        Such a body, as a box of inertia about a point mass, meets the core however it strikes.
+        Such a body, as a box of inertia about a point mass, meets a target's core however it strikes.
         """
         frames, depths = self.robot.model.frames, []
         for striker in self.robot.strikers.values():
@@ -185,15 +188,15 @@ class Bodies:
         """Mask (k,) of the instants at which a body of the world is present."""
         return np.asarray(at.phase == 0) if body.before else (at.phase != MISSED) | (not body.of_target)
 
-    # ------------------------------------------------------------------ exactly
+    # ------------------------------------------------------------------ exact distances
     def exact(self, at: Places, k: int, pair: Pair) -> float:
-        """Distance [m] at instant k of two joints, or of a joint and a body of the world, -1 - its index."""
+        """Distance [m] at instant k of a pair: two joints, or a joint and the world body -1 - index."""
         a, b = pair
         here, there = self._transform(at, k, a), self._transform(at, k, b)
         return min(distance(one.shape, here, two.shape, there) for one, two in self._pieces(pair))
 
     def exact_piece(self, at: Places, k: int, number: int) -> float:
-        """Distance [m] at instant k of a pair of pieces, by its number in `shapes`."""
+        """Distance [m] at instant k of a pair of pieces, by its index in `shapes`."""
         (a, b), n = self.shapes.pairs[number].tolist(), int(self.shapes.number[number])
         one, two = self._pieces((a, b))[n]
         return distance(one.shape, self._transform(at, k, a), two.shape, self._transform(at, k, b))
@@ -219,7 +222,7 @@ class Bodies:
         )
 
     def _pieces(self, pair: Pair) -> Sequence[tuple[Any, Any]]:
-        """Convex pieces of a pair that may meet."""
+        """Pairs of convex pieces of two bodies that may touch."""
         a, b = pair
         return self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
 
@@ -230,24 +233,25 @@ class Bodies:
         return known
 
     def placement(self, at: Places, k: int, body: int) -> tuple[Array, Array]:
-        """Rotation (3, 3) and translation (3,) [m] of a joint, or of a body of the world, -1 - its index."""
+        """Rotation (3, 3) and translation (3,) [m] of a joint, or of the world body -1 - index."""
         if body >= 0:
             return at.rotation[k, body], at.translation[k, body]
         solid = self.world[-1 - body]
         return solid.rotation, solid.place + at.travel[k] * self.normal * solid.moves
 
     def lower_bounds(self, at: Places, within: float) -> Iterator[tuple[float, int, Pair]]:
-        """Smooth distances [m] below ``within``, with instant and pair, nearest first.
+        """Smooth distances [m] below ``within``, with instant and pair, by increasing distance.
 
-        No pair is nearer there than its own less `SLACK`, and no other pair nearer than ``within`` less that.
+        Minus `SLACK` they are lower bounds of the exact distances, and ``within`` minus `SLACK` is one for
+        all others.
         """
         shapes, found = self.shapes, dict[tuple[int, Pair], float]()
         every = np.ones(len(shapes), dtype=bool)
-        for first in range(0, len(at), CHUNK):
-            placed = self.placed(at.part(first, first + CHUNK))
-            ways = np.zeros((len(placed.joints), len(shapes), 3))
-            looked = shapes.look(placed, within, ways, every)
-            for gap, k, number in zip(looked.gap, looked.spot.tolist(), looked.pair.tolist(), strict=True):
+        for first in range(0, len(at), _CHUNK):
+            placed = self.placed(at.part(first, first + _CHUNK))
+            directions = np.zeros((len(placed.joints), len(shapes), 3))
+            near = shapes.look(placed, within, directions, every)
+            for gap, k, number in zip(near.gap, near.spot.tolist(), near.pair.tolist(), strict=True):
                 a, b = shapes.pairs[number].tolist()
                 key = first + k, (a, b)
                 found[key] = min(float(gap), found.get(key, np.inf))
@@ -255,15 +259,16 @@ class Bodies:
             yield gap, k, pair
 
     def survey(self, time: Array, at: Places, within: float = 0.1) -> Survey:
-        """The least distance of any pair at any instant, and all that touches.
+        """Least distance of all pairs at all instants, and all penetrations.
 
-        time (k,) [s] : of the instants.  within [m] : pairs that are farther apart count as `FAR`.
-        Deep penetrations are looked at every `EVERY`, so that begin and end are that fine.
+        time (k,) [s] : of the instants.  within [m] : clearances above it count as `FAR`.
+        Deep penetrations are evaluated every 5 ms only, which is the accuracy of their start and end.
         """
-        close = SLACK + CLOSE  # of most motions the nearest two are, and then no others matter
+        # In most motions the nearest two bodies are close; then pairs farther apart need no evaluation.
+        close = SLACK + _CLOSE
         if close < within:
             found = self._survey(time, at, close)
-            if found.clearance <= CLOSE:
+            if found.clearance <= _CLOSE:
                 return found
         return self._survey(time, at, within)
 
@@ -274,20 +279,20 @@ class Bodies:
         for bound, k, pair in self.lower_bounds(at, within):
             if bound - SLACK >= max(least, 0.0):
                 break
-            moment = pair, int(time[k] / EVERY)
-            if moment in seen:
+            interval = pair, int(time[k] / _DEEP_INTERVAL)
+            if interval in seen:
                 continue
             distance = self.exact(at, k, pair)
             if distance < least:
                 least, when, which = distance, k, pair
             if distance < DEEPEST:
                 found.setdefault(pair, []).append((k, distance))
-            if distance < -SHALLOW:
-                seen.add(moment)
+            if distance < -_SHALLOW:
+                seen.add(interval)
         touches = []
-        for pair, hits in found.items():
-            instants = time[[k for k, _ in hits]]
-            depth = -min(d for _, d in hits)
+        for pair, penetrations in found.items():
+            instants = time[[k for k, _ in penetrations]]
+            depth = -min(d for _, d in penetrations)
             touches.append(Touch(*self.names(pair), float(instants.min()), float(instants.max()), depth))
         touches.sort(key=lambda t: -t.depth)
         names = () if which is None else self.names(which)

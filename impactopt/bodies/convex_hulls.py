@@ -1,13 +1,11 @@
-"""Convex hulls of a robot's links, from its files or the links' inertia; shapes that are not plausible."""
+"""Convex hulls of a robot's links, from its files or the links' inertia, and checks of their plausibility."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import coal
@@ -16,9 +14,8 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from impactopt.bodies.file_shapes import Geom, LinkShape, geoms_of, lost_meshes, shapes_of, urdf_root
-from impactopt.bodies.solids import Solid, cylinder, rounded_box
-from impactopt.codegen.files import kept
+from impactopt.bodies.file_shapes import Geom, LinkShape, geoms_of, lost_meshes, shapes_of
+from impactopt.bodies.solids import Solid, cached_arrays, cylinder, rounded_box
 from impactopt.robots.robot import Robot, Tool
 from impactopt.robots.tools import without
 
@@ -40,18 +37,19 @@ __all__ = [
 
 Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
-SIDE = 0.02  # [m] least side of a box of inertia
-LARGE, TIMES = 1.0, 8.0  # a shape is too large from so many metres on, and times the box of its inertia
-NEIGHBOURS = 200  # of a vertex at most: coal counts them in a byte
-THINNED = 1e-4  # [m] vertices nearer to each other become one, twice as far each time, where there are more
+_SHORTEST_SIDE = 0.02  # [m] of a box of inertia
+# a shape is too large above both this size [m] and this multiple of the box of its inertia
+_LARGE, _LARGE_RATIO = 1.0, 8.0
+_MAX_NEIGHBOURS = 200  # of a vertex: coal counts them in a byte
+_MERGE_DISTANCE = 1e-4  # [m] of vertices of hulls with more neighbours; doubled until there are few enough
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Piece:
-    """The convex hull of a shape of a link.
+    """Convex hull of a shape of a link.
 
-    joint : index in the model of the joint that moves it; its frame is that of the numbers.
-    vertices (k, 3) [m], triangles (m, 3) : of the hull, counter-clockwise seen from outside.
+    joint : index in the model of the joint that moves it.
+    vertices (k, 3) [m], triangles (m, 3) : in the joint's frame, counter-clockwise seen from outside.
     assumed : it is a box of the link's inertia, as no shape is known.
     """
 
@@ -63,7 +61,7 @@ class Piece:
 
     @cached_property
     def shape(self) -> Any:
-        """The hull as coal has it."""
+        """The hull in coal."""
         return convex(self.vertices, self.triangles)
 
     def depth(self, point: Array) -> float:
@@ -71,12 +69,12 @@ class Piece:
         a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
         out = np.cross(b - a, c - a)
         lengths = np.linalg.norm(out, axis=1)
-        flat = lengths <= 1e-12  # [m2] a facet without area has no normal
+        flat = lengths <= 1e-12  # [m2] facets without area have no normal
         return float(np.min((((a - point) * out).sum(axis=1) / np.where(flat, 1.0, lengths))[~flat]))
 
 
 def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
-    """A coal.Convex of a hull."""
+    """Hull as a coal.Convex."""
     points, facets = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     points.extend(list(vertices))
     facets.extend([coal.Triangle(*(int(i) for i in t)) for t in triangles])
@@ -84,11 +82,11 @@ def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
 
 
 def pieces_of(robot: Robot, known: Sequence[Piece] | None = None) -> tuple[tuple[Piece, ...], str]:
-    """The pieces of a robot, and in words where they are from; known : its `file_pieces`, if they are read.
+    """Pieces of a robot, and a description of their source; known : its `file_pieces`, if already read.
 
-    They are hulls of its URDF's or MJCF's collision shapes, or of the visual ones of a link that has no
-    others. A robot without any, what has lost its meshes, and what has shapes that are too large, is rounded
-    boxes of the links' inertia. Tools are rods to their heads.
+    They are hulls of the collision shapes in its URDF or MJCF, or of the visual shapes of links without
+    collision shapes. Rounded boxes of the links' inertia replace shapes that are too large or whose meshes
+    are missing, and all shapes of a robot without any. Tools are rods to their heads.
     """
     known = file_pieces(robot) if known is None else known
     found = [piece for piece in known if not is_too_large(robot.model, piece.joint, piece.vertices)]
@@ -106,26 +104,18 @@ def pieces_of(robot: Robot, known: Sequence[Piece] | None = None) -> tuple[tuple
 
 
 def file_pieces(robot: Robot) -> tuple[Piece, ...]:
-    """Hulls of the shapes in a robot's URDF or MJCF, whatever they are."""
+    """Hulls of the shapes in a robot's URDF or MJCF, plausible or not."""
     return tuple(_from_urdf(robot) if robot.mjcf is None else _from_mjcf(robot, robot.mjcf))
 
 
 def bare_joints(robot: Robot, shown: Collection[int]) -> set[int]:
-    """Joints whose bodies are not known, as all their meshes are nowhere; shown : those of which some are."""
-    urdf = Path(robot.urdf) if robot.urdf is not None else None
-    root = urdf_root(urdf) if urdf is not None else None
-    if root is None or urdf is None:
-        return set()
-    return set(lost_meshes(robot.model, root, urdf, without=shown))
+    """Joints whose shapes are all missing meshes; shown : joints with at least one shape."""
+    return set(lost_meshes(robot.model, robot.urdf, without=shown))
 
 
 def _from_urdf(robot: Robot) -> Iterator[Piece]:
-    urdf = Path(robot.urdf) if robot.urdf is not None else None
-    root = urdf_root(urdf) if urdf is not None else None
-    if root is None or urdf is None:
-        return
-    solid = list(shapes_of(robot.model, root, urdf, "collision"))
-    seen = shapes_of(robot.model, root, urdf, "visual", without={shape.link for shape in solid})
+    solid = list(shapes_of(robot.model, robot.urdf, "collision"))
+    seen = shapes_of(robot.model, robot.urdf, "visual", without={shape.link for shape in solid})
     yield from _hulls([*solid, *seen])
 
 
@@ -136,13 +126,13 @@ def _from_mjcf(robot: Robot, mjcf: str) -> Iterator[Piece]:
 
 
 def seen_pieces(robot: Robot, joint: int) -> tuple[Piece, ...]:
-    """Hulls of what an MJCF shows of a joint's links and lets touch nothing, as Unitree's of hands."""
+    """Hulls of the visual geoms of a joint's links in an MJCF, which Unitree's files have for hands."""
     geoms = geoms_of(robot.model, robot.mjcf) if robot.mjcf is not None else []
     return tuple(_hulls(geom for geom in geoms if geom.joint == joint and not geom.collides))
 
 
 def _hulls(shapes: Iterable[LinkShape | Geom]) -> Iterator[Piece]:
-    """Hulls of those shapes of a file that have one."""
+    """Hulls of the shapes of a file; shapes without volume are left out."""
     for shape in shapes:
         piece = _hull(shape.link, shape.joint, shape.solid)
         if piece is not None:
@@ -150,16 +140,17 @@ def _hulls(shapes: Iterable[LinkShape | Geom]) -> Iterator[Piece]:
 
 
 def _from_inertia(robot: Robot) -> Iterator[Piece]:
+    """Boxes of the inertia of all links, without their tools."""
     model = robot.model
-    held = [pin.Inertia.Zero() for _ in range(model.njoints)]
+    of_tools = [pin.Inertia.Zero() for _ in range(model.njoints)]
     for tool in robot.tools:
         frame = model.frames[model.getFrameId(tool.own_frame)]
         own = pin.Inertia(tool.mass, tool.center, tool.inertia)
-        held[frame.parentJoint] += frame.placement.act(own)
+        of_tools[frame.parentJoint] += frame.placement.act(own)
     for j in range(1, model.njoints):
         inertia = model.inertias[j]
-        if held[j].mass > 0:
-            inertia = without(inertia, held[j])
+        if of_tools[j].mass > 0:
+            inertia = without(inertia, of_tools[j])
         if inertia.mass > 1e-6:
             piece = _hull(model.names[j], j, inertia_box(inertia))
             if piece is not None:
@@ -167,11 +158,11 @@ def _from_inertia(robot: Robot) -> Iterator[Piece]:
 
 
 def inertia_box(inertia: Any) -> Solid:
-    """The box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis; rounded."""
+    """Rounded box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis."""
     moments, axes = np.linalg.eigh(np.array(inertia.inertia))
     squares = 6.0 / inertia.mass * (moments.sum() - 2 * moments)
     axes = axes if np.linalg.det(axes) > 0 else -axes
-    sides = np.sqrt(np.maximum(squares, SIDE**2))
+    sides = np.sqrt(np.maximum(squares, _SHORTEST_SIDE**2))
     return rounded_box(sides).moved(axes, np.array(inertia.lever))
 
 
@@ -185,7 +176,7 @@ def _of_tool(robot: Robot, tool: Tool) -> Iterator[Piece]:
 
 
 def tool_solids(tool: Tool) -> list[Solid]:
-    """The solids of a tool in its own frame: a rod to the point that hits, or to the bar of a hammer."""
+    """Solids of a tool in its own frame: a rod to its striking point, or to a hammer's bar, and the bar."""
     if tool.bar is None:
         return [_rod(np.zeros(3), np.asarray(tool.head), ROD)]
     back, middle = tool.head - tool.bar, tool.head - tool.bar / 2
@@ -193,7 +184,7 @@ def tool_solids(tool: Tool) -> list[Solid]:
 
 
 def _rod(start: Array, end: Array, radius: float) -> Solid:
-    """A cylinder from one point to another [m]."""
+    """Cylinder from one point to another [m]; at least 24 mm long."""
     length = max(float(np.linalg.norm(end - start)), 2 * ROD)
     along = (end - start) / length if length > 2 * ROD else np.array([0.0, 0.0, 1.0])
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
@@ -201,48 +192,42 @@ def _rod(start: Array, end: Array, radius: float) -> Solid:
 
 
 def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
-    """The hull of a solid, from disk if it was made before; None where it has no volume."""
+    """Hull of a solid, cached on disk; None if it has no volume."""
     digest = hashlib.sha256(np.round(solid.vertices, 9).tobytes() + b"thinned").hexdigest()
 
-    def make() -> bytes:
-        file = io.BytesIO()
-        vertices, triangles = _hull_of(solid.vertices)
-        np.savez(file, vertices=vertices, triangles=triangles)
-        return file.getvalue()
-
-    with np.load(io.BytesIO(kept("hull", digest, make)), allow_pickle=False) as found:
-        vertices, triangles = found["vertices"], found["triangles"]
-    return Piece(link=link, joint=joint, vertices=vertices, triangles=triangles) if len(triangles) else None
+    hull = cached_arrays("hull", digest, lambda: _hull_of(solid.vertices))
+    return Piece(link=link, joint=joint, **hull) if len(hull["triangles"]) else None
 
 
-def _hull_of(points: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Vertices and triangles of the hull of points (k, 3), none where it has no volume."""
-    near = THINNED
+def _hull_of(points: Array) -> dict[str, NDArray[Any]]:
+    """Vertices and triangles of the hull of points (k, 3); empty if it has no volume."""
+    near = _MERGE_DISTANCE
     while True:
         try:
             hull = ConvexHull(points)
         except (QhullError, ValueError):
-            return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp)
-        if np.bincount(hull.simplices.ravel()).max() <= NEIGHBOURS:
+            return {"vertices": np.zeros((0, 3)), "triangles": np.zeros((0, 3), dtype=np.intp)}
+        if np.bincount(hull.simplices.ravel()).max() <= _MAX_NEIGHBOURS:
             break
         points = points[np.unique(np.round(points / near), axis=0, return_index=True)[1]]
         near *= 2
-    place = np.full(len(points), -1)
-    place[hull.vertices] = np.arange(len(hull.vertices))
-    triangles = place[hull.simplices]
-    # Qhull does not order a facet's corners: turn those that look inwards
+    index = np.full(len(points), -1)  # of each point among the hull's vertices
+    index[hull.vertices] = np.arange(len(hull.vertices))
+    triangles = index[hull.simplices]
+    # Qhull does not order a facet's corners: reverse those whose normal points inwards
     vertices = points[hull.vertices]
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]
-    return vertices, triangles
+    return {"vertices": vertices, "triangles": triangles}
 
 
-FAR = 0.1  # [m] from all that is known of a link at least, and the shape's own size
+# [m] A shape is far from its link if its distance exceeds this and the shape's own size.
+FAR = 0.1
 
 
 def is_far(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> bool:
-    """True if a shape is farther from its link than its size; beside : all shapes that the joint moves."""
+    """True if a shape is far from its link; beside : all shapes that the joint moves."""
     return distance_to_link(model, piece, beside) > max(FAR, size_of(piece))
 
 
@@ -257,28 +242,28 @@ def _diagonal(points: ArrayLike) -> float:
 
 
 def is_too_large(model: pin.Model, joint: int, vertices: Array) -> bool:
-    """True if a shape that a joint moves is larger than the whole robot, and by far than the inertia of its
-    link says, as one in millimetres that is read as metres.
+    """True if a shape is larger than the robot, and much larger than its link's inertia suggests.
+
+    So are meshes in millimetres that are read as metres.
     """
     size, inertia = _diagonal(vertices), model.inertias[joint]
-    if size < LARGE or not inertia.mass:
+    if size < _LARGE or not inertia.mass:
         return False
     box = _diagonal(inertia_box(inertia).vertices)
-    return size > TIMES * box and size > 2 * _kinematic_size(model)
+    return size > _LARGE_RATIO * box and size > 2 * _kinematic_size(model)
 
 
 def _kinematic_size(model: pin.Model) -> float:
-    """Diagonal of the bounds of all joints, where they are at zero [m]."""
+    """Diagonal [m] of the bounds of all joints' origins, with all positions zero."""
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
     return _diagonal([place.translation for place in data.oMi])
 
 
 def distance_to_link(model: pin.Model, piece: Piece, beside: Sequence[Piece]) -> float:
-    """Distance [m] of a shape to the nearest of what is known of its link otherwise.
+    """Distance [m] of a shape to the nearest other feature of its link.
 
-    That is the joint that moves it, the centre of mass, frames on it, the joints that it carries, and its
-    other shapes.
+    Features are its joint, centre of mass, frames, child joints, and other shapes.
     """
     own = piece.joint
     places = [np.zeros(3), np.array(model.inertias[own].lever)]

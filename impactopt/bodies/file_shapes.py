@@ -18,16 +18,16 @@ from impactopt.bodies.solids import Solid, box, capsule, cylinder, find_mesh, la
 from impactopt.errors import FARTHEST
 from impactopt.robots.mjcf import compile_mjcf
 
-__all__ = ["Geom", "LinkShape", "geoms_of", "lost_meshes", "numbers", "shapes_of", "urdf_root"]
+__all__ = ["Geom", "LinkShape", "geoms_of", "lost_meshes", "numbers", "shapes_of", "urdf_elements"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinkShape:
-    """A shape of a link: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
+    """Shape of a link in a URDF: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
 
-    element : the URDF's <collision> or <visual>.
+    element : the <collision> or <visual>.
     """
 
     link: str
@@ -36,46 +36,46 @@ class LinkShape:
     element: ElementTree.Element
 
 
-def urdf_root(urdf: Path) -> ElementTree.Element | None:
-    """The root of a URDF; None if it cannot be read."""
+def urdf_elements(urdf: str | None, tag: str) -> list[ElementTree.Element]:
+    """Elements of a URDF with this tag; none without a URDF, or if it cannot be read."""
     try:
-        return ElementTree.parse(urdf).getroot()
+        return [] if urdf is None else ElementTree.parse(urdf).getroot().findall(tag)
     except (OSError, ElementTree.ParseError):
-        return None
+        return []
 
 
 def shapes_of(
-    model: Any, root: ElementTree.Element, urdf: Path, kind: str, *, without: Collection[str] = ()
+    model: Any, urdf: str | None, kind: str, *, without: Collection[str] = ()
 ) -> Iterator[LinkShape]:
-    """All readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
+    """Readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
 
-    without : names of links that are left out. So is what is malformed, and so are meshes that are missing or
-    damaged.
+    Malformed shapes, and meshes that are missing or damaged, are left out.
+
+    without : names of links to leave out.
     """
-    for link in root.findall("link"):
+    for link in urdf_elements(urdf, "link"):
         name = link.get("name", "")
         if name in without or not model.existFrame(name, pin.FrameType.BODY):
             continue
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
         for element in link.findall(kind):
-            solid, origin = _urdf_solid(element.find("geometry"), urdf), _origin(element.find("origin"))
+            solid = _urdf_solid(element.find("geometry"), Path(str(urdf)))
+            origin = _origin(element.find("origin"))
             if solid is not None and origin is not None:
                 place = frame.placement * origin
                 moved = solid.moved(place.rotation, place.translation)
                 if not (np.abs(moved.vertices) <= FARTHEST).all():
-                    continue  # it is nowhere, or no part of a robot
+                    continue  # not finite, or too far to be part of a robot
                 yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
 
 
-def lost_meshes(
-    model: Any, root: ElementTree.Element, urdf: Path, *, without: Collection[int] = ()
-) -> dict[int, dict[str, str]]:
-    """Meshes that are missing or unreadable, with the reason, by the joint that moves their link.
+def lost_meshes(model: Any, urdf: str | None, *, without: Collection[int] = ()) -> dict[int, dict[str, str]]:
+    """Missing or unreadable meshes of a URDF with the reason, by the joint that moves their link.
 
-    without : joints whose meshes are not looked at.
+    without : joints to leave out.
     """
     lost: dict[int, dict[str, str]] = {}
-    for link in root.findall("link"):
+    for link in urdf_elements(urdf, "link"):
         name = link.get("name", "")
         if not model.existFrame(name, pin.FrameType.BODY):
             continue
@@ -84,13 +84,13 @@ def lost_meshes(
             continue
         for mesh in link.iterfind("*/geometry/mesh"):
             file = mesh.get("filename", "")
-            if lack := lack_of(file, urdf):
-                lost.setdefault(int(frame.parentJoint), {})[file] = lack
+            if reason := lack_of(file, Path(str(urdf))):
+                lost.setdefault(int(frame.parentJoint), {})[file] = reason
     return lost
 
 
 def numbers(text: str, count: int = 3) -> Array:
-    """So many finite numbers in a text, apart by spaces; ValueError for anything else."""
+    """Finite numbers of a text, separated by spaces; ValueError unless there are `count` of them."""
     found = np.array([float(word) for word in text.split()])
     if len(found) != count or not np.all(np.isfinite(found)):
         raise ValueError(f"{text!r} are no {count} finite numbers")
@@ -98,7 +98,7 @@ def numbers(text: str, count: int = 3) -> Array:
 
 
 def _urdf_solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | None:
-    """The solid of a <geometry>; None if it is none, or its mesh cannot be read."""
+    """Solid of a <geometry>; None if it has none, or its mesh cannot be read."""
     for shape in geometry if geometry is not None else ():
         with contextlib.suppress(ValueError, RuntimeError, OSError, KeyError):
             if shape.tag == "box":
@@ -114,7 +114,7 @@ def _urdf_solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | Non
 
 
 def _origin(origin: ElementTree.Element | None) -> Any:
-    """The placement (pin.SE3) of an <origin>; None if it is none."""
+    """Placement (pin.SE3) of an <origin>, the identity without one; None if it is malformed."""
     if origin is None:
         return pin.SE3.Identity()
     try:
@@ -126,9 +126,9 @@ def _origin(origin: ElementTree.Element | None) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Geom:
-    """A geom of a body: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
+    """Geom of a body in an MJCF: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
 
-    collides : with anything; else it is there to be seen.  colour : red, green, blue.
+    collides : it is a collision geom, else a visual one.  colour : red, green, blue.
     """
 
     link: str
@@ -169,7 +169,7 @@ def _geoms(model: Any, mj: Any) -> Iterator[Geom]:
 
 
 def _mjcf_solid(mj: Any, g: int) -> Solid | None:
-    """A geom in its own frame; None for what is no solid."""
+    """Solid of a geom in its own frame; None for planes, height fields and signed distance fields."""
     import mujoco
 
     kind, kinds = int(mj.geom_type[g]), mujoco.mjtGeom

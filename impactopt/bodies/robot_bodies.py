@@ -1,4 +1,4 @@
-"""Bodies of a robot: hulls of its links, pairs that can meet, and the face of a link that strikes."""
+"""Bodies of a robot: hulls of its links, pairs that can collide, and the face of a striking link."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ Pair = tuple[int, int]
 class RobotBodies:
     """Collision geometry of a robot.
 
-    pieces : hulls of links, exact.  source : where they are from, in words.  too_large : shapes of its file
-        that are none of them.
+    pieces : exact hulls of links.  source : description of their source.
+    too_large : shapes of its file that are left out, as they are too large.
     """
 
     robot: Robot
@@ -39,17 +39,17 @@ class RobotBodies:
 
     @cached_property
     def joints(self) -> tuple[int, ...]:
-        """The joints that move anything, in the model's order."""
+        """Joints that move pieces, in the model's order."""
         return tuple(sorted({piece.joint for piece in self.pieces}))
 
     @cached_property
     def of_joint(self) -> dict[int, tuple[Piece, ...]]:
-        """The pieces that a joint moves."""
+        """Pieces by the joint that moves them."""
         return {j: tuple(p for p in self.pieces if p.joint == j) for j in self.joints}
 
     @cached_property
     def connected(self) -> tuple[Pair, ...]:
-        """Each joint that moves something, with its parent if that does too: their bodies always touch."""
+        """Pairs of a joint and its parent that both move pieces: their bodies always touch."""
         parents = ((j, parent_body(self.robot.model, j)) for j in self.joints)
         return tuple((j, parent) for j, parent in parents if parent in self.joints)
 
@@ -71,40 +71,40 @@ class RobotBodies:
         return {j: max(pieces, key=size).link for j, pieces in self.of_joint.items()}
 
     def name(self, joint: int) -> str:
-        """Name of the body that a joint moves, in messages: its largest link."""
+        """Name of the body that a joint moves, for messages: its largest link."""
         return self._names[joint]
 
     def piece_pairs(
         self, q: Array, disabled: Iterable[frozenset[str]] = ()
     ) -> tuple[dict[Pair, tuple[tuple[Piece, Piece], ...]], list[tuple[str, str]]]:
-        """Pairs of joints whose bodies can meet, with their pairs of pieces; and links that touch at ``q``.
+        """Pairs of pieces that can collide, by their two joints; and names of the links that touch at ``q``.
 
         Left out are links that a joint connects, those of ``disabled`` (names of two links each), and those
-        whose hulls touch in the start posture ``q`` (nq,): neighbours beyond a short link always do.
+        whose hulls touch in the start posture ``q`` (nq,), as neighbours beyond a short link always do.
         """
         model, data = self.robot.model, self.robot.model.createData()
         pin.forwardKinematics(model, data, q)
         places = {j: transform(data.oMi[j].rotation, data.oMi[j].translation) for j in self.joints}
         out: dict[Pair, tuple[tuple[Piece, Piece], ...]] = {}
-        touching, without = [], set(disabled)
+        touching, excluded = [], set(disabled)
         for n, a in enumerate(self.joints):
             for b in self.joints[:n]:
                 if (a, b) in self.connected:
                     continue
-                left = []
+                kept = []
                 (centre_a, radius_a), (centre_b, radius_b) = self.balls[a], self.balls[b]
-                apart = np.linalg.norm(data.oMi[a].act(centre_a) - data.oMi[b].act(centre_b))
-                far = apart > radius_a + radius_b
+                between = np.linalg.norm(data.oMi[a].act(centre_a) - data.oMi[b].act(centre_b))
+                far = between > radius_a + radius_b
                 for one in self.of_joint[a]:
                     for two in self.of_joint[b]:
-                        if frozenset((one.link, two.link)) in without:
+                        if frozenset((one.link, two.link)) in excluded:
                             continue
                         if not far and distance(one.shape, places[a], two.shape, places[b]) <= 0:
                             touching.append((one.link, two.link))
                         else:
-                            left.append((one, two))
-                if left:
-                    out[a, b] = tuple(left)
+                            kept.append((one, two))
+                if kept:
+                    out[a, b] = tuple(kept)
         return out, touching
 
 
@@ -112,7 +112,7 @@ _KNOWN: weakref.WeakKeyDictionary[Robot, RobotBodies] = weakref.WeakKeyDictionar
 
 
 def bodies_of(robot: Robot) -> RobotBodies:
-    """The robot's bodies, made once."""
+    """Bodies of the robot, cached."""
     if robot not in _KNOWN:
         known = file_pieces(robot)
         pieces, source = pieces_of(robot, known)
@@ -122,28 +122,30 @@ def bodies_of(robot: Robot) -> RobotBodies:
 
 
 def transform(rotation: Array, translation: Array) -> Any:
-    """A coal.Transform3s."""
+    """Placement as a coal.Transform3s."""
     return coal.Transform3s(np.asarray(rotation), np.asarray(translation))
 
 
 def distance(one: Any, at_one: Any, two: Any, at_two: Any) -> float:
-    """Distance of two coal shapes at these places [m]; below zero: depth of the penetration."""
+    """Distance of two coal shapes at these placements [m]; below zero: minus the depth of penetration."""
     return float(coal.distance(one, at_one, two, at_two, _REQUEST, coal.DistanceResult()))
 
 
 _REQUEST = coal.DistanceRequest()
 
 
-CONE = np.pi / 3  # [rad] about the face's normal: corners that lead in none of these directions never do
-DIRECTIONS = 400
+# [rad] half angle, about the face's normal, of the directions in which corners may be the foremost; and their
+# number
+CONE, DIRECTIONS = np.pi / 3, 400
 MERGED = 0.004  # [m] corners nearer to each other than this count as one
-FLAT = 0.9  # cosine: facets turned less belong to the face that the striking point lies on
+FLAT = 0.9  # cosine of the largest angle between facets of one face
 
 
 class StrikerFace(NamedTuple):
     """Face of a striking link about its striking point, in the frame of the striker.
 
-    normal (3,) : outward unit vector.  corners (k, 3) [m] : of the link's hull, from the striking point on.
+    normal (3,) : outward unit vector.  corners (k, 3) [m] : of the link's hull, relative to the striking
+        point.
     """
 
     normal: Array
@@ -151,17 +153,17 @@ class StrikerFace(NamedTuple):
 
     @property
     def ahead(self) -> float:
-        """Distance [m] by which the link sticks out beyond its striking point along the normal."""
+        """Distance [m] by which the link extends beyond its striking point along the normal."""
         return float(max(0.0, (self.corners @ self.normal).max()))
 
 
 def striker_face(
     robot: Robot, striker: str, axis: Array | None = None, *, assumed: bool = False
 ) -> StrikerFace | None:
-    """The face of one of a robot's strikers; None for a link without a known shape.
+    """Face of a striker; None for a link without a known shape.
 
-    axis (3,) : its outward unit vector in the striker's frame, if known. Else it is that of the hull's facets
-    next to the striking point; facets count by their areas.  assumed : boxes of links' inertia count too.
+    axis (3,) : its outward unit vector in the striker's frame, if known. Else it is the mean normal, weighted
+        by area, of the hull's facets next to the striking point.  assumed : also use boxes of links' inertia.
     """
     hit = robot.striker(striker)
     model, bodies = robot.model, bodies_of(robot)
@@ -187,8 +189,8 @@ def striker_face(
 
 
 def _leading(points: Array, normal: Array) -> Array:
-    """The points that lie farthest ahead in some direction within a cone about the normal."""
-    # a Fibonacci lattice on the cap covers it evenly
+    """Points that are foremost in some direction of a cone about the normal, without near duplicates."""
+    # directions on a Fibonacci lattice, which covers the cone's cap evenly
     k = np.arange(DIRECTIONS) + 0.5
     height, turn = 1 - (1 - np.cos(CONE)) * k / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
     wide = np.sqrt(1 - height**2)

@@ -1,17 +1,17 @@
-"""Signed distances of convex bodies that are smooth everywhere: what a plan's constraints between bodies are.
+"""Smooth signed distances of convex bodies, for the clearance constraints of a plan.
 
-The separation of two bodies A and B along a unit vector u from B to A is u . t less their supports. Its
-largest value over all u is their distance; where they penetrate it is, near the direction that they
-came from, how deep they are. With supports max_i a_i . u of vertices it has kinks, where faces are parallel.
-So supports are rounded,
+The separation s of two bodies A and B along a unit vector u from B to A is u . t, with t from B's origin to
+A's, minus their support functions. Its maximum over u is the distance. For bodies that penetrate, its local
+maximum near the direction they came from is minus the depth. Support functions of vertices, max_i a_i . u,
+make the distance nonsmooth where faces are parallel. So they are smoothed, with e = `ROUNDING`,
 
-    h(u) = e log sum_i exp(a_i . u / e),
+    h(u) = e log sum_i exp(a_i . u / e).
 
-which is never less than the hull's own and at most e log k more, k vertices being within about e of a face.
-Then the distance has derivatives of all orders, and the best direction tells them: by the envelope theorem
-the gradient is the separation's at that u, and the Hessian is s_qq - s_qu (s_uu)^-1 s_uq on its tangents.
+This is never less than the hull's own and at most e log k more, if k vertices are within about e of a face.
+The distance then has derivatives of all orders. By the envelope theorem its gradient is that of s at the best
+u, and its Hessian is s_qq - s_qu (s_uu)^-1 s_uq, with derivatives by u on the tangents of the unit sphere.
 
-The vertices are those of a hull that is within `THIN` of the body's own. In C (native/separation.c) a
+The vertices are those of a hull within `THIN` of the body's own. In C (native/separation.c) a
 distance takes 2 to 10 us; without a compiler `separation_numpy` does the same.
 """
 
@@ -20,7 +20,6 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
-import io
 import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,24 +33,26 @@ from impactopt.bodies import separation_numpy
 from impactopt.bodies.convex_hulls import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies
 from impactopt.bodies.separation_numpy import ROUNDING
+from impactopt.bodies.solids import cached_arrays
 from impactopt.bodies.world import WorldBody
 from impactopt.codegen.compiler import address, native_library
-from impactopt.codegen.files import kept
 
 __all__ = ["ROUNDING", "THIN", "Looked", "Placed", "Separations", "Shapes", "packed", "thinned"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-THIN = 1e-3  # [m] by which vertices left out are outside of the hull of the others, at most
-_FEW = 12  # vertices of which none is left out
-_EIGHT = 8  # vertices at once
-_SIDE = 33  # numbers that the C code keeps of a pair
+THIN = 1e-3  # [m] largest distance of omitted vertices from the hull of the others
+_SMALL_HULL = 12  # vertices; hulls with no more keep them all
+_BLOCK = 8  # vertices that the C code handles at once
+_SIDE = 33  # numbers of the C code's struct Side
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Placements at K instants of joints (K, J, 12) and of bodies of the world (K, W, 12), each a rotation
-    by rows and a translation [m]; and a mask of the bodies that are present (K, W).
+    """Placements at K instants of joints (K, J, 12) and bodies of the world (K, W, 12), and a mask (K, W).
+
+    A placement is a rotation by rows and a translation [m]. The mask is of the bodies of the world that are
+    present.
     """
 
     joints: Array
@@ -61,8 +62,9 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """Gaps of pairs (K, P) [m], lower bounds for those that are not near; instants (m,) and pair numbers
-    (m,) of those that are.
+    """Distances `gaps` (K, P) [m] of P pairs at K instants; instants (m,) and pairs (m,) of the near ones.
+
+    For pairs that are not near, the gaps are lower bounds.
     """
 
     gaps: Array
@@ -71,21 +73,21 @@ class Looked:
 
     @property
     def gap(self) -> Array:
-        """(m,) [m] of those that are near."""
+        """Distances of the near pairs (m,) [m]."""
         return np.asarray(self.gaps[self.spot, self.pair])
 
 
 class Shapes:
-    """The pairs of convex pieces in a scene that are not to touch.
+    """Pairs of convex pieces in a scene that must not touch.
 
     Attributes
     ----------
-    pairs (P, 2) : joint of the first; joint of the second, or -1 - the number of the world's body.
-    number (P,) : of the two pieces among those of the same pair of bodies.
-    between (P,) : joints between the two.
-    radius (P,) [m] : of the second beside its vertices: a capsule's or a sphere's.
-    points (k, 3) [m], blocks (k / 8, 3, 8) : vertices of all, as of `packed`.  hulls (P, 4) : first vertex
-        and number of vertices of both.
+    pairs (P, 2) : joint of the first; joint of the second, or -1 - the index of a body of the world.
+    number (P,) : index of the pair of pieces among those of the same two bodies.
+    between (P,) : number of joints between the two.
+    radius (P,) [m] : of the second if it is a capsule or a sphere, else zero.
+    points (k, 3) [m], blocks (k / 8, 3, 8) : all vertices, see `packed`.
+    hulls (P, 4) : first vertex and number of vertices of both.
     """
 
     def __init__(
@@ -95,16 +97,14 @@ class Shapes:
         pairs_of_links: Mapping[Pair, Sequence[tuple[Any, Any]]],
         pairs_with_world: Iterable[Pair],
     ) -> None:
-        """pairs_of_links : of two joints, with their pairs of pieces.  pairs_with_world : joint and number
-        of a body of the world.
-        """
+        """pairs_of_links : pairs of pieces by joints.  pairs_with_world : joint, index of a world body."""
         corners = [_corners(body.half) for body in world]
-        own = {id(piece): _few_of(piece) for piece in links.pieces}
-        ball = {id(piece): _ball(piece.vertices) for piece in links.pieces}
-        self.points, self.blocks, places = packed([*own.values(), *corners])
-        names: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
-        where = dict(zip(names, places, strict=True))
-        self.room = np.zeros(self.points.shape[0] + 1)
+        own = {id(piece): _thinned_piece(piece) for piece in links.pieces}
+        ball = {id(piece): _bounding_ball(piece.vertices) for piece in links.pieces}
+        self.points, self.blocks, ranges = packed([*own.values(), *corners])
+        keys: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
+        where = dict(zip(keys, ranges, strict=True))
+        self.room = np.zeros(self.points.shape[0] + 1)  # work memory of the C code
         pairs, number, hulls, balls, radius = [], [], [], [], []
         for (a, b), pieces in pairs_of_links.items():
             for k, (one, two) in enumerate(pieces):
@@ -126,18 +126,20 @@ class Shapes:
         self.hulls = np.array(hulls, dtype=np.int64).reshape(-1, 4)
         self.radius = np.array(radius, dtype=float)
         self._balls = np.array(balls, dtype=float).reshape(-1, 8)
-        up = [set(joints) for joints in links.robot.model.supports]
-        self.between = np.array([len(up[a] ^ up[b]) if b >= 0 else len(up) for a, b in pairs])
+        supports = [set(joints) for joints in links.robot.model.supports]
+        self.between = np.array(
+            [len(supports[a] ^ supports[b]) if b >= 0 else len(supports) for a, b in pairs]
+        )
         self.index = {(a, b, k): n for n, ((a, b), k) in enumerate(zip(pairs, number, strict=True))}
 
     def __len__(self) -> int:
         return len(self.pairs)
 
     def look(self, at: Placed, within: float, ways: Array, wanted: NDArray[np.bool_]) -> Looked:
-        """Gaps of the pairs ``wanted`` (P,), exact where they are less than ``within`` [m].
+        """Distances of the pairs ``wanted`` (P,); those above ``within`` [m] may be lower bounds.
 
-        ways (K, P, 3) : directions that separate them, zero where none is known; what is looked at moves
-        there.
+        ways (K, P, 3) : separating directions as initial guesses, zero if unknown; those found are written to
+            it.
         """
         (k, j), w, p = at.joints.shape[:2], at.world.shape[1], len(self)
         gaps, near = np.empty((k, p)), np.empty((k * p, 2), dtype=np.int64)
@@ -161,8 +163,9 @@ class Shapes:
     def may_meet(
         self, one: tuple[Placed, Looked], two: tuple[Placed, Looked], wanted: NDArray[np.bool_]
     ) -> tuple[Index, Index]:
-        """Instants and numbers of pairs that are apart in both, but may have met on the straight way between:
-        the first moves farther, as the second sees it, than both gaps are wide.
+        """Instants and indices of pairs that have clearance in both placements, but may penetrate in between.
+
+        These are pairs of which one moves, relative to the other, by more than the sum of both distances.
         """
         (k, j), w, p = one[0].joints.shape[:2], one[0].world.shape[1], len(self)
         near = np.empty((k * p, 2), dtype=np.int64)
@@ -177,14 +180,15 @@ class Shapes:
 
 
 class Separations:
-    """Distances of pairs at the ends of chains of n joints, less their reach, with derivatives.
+    """Distances of pairs at the ends of chains of n joints, minus their reach, with derivatives.
 
-    z (count, n + 3) : shift of the second body's frame [m], joints [rad, m].
+    z (count, n + 3) : shift of the second body's frame [m], joint positions [rad, m].
     """
 
     def __init__(self, shapes: Shapes, joints: int, pairs: Index, numbers: Array, ways: Array) -> None:
-        """pairs (count,) : numbers of pairs.  numbers (count, 13 joints + 13) : n + 1 placements, which
-        joints turn, and the reach [m].  ways (count, 3) : directions to begin at.
+        """pairs (count,) : indices of pairs.  ways (count, 3) : initial guesses of the separating directions.
+
+        numbers (count, 13 n + 13) : n + 1 placements, flags of the revolute joints, and the reach [m].
         """
         self._shapes, self._pairs, self.joints, self.count = shapes, pairs, joints, len(pairs)
         self.numbers, self.ways = np.ascontiguousarray(numbers), np.ascontiguousarray(ways, dtype=float)
@@ -193,7 +197,7 @@ class Separations:
         self.forget()
 
     def copy(self) -> Separations:
-        """The same, with numbers of its own."""
+        """Copy with separate numbers and directions."""
         return Separations(self._shapes, self.joints, self._pairs, self.numbers.copy(), self.ways.copy())
 
     def forget(self) -> None:
@@ -201,10 +205,10 @@ class Separations:
         self._seen = np.full((self.count, self.joints + 3), np.nan)
 
     def write(self, what: int, z: Array, out: Array, factors: Array | None = None) -> None:
-        """Writes values (what = 0), gradients (1), or ``factors`` times the Hessians' lower triangles, column
-        by column (2), to ``out``.
+        """Writes to ``out`` values (what = 0), gradients (1), or Hessians times ``factors`` (2).
 
-        Derivatives are those of an iterate: directions stay there. Values are of any trial.
+        Of Hessians, the lower triangles are written column by column. Derivatives are evaluated at iterates
+        and keep the directions found there as initial guesses; values are of any trial point, and do not.
         """
         z, library = np.ascontiguousarray(z), _library()
         if library is None:
@@ -223,72 +227,70 @@ class Separations:
 
 
 def packed(hulls: Sequence[Array]) -> tuple[Array, Array, list[tuple[int, int]]]:
-    """Vertices of all hulls one after the other (k, 3), each filled up to a multiple of eight; the same eight
-    by eight, with coordinates of a kind side by side (k / 8, 3, 8); first vertex and number of each hull.
+    """Vertices of all hulls, in two layouts; first vertex and number of vertices of each hull.
+
+    The first array is (k, 3), where copies of its last vertex fill each hull up to a multiple of eight. The
+    second has blocks of eight vertices with their x, y and z side by side (k / 8, 3, 8), for SIMD.
     """
     parts, where, size = [np.zeros((0, 3))], list[tuple[int, int]](), 0
     for hull in hulls:
-        vertices = hull[_neighbours(hull)]
+        vertices = hull[_clustered(hull)]
         where.append((size, len(vertices)))
-        more = -len(vertices) % _EIGHT
+        more = -len(vertices) % _BLOCK
         parts += [vertices, np.repeat(vertices[-1:], more, axis=0)]
         size += len(vertices) + more
     points = np.concatenate(parts)
-    return points, np.ascontiguousarray(points.reshape(-1, _EIGHT, 3).transpose(0, 2, 1)), where
+    return points, np.ascontiguousarray(points.reshape(-1, _BLOCK, 3).transpose(0, 2, 1)), where
 
 
-def _neighbours(vertices: Array) -> Index:
-    """Order (k,) of vertices (k, 3) in which eight by eight are close together: most of these are far below
-    the highest one in any direction, and cost no exponentials.
+def _clustered(vertices: Array) -> Index:
+    """Order (k,) of vertices (k, 3) in which each eight are close together.
+
+    In any direction most of these blocks are then far below the highest vertex, and need no exponentials.
     """
     order, parts = np.arange(len(vertices)), [slice(0, len(vertices))]
     while parts:
         own = parts.pop()
-        blocks = -(-(own.stop - own.start) // _EIGHT)
+        blocks = -(-(own.stop - own.start) // _BLOCK)
         if blocks < 2:
             continue
-        points, middle = vertices[order[own]], own.start + blocks // 2 * _EIGHT
+        points, middle = vertices[order[own]], own.start + blocks // 2 * _BLOCK
         longest = int(np.ptp(points, axis=0).argmax())
         order[own] = order[own][np.argsort(points[:, longest], kind="stable")]
         parts += [slice(own.start, middle), slice(middle, own.stop)]
     return order
 
 
-_FEW_OF: weakref.WeakKeyDictionary[Piece, Array] = weakref.WeakKeyDictionary()
+_THINNED: weakref.WeakKeyDictionary[Piece, Array] = weakref.WeakKeyDictionary()
 
 
-def _few_of(piece: Piece) -> Array:
-    """`thinned` of a piece's vertices, found once: scenes about one robot share its pieces."""
-    if piece not in _FEW_OF:
-        _FEW_OF[piece] = thinned(piece.vertices)
-    return _FEW_OF[piece]
+def _thinned_piece(piece: Piece) -> Array:
+    """`thinned` vertices of a piece, cached, as the scenes with one robot share its pieces."""
+    if piece not in _THINNED:
+        _THINNED[piece] = thinned(piece.vertices)
+    return _THINNED[piece]
 
 
 def thinned(vertices: Array) -> Array:
-    """Some of a hull's vertices (k, 3) [m]: the others are outside of their hull by `THIN` at most.
+    """Subset of a hull's vertices (k, 3) [m] such that the others are outside its hull by `THIN` at most.
 
-    They are chosen one by one, that which is farthest outside of those before. Kept on disk.
+    It is built greedily: the vertex farthest outside is added next. The result is cached on disk.
     """
-    if len(vertices) <= _FEW:
+    if len(vertices) <= _SMALL_HULL:
         return vertices
-    digest = hashlib.sha256(f"1 {THIN}".encode() + np.round(vertices, 9).tobytes()).hexdigest()
-
-    def make() -> bytes:
-        file = io.BytesIO()
-        np.save(file, _chosen(vertices))
-        return file.getvalue()
-
-    return vertices[np.load(io.BytesIO(kept("thin", digest, make)), allow_pickle=False)]
+    digest = hashlib.sha256(f"2 {THIN}".encode() + np.round(vertices, 9).tobytes()).hexdigest()
+    return vertices[cached_arrays("thin", digest, lambda: {"chosen": _chosen(vertices)})["chosen"]]
 
 
 def _chosen(vertices: Array) -> Index:
+    """Indices of `thinned` vertices; the first are the extreme ones in 26 directions of a grid."""
     grid = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
     first = (grid[np.any(grid != 0, axis=1)] @ vertices.T).argmax(axis=1)
     chosen = sorted(set(first.tolist()))
     while len(chosen) < len(vertices):
         try:
             planes = ConvexHull(vertices[chosen]).equations
-        except QhullError:  # those first ones are flat
+        except QhullError:  # the first vertices are in a plane
             return np.arange(len(vertices))
         out = (vertices @ planes[:, :3].T + planes[:, 3]).max(axis=1)
         k = int(out.argmax())
@@ -299,12 +301,12 @@ def _chosen(vertices: Array) -> Index:
 
 
 def _corners(half: Array) -> Array:
-    """Corners of a box; those of a flat or line-like box once each."""
+    """Distinct corners of a box with half sides (3,), some of which may be zero."""
     return np.unique(half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]), axis=0)
 
 
-def _ball(vertices: Array) -> tuple[float, float, float, float]:
-    """Centre and radius [m] of a sphere about them."""
+def _bounding_ball(vertices: Array) -> tuple[float, float, float, float]:
+    """Centre and radius [m] of a sphere that contains the vertices."""
     centre = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     x, y, z = centre.tolist()
     return x, y, z, float(np.linalg.norm(vertices - centre, axis=1).max())

@@ -1,4 +1,4 @@
-"""NumPy version of native/separation.c, for machines without a compiler: same numbers, 100 times slower."""
+"""NumPy version of native/separation.c, for machines without a compiler: same results, 100 times slower."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ __all__ = ["ROUNDING", "look", "may_meet", "write"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-ROUNDING = 1e-3  # [m] of supports
+ROUNDING = 1e-3  # [m] e of the smoothed support functions, see separation.py
 _SHARP = 1 / ROUNDING
-_FLOOR = 1e-4  # least curvature of a separation along its direction's tangents
-_LONGEST, _STEPS, _TRIES = 0.5, 100, 30  # [rad] a step, and how many of them
+_MIN_CURVATURE = 1e-4  # of a separation along the tangents of its direction, in Newton steps and Hessians
+_MAX_STEP, _MAX_STEPS, _MAX_TRIES = 0.5, 100, 30  # [rad]; of Newton's method, and of a line search
 
 
 class _Support(NamedTuple):
-    """Supports of m bodies in given directions: rounded supports (m,), mean (m, 3) and covariance (m, 3,
-    3) of the points that define them.
+    """Smoothed support functions of m bodies in directions u, with their weights exp(a_i . u / e) normalized.
+
+    height (m,) : values.  mean (m, 3), spread (m, 3, 3) : weighted mean, the gradient, and covariance of
+        vertices.
     """
 
     height: Array
@@ -28,29 +30,33 @@ class _Support(NamedTuple):
 
 
 class _Side(NamedTuple):
-    """Separations of m pairs in directions u from the second to the first, in the second's frame; see the
-    C code.
+    """Separations of m pairs in directions u from the second to the first, in the second's frame.
+
+    separation (m,).  slope (m, 3) : gradient by u.  point (m, 3) : support point of the first.
+    spread_one (m, 3, 3) : covariance of the first.  tangents (m, 2, 3) : unit vectors at right angles to u.
+    bend (m, 2, 2) : minus the Hessian by u on the tangents.
     """
 
     separation: Array
-    slope: Array  # w (m, 3)
+    slope: Array
     point: Array
     spread_one: Array
-    tangents: Array  # (m, 2, 3)
-    bend: Array  # (m, 2, 2)
+    tangents: Array
+    bend: Array
 
 
 def _gathered(points: Array, hulls: Index) -> tuple[Array, NDArray[np.bool_]]:
-    """Vertices (m, most, 3) of hulls (m, 2), and which of them are there."""
+    """Vertices (m, most, 3) of hulls (m, 2), padded with copies, and a mask of those that are no copies."""
     most = int(hulls[:, 1].max(initial=1))
     at = hulls[:, :1] + np.minimum(np.arange(most), hulls[:, 1:] - 1)
     return points[at], np.arange(most) < hulls[:, 1:]
 
 
-def _support(vertices: Array, there: NDArray[np.bool_], u: Array) -> _Support:
+def _support(vertices: Array, real: NDArray[np.bool_], u: Array) -> _Support:
     sharp = _SHARP
-    height = np.where(there, np.einsum("mki,mi->mk", vertices, u), -np.inf)
+    height = np.where(real, np.einsum("mki,mi->mk", vertices, u), -np.inf)
     most = height.max(axis=1)
+    # exponents relative to the largest, against overflow
     weight = np.exp(sharp * (height - most[:, None]))
     total = weight.sum(axis=1)
     weight /= total[:, None]
@@ -60,9 +66,7 @@ def _support(vertices: Array, there: NDArray[np.bool_], u: Array) -> _Support:
 
 
 class _Pairs:
-    """m pairs of bodies at their places: rotation (m, 3, 3), translation (m, 3) of the first as the second
-    sees it.
-    """
+    """m pairs of bodies; rotation (m, 3, 3) and translation (m, 3) of the first relative to the second."""
 
     def __init__(self, points: Array, hulls: Index, rotation: Array, translation: Array) -> None:
         self.one, self.two = _gathered(points, hulls[:, :2]), _gathered(points, hulls[:, 2:])
@@ -76,12 +80,13 @@ class _Pairs:
         return out
 
     def side(self, u: Array) -> _Side:
+        """Separations in directions u (m, 3)."""
         turn = self.rotation
         a = _support(*self.one, -np.einsum("mji,mj->mi", turn, u))
         b = _support(*self.two, u)
         point = np.einsum("mij,mj->mi", turn, a.mean) + self.translation
         one = turn @ a.spread @ turn.transpose(0, 2, 1)
-        away = np.eye(3)[np.abs(u).argmin(axis=1)]
+        away = np.eye(3)[np.abs(u).argmin(axis=1)]  # the axis that is least parallel to u
         x = np.cross(u, away)
         x /= np.linalg.norm(x, axis=1, keepdims=True)
         tangents = np.stack([x, np.cross(u, x)], axis=1)
@@ -93,13 +98,16 @@ class _Pairs:
         return _Side(separation, slope, point, one, tangents, bend)
 
     def separate(self, u: Array) -> tuple[Array, _Side]:
-        """The largest separations near directions u (m, 3), and these directions there."""
+        """Local maxima of the separation near directions u (m, 3), and their directions.
+
+        Newton's method on the unit sphere with line search, for all pairs at once.
+        """
         u, at = u.copy(), self.side(u)
         going = np.ones(len(u), dtype=bool)
-        for _ in range(_STEPS):
+        for _ in range(_MAX_STEPS):
             step2, gain = self._step(at)
             size = np.linalg.norm(step2, axis=1)
-            # no maximum, as bodies penetrate: along the way that it curves up
+            # stationary but no maximum, as may be if bodies penetrate: leave the saddle where it curves up
             curved, axes = np.linalg.eigh(at.bend)
             saddle = going & (size < 1e-9) & (curved[:, 0] < -1e-9)
             up = axes[saddle, :, 0]
@@ -109,27 +117,31 @@ class _Pairs:
             going &= size >= 1e-11
             if not going.any():
                 break
-            part = np.minimum(1.0, _LONGEST / np.maximum(size, 1e-300))
-            waiting = going.copy()
-            for _ in range(_TRIES):
+            part = np.minimum(1.0, _MAX_STEP / np.maximum(size, 1e-300))
+            waiting = going.copy()  # pairs whose step has not been accepted
+            for _ in range(_MAX_TRIES):
                 n = np.flatnonzero(waiting)
                 if not len(n):
                     break
                 found_u = u[n] + part[n, None] * np.einsum("mki,mk->mi", at.tangents[n], step2[n])
                 found_u /= np.linalg.norm(found_u, axis=1, keepdims=True)
                 found = self.only(_mask(n, len(u))).side(found_u)
-                fine = (found.separation >= at.separation[n] + 1e-4 * part[n] * gain[n]) | (size[n] < 1e-5)
-                u[n[fine]] = found_u[fine]
-                for mine, its in zip(at, found, strict=True):
-                    mine[n[fine]] = its[fine]
-                waiting[n[fine]] = False
-                part[n[~fine]] *= 0.4
+                # Armijo's condition; steps below 1e-5 rad are accepted without it
+                accepted = (found.separation >= at.separation[n] + 1e-4 * part[n] * gain[n]) | (
+                    size[n] < 1e-5
+                )
+                u[n[accepted]] = found_u[accepted]
+                for old, new in zip(at, found, strict=True):
+                    old[n[accepted]] = new[accepted]
+                waiting[n[accepted]] = False
+                part[n[~accepted]] *= 0.4
             low = np.linalg.eigvalsh(at.bend)[:, 0]
             going &= ~waiting & ((part * size >= 1e-7) | (low < -1e-9))
         return u, at
 
     @staticmethod
     def _step(at: _Side) -> tuple[Array, Array]:
+        """Newton steps on the tangents (m, 2), and the first-order gain of each (m,)."""
         slope2 = np.einsum("mki,mi->mk", at.tangents, at.slope)
         step2 = np.einsum("mkl,ml->mk", _inverse(at.bend), slope2)
         return step2, np.einsum("mk,mk->m", step2, slope2)
@@ -142,15 +154,17 @@ def _mask(numbers: NDArray[np.intp], size: int) -> NDArray[np.bool_]:
 
 
 def _inverse(bend: Array) -> Array:
-    """Inverse of ``bend``, made positive definite."""
+    """Inverse of ``bend`` (m, 2, 2), shifted to be positive definite."""
     least = np.linalg.eigvalsh(bend)[:, 0]
-    return np.linalg.inv(bend + np.maximum(_FLOOR - least, 0.0)[:, None, None] * np.eye(2))
+    return np.linalg.inv(bend + np.maximum(_MIN_CURVATURE - least, 0.0)[:, None, None] * np.eye(2))
 
 
 # ---------------------------------------------------------------- chains
 def _chain(n: int, z: Array, numbers: Array) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-    """Rotation (m, 3, 3) and translation (m, 3) of the end; axes and origins (m, n, 3) of joints; which of
-    them turn (m, n).
+    """Forward kinematics of chains of n joints, with z and numbers as of `Separations`.
+
+    Returns rotation (m, 3, 3) and translation (m, 3) of the end, axes and origins (m, n, 3) of the joints,
+    and a mask of the revolute ones (m, n).
     """
     m = len(z)
     places = numbers[:, : 12 * (n + 1)].reshape(m, n + 1, 12)
@@ -183,10 +197,13 @@ def write(
     if what == 0:
         out[...] = (at.separation - of.numbers[:, -1]).reshape(out.shape)
         return
+    # velocity of the first body's support point with each joint (m, n, 3)
     arm = np.where(turns[:, :, None], np.cross(axis, at.point[:, None] - origin), axis)
     if what == 1:
         out[...] = np.concatenate([u, np.einsum("mi,mki->mk", u, arm)], axis=1).reshape(out.shape)
         return
+    # Hessian s_qq - s_qu (s_uu)^-1 s_uq, see separation.py: `own` is s_qq by joints, `mixed` is s_qu on the
+    # tangents
     turning = np.where(turns[:, :, None], np.cross(u[:, None], axis), 0.0)
     spread = np.einsum("mij,mkj->mki", at.spread_one, turning)
     moved = np.concatenate([np.broadcast_to(np.eye(3), (len(z), 3, 3)), arm - _SHARP * spread], axis=1)
@@ -203,12 +220,13 @@ def write(
 
 # ---------------------------------------------------------------- all pairs
 def _relative(one: Array, two: Array) -> tuple[Array, Array]:
-    """Rotations (m, 3, 3) and translations (m, 3) of the first (m, 12) as the second sees it."""
+    """Rotations (m, 3, 3) and translations (m, 3) of placements (m, 12) relative to others (m, 12)."""
     a, b = (x[:, :9].reshape(-1, 3, 3) for x in (one, two))
     return b.transpose(0, 2, 1) @ a, np.einsum("mji,mj->mi", b, one[:, 9:] - two[:, 9:])
 
 
 def _of_pairs(shapes: Any, at: Any, spot: Index, pair: Index) -> tuple[Array, Array]:
+    """Placements of the first body relative to the second, of pairs (m,) at instants (m,)."""
     one, other = shapes.pairs[pair].T
     first = at.joints[spot, one]
     second = at.joints[spot, np.maximum(other, 0)].copy()
@@ -220,21 +238,23 @@ def _of_pairs(shapes: Any, at: Any, spot: Index, pair: Index) -> tuple[Array, Ar
 def look(
     shapes: Any, at: Any, within: float, ways: Array, wanted: NDArray[np.bool_], gaps: Array
 ) -> tuple[Index, Index]:
-    """NumPy version of `Shapes.look`: writes gaps and ways, returns the near pairs."""
+    """NumPy version of `Shapes.look`: writes gaps and directions, returns the near pairs."""
     spot, pair = (a.ravel() for a in np.indices(gaps.shape))
     other = shapes.pairs[pair, 1]
-    there = wanted[pair] & (
+    present = wanted[pair] & (
         (other >= 0) | (at.present[spot, np.maximum(-1 - other, 0)] > 0 if at.present.size else True)
     )
-    gaps[...] = 1e3
-    spot, pair = spot[there], pair[there]
+    gaps[...] = 1e3  # [m] of pairs that are not wanted or not present
+    spot, pair = spot[present], pair[present]
     turn, shift = _of_pairs(shapes, at, spot, pair)
+    # lower bounds: distance of the first's bounding ball from that of the second, or from a box of the world
     balls, world = shapes._balls[pair], shapes.pairs[pair, 1] < 0
     x = np.einsum("mij,mj->mi", turn, balls[:, :3]) + shift - np.where(world[:, None], 0.0, balls[:, 4:7])
     out = np.abs(x) - balls[:, 4:7]
     outside, deepest = np.maximum(out, 0.0), out.max(axis=1)
     box = np.where(deepest > 0, np.linalg.norm(outside, axis=1), deepest)
     bound = np.where(world, box, np.linalg.norm(x, axis=1)) - balls[:, 3] - balls[:, 7]
+    # initial direction: between the centres; from a box, its nearest corner's, edge's or face's
     face = np.where(outside.any(axis=1)[:, None], outside, np.eye(3)[out.argmax(axis=1)]) * np.where(
         x > 0, 1.0, -1.0
     )

@@ -1,4 +1,4 @@
-"""Solids as triangles, read from meshes, and how to make do with fewer of them."""
+"""Solids as triangle meshes: primitives, mesh files, and simplification."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import contextlib
 import hashlib
 import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from typing import Any
 
 import coal
 import numpy as np
@@ -21,6 +22,7 @@ from impactopt.codegen.files import kept
 __all__ = [
     "Solid",
     "box",
+    "cached_arrays",
     "capsule",
     "cylinder",
     "find_mesh",
@@ -33,13 +35,19 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-SELF_CONTAINED = (".dae", ".obj", ".stl")  # meshes whose files name no others that hold their numbers
-TO_MEAN = 1e-3  # how much a simplified vertex is drawn to the mean of those that it stands for
+SELF_CONTAINED = (
+    ".dae",
+    ".obj",
+    ".stl",
+)  # formats whose geometry is in one file, so that a hash of it identifies it
+# Weight of the mean of the merged vertices in `simplified`, relative to the quadric: without it the least
+# squares problem of flat parts has no unique solution.
+_MEAN_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
-    """A surface: vertices (n, 3) [m] and triangles (m, 3), indices counter-clockwise seen from outside."""
+    """Surface: vertices (n, 3) [m] and triangles (m, 3), indices counter-clockwise seen from outside."""
 
     vertices: Array
     triangles: NDArray[np.intp]
@@ -50,7 +58,7 @@ class Solid:
 
 
 def joined(solids: Sequence[Solid]) -> Solid:
-    """All of them as one."""
+    """Union of the surfaces as one solid."""
     counts = np.cumsum([0, *(len(s.vertices) for s in solids)])
     return Solid(
         vertices=np.concatenate([s.vertices for s in solids]),
@@ -67,26 +75,26 @@ def box(sides: ArrayLike) -> Solid:
 
 
 def rounded_box(sides: ArrayLike) -> Solid:
-    """The superellipsoid |x/a|^6 + |y/b|^6 + |z/c|^6 = 1 in a box of these sides (3,) [m]."""
+    """Superellipsoid |x/a|^6 + |y/b|^6 + |z/c|^6 = 1 in a box of these sides (3,) [m]."""
     round_ = sphere(1.0, sides=24)
     size = (np.abs(round_.vertices) ** 6).sum(axis=1) ** (1 / 6)
     return Solid(vertices=round_.vertices / size[:, None] * np.asarray(sides) / 2, triangles=round_.triangles)
 
 
 def cylinder(radius: float, length: float, *, tip: float = 1.0, sides: int = 20) -> Solid:
-    """Along z about the origin [m]; tip: the radius of its upper end over that of its lower one."""
+    """Cylinder along z about the origin [m]; tip : radius of its upper end over that of its lower one."""
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
     up = np.array([0.0, 0.0, length / 2])
     vertices = np.concatenate([radius * ring - up, radius * tip * ring + up, [-up, up]])
     k, n = np.arange(sides), (np.arange(sides) + 1) % sides
     bottom, top = np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
-    rows = ((k, n, n + sides), (k, n + sides, k + sides), (n, k, bottom), (k + sides, n + sides, top))
-    return Solid(vertices=vertices, triangles=np.concatenate([np.column_stack(row) for row in rows]))
+    triangles = ((k, n, n + sides), (k, n + sides, k + sides), (n, k, bottom), (k + sides, n + sides, top))
+    return Solid(vertices=vertices, triangles=np.concatenate([np.column_stack(t) for t in triangles]))
 
 
 def sphere(radius: float, *, sides: int = 16) -> Solid:
-    """About the origin, radius [m]."""
+    """Sphere of a radius [m] about the origin, with `sides` meridians."""
     rings, angle = sides // 2, 2 * np.pi * np.arange(sides) / sides
     polar = np.pi * np.arange(1, rings) / rings
     grid = np.stack(
@@ -100,28 +108,29 @@ def sphere(radius: float, *, sides: int = 16) -> Solid:
     vertices = radius * np.concatenate([grid, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
     k, n = np.arange(sides), (np.arange(sides) + 1) % sides
     north, south, last = np.full(sides, len(grid)), np.full(sides, len(grid) + 1), (rings - 2) * sides
-    rows = [(north, k, n), (south, last + n, last + k)]
+    triangles = [(north, k, n), (south, last + n, last + k)]
     for r in range(rings - 2):
         a, b = r * sides, (r + 1) * sides
-        rows += [(a + k, b + k, b + n), (a + k, b + n, a + n)]
-    return Solid(vertices=vertices, triangles=np.concatenate([np.column_stack(row) for row in rows]))
+        triangles += [(a + k, b + k, b + n), (a + k, b + n, a + n)]
+    return Solid(vertices=vertices, triangles=np.concatenate([np.column_stack(t) for t in triangles]))
 
 
 def capsule(radius: float, length: float, *, sides: int = 50) -> Solid:
-    """Capsule with this radius about a line of this length along z, whose middle is the origin [m]; sides:
-    4 k + 2.
+    """Capsule of a radius about a line of a length along z, with its middle at the origin [m].
+
+    sides : 4 k + 2, so that the sphere has an odd number of triangle rows; the middle row becomes the
+        cylinder.
     """
-    round_ = sphere(radius, sides=sides)  # of an odd number of rows: the middle one becomes the cylinder
+    round_ = sphere(radius, sides=sides)
     lift = np.sign(round_.vertices[:, 2:]) * [0.0, 0.0, length / 2]
     return Solid(vertices=round_.vertices + lift, triangles=round_.triangles)
 
 
 def simplified(solid: Solid, cell: float) -> Solid:
-    """One vertex in each cube of side `cell` [m], where it is nearest to the planes of all triangles there.
+    """Mesh with one vertex in each cube of side `cell` [m], nearest to the planes of all triangles there.
 
     Source: vertex clustering with quadric error; P. Lindstrom, "Out-of-core simplification of large polygonal
-    models", SIGGRAPH 2000, 259-262. Least squares, drawn a little to the mean so that flat parts have one
-    solution too.
+    models", SIGGRAPH 2000, 259-262.
     """
     v, t = solid.vertices, solid.triangles
     cube = np.floor((v - v.min(axis=0)) / cell).astype(np.int64)
@@ -135,15 +144,17 @@ def simplified(solid: Solid, cell: float) -> Solid:
     plane, offset = np.zeros((n, 9)), np.zeros((n, 3))
     for k in range(3):
         owner = cells[:, k]
-        away = ((a - mean[owner]) * normal).sum(axis=1)  # from the mean, where least squares is well scaled
+        away = ((a - mean[owner]) * normal).sum(axis=1)  # relative to the mean, for the conditioning
         plane += _sums(owner, (normal[:, :, None] * normal[:, None, :]).reshape(-1, 9), n)
         offset += _sums(owner, away[:, None] * normal, n)
     planes = plane.reshape(n, 3, 3)
-    size = np.trace(planes, axis1=1, axis2=2) + 1e-30
-    shift = np.linalg.solve(planes + (TO_MEAN * size)[:, None, None] * np.eye(3), offset[:, :, None])[:, :, 0]
+    weight = _MEAN_WEIGHT * (np.trace(planes, axis1=1, axis2=2) + 1e-30)
+    shift = np.linalg.solve(planes + weight[:, None, None] * np.eye(3), offset[:, :, None])[:, :, 0]
     vertices = mean + np.clip(shift, -cell / 2, cell / 2)
-    apart = (cells[:, 0] != cells[:, 1]) & (cells[:, 1] != cells[:, 2]) & (cells[:, 0] != cells[:, 2])
-    cells = cells[apart]
+    # keep the triangles whose corners are in three different cubes, each once: rotated to begin with the
+    # least index
+    distinct = (cells[:, 0] != cells[:, 1]) & (cells[:, 1] != cells[:, 2]) & (cells[:, 0] != cells[:, 2])
+    cells = cells[distinct]
     first = np.argmin(cells, axis=1)[:, None]
     cells = np.take_along_axis(cells, (first + np.arange(3)) % 3, axis=1)
     _, kept = np.unique((cells[:, 0] * n + cells[:, 1]) * n + cells[:, 2], return_index=True)
@@ -151,31 +162,30 @@ def simplified(solid: Solid, cell: float) -> Solid:
     return Solid(vertices=vertices[used], triangles=triangles.reshape(-1, 3))
 
 
-def _sums(label: NDArray[np.intp], rows: Array, n: int) -> Array:
-    """(n, k) sums of rows (m, k) by label."""
-    return np.stack([np.bincount(label, weights=column, minlength=n) for column in rows.T], axis=1)
+def _sums(label: NDArray[np.intp], values: Array, n: int) -> Array:
+    """Sums (n, k) of values (m, k) by label (m,)."""
+    return np.stack([np.bincount(label, weights=column, minlength=n) for column in values.T], axis=1)
 
 
-_POINTER = b"version https://git-lfs.github.com/spec/"
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 
 
 def find_mesh(name: str, urdf: Path) -> Path:
-    """The file of a mesh: a path from the URDF, or package://NAME/..., where a folder above it holds NAME.
+    """File of a mesh, by a path relative to the URDF, or package://NAME/... with NAME in a folder above it.
 
-    Packages are looked for in ROS's own folders too (ROS_PACKAGE_PATH, AMENT_PREFIX_PATH), and where
-    example-robot-data is installed.
+    Packages are also searched in ROS_PACKAGE_PATH, AMENT_PREFIX_PATH, and the installed example-robot-data.
 
     Raises
     ------
     FileNotFoundError : there is none.
     """
-    if name.startswith("package://"):  # some files have a slash too many
+    if name.startswith("package://"):  # some files have a superfluous slash
         path = Path(name.removeprefix("package://").lstrip("/"))
     else:
         path = Path(name.removeprefix("file://"))
     above = [*urdf.resolve().parents]
     places = [folder / path for folder in above]
-    if name.startswith("package://"):  # the folder may be called otherwise than the package
+    if name.startswith("package://"):  # the folder's name may differ from the package's
         places += [folder.joinpath(*path.parts[1:]) for folder in above]
         places += [folder / path for folder in _package_folders()]
     for place in places if not path.is_absolute() else [path]:
@@ -185,9 +195,9 @@ def find_mesh(name: str, urdf: Path) -> Path:
 
 
 def _package_folders() -> Iterator[Path]:
-    """Folders that packages of meshes may be in, beside a URDF's own folders."""
+    """Folders that may contain packages of meshes, besides those above a URDF."""
     for place in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
-        yield from (Path(place), Path(place).parent)  # it holds packages, or it is one
+        yield from (Path(place), Path(place).parent)  # it contains packages, or it is one
     for place in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
         yield Path(place) / "share"
     with contextlib.suppress(PackageNotFoundError):
@@ -214,11 +224,11 @@ def _lack(path: Path, _changed: int) -> str:
 
 
 def read_mesh(path: Path, scale: Array) -> Solid:
-    """The triangles of a mesh file: STL, or another kind that coal reads, such as Collada and OBJ.
+    """Solid of a mesh file: STL, or another format that coal reads, such as Collada and OBJ.
 
     Raises
     ------
-    ValueError, RuntimeError, OSError : it cannot be read, or there are no triangles in it.
+    ValueError, RuntimeError, OSError : it cannot be read, or has no triangles.
     """
     solid = _read(path, scale)
     if not len(solid.triangles):
@@ -230,39 +240,41 @@ def read_mesh(path: Path, scale: Array) -> Solid:
 
 def _read(path: Path, scale: Array) -> Solid:
     data = path.read_bytes()
-    if data.startswith(_POINTER):
+    if data.startswith(_LFS_POINTER):
         raise ValueError("it is a pointer to large-file storage; get the file itself by `git lfs pull`")
     count = int.from_bytes(data[80:84], "little")
-    if path.suffix.lower() == ".stl" and len(data) == 84 + 50 * count:  # binary; coal takes seconds for it
+    kind = path.suffix.lower()
+    if kind == ".stl" and len(data) == 84 + 50 * count:  # binary, for which coal takes seconds
         facets = np.frombuffer(data, offset=84, dtype=[("at", "<f4", (4, 3)), ("attribute", "<u2")])
         vertices = facets["at"][:, 1:].reshape(-1, 3).astype(float)
         return Solid(vertices=scale * vertices, triangles=np.arange(3 * count).reshape(-1, 3))
-    if path.suffix.lower() not in SELF_CONTAINED:  # it names other files that hold its numbers
-        return _scaled(_loaded(path), scale)
-    digest = hashlib.sha256(data + b"coal").hexdigest()
-    archive = io.BytesIO(kept("mesh", digest, lambda: _saved(_loaded(path))))
-    with np.load(archive, allow_pickle=False) as found:
-        solid = Solid(vertices=found["vertices"], triangles=found["triangles"])
-    return _scaled(solid, scale)
-
-
-def _scaled(solid: Solid, scale: Array) -> Solid:
+    if kind not in SELF_CONTAINED:  # not cached, as its geometry may be in other files
+        solid = _loaded(path)
+    else:
+        digest = hashlib.sha256(data + b"coal").hexdigest()
+        solid = Solid(**cached_arrays("mesh", digest, lambda: vars(_loaded(path))))
     return Solid(vertices=scale * solid.vertices, triangles=solid.triangles)
 
 
-def _saved(solid: Solid) -> bytes:
-    file = io.BytesIO()
-    np.savez(file, vertices=solid.vertices, triangles=solid.triangles)
-    return file.getvalue()
+def cached_arrays(kind: str, digest: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, Any]:
+    """Arrays by name, from the cache on disk (`impactopt.codegen.files.kept`), or made and stored there."""
+
+    def archive() -> bytes:
+        file = io.BytesIO()
+        np.savez(file, **make())  # type: ignore[arg-type]  # of keywords that are not arrays
+        return file.getvalue()
+
+    with np.load(io.BytesIO(kept(kind, digest, archive)), allow_pickle=False) as found:
+        return dict(found)
 
 
 def _loaded(path: Path) -> Solid:
-    """A mesh by coal: seconds for a large one."""
+    """Solid of a mesh file, read by coal, which takes seconds for a large one."""
     try:
         mesh = coal.MeshLoader().load(str(path), np.ones(3))
-    except (ValueError, RuntimeError) as error:  # the reader's own words come after the file's name
-        said = str(error).partition(str(path))[2].strip().splitlines()
-        raise ValueError(said[0].rstrip(".") if said else "no reader of meshes takes it") from error
+    except (ValueError, RuntimeError) as error:  # coal's reason comes after the file's name
+        reason = str(error).partition(str(path))[2].strip().splitlines()
+        raise ValueError(reason[0].rstrip(".") if reason else "no reader of meshes takes it") from error
     corners = [mesh.tri_indices(k) for k in range(mesh.num_tris)]
     triangles = np.array([[t[0], t[1], t[2]] for t in corners], dtype=np.intp)
     return Solid(vertices=np.array(mesh.vertices()), triangles=triangles.reshape(-1, 3))

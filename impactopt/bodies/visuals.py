@@ -5,7 +5,6 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from impactopt.bodies.convex_hulls import ROD, bare_joints, inertia_box, is_too_large, tool_solids
-from impactopt.bodies.file_shapes import geoms_of, numbers, shapes_of, urdf_root
+from impactopt.bodies.file_shapes import geoms_of, numbers, shapes_of, urdf_elements
 from impactopt.bodies.solids import Solid, box, cylinder, sphere
 from impactopt.bodies.world import WorldBody
 from impactopt.robots.attachments import Tool
@@ -23,14 +22,14 @@ from impactopt.robots.robot import Robot, Striker
 __all__ = ["Hinge", "Part", "Visual", "surroundings_of", "visuals_of"]
 
 Array = NDArray[np.float64]
-GREY = (0.72, 0.74, 0.77)  # of what has no colour of its own
+GREY = (0.72, 0.74, 0.77)  # default colour
 JOINT, BONE = (0.35, 0.37, 0.40), (0.55, 0.57, 0.60)
 THIN, THICK = ROD, 0.028  # [m] radii of a bone, and of the ball at its joint
 
 
 @dataclass(frozen=True, kw_only=True)
 class Visual:
-    """A solid in the frame of the joint of that index, and its colour (red, green, blue) in [0, 1]."""
+    """Solid in the frame of a joint, by index, with its colour (red, green, blue) in [0, 1]."""
 
     joint: int
     solid: Solid
@@ -38,14 +37,12 @@ class Visual:
 
 
 def visuals_of(robot: Robot) -> list[Visual]:
-    """The robot's visual shapes; tools are rods, with a bar across the end of a hammer.
+    """Visual shapes of the robot; tools are rods, with a bar across the end of a hammer.
 
-    What has lost its meshes, or has too large ones, is drawn by boxes of the links' inertia and bones between
-    the joints, and so is a robot without shapes.
+    Boxes of the links' inertia and bones between the joints replace shapes that are too large or whose meshes
+    are missing, and all shapes of a robot without any.
     """
-    found = [] if robot.urdf is None else _from_urdf(robot, Path(robot.urdf))
-    if robot.mjcf is not None:
-        found = _from_mjcf(robot, robot.mjcf)
+    found = _from_urdf(robot) if robot.mjcf is None else _from_mjcf(robot, robot.mjcf)
     known = {visual.joint for visual in found}
     found = [v for v in found if not is_too_large(robot.model, v.joint, v.solid.vertices)]
     if not found:
@@ -55,13 +52,10 @@ def visuals_of(robot: Robot) -> list[Visual]:
     return [*found, *(visual for tool in robot.tools for visual in _of_tool(robot, tool))]
 
 
-def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
-    root = urdf_root(urdf)
-    if root is None:
-        return []
-    colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
+def _from_urdf(robot: Robot) -> list[Visual]:
+    colours = {m.get("name", ""): _colour(m) for m in urdf_elements(robot.urdf, "material")}
     found = []
-    for shape in shapes_of(robot.model, root, urdf, "visual"):
+    for shape in shapes_of(robot.model, robot.urdf, "visual"):
         material = shape.element.find("material")
         colour = None if material is None else _colour(material) or colours.get(material.get("name", ""))
         found.append(Visual(joint=shape.joint, solid=shape.solid, colour=colour or GREY))
@@ -80,7 +74,7 @@ def _from_mjcf(robot: Robot, mjcf: str) -> list[Visual]:
 
 
 def _colour(material: ElementTree.Element) -> tuple[float, float, float] | None:
-    """The <color> of a <material>; None if it has none, or none that can be read."""
+    """Colour of a <material>; None if it has none, or none that can be read."""
     colour = material.find("color")
     try:
         red, green, blue, _ = numbers("" if colour is None else colour.get("rgba", ""), 4).tolist()
@@ -104,7 +98,7 @@ def _from_inertia(robot: Robot) -> list[Visual]:
 
 
 def _of_tool(robot: Robot, tool: Tool) -> Iterator[Visual]:
-    """A tool as large as it is, with a ball at a rod's end."""
+    """Visuals of a tool, with a ball at a rod's end."""
     frame = robot.model.frames[robot.model.getFrameId(tool.own_frame)]
     solids = tool_solids(tool)
     if tool.bar is None:
@@ -115,7 +109,7 @@ def _of_tool(robot: Robot, tool: Tool) -> Iterator[Visual]:
 
 
 def _bones_to(robot: Robot, strikers: Iterable[Striker]) -> list[Visual]:
-    """Sticks from the frame of each striker to its striking point, with a ball there."""
+    """Bones from the frame of each striker to its striking point, with a ball there."""
     model, found = robot.model, []
     for striker in strikers:
         frame = model.frames[model.getFrameId(striker.frame)]
@@ -136,11 +130,11 @@ def _bone(joint: int, end: Array) -> list[Visual]:
     return [Visual(joint=joint, solid=solid.moved(turn, np.zeros(3)), colour=BONE)]
 
 
-LARGE = 0.6  # [m] sides of what stands still and would hide the robot
+LARGE = 0.6  # [m] fixed targets with a longer side are drawn transparent, as they would hide the robot
 
 
 class Hinge(NamedTuple):
-    """A line through ``place`` (3,) [m] along ``axis`` (3,), and how far [m] from it the blow comes down."""
+    """Line through ``place`` (3,) [m] along ``axis`` (3,); ``arm`` [m] is its distance from the hit point."""
 
     place: Array
     axis: Array
@@ -149,11 +143,11 @@ class Hinge(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Part:
-    """A solid in the world, before the blow.
+    """Solid in the world, at its place before contact.
 
-    kind : "target", what the blow moves; "held", what holds it, or a target that stands still; "obstacle".
-    moves : along the normal with the target; with a hinge it turns about that instead.
-    clear : the robot is to be seen through it.
+    kind : "target" for a target that moves; "held" for its supports, or a fixed target; "obstacle".
+    moves : moves along the normal with the target; with a hinge it turns about that instead.
+    clear : is drawn transparent.
     """
 
     kind: str
@@ -163,7 +157,7 @@ class Part:
     clear: bool = False
 
     def placed(self, travel: float, normal: Array) -> Array:
-        """Its vertices (k, 3) [m] when the target has moved so far [m] along the normal."""
+        """Its vertices (k, 3) [m] after a `travel` [m] of the target along the normal."""
         vertices = self.solid.vertices
         if self.hinge is None:
             return vertices + travel * normal if self.moves else vertices
@@ -172,10 +166,10 @@ class Part:
 
 
 def surroundings_of(world: Sequence[WorldBody]) -> list[Part]:
-    """Drawable parts of `ImpactProblem.world`: all but the ground, and cores, which are no objects.
+    """Drawable parts of `ImpactProblem.world`: all except the ground and the cores of targets.
 
-    A board that lies on two supports is drawn as two halves. Each tips over the inner edge of its support as
-    far as the blow has moved the middle, so that it bends a little, and opens when it is broken.
+    A board on two supports is drawn as two halves. Each turns about the inner edge of its support as
+    far as the middle has moved: the board bends a little, and opens when it breaks.
     """
     parts: list[Part] = []
     for body in world:
@@ -192,12 +186,12 @@ def surroundings_of(world: Sequence[WorldBody]) -> list[Part]:
 
 
 def _half(board: WorldBody, support: WorldBody) -> Part:
-    """The half of a board that lies on this support."""
+    """Half of a board that lies on this support."""
     wide, high, thick = board.half
     across, _, _ = board.rotation.T @ (support.place - board.place)
-    way = float(np.sign(across))
+    side = float(np.sign(across))
     edge = float(abs(across) - support.half[0])
-    middle, inner = np.array([way * wide / 2, 0.0, 0.0]), np.array([way * edge, 0.0, thick])
+    middle, inner = np.array([side * wide / 2, 0.0, 0.0]), np.array([side * edge, 0.0, thick])
     solid = box([wide, 2 * high, 2 * thick]).moved(board.rotation, board.place + board.rotation @ middle)
-    hinge = Hinge(board.place + board.rotation @ inner, way * board.rotation[:, 1], edge)
+    hinge = Hinge(board.place + board.rotation @ inner, side * board.rotation[:, 1], edge)
     return Part(kind="target", solid=solid, moves=True, hinge=hinge)

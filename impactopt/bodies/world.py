@@ -1,4 +1,4 @@
-"""Bodies of the world: shapes that users give, the ground, the target and what holds it, obstacles."""
+"""Bodies of the world: shapes that users give, the ground, the target with its supports, obstacles."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Vector = tuple[float, float, float]
 
 
 def vector(name: str, value: Sequence[float]) -> Vector:
-    """Three finite numbers; InputError names what is wrong."""
+    """Checked vector of three finite numbers."""
     x, y, z = check_array(name, value, (3,), most=FARTHEST).tolist()
     return x, y, z
 
@@ -120,7 +120,7 @@ class Obstacle(Described):
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Its middle (3,) [m]."""
+        """Centre (3,) [m]."""
         if self.size is not None or self.start is None or self.end is None:
             return np.array(self.position)
         return (np.array(self.start) + np.array(self.end)) / 2
@@ -138,7 +138,7 @@ class Obstacle(Described):
 
     @property
     def rotation(self) -> NDArray[np.float64]:
-        """(3, 3) axes in the world, as columns."""
+        """Rotation (3, 3); columns are the axes in the world."""
         if self.size is None:
             if self._length < 1e-9:
                 return np.eye(3)
@@ -162,9 +162,9 @@ class Ground(Described):
 
 
 def face_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) rows: the normal, the direction across (level, to the left), and up, at right angles to both.
+    """Orthonormal axes of a target's face as rows (3, 3): normal, across (level, to the left), up.
 
-    Of a normal that is vertical, across is the world's y.
+    For a vertical normal, across is the world's y.
     """
     level = np.cross([0.0, 0.0, 1.0], normal)
     size = float(np.linalg.norm(level))
@@ -173,14 +173,16 @@ def face_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 Array = NDArray[np.float64]
-BEHIND = 0.08  # [m] behind its face a target is its core, which the striker has not to reach before contact
-DEEP = 0.5  # [m] how far the core goes
+# [m] The core of a target begins so far behind its face. The striker must not touch it before contact, so
+# that it cannot come through the target from behind.
+BEHIND = 0.08
+CORE_DEPTH = 0.5  # [m]
 FLOOR, THICK = 10.0, 0.5  # [m] half sides of the ground
-# [m] of targets: (across, up, deep)
+# [m] sizes of targets: (across, up, deep)
 BOX, WALL, BOARD, BLOCK = (0.18, 0.18, 0.18), (1.5, 1.5, 0.1), (0.30, 0.24, 0.02), (0.2, 0.2, 0.06)
-SUPPORT = (0.04, 0.24, 0.12)  # under either end of a board
-NAIL_LENGTH, NAIL_RADIUS = 0.07, 0.004
-# by the target's kind: in a word, and its sides; of others a box
+SUPPORT = (0.04, 0.24, 0.12)  # [m] of the supports at both ends of a board
+NAIL_LENGTH, NAIL_RADIUS = 0.07, 0.004  # [m]
+# description and default size by the target's class; others are a box
 USUAL: dict[type[Target], tuple[str, tuple[float, ...]]] = {
     RigidWall: ("wall", WALL),
     Board: ("board on two supports", BOARD),
@@ -190,12 +192,13 @@ USUAL: dict[type[Target], tuple[str, tuple[float, ...]]] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorldBody:
-    """A box of half sides ``half`` (3,) [m], inflated by ``radius`` [m], at ``place``, axes ``rotation``.
+    """Box of half sides ``half`` (3,) [m], inflated by ``radius`` [m], at ``place``, with axes ``rotation``.
 
-    half zero: a sphere; only its last number not zero: a capsule along its z axis.
-    of_target : it comes and goes with the target.  moves : with it, along the normal.
-    strikable : the link that strikes may touch it.  before : it is there until contact only.
-    core : of the target, which the striker is to reach from its face.  ground : it is the floor.
+    It is a sphere if half is zero, and a capsule along z if only its last number is not zero.
+
+    of_target : is present only if the target is.  moves : moves with the target along the normal.
+    strikable : the striking link may touch it.  before : is present until contact only.
+    core : core of the target, see `BEHIND`.  ground : is the floor.
     """
 
     name: str
@@ -212,20 +215,20 @@ class WorldBody:
 
     @cached_property
     def shape(self) -> Any:
-        """Shape for coal."""
+        """Its shape in coal."""
         if not self.radius:
             return coal.Box(*(2 * self.half))
         return coal.Capsule(self.radius, 2 * self.half[2]) if self.half[2] > 0 else coal.Sphere(self.radius)
 
     @property
     def solid(self) -> Solid:
-        """Its surface as triangles, to draw, in the world."""
+        """Its surface as triangles in the world, for pictures."""
         own = capsule(self.radius, 2 * self.half[2]) if self.radius else cuboid(2 * self.half)
         return own.moved(self.rotation, self.place)
 
 
 def ground_body(height: float) -> WorldBody:
-    """The half-space below a height [m], as a large box."""
+    """Half-space below a height [m], as a large box."""
     return WorldBody(
         name="ground",
         half=np.array([FLOOR, FLOOR, THICK]),
@@ -236,7 +239,7 @@ def ground_body(height: float) -> WorldBody:
 
 
 def _usual(body: TargetBody, target: Target) -> tuple[str, tuple[float, ...]]:
-    """Default appearance of a target for which the problem gives no size: its shape, and its sides [m]."""
+    """Description and sides [m] of a target for which the problem gives no size."""
     if body.shape == "ball":
         return "ball", BOX[:1]
     for kind, usual in USUAL.items():
@@ -246,7 +249,7 @@ def _usual(body: TargetBody, target: Target) -> tuple[str, tuple[float, ...]]:
 
 
 def body_message(body: TargetBody, target: Target) -> str:
-    """The target's body in words, with its size, and whether that was assumed."""
+    """Description of the target's body with its size, and whether that is assumed."""
     if body.shape == "none":
         return "none: nothing keeps off it"
     word, size = _usual(body, target)
@@ -255,18 +258,19 @@ def body_message(body: TargetBody, target: Target) -> str:
 
 
 def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array) -> list[WorldBody]:
-    """Bodies of a target: its face's middle is at the point, and it extends from there along the normal."""
-    rows = face_axes(normal)  # normal, across, up
-    axes = np.column_stack([rows[1], rows[2], rows[0]])  # of boxes: across, up, deep
+    """Bodies of a target, whose face has its middle at the point; they extend from there along the normal."""
+    normal, left, up = face_axes(normal)
+    axes = np.column_stack([left, up, normal])  # of boxes: across, up, deep
 
-    def solid(name: str, half: Array, deep: float, across: float = 0.0, **how: Any) -> WorldBody:
-        """Its middle is so deep behind the face [m]."""
+    def solid(name: str, half: Array, deep: float, across: float = 0.0, **flags: Any) -> WorldBody:
+        """Body with its middle so deep behind the face, and so far across [m]."""
         place = point + axes @ np.array([across, 0.0, deep])
-        return WorldBody(name=name, half=half, place=place, rotation=axes, of_target=True, **how)
+        return WorldBody(name=name, half=half, place=place, rotation=axes, of_target=True, **flags)
 
-    def box(name: str, size: Any, start: float = 0.0, across: float = 0.0, **how: Any) -> WorldBody:
+    def box(name: str, size: Any, start: float = 0.0, across: float = 0.0, **flags: Any) -> WorldBody:
+        """Box of these sides [m] that begins so deep behind the face."""
         half = np.asarray(size, dtype=float) / 2
-        return solid(name, half, start + half[2], across, **how)
+        return solid(name, half, start + half[2], across, **flags)
 
     if body.shape == "none":
         return []
@@ -286,22 +290,23 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
     if isinstance(target, Board):
         across = (size[0] - SUPPORT[0]) / 2
         post = (SUPPORT[0], size[1], SUPPORT[2])
-        supports = [
-            box("target's support", post, size[2], way * across) for way in (-1.0, 1.0)
-        ]  # what held the board stays when it is broken
+        # the supports stay when the board is broken
+        supports = [box("target's support", post, size[2], side * across) for side in (-1.0, 1.0)]
         main = box("target", size, moves=True, strikable=True, before=True)
         return [main, *supports, _core(box, size)]
     return [box("target", size, moves=moves, strikable=True), _core(box, size)]
 
 
 def _core(box: Any, size: tuple[float, ...]) -> WorldBody:
-    """Core behind the face, which keeps a striking link from coming through from behind."""
-    body: WorldBody = box("target from behind", (size[0], size[1], DEEP), BEHIND, before=True, core=True)
+    """Core of the target behind its face, see `BEHIND`."""
+    body: WorldBody = box(
+        "target from behind", (size[0], size[1], CORE_DEPTH), BEHIND, before=True, core=True
+    )
     return body
 
 
 def obstacle_bodies(obstacles: tuple[Obstacle, ...]) -> list[WorldBody]:
-    """The user's boxes and capsules."""
+    """Bodies of the user's boxes and capsules."""
     return [
         WorldBody(
             name=o.name,

@@ -1,1 +1,1 @@
-"""The command line: one file a command, registered in `app.py`; `options.py` has what several take."""
+"""Command line: one file a command, registered in `app.py`; `options.py` has shared options."""

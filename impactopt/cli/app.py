@@ -1,8 +1,8 @@
-"""The command line: `impactopt solve`, and the commands that it gathers.
+"""Command line application: the command `impactopt solve`, and the registration of all others.
 
-What is heavy (Pinocchio, CasADi, matplotlib) is imported by the commands that need it: `--help` is quick.
-Exit codes: 0 done; 1 the answer is no: not solved, fallen in a replay, no such collision; 2 bad input; 70 a
-fault of ours; 130 Ctrl-C.
+Heavy packages (Pinocchio, CasADi, matplotlib) are imported in the commands that need them, so that `--help`
+is quick. Exit codes: 0 done; 1 the answer is no: not solved, fallen in a replay, no such collision; 2 bad
+input; 70 a fault of ours; 130 Ctrl-C.
 """
 
 from __future__ import annotations
@@ -100,14 +100,16 @@ def solve(
     ] = None,
     solver: SolverName = None,
     start: Annotated[
-        Start, typer.Option(help="What to start from: a plain reach, or the hardest strike near it.")
+        Start, typer.Option(help="Initial guess: a plain reach, or the hardest strike near it.")
     ] = Start.reach,
     starts: Starts = 1,
     workers: Workers = 1,
     seed: Seed = 0,
     store: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Start from the nearest plan kept there, and keep this one too."),
+        typer.Option(
+            metavar="DIR", help="Warm start from the nearest plan stored there; store this one too."
+        ),
     ] = None,
     time_limit: TimeLimit = None,
     settings: Settings = None,
@@ -123,13 +125,13 @@ def solve(
         ),
     ] = False,
 ) -> None:
-    """Plan the motion that a problem asks for, replay it in full dynamics, write numbers and pictures.
+    """Plan the motion of a problem, replay it in full dynamics, write numbers and pictures.
 
-    Ctrl-C, or SIGTERM, stops the solver; its best iterate is kept. What is not solved goes to DIR/failed if
-    there is a good result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
+    Ctrl-C, or SIGTERM, stops the solver; its best iterate is kept. A failed result goes to DIR/failed if
+    there is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
-    said = "interrupted before there was a plan to keep"
-    with plain_errors(said, verbose=verbose, keeps=True) as console:
+    interrupted = "interrupted before there was a plan to keep"
+    with plain_errors(interrupted, verbose=verbose, keeps=True) as console:
         from impactopt.cli.replays import compared_record
         from impactopt.errors import printable
         from impactopt.files.output import keep_record, make_directory, set_aside
@@ -146,7 +148,7 @@ def solve(
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
-            progress.say("building the program (compiles for some ten seconds the first time)")
+            progress.say("building the nonlinear program (compiles for some ten seconds the first time)")
             processes = workers if starts > 1 else 1
             chosen |= {"start": start.value, "starts": starts, "workers": processes, "seed": seed}
             chosen |= {"report": progress.say, "callback": progress.iteration if processes == 1 else None}
@@ -156,7 +158,7 @@ def solve(
                 kept = SolvedFolder(store)
                 solution, near = kept.solve(problem, read, **chosen)
                 kept.keep(solution, read)
-                progress.say(f"started from {near}" if near else f"no plan in {store} is near enough")
+                progress.say(f"warm start from {near}" if near else f"no plan in {store} is near enough")
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
             if solution.caution:
                 progress.say(solution.caution)
@@ -166,7 +168,7 @@ def solve(
             record.summary.update(command=command_line(context), ok=solution.status.usable)
             written = [*keep_record(record, directory)]
         _show(record, as_json, solution.status.usable)
-        from impactopt.report.pictures import save_pictures  # matplotlib only now
+        from impactopt.report.pictures import save_pictures  # loads matplotlib
 
         with progress:
             progress.say("drawing pictures")

@@ -1,4 +1,4 @@
-"""The command `impactopt collide`: one collision, from a posture or from the contact of a saved result."""
+"""Command `impactopt collide`: one collision, from a posture or from the contact of a saved result."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from impactopt.cli.options import (
 from impactopt.report.plain_errors import plain_errors
 
 NO_COLLISION = 1  # exit code
-OFTEN = 16  # freezes of a saved result: a plan's contacts are long
+RESULT_FREEZES = 16  # default for a saved result, as the contacts of plans are long
 
 
 class Model(str, enum.Enum):
@@ -58,13 +58,16 @@ def collide(
     freezes: Annotated[
         int | None,
         typer.Option(
-            metavar="N", min=0, help=f"Freezes of the sdc on the way; left out: {OFTEN} for a result, else 0."
+            metavar="N",
+            min=0,
+            help=f"Further freezes of the sdc (default: {RESULT_FREEZES} for a result, else 0).",
         ),
     ] = None,
     accuracy: Annotated[
         float,
         typer.Option(
-            metavar="PCT", help="Warn if the estimated error of freezing is above this share of the impulse."
+            metavar="PCT",
+            help="Warn if the estimated error of freezing is above this percentage of the impulse.",
         ),
     ] = 1.0,
     settings: Settings = None,
@@ -75,7 +78,7 @@ def collide(
     """Compute one collision, from a posture or as in a saved plan or strike, without a motion.
 
     Prints impulse, peak force, duration, ZMP margin and torques. For the sdc it also prints the estimated
-    error of freezing, and what to do if that is above --accuracy. With a posture, the striking point moves
+    error of freezing, with advice if that is above --accuracy. With a posture, the striking point moves
     along the normal at --speed with the least kinetic energy, the soles are at rest, and the servo's
     reference keeps the joint velocities. A result has its own reference, which keeps the soles in place; its
     planned numbers are printed too. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
@@ -89,7 +92,7 @@ def collide(
         check_loudness(quiet, verbose)
         if not 0 < accuracy < math.inf:
             raise typer.BadParameter(f"{accuracy:g}; give a number > 0", param_hint="--accuracy")
-        saved = os.path.isdir(what)  # also of names that are too long for one
+        saved = os.path.isdir(what)  # False also for names that are too long
         if not saved and speed is None:
             raise typer.BadParameter("missing; only a result has a speed of its own", param_hint="--speed")
         if saved and posture is not None:
@@ -98,7 +101,7 @@ def collide(
         read = problem_of_result(what).changed(changes) if saved else read_problem_file(what, changes)
         at_contact: dict[str, Any] = {"model": model.value}
         if freezes is None and saved and model is Model.sdc:
-            freezes = OFTEN
+            freezes = RESULT_FREEZES
         at_contact |= {} if freezes is None else {"freezes": freezes}
         at_contact |= {"result": str(what.resolve())} if saved else {}
         at_contact |= {} if posture is None else {"posture": posture}

@@ -1,4 +1,4 @@
-"""The command `impactopt compare`: results beside each other."""
+"""Command `impactopt compare`: comparison of results."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def compare(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare results: their numbers, where their problems and versions differ, their force, ZMP and torque.
+    """Compare results: numbers, differences of problems and versions, force, ZMP and torque.
 
     Exit code: 0 compared, 2 bad input.
     """
     with plain_errors("interrupted before the results were compared"):
         from impactopt.errors import printable
         from impactopt.files.output import load_record, make_directory, write_file
-        from impactopt.report.comparison import compare as put_together
+        from impactopt.report.comparison import compare as comparison_of
 
         names = _names(results)
-        found = put_together({name: load_record(path) for name, path in zip(names, results, strict=True)})
+        found = comparison_of({name: load_record(path) for name, path in zip(names, results, strict=True)})
         text, written = json.dumps(found.describe(), indent=2), []
         if out is not None:
             from impactopt.report.pictures.compare import comparison_picture
@@ -61,7 +61,7 @@ def compare(
 
 
 def _names(results: Sequence[Path]) -> list[str]:
-    """The directories' own names; as they were given where two have the same.
+    """Names of the directories; their paths as given if two have the same name.
 
     Raises
     ------

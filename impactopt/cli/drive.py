@@ -1,4 +1,4 @@
-"""The command `impactopt drive`: blows on a nail until it is in."""
+"""Command `impactopt drive`: a series of blows on a nail until it is in."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def drive(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Plan a series of blows on a nail until it is in, each for the depth that the one before has reached.
+    """Plan a series of blows on a nail until it is in, each from the depth that the one before has reached.
 
-    A series that ends before that is written to DIR/failed if DIR has one whose nail is in. Exit code: 0 it
+    A series that ends earlier is written to DIR/failed if DIR has a complete one. Exit code: 0 the nail
     is in, 1 it is not, 2 bad input.
     """
     with plain_errors("interrupted before the nail was in", verbose=verbose) as console:

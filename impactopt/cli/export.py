@@ -1,4 +1,4 @@
-"""The command `impactopt export`: a saved plan as files for other programs."""
+"""Command `impactopt export`: a saved plan as files for other programs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 from impactopt.cli.options import AsJson, OtherProblem, print_json
 from impactopt.report.plain_errors import plain_errors
 
-# what is done with the files where they go, said when they are written
+# commands that use the files, printed after writing them
 NEXT = {
     "ros2": "ros2 action send_goal --stdin /joint_trajectory_controller/follow_joint_trajectory "
     "control_msgs/action/FollowJointTrajectory < {directory}/motion.yaml",
@@ -59,14 +59,14 @@ def export(
         bool,
         typer.Option(
             "--gravity/--no-gravity",
-            help="Whether effort holds the arm against gravity; not, if its controller does.",
+            help="Whether effort includes gravity compensation; not, if the controller does it.",
         ),
     ] = True,
     smooth: Annotated[
         str | None,
         typer.Option(
             metavar="A,J",
-            help="No jumps: the nearest motion with at most A rad/s^2 and J rad/s^3, for bolted arms whose "
+            help="Smooth: the nearest motion with at most A rad/s^2 and J rad/s^3, for bolted arms whose "
             "controllers refuse more.",
         ),
     ] = None,
@@ -75,7 +75,7 @@ def export(
 ) -> None:
     """Write a plan for other programs: reference, feed-forward, gains, contact, abort motion.
 
-    What each format has and loses, and how to run it there: docs/howto/export.md. An earlier export to the
+    Contents and losses of each format, and how to use it: docs/howto/export.md. An earlier export to the
     same format in DIR is replaced.
 
     Exit code: 0 written, 2 bad input.
@@ -87,17 +87,17 @@ def export(
 
         planned = load_planned(result, problem_file=problem)
         folder = result if result.is_dir() else result.parent
-        beside = folder.parent if folder.name.strip(".") else folder.resolve().parent  # not in "."
-        directory = out if out is not None else beside / f"{folder.resolve().name}_{to.value}"
+        parent = folder.parent if folder.name.strip(".") else folder.resolve().parent  # also for "." and ".."
+        directory = out if out is not None else parent / f"{folder.resolve().name}_{to.value}"
         names = None if joints is None else [name.strip() for name in joints.split(",")]
-        most = None if smooth is None else _limits(smooth)
+        limits = None if smooth is None else _limits(smooth)
         written = export_planned(
-            planned, to.value, directory, rate=rate, joints=names, gravity=gravity, smooth=most
+            planned, to.value, directory, rate=rate, joints=names, gravity=gravity, smooth=limits
         )
-        cost = None if most is None else json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
+        cost = None if limits is None else json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
         if as_json:
-            told = {"to": to.value, "directory": str(directory), "files": [str(path) for path in written]}
-            print_json(told | ({} if cost is None else {"smooth": cost}), True)
+            summary = {"to": to.value, "directory": str(directory), "files": [str(path) for path in written]}
+            print_json(summary | ({} if cost is None else {"smooth": cost}), True)
             return
         for path in written:
             typer.echo(printable(str(path)))

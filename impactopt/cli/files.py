@@ -1,4 +1,4 @@
-"""The commands about problem files and what they can name: `check`, `new`, `problems`, `robots`."""
+"""Commands about problem files, problems and robots: `check`, `new`, `problems`, `robots`."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 def check(
     file: ProblemPath, settings: Settings = None, as_json: AsJson = False, verbose: Verbose = False
 ) -> None:
-    """Say whether a problem file is sound and its target within reach; else every mistake, and its fix.
+    """Check that a problem file is sound and its target within reach; list every mistake with its fix.
 
-    What to fix first stands first. With --json {"ok", "file", "hash", "problem", "doubts"}, or {"ok",
+    The mistake to fix first comes first. With --json {"ok", "file", "hash", "problem", "doubts"}, or {"ok",
     "file", "mistakes"}. Exit code: 0 sound, 2 not.
     """
     with plain_errors("interrupted", verbose=verbose):
@@ -46,35 +46,35 @@ def check(
             found = Mistakes()
             found.found += hopeless(problem)
             found.raise_if_any(str(file))
-            doubtful = [
+            warnings = [
                 text for text in (too_weak(problem), *sticks_out(problem), *doubts(problem.robot)) if text
             ]
         except InputError as error:
             if not as_json:
                 raise
             first, *rest = str(error).splitlines()
-            told = {"sound": False, "file": str(file), "mistakes": [m.strip() for m in rest] or [first]}
-            print_json(told, False)
+            summary = {"sound": False, "file": str(file), "mistakes": [m.strip() for m in rest] or [first]}
+            print_json(summary, False)
             raise typer.Exit(BAD_INPUT) from None
         if as_json:
-            told = {"sound": True, "file": str(file), "hash": problem.hash, "problem": problem.describe()}
-            print_json(told | {"doubts": doubtful}, True)
+            summary = {"sound": True, "file": str(file), "hash": problem.hash, "problem": problem.describe()}
+            print_json(summary | {"doubts": warnings}, True)
             return
         typer.echo(printable(f"{file} is sound:"))
         plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
         for name, value in (problem.describe() | plain).items():
-            for text in value if name in ("inertias", "notes", "followers") else [_in_words(value)]:
+            for text in value if name in ("inertias", "notes", "followers") else [_as_text(value)]:
                 typer.echo(printable(f"  {name:<10} {text}"))
         if lost := _lost_meshes(problem.robot):
             typer.echo(printable(f"  {'meshes':<10} {lost}"))
         if strength := _strength(problem):
             typer.echo(printable(f"  {'strength':<10} {strength}"))
-        for doubt in doubtful:
-            typer.echo(printable(f"  {'doubt':<10} {doubt}"))
+        for warning in warnings:
+            typer.echo(printable(f"  {'doubt':<10} {warning}"))
 
 
 def _strength(problem: ImpactProblem) -> str:
-    """Estimated fraction of the hardest blow nearby that this one reaches; "" if that is not known."""
+    """Estimated impulse as a percentage of the hardest blow nearby, as a message; "" if it is not known."""
     from impactopt.problem.strength import best_share
 
     found = best_share(problem)
@@ -86,44 +86,41 @@ def _strength(problem: ImpactProblem) -> str:
 
 
 def _lost_meshes(robot: Robot) -> str:
-    """Message about a robot's meshes that are missing or unreadable, and the consequences; "" if there are
-    none.
-    """
-    from impactopt.bodies.file_shapes import lost_meshes, urdf_root
+    """Message about missing or unreadable meshes of a robot, and the consequences; "" if there are none."""
+    from impactopt.bodies.file_shapes import lost_meshes
 
-    root = None if robot.urdf is None else urdf_root(Path(robot.urdf))
-    found = {} if root is None or robot.urdf is None else lost_meshes(robot.model, root, Path(robot.urdf))
-    lacks = dict(sorted(pair for several in found.values() for pair in several.items()))
-    if not lacks:
+    found = lost_meshes(robot.model, robot.urdf)
+    reasons = dict(sorted(pair for meshes in found.values() for pair in meshes.items()))
+    if not reasons:
         return ""
-    kinds = {lack: [name for name, other in lacks.items() if other == lack] for lack in lacks.values()}
+    by_reason = {why: [name for name, other in reasons.items() if other == why] for why in reasons.values()}
     each = (
-        f"{names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)} {lack}"
-        for lack, names in kinds.items()
+        f"{names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)} {why}"
+        for why, names in by_reason.items()
     )
-    where = (
+    fix = (
         "; put them into a folder above the URDF, or name the folder of their package in ROS_PACKAGE_PATH"
-        if "is not found" in kinds
+        if "is not found" in by_reason
         else ""
     )
     return (
-        f"{len(lacks)} are lost, and boxes of inertia stand for links without any: {'; '.join(each)}{where}"
+        f"{len(reasons)} are lost, and boxes of inertia stand for links without any: {'; '.join(each)}{fix}"
     )
 
 
 def _with_units(thing: Any) -> str:
-    """`SpringDamper, stiffness 10000 N/m, damping 300 N s/m` of a law or target."""
+    """Law or target as text, such as `SpringDamper, stiffness 10000 N/m, damping 300 N s/m`."""
     from impactopt.contact.fields import abouts
 
-    numbers = [(field.name, getattr(thing, field.name), told.unit) for field, told in abouts(type(thing))]
+    numbers = [(field.name, getattr(thing, field.name), about.unit) for field, about in abouts(type(thing))]
     parts = [f"{name} {value:g} {unit}".rstrip() for name, value, unit in numbers if isinstance(value, float)]
     return ", ".join([type(thing).__name__, *parts]) if parts else repr(thing)
 
 
-def _in_words(value: Any) -> str:
-    """A value of `ImpactProblem.describe` as a person writes it."""
+def _as_text(value: Any) -> str:
+    """Value of `ImpactProblem.describe` as readable text."""
     if isinstance(value, list):
-        return ("; " if value and isinstance(value[0], str) else ", ").join(_in_words(one) for one in value)
+        return ("; " if value and isinstance(value[0], str) else ", ").join(_as_text(one) for one in value)
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -158,10 +155,10 @@ def new(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print a problem file to start from, with a comment to each key; without a name, list the problems.
+    """Print a problem file to start from, with a comment on each key; without a name, list the problems.
 
-    Keys that the problem leaves out stand there as comments with their defaults. With --urdf or --mjcf the
-    file is drafted for that robot: soles, strikers, a posture, a target, and guesses of what its description
+    Keys that the problem leaves out are included as comments with their defaults. With --urdf or --mjcf the
+    file is drafted for that robot: soles, strikers, a posture, a target, and guesses for what its description
     lacks. --json prints the file as `toml` and its tables as `data`, or the list.
     """
     with plain_errors("interrupted"):
@@ -222,7 +219,7 @@ def _draft(
 
 
 def _give(text: str, out: Path | None, as_json: bool = False) -> None:
-    """Print a file's text, or write it where there is none yet; as JSON what is in it, too."""
+    """Prints a file's text, or writes it to a new file; as JSON also its data."""
     from impactopt.codegen.files import write_atomically
     from impactopt.errors import InputError
     from impactopt.files.problem_file.toml import read_toml
@@ -235,8 +232,8 @@ def _give(text: str, out: Path | None, as_json: bool = False) -> None:
         except OSError as error:
             raise InputError(f"cannot write {out}: {error.strerror}") from error
     if as_json:
-        place = None if out is None else str(out)
-        print_json({"file": place, "toml": text, "data": read_toml(text)}, True)
+        path = None if out is None else str(out)
+        print_json({"file": path, "toml": text, "data": read_toml(text)}, True)
     elif out is None:
         typer.echo(text, nl=False)
 

@@ -1,4 +1,4 @@
-"""The command `impactopt identify`: contact laws from a measured log of blows."""
+"""Command `impactopt identify`: contact laws from a measured log of impacts."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def identify(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="A contact law, as problem files call it; may be repeated. Left out: all of them.",
+            help="A contact law, by its name in problem files; may be repeated (default: all of them).",
         ),
     ] = None,
     target_mass: Annotated[
         float | None,
-        typer.Option(metavar="KG", help="Mass of a target that is free; left out: it stays, as a load cell."),
+        typer.Option(metavar="KG", help="Mass of a free target (default: it is fixed, as a load cell)."),
     ] = None,
     problem: Annotated[
         Path | None,
         typer.Option(
             metavar="PROBLEM",
-            help="Problem whose robot, striker and normal the joint positions are of.",
+            help="Problem with the robot, striker and normal of the joint positions.",
             autocompletion=complete_problem,
         ),
     ] = None,
@@ -51,10 +51,10 @@ def identify(
     as_json: AsJson = False,
     verbose: Verbose = False,
 ) -> None:
-    """Find stiffness, damping and effective mass from a log of one blow or several, with 95 % intervals.
+    """Find stiffness, damping and effective mass from a log of one or more impacts, with 95 % intervals.
 
-    Each contact law is fitted by least squares on the collision of two masses. Prints the laws, the best
-    first, and what not to believe. Exit code: 0 done, 2 bad input.
+    Each contact law is fitted by least squares to the collision of two masses. Prints the laws, the best
+    first, and cautions. Exit code: 0 done, 2 bad input.
     """
     with plain_errors("interrupted before the laws were fitted", verbose=verbose):
         import numpy as np
@@ -71,7 +71,9 @@ def identify(
         else:
             of = load_problem(problem)
             if of.friction is not None:
-                raise InputError(f"{problem}: [friction]: laws are fitted to a blow without it: leave it out")
+                raise InputError(
+                    f"{problem}: [friction]: laws are fitted to impacts without it: leave it out"
+                )
             measured = read_log(log, robot=of.robot, striker=of.striker, normal=of.normal)
         mass = np.inf if target_mass is None else target_mass
         found = fit(measured, target_mass=mass, laws=law or LAWS)

@@ -19,12 +19,12 @@ NOT_SOLVED = 1  # exit code
 
 
 def complete_problem(incomplete: str) -> list[str]:
-    """Names of problems, and files, that begin like this: for the shell, which waits for it."""
+    """Completions of a problem's name or file, for the shell. It has to be quick."""
     return _complete(incomplete, "")
 
 
 def complete_sweep(incomplete: str) -> list[str]:
-    """The same of sweeps."""
+    """Completions of a sweep's name or file, for the shell."""
     from impactopt.files.folders import SWEEPS
 
     return _complete(incomplete, SWEEPS)
@@ -42,15 +42,15 @@ def _complete(incomplete: str, folder: str) -> list[str]:
 
 
 def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
-    """Keys of the problem that the command names, or of any, that begin like this.
+    """Completions of a key, of the problem that the command names, or of any problem.
 
-    To know all keys takes seconds of imports: those of a file are kept in the cache, as long as it and our
-    sources stay as they are.
+    Finding all keys takes seconds of imports. So they are cached, until the problem file or our sources
+    change.
     """
     from impactopt.codegen.files import kept
     from impactopt.files.folders import named_files
 
-    # where the option's value is still to come, click has not made arguments of the words before it
+    # if the option's value is still missing, click has not assigned the words before it to parameters
     name = str(context.params.get("file") or next(iter(context.args), ""))
     text = ""
     with contextlib.suppress(OSError, UnicodeDecodeError, ValueError):
@@ -62,13 +62,13 @@ def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
         return "\n".join(_setting_keys(text)).encode()
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a cache that cannot be used
+        warnings.simplefilter("ignore")  # about a cache that cannot be used
         paths = kept("keys", hashlib.sha256(known.encode()).hexdigest(), make).decode().splitlines()
     return [f"{path}=" for path in paths if path.startswith(incomplete)]
 
 
 def _setting_keys(text: str) -> list[str]:
-    """Key paths of a problem file's text; of any problem where that is none."""
+    """Key paths of a problem file's text; of any problem if it is not valid TOML."""
     from impactopt.files.problem_file.reading import key_paths
     from impactopt.files.problem_file.toml import TOMLError, read_toml
 
@@ -116,12 +116,10 @@ TimeLimit = Annotated[
     typer.Option(metavar="SECONDS", help="Time limit of the solver, whose best iterate is kept."),
 ]
 Starts = Annotated[
-    int, typer.Option(min=1, help="Multistart: number of starts, all but the first drawn; the best is kept.")
+    int, typer.Option(min=1, help="Multistart: number of initial guesses; all but the first are random.")
 ]
-Workers = Annotated[
-    int, typer.Option(min=1, help="Processes for what can be done side by side: starts, replays, a baseline.")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the starts that are drawn.")]
+Workers = Annotated[int, typer.Option(min=1, help="Parallel processes, for starts, replays and a baseline.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the random starts.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Verbose = Annotated[
@@ -129,13 +127,14 @@ Verbose = Annotated[
 ]
 
 
-def print_json(told: Mapping[str, Any], ok: bool) -> None:
-    """Prints what a command has to tell, as JSON; its first key is `ok` for every command: exit code 0."""
-    typer.echo(json.dumps({"ok": ok} | {key: value for key, value in told.items() if key != "ok"}, indent=2))
+def print_json(summary: Mapping[str, Any], ok: bool) -> None:
+    """Prints the result of a command as JSON; its first key is `ok` for every command: exit code 0."""
+    fields = {key: value for key, value in summary.items() if key != "ok"}
+    typer.echo(json.dumps({"ok": ok} | fields, indent=2))
 
 
 class _Plain:
-    """Mixin of commands in whose help flags have no type beside them."""
+    """Mixin of commands whose help shows flags without a type."""
 
     def get_params(self, context: Any) -> Any:
         found = super().get_params(context)  # type: ignore[misc]
@@ -146,32 +145,32 @@ class _Plain:
 
 
 class PlainCommand(_Plain, TyperCommand):
-    """Command with flags without a type."""
+    """Command whose help shows flags without a type."""
 
 
 class PlainGroup(_Plain, TyperGroup):
-    """Commands together, with flags without a type."""
+    """Group of commands whose help shows flags without a type."""
 
 
 def check_loudness(quiet: bool, verbose: bool) -> None:
-    """BadParameter if both are asked for."""
+    """BadParameter if both are given."""
     if quiet and verbose:
         raise typer.BadParameter("give one of them", param_hint="--quiet, --verbose")
 
 
 def examples(*lines: str) -> str:
-    """Examples as the end of a command's help."""
+    """Examples for the end of a command's help."""
     return "\n\n".join(["Examples:", *(f"  {line}" for line in lines)])
 
 
 def check_time_limit(seconds: float | None) -> None:
-    """BadParameter if it is none."""
+    """BadParameter unless it is positive."""
     if seconds is not None and not seconds > 0:
         raise typer.BadParameter(f"{seconds:g}; give seconds > 0", param_hint="--time-limit")
 
 
 def command_line(context: typer.Context) -> str:
-    """The command as it was given, for the record: its name, arguments, and options that were set."""
+    """Command line of a command, for the record: its name, arguments, and the options that were given."""
     words = ["impactopt", str(context.info_name)]
     for parameter in context.command.params:
         name, value = str(parameter.name), context.params[str(parameter.name)]

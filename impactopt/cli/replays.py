@@ -1,4 +1,4 @@
-"""Replays of a plan in both engines and its baseline, side by side on processes where that was asked for."""
+"""Replays of a plan in both engines, and its baseline, in parallel processes if requested."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ def compared_record(
     baseline: bool,
     workers: int,
 ) -> Record:
-    """The solution as numbers, with its replays and its baseline, where there is something to replay.
+    """Record of a solution with its replays and its baseline, if it can be replayed.
 
-    workers : processes that do these side by side; 1: one after the other, here.
+    After Ctrl-C, or if processes do not start, the record has the results that are finished.
 
-    Ctrl-C, and processes that do not start, keep the plan with what is done.
+    workers : parallel processes; 1: none, one job after the other.
     """
     jobs = [*(_engines(solution, progress) if validate else ()), *([BASELINE] if baseline else ())]
     if solution.status is Status.INTERRUPTED:
         jobs = []
-    told = {
+    names = {
         "pinocchio": "replay in full dynamics",
         "mujoco": f"replay {'on free soles' if solution.problem.soles else 'in MuJoCo'}",
         BASELINE: "search for the hardest minimum-jerk reach",
@@ -49,19 +49,21 @@ def compared_record(
     done, failed = dict[str, Any](), dict[str, str]()
     why = ""
     try:
-        for job, found in _side_by_side(solution, jobs, told, min(workers, len(jobs)), progress):
+        for job, found in _in_parallel(solution, jobs, names, min(workers, len(jobs)), progress):
             if isinstance(found, str):
                 failed[job] = found
-                progress.say(f"no result of the {told[job]}: {found}")
+                progress.say(f"no result of the {names[job]}: {found}")
             else:
                 done[job] = found
     except KeyboardInterrupt:
         why = "interrupted"
     except InputError as error:  # the processes do not start
         why = str(error)
-    if left := [job for job in jobs if job not in done and job not in failed]:
-        progress.say(f"{why}; the plan is kept without results of: {', '.join(told[job] for job in left)}")
-        failed |= dict.fromkeys(left, why)
+    if missing := [job for job in jobs if job not in done and job not in failed]:
+        progress.say(
+            f"{why}; the plan is kept without results of: {', '.join(names[job] for job in missing)}"
+        )
+        failed |= dict.fromkeys(missing, why)
     record = record_of(
         solution,
         simulation=done.get("pinocchio"),
@@ -75,23 +77,23 @@ def compared_record(
 
 
 def _engines(solution: Solution, progress: SolveConsole) -> list[str]:
-    """The engines that can replay the plan; why there are none is told."""
+    """Engines that can replay the plan; if there are none, the console shows the reason."""
     violation = solution.result.max_violation
     if solution.status is Status.INTERRUPTED:
-        progress.say("no replay of what was interrupted; `impactopt validate` does it")
+        progress.say("no replay after an interruption; `impactopt validate` does it")
     elif not violation <= VIOLATED:
-        progress.say(f"no replay: what meets its constraints only to {violation:.2g} is no plan")
+        progress.say(f"no replay: the constraints are violated by up to {violation:.2g}")
     else:
         return ["pinocchio", *(["mujoco"] if has_mujoco() else [])]
     return []
 
 
-def _side_by_side(
-    solution: Solution, jobs: list[str], told: dict[str, str], workers: int, progress: SolveConsole
+def _in_parallel(
+    solution: Solution, jobs: list[str], names: dict[str, str], workers: int, progress: SolveConsole
 ) -> Iterator[tuple[str, Any]]:
-    """Each job's name with its result, or with the reason why there is none.
+    """Each job with its result, or with the reason why there is none.
 
-    told : what each job is, for the user.
+    names : names of the jobs in messages.
 
     Raises
     ------
@@ -99,10 +101,10 @@ def _side_by_side(
     """
     if workers < 2:
         for job in jobs:
-            progress.say(told[job])
+            progress.say(names[job])
             yield job, _done(solution, job)
         return
-    progress.say(f"side by side: {', '.join(told[job] for job in jobs)}")
+    progress.say(f"in parallel: {', '.join(names[job] for job in jobs)}")
     with contextlib.closing(each_on_workers(_done, solution, enumerate(jobs), workers=workers)) as results:  # type: ignore[type-var]
         for k, found in results:
             died = isinstance(found, Died)
@@ -110,7 +112,7 @@ def _side_by_side(
 
 
 def _done(solution: Solution, job: str) -> Any:
-    """The replay in an engine, or the baseline's numbers; a text where that cannot be had."""
+    """Result of the replay in an engine, or of the baseline; the reason as text if there is none."""
     try:
         if job == BASELINE:
             return minimum_jerk_baseline(solution.problem).describe()

@@ -1,4 +1,4 @@
-"""The command `impactopt show`: a result, or the bodies of a robot, as one page for a browser; or live."""
+"""Command `impactopt show`: a page for the browser of a result or of a robot's bodies, static or live."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from impactopt.report.report import Report
 
 PAGE = "report.html"
-BODIES = "results"  # where the page of a robot goes
+BODIES = "results"  # default directory of a robot's page
 
 
 def show(
@@ -26,7 +26,7 @@ def show(
         Path,
         typer.Argument(
             metavar="RESULT|ROBOT",
-            help="What `impactopt solve` wrote, such as results/punch; or a robot, as `impactopt robots` "
+            help="Directory of `impactopt solve`, such as results/punch; or a robot, as `impactopt robots` "
             "lists them; or a problem file (.toml), for its robot and its world.",
         ),
     ],
@@ -64,11 +64,11 @@ def show(
         ),
     ] = None,
 ) -> None:
-    """Write a result as one page: numbers, plots, the robot's motion, how it was made. It needs no network.
+    """Write a result as one page with numbers, plots, motion, problem and command; it needs no network.
 
-    For a robot the page shows its bodies: hulls over its meshes, and which may touch.
+    For a robot the page shows its bodies: hulls over its meshes, and the pairs that may touch.
 
-    Exit code: 0 written, 2 bad input, 130 Ctrl-C, which is how a live page ends.
+    Exit code: 0 written, 2 bad input, 130 Ctrl-C, which ends a live page.
     """
     if port is not None and not live:
         raise typer.BadParameter("it is for --live alone", param_hint="--port")
@@ -96,7 +96,7 @@ def show(
 
 
 def _sheet(result: Path, problem: Path | None, file: Path) -> None:
-    """Write the contact sheet of a result."""
+    """Writes the contact sheet of a result."""
     with plain_errors("interrupted before the picture was written"):
         from impactopt.errors import printable
         from impactopt.files.output import make_directory
@@ -112,16 +112,16 @@ def _sheet(result: Path, problem: Path | None, file: Path) -> None:
 
 
 def _live(what: Path, problem: Path | None, port: int | None, open_: bool) -> None:
-    """Serve the page of a result."""
-    with plain_errors("the live page has ended"), _page(what, problem, port or 0) as look:
-        typer.echo(f"{look.address} (Ctrl-C ends it)")
+    """Serves the live page of a result or of a problem file."""
+    with plain_errors("the live page has ended"), _page(what, problem, port or 0) as page:
+        typer.echo(f"{page.address} (Ctrl-C ends it)")
         if open_:
-            webbrowser.open(look.address)
-        look.run()
+            webbrowser.open(page.address)
+        page.run()
 
 
 def _page(what: Path, problem: Path | None, port: int) -> PlanPage | CollisionPage:
-    """Page of a result, or of a problem file's collision."""
+    """Live page of a result, or of a problem file's collision."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file
     from impactopt.files.replay import load_planned, resumed
@@ -132,21 +132,19 @@ def _page(what: Path, problem: Path | None, port: int) -> PlanPage | CollisionPa
         planned = load_planned(what, problem_file=problem)
         return PlanPage(resumed(planned.record, planned.problem), port=port)
     if what.suffix != ".toml" or problem is not None:
-        raise InputError(
-            f"--live is for a result, or for a problem file alone: {str(what)!r} does not say what is hit"
-        )
+        raise InputError(f"--live is for a result, or for a problem file alone: {str(what)!r} has no target")
     return CollisionPage(read_problem_file(what).build(), port=port)
 
 
 def _is_robot(what: Path) -> bool:
-    """A name of a robot that is no file's or directory's, or a problem file."""
+    """True for a problem file, and for a robot's name that no file or directory has."""
     from impactopt.robots.presets import robot_names
 
     return what.suffix == ".toml" or (str(what) in robot_names() and not os.path.exists(what))
 
 
 def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
-    """The page of a result, and where it goes."""
+    """Page of a result, and its default path."""
     from impactopt.errors import InputError, did_you_mean
     from impactopt.files.output import load_record
     from impactopt.files.replay import load_planned
@@ -165,7 +163,7 @@ def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
 
 
 def _bodies(what: Path, problem: Path | None) -> tuple[Report, Path]:
-    """The page of a robot's bodies, and where it goes."""
+    """Page of a robot's bodies, and its default path."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file
     from impactopt.report.robot_page import bodies_page, bodies_page_of_problem

@@ -1,4 +1,4 @@
-"""The command `impactopt strike`: the hardest blow by itself."""
+"""Command `impactopt strike`: the hardest blow by itself, without a motion."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def strike(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Find the posture and velocity at contact that hit hardest, with no motion that leads to them.
+    """Find the posture and velocity at contact that hit hardest, without a motion that leads to them.
 
-    From several starts, as local optima differ much. What is not solved goes to DIR/failed if there is a good
-    result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
+    It has several initial guesses, as local optima differ much. A failed result goes to DIR/failed if there
+    is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
         from impactopt.errors import printable
@@ -67,7 +67,7 @@ def strike(
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = None if out is None else make_directory(out)
-            progress.say("building the program (compiles for some ten seconds the first time)")
+            progress.say("building the nonlinear program (compiles for some ten seconds the first time)")
             solution = optimize_strike(
                 problem,
                 method=method,

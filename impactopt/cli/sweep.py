@@ -1,4 +1,4 @@
-"""The command `impactopt sweep`: many cases of one problem."""
+"""Command `impactopt sweep`: many cases of one problem."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def sweep(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Address of a Dask scheduler, tcp://host:port, whose workers do the cases.",
+            help="Address of a Dask scheduler, tcp://host:port, whose workers compute the cases.",
         ),
     ] = None,
     again: Annotated[
@@ -45,7 +45,7 @@ def sweep(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Another value for a key of the sweep file, as draw.count=100; of the problem's, as "
+            help="Change a key of the sweep file, as draw.count=100, or of the problem, as "
             "set.target.mass=8; may be repeated.",
         ),
     ] = None,
@@ -55,12 +55,12 @@ def sweep(
         bool, typer.Option("--verbose", "-v", help="A line after every case, and the traceback of an error.")
     ] = False,
 ) -> None:
-    """Do every case of a sweep file, and write one table of them: DIR/table.parquet, and DIR/figure.png.
+    """Compute all cases of a sweep file, and write them as one table: DIR/table.parquet, and DIR/figure.png.
 
-    Each finished case is on disk at once: after Ctrl-C, a kill or a power cut the same command goes on. A
+    Each finished case is saved at once: after Ctrl-C, a kill or a power cut the same command resumes. A
     case that fails is a row with its reason. Exit code: 0 done, 1 no case has a usable result, 2 bad input.
     """
-    interrupted = f"interrupted; what is finished is in {out}, and the same command goes on from there"
+    interrupted = f"interrupted; finished cases are in {out}, and the same command resumes the sweep"
     with plain_errors(interrupted, verbose=verbose) as console:
         from impactopt.files.problem_file import parse_settings
         from impactopt.sweeps import read_sweep_file
@@ -70,8 +70,8 @@ def sweep(
         check_loudness(quiet, verbose)
         chosen = read_sweep_file(file, parse_settings(settings or ()))
         with SweepConsole(console, quiet=quiet, verbose=verbose) as shown:
-            told: dict[str, Any] = {"report": shown.say, "progress": shown.progress}
-            result = run(chosen, out, workers=workers, scheduler=scheduler, again=again, **told)
+            callbacks: dict[str, Any] = {"report": shown.say, "progress": shown.progress}
+            result = run(chosen, out, workers=workers, scheduler=scheduler, again=again, **callbacks)
         if as_json:
             print_json(result.summary(), result.failed < result.done)
         else:
@@ -96,14 +96,15 @@ def _show(result: SweepResult) -> None:
     table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
     rows = {
         "without a usable result": str(result.failed),
-        "there from before": str(result.resumed),
+        "from an earlier run": str(result.resumed),
         "this run": f"{words_for_time(result.seconds)}, {result.rate_per_second:.3g} cases a second",
         "most memory of a worker": f"{result.peak_worker_mb:.0f} MB",
     }
     if result.best is not None:
         rows["largest impulse"] = f"{result.best:.2f} N s, in case {result.best_case}"
     if result.iterations:
-        rows["iterations"] = ", ".join(f"{n:.0f} from a {start}" for start, n in result.iterations.items())
+        iterations = (f"{n:.0f} from a {guess}" for guess, n in result.iterations.items())
+        rows["iterations"] = ", ".join(iterations)
     for name, value in rows.items():
         table.add_row(name, value)
     console = output()

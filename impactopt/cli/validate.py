@@ -1,4 +1,4 @@
-"""The command `impactopt validate`: replay a result, in the world as planned or in another one."""
+"""Command `impactopt validate`: replay of a result, as planned or with perturbations."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def validate(
         ),
     ],
     engine: Annotated[
-        Engine, typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: soles are held.")
+        Engine, typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: fixed soles.")
     ] = Engine.mujoco,
     out: Annotated[
         Path | None,
@@ -50,7 +50,9 @@ def validate(
     ] = None,
     controller: Annotated[
         Controller,
-        typer.Option(help="servo: of the joints; wbc: whole-body controller, set as the problem file says."),
+        typer.Option(
+            help="servo: of the joints; wbc: whole-body controller, with the problem file's settings."
+        ),
     ] = Controller.servo,
     contact: Annotated[
         Contact,
@@ -94,9 +96,9 @@ def validate(
     push_time: Annotated[float, typer.Option(metavar="S", help="How long it lasts.")] = 0.1,
     push_way: Annotated[float, typer.Option(metavar="RAD", help="Its angle from x, to the left.")] = 0.0,
 ) -> None:
-    """Replay a result with nothing held, as planned or with perturbations: does the robot stand?
+    """Replay a result on free soles, as planned or with perturbations: does the robot stand?
 
-    Exit code: 0 stands (or the engine holds the soles), 1 fell, 2 bad input.
+    Exit code: 0 stands (or the engine fixes the soles), 1 fell, 2 bad input.
     """
     with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
         from impactopt.errors import printable
@@ -149,8 +151,8 @@ def validate(
 
                 text = f"{json.dumps({'ok': ok, **done.report}, indent=2)}\n".encode()
                 written.append(directory / "replay.json")
-                drawn = directory / "replay.png"  # of another replay, or of none
-                write_file(written[0], lambda file: file.write(text), before=lambda: remove_file(drawn))
+                old_picture = directory / "replay.png"  # of an earlier replay
+                write_file(written[0], lambda file: file.write(text), before=lambda: remove_file(old_picture))
                 written += save_pictures(done.record, directory, ["replay"])
             if animation is not None:
                 progress.say("drawing the motion")
@@ -166,8 +168,8 @@ def validate(
             console.print(replay_table(done.report, planned.record.summary))
             if beyond := done.record.summary.get("gear_caution"):
                 console.print(printable(str(beyond)), markup=False, highlight=False)
-            if told := touch_message(done.report):
-                console.print(told, highlight=False, markup=False)
+            if message := touch_message(done.report):
+                console.print(message, highlight=False, markup=False)
             for path in written:
                 console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
         if not ok:

@@ -1,4 +1,4 @@
-"""The command `impactopt verify`: is a result what it says, computed anew computed anew?"""
+"""Command `impactopt verify`: independent check of a saved result."""
 
 from __future__ import annotations
 
@@ -28,10 +28,9 @@ def verify(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Compute every constraint, the objective and the KKT residual of a result anew, trusting nothing of the
-    solver.
+    """Recompute all constraints, the objective and the KKT residual of a result, independently of the solver.
 
-    Exit code: 0 all is as it says, 1 it is not, or part of it could not be computed, 2 bad input.
+    Exit code: 0 all agree, 1 some do not, or could not be computed, 2 bad input.
     """
     with plain_errors("interrupted before the result was verified", verbose=verbose) as stderr:
         from impactopt.files.output import plain
@@ -40,7 +39,7 @@ def verify(
 
         check_loudness(quiet, verbose)
         with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
-            progress.say(f"{result}: computing its constraints, and their slopes by differences")
+            progress.say(f"{result}: computing its constraints, and their derivatives by differences")
             verdict = verified(result, problem_file=problem)
         if as_json:
             print_json(plain(verdict.describe()), verdict.ok)

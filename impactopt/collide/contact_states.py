@@ -1,9 +1,9 @@
-"""States at contact of many rows: posture, velocity and feed-forward torque, in compiled code.
+"""States of a robot at contact for many cases: posture, velocity and feed-forward torque, in compiled code.
 
-`impactopt.kinematics.operational_space` has the same for one state, by Pinocchio and least squares; they
-are tested against each other. That takes some milliseconds a state, which for millions would be hours.
+`impactopt.kinematics.operational_space` computes the same for one state, by Pinocchio and least squares; each
+is tested against the other. It takes some milliseconds a state, which for millions of states would be hours.
 
-A robot's posture in a row is one of a few, found once each, with joints moved from there.
+A case's posture is one of a few, each found once, with changes of some joint angles.
 """
 
 from __future__ import annotations
@@ -32,21 +32,23 @@ from impactopt.transcription.batched import BatchedFunction
 
 __all__ = ["ContactStates", "Posture", "States", "striking_functions"]
 
-_BASE = 100.0  # [m/s], [rad/s]
+# [m/s], [rad/s] In the place of velocity limits of the base, which has none. It is so large that base
+# velocities cost next to nothing: they follow from the constraints of the legs.
+_BASE_VELOCITY_SCALE = 100.0
 
 
 def striking_functions(robot: Robot, *, striker: str, stance: Stance) -> dict[str, Any]:
-    """Compiled ca.Functions of a robot on a stance whose soles are held exactly.
+    """Compiled ca.Functions for the states at contact of a robot whose stance's frames are fixed exactly.
 
     * ``least_energy`` (q (nq), -) -> (B (nv, 3), G (3, 3), J (3, nv)): J is the striking point's linear
-      Jacobian, and with P the inverse inertia of the robot as held B = P J' and G = J P J'. A velocity
-      v = B x has the least kinetic energy of all that move the striking point at G x.
-    * ``least_rates``: likewise with the sum of squares of the joints' speeds over their limits in place of
-      the kinetic energy.
-    * ``holding`` ((q, v), -) -> tau (n) [N m]: the least-norm torque and wrenches that keep all velocities as
-      they are.
+      Jacobian. With the inverse inertia P of the constrained robot, B = P J' and G = J P J'. The velocity
+      v = B x has the least kinetic energy of all that give the striking point the velocity G x.
+    * ``least_rates``: likewise with the sum of squares of the joint velocities over their limits in the
+      place of the kinetic energy.
+    * ``holding`` ((q, v), -) -> tau (n) [N m]: torque for zero acceleration; torque and constraint wrenches
+      together have the least norm.
 
-    The second input of each is empty, and outputs lie one after the other by columns.
+    The second input of each is empty. Outputs are joined in one vector, matrices by columns.
     """
     frame, held = robot.striker(striker).model_frame, stance.constraint_frames(robot)
 
@@ -59,14 +61,13 @@ def striking_functions(robot: Robot, *, striker: str, stance: Stance) -> dict[st
 
 
 class _StrikingGraphs:
-    """Quantities that depend on the robot's tree in SX, dense algebra in MX, as in `FrozenDynamics`."""
+    """Graphs of `striking_functions`: algebra on the kinematic tree in SX, dense algebra in MX."""
 
     def __init__(self, robot: Robot, held: tuple[str, ...], frame: str) -> None:
         self.rb = RigidBody(robot.model, springs=robot.springs)
         self.n, self.base = robot.n, robot.nv - robot.n
         self.nq, self.nv, self.held, self.frame = robot.nq, robot.nv, held, frame
-        # the base's speeds are those that the legs leave it: they cost next to nothing
-        self.ease = np.concatenate([np.full(self.base, _BASE), robot.velocity_limit])
+        self.velocity_scale = np.concatenate([np.full(self.base, _BASE_VELOCITY_SCALE), robot.velocity_limit])
 
     def least_energy(self) -> Any:
         H = self.rb.mass_matrix()
@@ -78,19 +79,20 @@ class _StrikingGraphs:
         return self._mobility("least_energy", lambda q: inverse_root(inertia(q)))
 
     def least_rates(self) -> Any:
-        return self._mobility("least_rates", lambda q: ca.MX(ca.diag(ca.DM(self.ease))))
+        return self._mobility("least_rates", lambda q: ca.MX(ca.diag(ca.DM(self.velocity_scale))))
 
     def _mobility(self, name: str, root: Callable[[Any], Any]) -> Any:
-        """Function of the mobility W of a configuration, with W' W the inverse of the least quantity."""
+        """ca.Function q -> (B, G, J); root : q -> W, with W' W the inverse of the minimized form's matrix."""
         q, none = ca.MX.sym("q", self.nq), ca.MX.sym("none", 0)
-        rows = ca.Function("rows", [self.rb.q], [ca.densify(self.rb.jacobian(self.frame)[:3, :]), self._held])
-        J, J_c = rows(q)
+        point = ca.densify(self.rb.jacobian(self.frame)[:3, :])
+        J, J_c = ca.Function("jacobians", [self.rb.q], [point, self._held])(q)
         W = root(q)
         hand = ca.mtimes(W, J.T)
         if self.held:
-            soles = ca.mtimes(W, J_c.T)
-            R = _inverse_of_cholesky(soles.size2())(ca.mtimes(soles.T, soles))
-            hand = hand - ca.mtimes(soles, ca.mtimes(R.T, ca.mtimes(R, ca.mtimes(soles.T, hand))))
+            # the projection I - Q Q' imposes the constraints; Q = W J_c' R' is an orthonormal basis of W J_c'
+            held = ca.mtimes(W, J_c.T)
+            R = _inverse_of_cholesky(held.size2())(ca.mtimes(held.T, held))
+            hand = hand - ca.mtimes(held, ca.mtimes(R.T, ca.mtimes(R, ca.mtimes(held.T, hand))))
         return ca.Function(name, [q, none], [_column(ca.mtimes(W.T, hand), ca.mtimes(hand.T, hand), J)])
 
     def holding(self) -> Any:
@@ -102,7 +104,8 @@ class _StrikingGraphs:
         if not self.held:
             return ca.Function("holding", [state, none], [_column(of_joints)])
         J_b, J_j = J_c[:, : self.base], J_c[:, self.base :]
-        # least |tau|^2 + |w|^2 with J_b' w = b_base and tau = b_joints - J_j' w
+        # least |tau|^2 + |w|^2 with J_b' w = b_base and tau = b_joints - J_j' w, by the normal equations in w
+        # with the matrix I + J_j J_j', and a Schur complement for the base's equations
         R = _inverse_of_cholesky(J_c.size1())(ca.DM.eye(J_c.size1()) + ca.mtimes(J_j, J_j.T))
         y, U = ca.mtimes(R, ca.mtimes(J_j, of_joints)), ca.mtimes(R, J_b)
         if self.base:
@@ -113,7 +116,7 @@ class _StrikingGraphs:
 
     @property
     def _held(self) -> Any:
-        """J_c (c, nv)."""
+        """Jacobians J_c (c, nv) of the constrained frames."""
         frames = [self.rb.jacobian(frame) for frame in self.held]
         return ca.densify(ca.vertcat(ca.SX(0, self.nv), *frames))
 
@@ -125,32 +128,39 @@ def _column(*parts: Any) -> Any:
 Array = NDArray[np.float64]
 Reasons = NDArray[np.object_]
 
-_BLOCK = 256  # states a call of a compiled function
-_UNTIL = 2.1  # of a planned contact: how long its reference is known, for other targets too
-_LONG = 0.1  # [s] likewise, where a record does not say
-_OFF = 1e-6  # [m/s] at 1 m/s, across what can be moved
+_BLOCK = 256  # states in one call of a compiled function
+# Duration of a servo's reference: relative to the planned contact, as with other targets contact may last
+# longer; and [s] if the record has no contact.
+_REFERENCE_TIME, _DEFAULT_REFERENCE_TIME = 2.1, 0.1
+_VELOCITY_ERROR = 1e-6  # [m/s] permitted of the striking point, at 1 m/s
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posture:
-    """Posture that rows start from: q (nq,); of a saved result also its velocity v (nv,), torque (n,) [N m]
-    and its servo's reference, the settings of `coasting_reference`.
+    """Posture q (nq,) that the joint angles of cases are relative to.
 
     polygon (k, 2) [m] : support polygon; without corners on a fixed base.
+    v (nv,), torque (n,) [N m], reference : of a saved result, its velocity, torque, and the reference of its
+    servo,
+        settings as of `coasting_reference`.
     """
 
     q: Array
     polygon: Array
     v: Array | None = None
     torque: Array | None = None
-    bend: Mapping[str, Array] | None = None
+    reference: Mapping[str, Array] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class States:
-    """States at contact of N rows: q (N, nq), v (N, nv), torque (N, n) [N m], the striking point's speed
-    along the normal (N) [m/s], the effective mass there (N) [kg], and why a row is impossible, "" where it is
-    not; of a result also the settings `reference` (N, n, k) and `reference_until` (N)."""
+    """States at contact of N cases.
+
+    q (N, nq), v (N, nv), torque (N, n) [N m].
+    speed (N) [m/s], mass (N) [kg] : speed and effective mass of the striking point along the normal.
+    reason (N) : why a case is impossible; "" if it is possible.
+    reference (N, n, k), reference_until (N) : settings of the servo's reference, of a saved result.
+    """
 
     q: Array
     v: Array
@@ -162,23 +172,24 @@ class States:
     reference_until: Array | None = None
 
     @property
-    def bend(self) -> dict[str, Array]:
-        """Settings of the servo's reference, a row each; none of a posture."""
+    def reference_settings(self) -> dict[str, Array]:
+        """Settings of the servo's reference, one of each a case; empty without a saved result."""
         if self.reference is None or self.reference_until is None:
             return {}
         return {"reference": self.reference, "reference_until": self.reference_until}
 
-    def some(self, rows: NDArray[np.intp]) -> States:
-        """States of these rows alone."""
-        kept: dict[str, Any] = {name: None if x is None else x[rows] for name, x in vars(self).items()}
+    def some(self, cases: NDArray[np.intp]) -> States:
+        """States of the cases with these indices."""
+        kept: dict[str, Any] = {name: None if x is None else x[cases] for name, x in vars(self).items()}
         return States(**kept)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContactStates:
-    """States at contact of one robot on one stance.
+    """Computes states at contact of one robot on one stance.
 
-    start : posture (nq,) that reaches begin from.  folder : where a result's relative path begins.
+    start (nq,) : initial guess of the inverse kinematics.  folder : directory that paths of results are
+        relative to.
     """
 
     robot: Robot
@@ -191,7 +202,9 @@ class ContactStates:
 
     # ------------------------------------------------------------ postures
     def posture(self, name: str, result: str | None, point: tuple[float, ...]) -> Posture | str:
-        """Posture of [at_contact] posture or result, and the point (3,) [m] of a reach; or why there is none.
+        """Posture of [at_contact] posture or result, or the reason why there is none.
+
+        point (3,) [m] : of the posture "reach".
 
         Raises
         ------
@@ -207,8 +220,8 @@ class ContactStates:
         robot, q = self.robot, self.start
         if isinstance(self.stance, Free):
             raise InputError(
-                f"[at_contact] posture: {robot.name} floats freely, so it reaches the point from no "
-                f"known place: name a posture; there are {', '.join(robot.postures)}"
+                f"[at_contact] posture: {robot.name} floats freely, so its position at contact is unknown: "
+                f"name a posture; there are {', '.join(robot.postures)}"
             )
         coordinates = self._coordinates(q)
         try:
@@ -218,9 +231,9 @@ class ContactStates:
         return Posture(q=q, polygon=support_polygon(robot, coordinates))
 
     def _named(self, name: str, result: str | None) -> Posture:
-        robot, v, torque, lasts = self.robot, None, None, _LONG
+        robot, v, torque, until = self.robot, None, None, _DEFAULT_REFERENCE_TIME
         if result is not None:
-            q, v, torque, lasts = self._of_result(result)
+            q, v, torque, until = self._of_result(result)
         else:
             known = ("reach", *robot.postures)
             check_choice(f"[at_contact] posture: {robot.name} has no posture", name, known)
@@ -229,35 +242,37 @@ class ContactStates:
             return Posture(q=q, polygon=np.zeros((0, 2)))
         robot.check_stance(q, self.stance.sole_names(robot))
         coordinates = self._coordinates(q)
-        bend = None if v is None else coasting_reference(coordinates, q, v, until=lasts)
+        reference = None if v is None else coasting_reference(coordinates, q, v, until=until)
         polygon = support_polygon(robot, coordinates)
-        return Posture(q=q, v=v, torque=torque, bend=bend, polygon=polygon)
+        return Posture(q=q, v=v, torque=torque, reference=reference, polygon=polygon)
 
     def _coordinates(self, q: Array) -> StanceCoordinates:
-        """Coordinates with the stance's frames fixed where they are in a posture (nq,)."""
+        """Coordinates with the stance's frames fixed at their places in a posture (nq,)."""
         robot, stance = self.robot, self.stance
         return StanceCoordinates(robot, stance.soles(robot), q, stance.held_hands(robot))
 
     def _of_result(self, result: str) -> tuple[Array, Array, Array, float]:
-        """q, v, torque, and for how long [s] the reference is to be known."""
+        """q, v, torque of a saved result at contact, and the duration [s] of its reference."""
         record = load_record(self.folder / result)
         a = record.arrays
         if tuple(a["joints"]) != self.robot.joint_names:
             raise InputError(
                 f"[at_contact] result: {result} is of a robot with other joints than {self.robot.name}"
             )
-        lasts = _UNTIL * float(a["collision_time"][-1]) if "collision_time" in a else _LONG
-        lasts = max(lasts, _LONG / 2)
+        until = _DEFAULT_REFERENCE_TIME
+        if "collision_time" in a:
+            until = _REFERENCE_TIME * float(a["collision_time"][-1])
+        until = max(until, _DEFAULT_REFERENCE_TIME / 2)
         if "strike_posture" in a:
-            return a["strike_posture"], a["strike_velocity"], a["strike_torque"], lasts
+            return a["strike_posture"], a["strike_velocity"], a["strike_torque"], until
         if not record.completed:
             raise InputError(f"[at_contact] result: {result} has no motion; solve it again")
         last = int(np.flatnonzero(a["reference_phase"] == 0)[-1])  # the end of the swing
-        return a["reference_q"][last], a["reference_v"][last], a["reference_torque"][last], lasts
+        return a["reference_q"][last], a["reference_v"][last], a["reference_torque"][last], until
 
-    # ------------------------------------------------------------ rows
+    # ------------------------------------------------------------ cases
     def check_joint(self, name: str) -> None:
-        """InputError for a joint that there is not, or one whose motion would move what is held."""
+        """InputError for an unknown joint, or one whose motion would move a fixed frame."""
         k = self.robot.joint_index(name)
         for sole in self.stance.soles(self.robot):
             if k in self.robot.limb(sole.frame):
@@ -272,7 +287,7 @@ class ContactStates:
                     "move other joints, or [problem] point_m"
                 )
 
-    def rows(
+    def compute(
         self,
         posture: Posture,
         joints: Mapping[str, Array],
@@ -282,27 +297,37 @@ class ContactStates:
         *,
         velocity: str = "least energy",
     ) -> States:
-        """States of `count` rows; joints (count,) [rad] are added to the posture's; speed (count,) [m/s];
-        normal (3,); velocity as of [at_contact]."""
-        moves = np.stack([*joints.values()], axis=1) if joints else np.zeros((count, 0))
-        # rows that differ in speed only have one posture
-        same = not moves.size or bool((moves == moves[0]).all())
-        kept, back = (moves[:1], np.zeros(count, dtype=np.intp)) if same else _distinct(moves)
+        """States of `count` cases.
+
+        joints : changes (count,) [rad] of the posture's joint angles.  speed (count,) [m/s].  normal (3,).
+        velocity : as of [at_contact].
+        """
+        changes = np.stack([*joints.values()], axis=1) if joints else np.zeros((count, 0))
+        # P distinct postures, and the index (count,) of each case's; cases that differ in speed only share
+        # one
+        same = not changes.size or bool((changes == changes[0]).all())
+        kept, back = changes[:1], np.zeros(count, dtype=np.intp)
+        if not same:
+            kept, back = np.unique(changes, axis=0, return_inverse=True)
+            back = back.ravel()
         q, reason = self._moved(posture.q, tuple(joints), kept)
         robot, nv = self.robot, self.robot.nv
         B, G, J = self._mobility("least_energy", q)
         mass = 1 / np.einsum("i,rij,j->r", normal, G, normal)
         if posture.v is None:
+            # v = B x with G x = normal: the striking point has 1 m/s along the normal
             if velocity != "least energy":
                 B, G, J = self._mobility("least_rates", q)
+            # G is singular if the point cannot move in some direction
             x = np.linalg.pinv(G, rcond=1e-12, hermitian=True) @ normal
-            stuck = np.abs(np.einsum("rij,rj->ri", G, x) - normal).max(axis=1) > _OFF
-            _say(reason, stuck, "the striking point cannot move along the normal here")
+            stuck = np.abs(np.einsum("rij,rj->ri", G, x) - normal).max(axis=1) > _VELOCITY_ERROR
+            _set_reason(reason, stuck, "the striking point cannot move along the normal here")
             unit = np.einsum("rkv,rk->rv", B, x)
         else:
             unit = np.broadcast_to(posture.v, (len(q), nv))
         own = np.einsum("i,rvi,rv->r", normal, J, unit)
-        _say(reason, own <= 0, "the striking point does not approach the target")
+        _set_reason(reason, own <= 0, "the striking point does not approach the target")
+        # of each case's velocity, relative to the `unit` of its posture
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = np.ones(count) if speed is None else speed / own[back]
         rest = self._call("holding", np.hstack([q, np.zeros_like(unit)]))
@@ -315,13 +340,14 @@ class ContactStates:
         reasons = reason[back]
         over = np.abs(v[:, nv - robot.n :]) > robot.velocity_limit * (1 + 1e-9)
         for k in np.flatnonzero(over.any(axis=0)):
-            _say(reasons, over[:, k], f"{robot.joint_names[k]} would be faster than its limit")
-        bend: dict[str, Any] = {}
-        if posture.bend is not None:  # the same way, in less time
-            reference = posture.bend["reference"]
-            powers = np.arange(2, reference.shape[1] + 2)
-            bend["reference"] = reference * factor[:, None, None] ** powers
-            bend["reference_until"] = posture.bend["reference_until"] / factor
+            _set_reason(reasons, over[:, k], f"{robot.joint_names[k]} would be faster than its limit")
+        reference: dict[str, Any] = {}
+        if posture.reference is not None:
+            # the same path at `factor` times the speed: t^k of a velocity gets the factor's power k + 1
+            coefficients = posture.reference["reference"]
+            powers = np.arange(2, coefficients.shape[1] + 2)
+            reference["reference"] = coefficients * factor[:, None, None] ** powers
+            reference["reference_until"] = posture.reference["reference_until"] / factor
         return States(
             q=q[back],
             v=v,
@@ -329,17 +355,18 @@ class ContactStates:
             speed=own[back] * factor,
             mass=mass[back],
             reason=reasons,
-            **bend,
+            **reference,
         )
 
     def _mobility(self, name: str, q: Array) -> tuple[Array, Array, Array]:
-        """B (R, 3, nv), G (R, 3, 3) and J (R, nv, 3) of `striking_functions`, by columns."""
+        """B' (P, 3, nv), G (P, 3, 3) and J' (P, nv, 3) of `striking_functions` at P configurations."""
         found, nv = self._call(name, q), self.robot.nv
         ends = 3 * nv, 3 * nv + 9
         B, G, J = found[:, : ends[0]], found[:, ends[0] : ends[1]], found[:, ends[1] :]
         return B.reshape(-1, 3, nv), G.reshape(-1, 3, 3), J.reshape(-1, nv, 3)
 
     def _moved(self, start: Array, names: tuple[str, ...], by: Array) -> tuple[Array, Reasons]:
+        """Configurations (P, nq) with the named joints moved by angles (P, joints), and reasons (P)."""
         robot, model = self.robot, self.robot.model
         q = np.repeat(start[None], len(by), axis=0)
         reason = np.full(len(by), "", dtype=object)
@@ -347,29 +374,29 @@ class ContactStates:
         for name, angle in zip(names, by.T, strict=True):
             k = robot.joint_index(name)
             joint = model.joints[model.getJointId(name)]
-            place = int(joint.idx_q)
+            index = int(joint.idx_q)
             if joint.nq == 1:
-                q[:, place] += angle
+                q[:, index] += angle
             else:  # a continuous joint: cosine and sine
-                q[:, place], q[:, place + 1] = np.cos(own[k] + angle), np.sin(own[k] + angle)
+                q[:, index], q[:, index + 1] = np.cos(own[k] + angle), np.sin(own[k] + angle)
             out = (own[k] + angle < robot.lower[k] - 1e-9) | (own[k] + angle > robot.upper[k] + 1e-9)
-            _say(reason, out, f"{name} would be beyond its limit")
+            _set_reason(reason, out, f"{name} would be beyond its limit")
         return q, reason
 
-    def _call(self, name: str, rows: Array) -> Array:
-        """A compiled function of rows (N, numbers)."""
+    def _call(self, name: str, inputs: Array) -> Array:
+        """Outputs (N, ...) of a compiled function for inputs (N, size), in blocks of a fixed size."""
         if "functions" not in self._compiled:
             self._compiled["functions"] = striking_functions(
                 self.robot, striker=self.striker, stance=self.stance
             )
-        size = 1 if len(rows) == 1 else _BLOCK
+        size = 1 if len(inputs) == 1 else _BLOCK
         key = (name, size)
         if key not in self._compiled:
             function = self._compiled["functions"][name]
             self._compiled[key] = BatchedFunction(function, size, np.zeros((size, 0)))
         function, out = self._compiled[key], []
-        for begin in range(0, len(rows), size):
-            block = rows[begin : begin + size]
+        for begin in range(0, len(inputs), size):
+            block = inputs[begin : begin + size]
             filled = (
                 block
                 if len(block) == size
@@ -379,11 +406,6 @@ class ContactStates:
         return np.concatenate(out)
 
 
-def _distinct(moves: Array) -> tuple[Array, NDArray[np.intp]]:
-    kept, back = np.unique(moves, axis=0, return_inverse=True)
-    return kept, back.ravel()
-
-
-def _say(reason: Reasons, where: NDArray[np.bool_], text: str) -> None:
-    """The first reason stays."""
+def _set_reason(reason: Reasons, where: NDArray[np.bool_], text: str) -> None:
+    """Sets the reason where there is none yet."""
     reason[where & (reason == "")] = text

@@ -1,4 +1,4 @@
-"""One collision in numbers, as `impactopt collide` shows it: [at_contact], collision model, measures."""
+"""Single collision of a problem, as `impactopt collide` shows it: [at_contact], collision model, measures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = [
     "MEASURES",
     "NOT_ENDED",
     "AtContact",
-    "Blow",
+    "CollisionBatch",
     "Measure",
     "check_at_contact",
     "chosen",
@@ -45,18 +45,18 @@ __all__ = [
 ]
 
 NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
-_STEP = 1e-4  # [s] between instants of the full dynamics
+_FULL_DYNAMICS_STEP = 1e-4  # [s] between instants of its histories
 
 
 class AtContact(Section):
     """Section [at_contact] of a sweep of collisions.
 
     The state at contact is that of `result`, a directory of `impactopt solve` or `strike`; or of `posture`:
-    "reach" for the problem's start with the striking point moved to the problem's point, or a posture of the
-    robot by name, which hits where its hand is. `joints` are added to it. The striking point moves along the
-    normal at `speed`: a result's velocity is scaled, a posture gets the `velocity` of least kinetic energy,
-    or the one whose joint speeds over their limits have the least sum of squares. The feed-forward torque
-    lets the robot coast. Scales are of the robot's own gains and torque limits.
+    "reach" for the problem's start posture with the striking point moved to the problem's point, or a
+    posture of the robot by name, with the target at its hand. `joints` are added to it. The striking point
+    moves along the normal at `speed`: a result's velocity is scaled; a posture gets the `velocity` of least
+    kinetic energy, or that of the least sum of squares of joint velocities over their limits. The
+    feed-forward torque gives zero acceleration. Scales multiply the robot's gains and torque limits.
     """
 
     posture: str = "reach"
@@ -73,17 +73,18 @@ class AtContact(Section):
 
 
 def full_names(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The table with the units that its keys may leave out: `speed` is `speed_m_s`."""
+    """Table with units added to its keys, which may omit them: `speed` is `speed_m_s`."""
     names = {name: info.alias for name, info in AtContact.model_fields.items() if info.alias}
     return {names[k] if k in names and names[k] not in given else k: value for k, value in given.items()}
 
 
 def check_at_contact(given: Mapping[str, Any]) -> AtContact:
-    """The section from its table, whose keys may leave out their units.
+    """Section from its table, whose keys may omit their units.
 
     Raises
     ------
-    InputError : one message with all mistakes. It names no file: the table may be a sweep's, or from a call.
+    InputError : one message with all mistakes. It names no file, as the table may come from a sweep or a
+        call.
     """
     try:
         section = AtContact.model_validate(full_names(given))
@@ -101,7 +102,7 @@ def check_at_contact(given: Mapping[str, Any]) -> AtContact:
 def collision_model(
     content: File, robot: Robot, stance: Stance, section: AtContact, accuracy: float = 1e-2
 ) -> CollisionModel:
-    """The model that [at_contact] names, for a problem file's blow; accuracy: as of `SDC`."""
+    """Collision model that [at_contact] names, for a problem file; accuracy as of `SDC`."""
     content.check_one_striker()
     options: dict[str, Any] = {
         "robot": robot,
@@ -114,7 +115,7 @@ def collision_model(
     }
     friction = None if content.friction is None else content.friction.build()
     if section.model == "full":
-        return FullDynamics(**options, step=_STEP, contact_friction=friction)
+        return FullDynamics(**options, step=_FULL_DYNAMICS_STEP, contact_friction=friction)
     if section.model == "rigid":
         if friction is not None:
             raise InputError("[friction]: a rigid impact has none: take another model, or leave it out")
@@ -126,13 +127,17 @@ def collision_model(
 
 Array = NDArray[np.float64]
 
-LEAST_WEIGHT = 1.0  # [N] on the ground; with less there is no ZMP
+LEAST_WEIGHT = 1.0  # [N] vertical force on the ground; with less the ZMP is undefined
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Blow:
-    """N collisions: outputs by name as of `SymbolicModel.batch`, their states, torque limits (N, n) or (1, n)
-    [N m], and the support polygon (k, 2) [m]."""
+class CollisionBatch:
+    """Results of N collisions of a robot, from which measures are computed.
+
+    found : outputs by name, as of `SymbolicModel.batch`.  states : at contact.  torque_limit (N, n) or (1, n)
+        [N m].
+    velocity_limit (n) [rad/s].  polygon (k, 2) [m] : support polygon.
+    """
 
     found: Mapping[str, Array]
     states: States
@@ -143,29 +148,29 @@ class Blow:
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """A column of the table: the outputs of a collision that it takes, what it is, and how it is had."""
+    """Column of the table of collisions: required outputs, description, and its values (N) from a batch."""
 
     outputs: tuple[str, ...]
     what: str
-    of: Callable[[Blow], Array]
+    of: Callable[[CollisionBatch], Array]
 
 
-def _torque_ratio(blow: Blow) -> Array:
-    demand = np.abs(blow.found["demand"])
-    return np.asarray((demand.max(axis=1) / blow.torque_limit).max(axis=1))
+def _torque_ratio(batch: CollisionBatch) -> Array:
+    demand = np.abs(batch.found["demand"])
+    return np.asarray((demand.max(axis=1) / batch.torque_limit).max(axis=1))
 
 
-def _velocity_ratio(blow: Blow) -> Array:
-    joints = np.abs(blow.states.v[:, -blow.velocity_limit.size :])
-    return np.asarray((joints / blow.velocity_limit).max(axis=1))
+def _velocity_ratio(batch: CollisionBatch) -> Array:
+    joints = np.abs(batch.states.v[:, -batch.velocity_limit.size :])
+    return np.asarray((joints / batch.velocity_limit).max(axis=1))
 
 
-def _zmp_margin(blow: Blow) -> Array:
-    ground = blow.found["ground_wrench"]
+def _zmp_margin(batch: CollisionBatch) -> Array:
+    ground = batch.found["ground_wrench"]
     flat = ground.reshape(-1, 6)
     out = np.full(len(flat), -np.inf)
     stands = flat[:, 2] > LEAST_WEIGHT
-    out[stands] = margin(blow.polygon, zmp(flat[stands]))
+    out[stands] = margin(batch.polygon, zmp(flat[stands]))
     return out.reshape(ground.shape[:2]).min(axis=1)
 
 
@@ -198,8 +203,8 @@ MEASURES: Mapping[str, Measure] = {
     ),
     "freeze_error_pct": Measure(
         outputs=("freeze_error",),
-        what="what freezing may have cost of the impulse, as an estimate; 0 of full dynamics, nan of models "
-        "whose error is another",
+        what="estimated error of the impulse by freezing; 0 of full dynamics, nan of models with larger "
+        "errors of another kind",
         of=lambda b: 100 * b.found["freeze_error"],
     ),
     "hand_speed_m_s": Measure(
@@ -207,7 +212,7 @@ MEASURES: Mapping[str, Measure] = {
     ),
     "effective_mass_kg": Measure(
         outputs=(),
-        what="of the held robot at the striking point along the normal",
+        what="of the constrained robot at the striking point along the normal",
         of=lambda b: b.states.mass,
     ),
     "velocity_ratio": Measure(
@@ -217,11 +222,11 @@ MEASURES: Mapping[str, Measure] = {
 
 
 def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
-    """Measures by name; of a target its results too: target_speed_m_s, target_depth_m, target_broken.
+    """Measures by name, among them the target's results: target_speed_m_s, target_depth_m, target_broken.
 
     Raises
     ------
-    InputError : a name that there is not.
+    InputError : an unknown name.
     """
     results = {f"target_{name}": _result(k) for k, name in enumerate(target.result_names)}
     known = {**MEASURES, **results}
@@ -235,34 +240,35 @@ def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
 
 
 def _result(k: int) -> Measure:
-    def of(blow: Blow) -> Array:
-        result: Any = blow.found["target_result"]
+    def of(batch: CollisionBatch) -> Array:
+        result: Any = batch.found["target_result"]
         return np.asarray(result[:, k])
 
-    return Measure(outputs=("target_result",), what="of the target after the blow", of=of)
+    return Measure(outputs=("target_result",), what="of the target after the collision", of=of)
 
 
-_TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
-_STAYS = (
-    "by this model the contact of the result does not end: its freezes go by the duration that the first one "
-    "predicts, which is far too short here; take the full dynamics (--model full)"
+_IMPULSE_TOLERANCE = 1e-4  # relative, of the full dynamics
+_CONTACT_DOES_NOT_END = (
+    "the contact of the result does not end with this model: its freezes are placed by the duration that the "
+    "first "
+    "one predicts, which is far too short here; take the full dynamics (--model full)"
 )
-# what of a model's difference from the plan is the model's
-_OWN_ERRORS = {
-    "sdc": "H, J, the bias and the acceleration of the servo's reference are frozen {}; what it differs by "
-    "from the plan and its replays is its own error",
-    "sdc-paper": "it has no servo stiffness, no feed-forward torque, no bias and no dJ/dt v: of ZMP, "
-    "forces on soles and torques believe the plan and its replays",
-    "virtual-mass": "a point mass, which no servo pushes on: believe the plan and its replays",
-    "rigid": "an impact in no time, which neither servo nor contact law has a part in: believe the plan and "
-    "its replays",
-    "full": "nothing is frozen; it differs from the replay on held soles by their steps, and from "
-    "the plan by what that has between its collocation points",
+# causes of differences between a model and the plan, and which of the two to trust
+_MODEL_ERRORS = {
+    "sdc": "H, J, the bias and the acceleration of the servo's reference are frozen {}; its differences from "
+    "the "
+    "plan and the replays are errors of this model",
+    "sdc-paper": "it has no servo stiffness, no feed-forward torque, no bias and no dJ/dt v: for ZMP, "
+    "forces on soles and torques trust the plan and its replays",
+    "virtual-mass": "a point mass without servo: trust the plan and its replays",
+    "rigid": "an impact without duration, servo and contact law: trust the plan and its replays",
+    "full": "nothing is frozen; it differs from the replay on fixed soles by the steps of both, and from "
+    "the plan by the plan's error between collocation points",
 }
 
 
 def problem_of_result(result: Path) -> ProblemFile:
-    """The problem file that a directory of `impactopt solve` or `strike` keeps.
+    """Problem file that is stored in a directory of `impactopt solve` or `strike`.
 
     Raises
     ------
@@ -275,47 +281,48 @@ def problem_of_result(result: Path) -> ProblemFile:
 
 
 def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
-    """Contact figures of a result by their source: ``planned``, ``simulated`` on fixed soles, and ``free
-    soles``, as far as there are any; keys as of `collide_once`.
+    """Measures of a saved result's contact, by source and by the keys of `collide_once`.
+
+    Sources are ``planned``, ``simulated`` on fixed soles, and ``free soles``, as far as the result has them.
     """
-    a, told = record.arrays, record.summary
+    a, summary = record.arrays, record.summary
     if "collision_time" not in a:
         return {}
     torque, ground = a["collision_torque"], a["collision_ground"]
     keys = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
-    planned = {key: told[key] for key in keys if key in told}
+    planned = {key: summary[key] for key in keys if key in summary}
     if len(torque) > 1:  # an impact without duration has neither
         planned["torque_ratio"] = float(np.abs(torque / a["torque_limit"]).max())
     if len(ground) and len(a["polygon"]):
         planned["zmp_margin_m"] = float(margin(a["polygon"], zmp(ground)).min())
-        soles = sum(name.startswith("sole_") for name in a)  # hands that hold on come after them
+        soles = sum(name.startswith("sole_") for name in a)  # wrenches of supporting hands come after theirs
         planned["sole_force_N"] = float(a["collision_sole_wrench"][:, 2 : 6 * soles : 6].min())
     out = {"planned": planned}
     names = {"torque_ratio": "torque_ratio_by_phase", "zmp_margin_m": "zmp_margin_by_phase_m"}
     for name, by_phase in (("simulated", {key: key for key in names}), ("replayed", names)):
-        report = told.get(name) or {}
+        report = summary.get(name) or {}
         numbers = {key: report[key] for key in keys if key in report}
         for key, source in by_phase.items():
             found = report.get(source) or {}
             numbers |= {key: found["collision"]} if "collision" in found else {}
         if numbers:
-            out["simulated" if name == "simulated" else replay_name(told)] = numbers
+            out["simulated" if name == "simulated" else replay_name(summary)] = numbers
     return out
 
 
 def collide_once(
     file: ProblemFile, at_contact: Mapping[str, Any], *, accuracy: float = 1e-2
 ) -> dict[str, Any]:
-    """One collision of a problem's robot with its target, as plain numbers with units in their names.
+    """One collision of a problem's robot with its target, as a table with units in its keys.
 
-    at_contact : the state at contact and the model, by the keys of docs/sweeps.md.
-    accuracy : relative, of the impulse: freezing that may have cost more is reported.
+    at_contact : state at contact and collision model, by the keys of docs/sweeps.md.
+    accuracy : required relative accuracy of the impulse; a larger estimated error of freezing is reported.
 
-    Returns the measures of docs/sweeps.md; ``target``, what it says after the blow; ``joints``, the largest
-    torque demand [N m] and the limit of each, hardest first; or ``reason``, why there is no such collision.
-    ``caution`` says what to do where freezing may have cost more of the impulse than was asked for.
-    Of a result whose contact is as it was saved also ``saved`` (`planned_numbers`), and ``believe``: which of
-    its numbers and the model's are right where they differ.
+    Returns the measures of docs/sweeps.md; ``target``, its results after the collision; ``joints``, the
+    largest torque demand [N m] and the limit of each, by decreasing ratio; and ``caution`` if the estimated
+    error of freezing is too large. If the collision is impossible there is only ``reason``.
+    For a saved result with unchanged contact also ``saved`` (`planned_numbers`), and ``believe``, which of
+    its numbers and the model's to trust if they differ.
 
     Raises
     ------
@@ -331,60 +338,66 @@ def collide_once(
         robot=robot, striker=striker, stance=stance, start=content.make_start(robot), folder=Path()
     )
     model = collision_model(content, robot, stance, section, accuracy)
-    told: dict[str, Any] = {"problem": content.problem.name or file.path.stem, "robot": robot.name}
-    told |= {"model": section.model}
-    told |= {"freezes": section.freezes} if section.model == "sdc" else {}
+    head: dict[str, Any] = {"problem": content.problem.name or file.path.stem, "robot": robot.name}
+    head |= {"model": section.model}
+    head |= {"freezes": section.freezes} if section.model == "sdc" else {}
     point = tuple(map(float, content.problem.point))
     posture = states.posture(section.posture, section.result, point)
     if isinstance(posture, str):
-        return {**told, "reason": posture}
+        return {**head, "reason": posture}
     speed = None if section.speed is None else np.array([section.speed])
     joints = {name: np.array([angle]) for name, angle in section.joints.items()}
     normal = np.asarray(model.normal)
-    rows = states.rows(posture, joints, speed, normal, 1, velocity=section.velocity)
-    if rows.reason[0]:
-        return {**told, "reason": str(rows.reason[0])}
-    collision = _collide(model, rows, section)
+    state = states.compute(posture, joints, speed, normal, 1, velocity=section.velocity)
+    if state.reason[0]:
+        return {**head, "reason": str(state.reason[0])}
+    collision = _collide(model, state, section)
     if not collision.separated:
-        own = record is not None and section.model == "sdc"
-        return {**told, "reason": _STAYS if own else NOT_ENDED}
-    found: dict[str, Any] = {name: _row(getattr(collision, name)) for name in _OUTPUTS}
+        misplaced = record is not None and section.model == "sdc"
+        return {**head, "reason": _CONTACT_DOES_NOT_END if misplaced else NOT_ENDED}
+    found: dict[str, Any] = {}
+    for name in dict.fromkeys(name for m in MEASURES.values() for name in m.outputs):
+        value = getattr(collision, name)
+        found[name] = None if value is None else np.asarray(value, dtype=float)[None]
     limit = robot.torque_limit * section.torque_limit_scale
-    blow = Blow(
+    batch = CollisionBatch(
         found=found,
-        states=rows,
+        states=state,
         torque_limit=limit[None],
         velocity_limit=robot.velocity_limit,
         polygon=posture.polygon,
     )
-    there = {name: m for name, m in MEASURES.items() if all(found[o] is not None for o in m.outputs)}
-    numbers = {name: float(measure.of(blow)[0]) for name, measure in there.items()}
+    available = {name: m for name, m in MEASURES.items() if all(found[o] is not None for o in m.outputs)}
+    numbers = {name: float(measure.of(batch)[0]) for name, measure in available.items()}
     target = model.target.with_units(collision.target_result.values())
-    found = {**told, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
+    found = {**head, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
     found |= {"caution": collision.caution} if collision.caution else {}
     return plain(found | ({} if record is None else _saved(file, section, record)))
 
 
-def _horizon(record: Record, usual: float) -> float:
-    """[s] by which a saved contact is over by any model: in steps, as each makes functions of its own."""
-    lasts = float(record.arrays["collision_time"][-1]) if "collision_time" in record.arrays else 0.0
-    return usual * max(1, ceil(1.5 * lasts / usual))
+def _horizon(record: Record, default: float) -> float:
+    """Horizon [s] by which a saved contact is over in any model.
+
+    It is a multiple of the default, as compiled functions depend on it.
+    """
+    duration = float(record.arrays["collision_time"][-1]) if "collision_time" in record.arrays else 0.0
+    return default * max(1, ceil(1.5 * duration / default))
 
 
 def _saved(file: ProblemFile, section: AtContact, record: Record) -> dict[str, Any]:
-    """Saved figures to show beside a collision of the same state."""
+    """Saved measures to show beside those of a collision from the same state."""
     given = section.model_fields_set - {"result", "model", "freezes", "horizon"}
-    # of another blow they would mislead
+    # for another problem or state they would mislead
     same = record.problem and parse_problem_file(record.problem, file.path).data == file.data
     saved = planned_numbers(record) if same and not given else {}
     if not saved:
         return {}
-    often = f"at contact and {section.freezes} times on the way" if section.freezes else "at contact"
-    return {"saved": saved, "believe": _OWN_ERRORS[section.model].format(often)}
+    often = f"at contact and {section.freezes} times during it" if section.freezes else "at contact"
+    return {"saved": saved, "believe": _MODEL_ERRORS[section.model].format(often)}
 
 
 def _joints(collision: Collision, robot: Robot, limit: Array) -> list[dict[str, Any]]:
-    """Each joint's largest torque demand and its limit [N m], hardest first."""
+    """Largest torque demand and limit [N m] of each joint, by decreasing ratio."""
     if collision.demand is None:
         return []
     peaks = zip(robot.joint_names, np.abs(collision.demand).max(axis=0), limit, strict=True)
@@ -392,33 +405,27 @@ def _joints(collision: Collision, robot: Robot, limit: Array) -> list[dict[str, 
     return sorted(rows, key=lambda row: -row["ratio"])
 
 
-_OUTPUTS = tuple(dict.fromkeys(name for m in MEASURES.values() for name in m.outputs))
-
-
-def _row(value: Any) -> Any:
-    """A number or a history as the only row of a column."""
-    return None if value is None else np.asarray(value, dtype=float)[None]
-
-
-def _collide(model: CollisionModel, rows: States, section: AtContact) -> Collision:
+def _collide(model: CollisionModel, state: States, section: AtContact) -> Collision:
     robot = model.robot
     settings = {
         "kp": robot.kp * section.kp_scale,
         "kd": robot.kd * section.kd_scale,
         "torque_limit": robot.torque_limit * section.torque_limit_scale,
     }
-    settings |= {name: x[0] for name, x in rows.bend.items()}
+    settings |= {name: x[0] for name, x in state.reference_settings.items()}
     # a point mass has no servo, and the paper's SDC no stiffness
     known = getattr(model, "settings", settings)
     given = {name: x for name, x in settings.items() if name in known}
-    q, v, torque = rows.q[0], rows.v[0], rows.torque[0]
+    q, v, torque = state.q[0], state.v[0], state.torque[0]
     return one_collision(model, q, v, torque, **given)
 
 
 def one_collision(
     model: CollisionModel, q: Array, v: Array, torque: Array, **settings: ArrayLike
 ) -> Collision:
-    """A collision of any model, that of full dynamics with steps so short that they change nothing."""
+    """Collision by any model; the steps of full dynamics are refined until the impulse converges."""
     if isinstance(model, FullDynamics):
-        return model.converged(q, v, torque, tolerance=_TOLERANCE, require_separation=False, **settings)[0]
+        return model.converged(
+            q, v, torque, tolerance=_IMPULSE_TOLERANCE, require_separation=False, **settings
+        )[0]
     return model.collide(q, v, torque, require_separation=False, **settings)

@@ -1,7 +1,8 @@
-"""Many collisions in one call: a loop in C over arrays, on several cores.
+"""Batches of collisions: a C loop over arrays, on several cores.
 
-CasADi's own maps are serial in its wheels, and its calls keep the interpreter's lock. So the loop is an entry
-of its own in the library, called through ctypes, which lets go of the lock: threads are then cores.
+CasADi's own maps are serial in its wheels, and its calls keep the interpreter's lock. So the compiled library
+has a loop of its own, which is called through ctypes. That releases the lock, so that threads run on several
+cores.
 """
 
 from __future__ import annotations
@@ -37,18 +38,18 @@ from impactopt.errors import InputError, check_array, raw_array
 __all__ = ["Batch"]
 
 Array = NDArray[np.float64]
-_ALIGNED = 8  # doubles
-_TOGETHER = 256  # rows whose steps are looked at together
+_ALIGNED = 8  # doubles that a work array is longer, as the C code aligns it
+_CHECKED_TOGETHER = 256  # cases whose step lengths are checked in one call
 
 
 class Batch:
-    """The compiled function of a model and outputs, over arrays of collisions.
+    """Compiled function of a model and outputs, evaluated for arrays of collisions.
 
     Parameters
     ----------
-    model : of the collision.
+    model : collision model.
     outputs : names out of `impactopt.collision.OUTPUTS` that the model has.
-    stability : how long its steps may be.
+    stability : stable step lengths of the model.
     every : keep every so many steps of the histories.
     """
 
@@ -60,14 +61,14 @@ class Batch:
         *,
         every: int = 1,
     ) -> None:
-        # these say which contacts have not ended, and which steps were too long
-        judges = ("step_error", "separated") if model.stepping in ACCURACY else ("separated",)
-        self._given = {*outputs, *judges}
-        judges = (*judges, "duration", "impulse")
+        # for the checks of a result; the first of them are returned with it
+        checked = ("step_error", "separated") if model.stepping in ACCURACY else ("separated",)
+        self._returned = {*outputs, *checked}
+        checked = (*checked, "duration", "impulse")
         if breaks(model):
-            judges = (*judges, "target_result")
+            checked = (*checked, "target_result")
         self.model, self._stability = model, stability
-        self.outputs = tuple(dict.fromkeys((*outputs, *judges)))
+        self.outputs = tuple(dict.fromkeys((*outputs, *checked)))
         recipe = (*model._recipe, *self.outputs, every)
 
         def build() -> list[Any]:
@@ -95,60 +96,61 @@ class Batch:
         given = _inputs(self.model, q, v, torque, settings)
         unstable = None if self.model.stepping == "implicit" else self._unstable(given)
         count, function = given["q"].shape[0], self._function
-        rows = [_by_columns(given[name]) for name in function.name_in()]
+        inputs = [_by_columns(given[name]) for name in function.name_in()]
         shapes = [function.size_out(k) for k in range(function.n_out())]
         found = [np.zeros((count, shape[0] * shape[1])) for shape in shapes]
         if self._loop is None:
-            _one_by_one(function, rows, found)
+            _one_by_one(function, inputs, found)
         else:
-            _in_threads(self._loop, function.sz_w(), rows, found, cores)
-        names = function.name_out()
-        if "step_error" in names:
-            # a contact that never was has left nothing out
-            error = found[names.index("step_error")]
+            _in_threads(self._loop, function.sz_w(), inputs, found, cores)
+        by_name = dict(zip(function.name_out(), found, strict=True))
+
+        def clear(cases: Any, *kept: str) -> None:
+            """Sets the outputs of cases that `collide` refuses to NaN."""
+            for name, x in by_name.items():
+                if name not in ("step_error", *kept):
+                    x[cases] = np.nan
+
+        if "step_error" in by_name:  # steps that are too long or unstable
+            error = by_name["step_error"]
             if breaks(self.model):
-                impulse, results = (found[names.index(name)] for name in ("impulse", "target_result"))
+                impulse, results = by_name["impulse"][:, 0], by_name["target_result"]
                 force = given["target_breaking_force"][:, 0]
-                error[:, 0] += left_out_by_breaking(self.model, impulse[:, 0], results, force)
+                error[:, 0] += left_out_by_breaking(self.model, impulse, results, force)
             wrong = too_large(self.model.stepping, error[:, 0])
             if unstable is not None:
                 error[unstable] = np.nan
                 wrong |= unstable
-            for name, x in zip(names, found, strict=True):
-                if name != "step_error":
-                    x[wrong] = np.nan
-        impulse, duration = (found[names.index(name)][:, 0] for name in ("impulse", "duration"))
-        separated = found[names.index("separated")][:, 0] > 0.5
+            clear(wrong)
+        impulse, duration = by_name["impulse"][:, 0], by_name["duration"][:, 0]
+        separated = by_name["separated"][:, 0] > 0.5
         step = 0.0 if self.model.stepping == "implicit" else self.model.step_length
-        nothing = ~np.isfinite(impulse) | without_contact(impulse, duration, step * separated)
-        for name, x in zip(names, found, strict=True):
-            if name != "step_error":
-                x[nothing] = np.nan
-        # steps that events have used up before the horizon, which `collide` refuses too
-        cut = ~separated & (duration < self.model.horizon * (1 - 1e-9))
-        for name, x in zip(names, found, strict=True):
-            if name not in ("separated", "step_error"):
-                x[cut] = np.nan
+        # contacts whose force rounding hides
+        clear(~np.isfinite(impulse) | without_contact(impulse, duration, step * separated))
+        # collisions with so many events that the steps are used up
+        clear(~separated & (duration < self.model.horizon * (1 - 1e-9)), "separated")
         return {
             name: self._shaped(name, x, shape)
-            for name, x, shape in zip(names, found, shapes, strict=True)
-            if name in self._given
+            for (name, x), shape in zip(by_name.items(), shapes, strict=True)
+            if name in self._returned
         }
 
     def _unstable(self, given: Mapping[str, Array]) -> Any:
-        """(N) rows that the steps are unstable of, InputError where that is all; rows that are the same but
-        for their motion are looked at once."""
+        """Mask (N) of the cases for which the step is unstable; InputError if it is for all.
+
+        Stability does not depend on the velocity: cases that differ in nothing else are checked once.
+        """
         names = ("q", *self.model.settings)
         own = {name: given[name] for name in names}
         count = len(given["q"])
         flat = [x.reshape(len(x), -1) for x in own.values()]
         whole = np.concatenate([np.broadcast_to(x, (count, x.shape[1])) for x in flat], axis=1)
         _, first, back = np.unique(whole, axis=0, return_index=True, return_inverse=True)
-        parts = [
+        masks = [
             self._stability.unstable({name: x if len(x) == 1 else x[some] for name, x in own.items()})
-            for some in np.split(first, range(_TOGETHER, len(first), _TOGETHER))
+            for some in np.split(first, range(_CHECKED_TOGETHER, len(first), _CHECKED_TOGETHER))
         ]
-        unstable = np.concatenate(parts)[back.ravel()]
+        unstable = np.concatenate(masks)[back.ravel()]
         if unstable.all():
             one = {name: given[name][0].reshape(x.shape) for name, x in self.model.settings.items()}
             longest = self._stability.longest(self._stability.frozen(given["q"][0], one), one)
@@ -156,7 +158,7 @@ class Batch:
         return unstable
 
     def _shaped(self, name: str, flat: Array, shape: tuple[int, int]) -> Array:
-        """Collisions first, then instants; matrices of CasADi's lie by columns."""
+        """Output with axes (collision, instant, component), from matrices by columns (N, size)."""
         count = flat.shape[0]
         if name == "separated":
             mask: Any = flat[:, 0] > 0.5
@@ -171,22 +173,24 @@ class Batch:
 
 
 # ---------------------------------------------------------------- running
-def _in_threads(loop: Any, work: int, rows: list[Array], found: list[Array], threads: int) -> None:
+def _in_threads(loop: Any, work: int, inputs: list[Array], found: list[Array], threads: int) -> None:
+    """Evaluates a batch by the loop in C; see native/batch.c for its arguments."""
     count, steps, pointers = found[0].shape[0], ctypes.c_longlong, ctypes.c_void_p
-    arg = (pointers * len(rows))(*[x.ctypes.data for x in rows])
-    arg_step = (steps * len(rows))(*[0 if x.shape[0] == 1 else x.shape[1] for x in rows])
+    arg = (pointers * len(inputs))(*[x.ctypes.data for x in inputs])
+    # a stride of zero repeats an input that all cases share
+    arg_step = (steps * len(inputs))(*[0 if x.shape[0] == 1 else x.shape[1] for x in inputs])
     res = (pointers * len(found))(*[x.ctypes.data for x in found])
     res_step = (steps * len(found))(*[x.shape[1] for x in found])
     slices = _slices(count, threads)
 
     def run() -> None:
         memory = np.empty(work + _ALIGNED)
-        place = pointers(memory.ctypes.data)
-        # a thread that is done with one takes the next; the interpreter's lock gives it to one only
+        work_array = pointers(memory.ctypes.data)
+        # the threads share the iterator: each takes the next slice, under the interpreter's lock
         for begin, end in slices:
-            loop(steps(begin), steps(end), arg, arg_step, res, res_step, place)
+            loop(steps(begin), steps(end), arg, arg_step, res, res_step, work_array)
 
-    # the calling thread works too: no pool, whose start takes as long as ten collisions
+    # Plain threads, of which the calling one is one: the start of a pool takes as long as ten collisions.
     others = [threading.Thread(target=run) for _ in range(min(threads, count) - 1)]
     for thread in others:
         thread.start()
@@ -198,34 +202,35 @@ def _in_threads(loop: Any, work: int, rows: list[Array], found: list[Array], thr
 
 
 def _slices(count: int, threads: int) -> Iterator[tuple[int, int]]:
-    """Begins and ends, ever closer: collisions differ in length, and all threads are to end together."""
+    """Starts and ends of ever shorter slices: collisions differ in time, and threads should end together."""
     ends = [0]
     while ends[-1] < count:
         left = count - ends[-1]
+        # half of an equal share of what is left, as in guided self-scheduling
         ends.append(ends[-1] + (left if threads == 1 else -(-left // (2 * threads))))
     return iter([*pairwise(ends)])
 
 
-def _one_by_one(function: Any, rows: list[Array], found: list[Array]) -> None:
+def _one_by_one(function: Any, inputs: list[Array], found: list[Array]) -> None:
     """Evaluates a batch without a compiler, one collision at a time."""
     shapes = [function.size_in(k) for k in range(function.n_in())]
     for i in range(found[0].shape[0]):
-        mine = [x[0 if x.shape[0] == 1 else i] for x in rows]
-        values = [ca.DM(x.reshape(shape, order="F")) for x, shape in zip(mine, shapes, strict=True)]
+        case = [x[0 if x.shape[0] == 1 else i] for x in inputs]
+        values = [ca.DM(x.reshape(shape, order="F")) for x, shape in zip(case, shapes, strict=True)]
         for into, out in zip(found, function.call(values), strict=True):
             into[i] = np.array(out).ravel(order="F")
 
 
 # ---------------------------------------------------------------- inputs
 def _by_columns(x: Array) -> Array:
-    """(cases, numbers), each case's as CasADi has them."""
+    """Array (cases, size), each case's matrix by columns, as CasADi stores it."""
     return np.ascontiguousarray(np.swapaxes(x, 1, 2) if x.ndim == 3 else x).reshape(x.shape[0], -1)
 
 
 def _inputs(
     model: SteppedModel, q: ArrayLike, v: ArrayLike, torque: ArrayLike | None, settings: Mapping[str, Any]
 ) -> dict[str, Array]:
-    """Each input, (N, ...) or (1, ...)."""
+    """Checked inputs by name, each (N, ...), or (1, ...) if all cases share it."""
     robot = model.robot
     given = {"q": check_array("q", q, (None, robot.nq))}
     count = given["q"].shape[0]
@@ -246,23 +251,24 @@ def _inputs(
 
 
 def _settings(model: SteppedModel, settings: Mapping[str, Any], count: int) -> dict[str, Array]:
-    """Values of each setting, for all or one a collision, checked against its range."""
-    alone = model.settings.override(
+    """Values of each setting, shared or one a collision, checked against its range."""
+    shared = model.settings.override(
         {
             name: x
             for name, x in settings.items()
             if name not in model.settings or raw_array(name, x).ndim <= model.settings[name].ndim
         }
     )
-    out = {name: value[None] if value.ndim else value.reshape(1, 1) for name, value in alone.items()}
+    out = {name: value[None] if value.ndim else value.reshape(1, 1) for name, value in shared.items()}
     for name, given in settings.items():
-        usual = model.settings[name]
-        if raw_array(name, given).ndim > usual.ndim:
-            value = check_array(name, given, (count, *usual.shape), finite=name != "torque_limit")
-            # ranges are intervals: if least and largest are in it, all are
-            whole = name == "normal" or (name in ("kp", "kd") and usual.ndim == 2)
+        default = model.settings[name]
+        if raw_array(name, given).ndim > default.ndim:
+            value = check_array(name, given, (count, *default.shape), finite=name != "torque_limit")
+            # The range of a number is an interval: least and largest suffice. Directions and matrices are
+            # checked one by one.
+            whole = name == "normal" or (name in ("kp", "kd") and default.ndim == 2)
             for one in value if whole else (value.min(axis=0), value.max(axis=0)):
                 model.settings.override({name: one})
             capped = np.minimum(value, NO_LIMIT) if name == "torque_limit" else value
-            out[name] = capped if usual.ndim else capped.reshape(count, 1)
+            out[name] = capped if default.ndim else capped.reshape(count, 1)
     return out

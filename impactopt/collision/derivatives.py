@@ -1,16 +1,16 @@
-"""The compiled collision as a CasADi function that can be differentiated: by the C that has its derivatives.
+"""Derivatives of the compiled collision function in CasADi, by compiled C.
 
-CasADi asks an external function for derivatives by names of its own, and before it knows whether they will
-ever be needed. Here they come through a custom Jacobian, whose blocks are compiled when one of them is first
-evaluated:
+CasADi requests derivatives of an external function by names of its own, and before it knows whether they are
+needed. Here they come through a custom Jacobian instead, whose blocks are compiled when first evaluated:
 
-    `native_gradient`     the adjoint, of a single number by q and v
+    `native_gradient`     adjoint, of a single number by q and v
     `native_jacobian`     tangents, of numbers and histories by q, v and the feed-forward torque
-    `native_differences`  differences of collisions with tight steps, of all else
+    `native_differences`  differences of collisions with tight steps, for all other derivatives
 
-q's blocks are in the basis of v there. The chain rule to Pinocchio's q is T(q) (nv, nq) with v = T dq/dt: of
-the base R' for its position and 2 Im(conj(p) dp) for its quaternion p, ones at the joints. The function makes
-quaternions, and cosines and sines, unit ones first, so that it does not change along their lengths.
+Their derivatives by q are in the basis of v. The chain rule to Pinocchio's q has the matrix T(q) (nv, nq)
+with v = T dq/dt: R' for the base's position, 2 Im(conj(p) dp) for its quaternion p, and one for each joint.
+The function normalizes quaternions, and the cosine and sine of continuous joints, so that it is constant
+along their lengths.
 """
 
 from __future__ import annotations
@@ -48,17 +48,21 @@ __all__ = [
 Array = NDArray[np.float64]
 Compile = Callable[[str, tuple[Any, ...], Callable[[], Any]], Any]
 
-# of the differences that give second derivatives, of an input's size; those of first derivatives that are
-# differences themselves are longer, as what is left in them is divided by it once more
-_SECOND = {"collision_gradient": 1e-4, "collision_jacobian": 1e-4, "collision_differences": 1e-3}
-_TANGENTS = ("q", "v", "feedforward")
-# of the steps whose tangents are taken: those of 1e-7 are off by up to 4e-6
-_OF_TANGENTS = 1e-9
+# Step of the differences that give second derivatives, relative to an input's size. It is longer if the first
+# derivatives are differences themselves, as their error is divided by it.
+_SECOND_DIFFERENCE_STEP = {
+    "collision_gradient": 1e-4,
+    "collision_jacobian": 1e-4,
+    "collision_differences": 1e-3,
+}
+_TANGENT_INPUTS = ("q", "v", "feedforward")
+# Tolerance of the integration for tangents: with 1e-7 they are off by up to 4e-6.
+_TANGENT_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class Part:
-    """A compiled function of derivatives, and what it gives: (output, input) pairs."""
+    """A compiled function of derivatives, of each of its `outputs` by each input in `by`."""
 
     name: str
     outputs: tuple[str, ...]
@@ -66,7 +70,7 @@ class Part:
 
 
 class CollisionFunction(ca.Function):
-    """A ca.Function that says how it is taken to another process, where CasADi would say so too late."""
+    """A ca.Function that refuses serialization with advice, where CasADi would fail later."""
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
         raise InputError(
@@ -91,18 +95,18 @@ def differentiable(
 
     Parameters
     ----------
-    model : of the collision.
+    model : collision model.
     whole : its compiled function, with all settings as inputs.
-    by : inputs that derivatives are by; None: all.
+    by : inputs to differentiate with respect to; None: all.
     every : keep every so many steps of the histories.
-    compiled : (name, what, build) -> the compiled function of these, as `SymbolicModel._compiled`.
+    compiled : (name, what, build) -> compiled function, as `SymbolicModel._compiled`.
     """
 
-    def late(part: Part) -> tuple[Any, Mapping[str, Any]]:
-        function = _late(model, whole, part, every, compiled)
+    def on_demand(part: Part) -> tuple[Any, Mapping[str, Any]]:
+        function = _on_demand(model, whole, part, every, compiled)
         return function, function.sizes
 
-    value, jacobian = with_jacobian(model, whole, parameters, by, late)
+    value, jacobian = with_jacobian(model, whole, parameters, by, on_demand)
     own = {"custom_jacobian": jacobian, "jac_penalty": 0, "never_inline": True}
     own |= {"enable_forward": False, "enable_reverse": False}
     moving = value.name_in() if by is None else by
@@ -120,10 +124,10 @@ def with_jacobian(
     derivatives: Callable[[Part], tuple[Any, Mapping[str, Any]]],
     name: str = "",
 ) -> tuple[Any, Any]:
-    """(ca.Function of q, v[, feedforward] and the parameters; its Jacobian's blocks, in CasADi's own form).
+    """ca.Functions of q, v[, feedforward] and the parameters: the values, and CasADi's Jacobian blocks.
 
-    derivatives : of a part, the function that gives it, and what its inputs are divided by, by name.
-    name : of the first; the other's has jac_ before it.
+    derivatives : part -> (its function, divisors of its inputs by name).
+    name : of the first function; the other's has jac_ before it.
     """
     name, outputs = name or whole.name(), tuple(whole.name_out())
     inputs = {name: ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()}
@@ -165,7 +169,7 @@ def in_order(
 
 
 def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> list[Part]:
-    """Functions that give each derivative by these inputs; those of `separated` are zero."""
+    """Functions that together give all derivatives by these inputs; those of `separated` are zero."""
     outputs = tuple(name for name in outputs if name != "separated")
     refrozen, name = model.n_freezes > 0, ""
     carried: tuple[str, ...]
@@ -175,10 +179,10 @@ def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...
         carried, name = outputs, "collision_gradient"
         by = tuple(x for x in ("q", "v") if x in inputs)
         if "feedforward" in inputs and model.stepping == "implicit":
-            name, by = "collision_jacobian", tuple(x for x in _TANGENTS if x in inputs)
+            name, by = "collision_jacobian", tuple(x for x in _TANGENT_INPUTS if x in inputs)
     elif not refrozen and model.stepping == "implicit":
         carried = tuple(name for name in outputs if name in (*SCALARS, *HISTORIES))
-        name, by = "collision_jacobian", tuple(x for x in _TANGENTS if x in inputs)
+        name, by = "collision_jacobian", tuple(x for x in _TANGENT_INPUTS if x in inputs)
     else:
         carried = by = ()
     others = tuple(x for x in outputs if x not in carried)
@@ -188,27 +192,27 @@ def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...
 
 
 # ---------------------------------------------------------------- compiled when needed
-# A callback has to outlive what calls it, of which CasADi says nothing: one of each kind of model and its
-# outputs is kept.
-_KEPT: dict[Any, _Late] = {}
+# A callback has to outlive the functions that call it, and CasADi does not tell when these are gone: one for
+# each kind of model and its outputs is kept.
+_KEPT: dict[Any, _OnDemand] = {}
 
 
-def _late(model: SteppedModel, whole: Any, part: Part, every: int, compiled: Compile) -> _Late:
+def _on_demand(model: SteppedModel, whole: Any, part: Part, every: int, compiled: Compile) -> _OnDemand:
     key: Any = (model._recipe, part, every)
     try:
         found = _KEPT.get(key)
-    except TypeError:
+    except TypeError:  # a recipe that is not hashable
         key, found = object(), None
     if found is None:
-        found = _KEPT[key] = _Late(model, whole, part, every, compiled)
+        found = _KEPT[key] = _OnDemand(model, whole, part, every, compiled)
     return found
 
 
-class _Late(ca.Callback):
-    """A compiled function of derivatives that is compiled when it is first evaluated.
+class _OnDemand(ca.Callback):
+    """A function of derivatives that is compiled when it is first evaluated.
 
-    Its inputs are those of the collision over their sizes, so that the lengths of CasADi's differences, from
-    which second derivatives come, suit all of them.
+    Its inputs are those of the collision divided by their sizes: CasADi has one step length for the
+    differences that give second derivatives, and it should suit all of them.
     """
 
     def __init__(self, model: SteppedModel, whole: Any, part: Part, every: int, compiled: Compile) -> None:
@@ -219,17 +223,18 @@ class _Late(ca.Callback):
         self._out = [
             (int(np.prod(shapes[output])), seeds[given]) for output, given in product(part.outputs, part.by)
         ]
-        # of the model that it is made for first: settings of another may differ
+        # of the first such model; the settings of others may differ
         self.sizes = {name: _size(model, name) for name, _ in self._in}
         self._flat_sizes = [size.ravel(order="F") for size in self.sizes.values()]
-        self._make = lambda: _compiled(model, part, every, compiled)
+        self._compile = lambda: compiled(part.name, *native_part(model, part, every))
         self._function: Any = None
-        self._room = [np.empty(rows * columns) for _, (rows, columns) in self._in]
+        self._buffers = [np.empty(rows * columns) for _, (rows, columns) in self._in]
         self._runs: dict[tuple[bool, ...], Any] = {}
-        differences = {"enable_fd": True, "fd_method": "central", "fd_options": {"h": _SECOND[part.name]}}
+        step = _SECOND_DIFFERENCE_STEP[part.name]
+        differences = {"enable_fd": True, "fd_method": "central", "fd_options": {"h": step}}
         self.construct(f"{part.name}_late", differences)
 
-    # ------------------------------------------------------------ what CasADi asks
+    # ------------------------------------------------------------ interface of ca.Callback
     def get_n_in(self) -> int:
         return len(self._in)
 
@@ -254,38 +259,35 @@ class _Late(ca.Callback):
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
         """Evaluates the outputs; null results are not computed."""
         if self._function is None:
-            self._function = self._make()  # type: ignore[no-untyped-call]
-        for given, size, room in zip(arg, self._flat_sizes, self._room, strict=True):
+            self._function = self._compile()  # type: ignore[no-untyped-call]
+        for given, size, buffer in zip(arg, self._flat_sizes, self._buffers, strict=True):
             if given is None:
-                room[:] = 0.0
+                buffer[:] = 0.0
             else:
-                np.multiply(np.frombuffer(given), size, out=room)
+                np.multiply(np.frombuffer(given), size, out=buffer)
         wanted = tuple(x is not None and len(x) > 0 for x in res)
+        # a CasADi buffer remembers its results: one for each set of results that has been requested
         if wanted not in self._runs:
-            buffer, run = self._function.buffer()
-            for i, room in enumerate(self._room):
-                buffer.set_arg(i, room.data)
-            self._runs[wanted] = buffer, run
-        buffer, run = self._runs[wanted]
+            memory, run = self._function.buffer()
+            for i, buffer in enumerate(self._buffers):
+                memory.set_arg(i, buffer.data)
+            self._runs[wanted] = memory, run
+        memory, run = self._runs[wanted]
         for name, x, is_wanted in zip(self._names, res, wanted, strict=True):
             if is_wanted:
-                buffer.set_res(self._function.index_out(name), x)
+                memory.set_res(self._function.index_out(name), x)
         run()
         return 0
-
-
-def _compiled(model: SteppedModel, part: Part, every: int, compiled: Compile) -> Any:
-    return compiled(part.name, *native_part(model, part, every))
 
 
 def native_part(
     model: SteppedModel, part: Part, every: int
 ) -> tuple[tuple[Any, ...], Callable[[], NativeCode]]:
-    """(what a part's code depends on besides the model, what makes it)."""
+    """Cache key of a part's code, besides the model; and the function that generates the code."""
     if part.name == "collision_gradient":
         return part.outputs, lambda: native_gradient(model, *part.outputs)
     if part.name == "collision_jacobian":
-        tight = replace(model, tolerance=min(model.tolerance, _OF_TANGENTS))
+        tight = replace(model, tolerance=min(model.tolerance, _TANGENT_TOLERANCE))
         what = (*part.outputs, every, tight.tolerance)
         return what, lambda: native_jacobian(tight, part.outputs, every=every)
     what = (part.outputs, part.by, every)
@@ -302,7 +304,7 @@ def _size(model: SteppedModel, name: str) -> Array:
 
 # ---------------------------------------------------------------- configurations
 def _configuration(model: SteppedModel) -> tuple[Any, Any]:
-    """(q -> q with unit quaternions, cosines and sines, None where there are none; q -> T (nv, nq))."""
+    """ca.Functions q -> q with unit-length parts normalized (None without any), and q -> T (nv, nq)."""
     robot = model.robot
     units = _units(robot.model)
     q = ca.MX.sym("q", robot.nq)
@@ -310,9 +312,9 @@ def _configuration(model: SteppedModel) -> tuple[Any, Any]:
         return None, ca.Function("to_tangent", [q], [ca.MX.eye(robot.nv)])
     rb = RigidBody(robot.model)
     given, lengths, square = ca.SX.sym("q", robot.nq), ca.SX.ones(robot.nq), np.ones(robot.nv)
-    for begin, end, way in units:
+    for begin, end, velocities in units:
         lengths[begin:end] = ca.norm_2(given[begin:end])
-        square[way] = (end - begin) ** 2 / 4  # the columns of dq/dv have length 1/2 for a quaternion
+        square[velocities] = (end - begin) ** 2 / 4  # the columns of dq/dv have length 1/2 for a quaternion
     unit = given / lengths
     basis = ca.Function("basis", [rb.q], [rb.tangent_map()])
     to_tangent = ca.mtimes(ca.diag(ca.DM(square)), basis(unit).T)
@@ -321,7 +323,7 @@ def _configuration(model: SteppedModel) -> tuple[Any, Any]:
 
 
 def _units(model: Any) -> list[tuple[int, int, slice]]:
-    """Unit-length parts of q: their ends there, and the slice of their velocities."""
+    """Unit-length parts of q, quaternions or (cosine, sine): start and end in q, and the slice in v."""
     found = []
     for joint in model.joints:
         if joint.nq == 7:
@@ -331,8 +333,8 @@ def _units(model: Any) -> list[tuple[int, int, slice]]:
     return found
 
 
-_TAKEN = ("collision", "collision_gradient", "collision_jacobian", "collision_differences")
-_SEEN = "-DGCC_HASCLASSVISIBILITY"  # of the function that CasADi writes, where nothing else is
+_RESERVED_NAMES = ("collision", "collision_gradient", "collision_jacobian", "collision_differences")
+_EXPORT_SYMBOLS = "-DGCC_HASCLASSVISIBILITY"  # of CasADi's function; all else is hidden
 
 
 def export(
@@ -345,9 +347,9 @@ def export(
     folder: Path,
     name: str,
 ) -> Path:
-    """The library, from arguments as of `differentiable`; see `SymbolicModel.export`."""
-    if not name.isidentifier() or name in _TAKEN or not ca.Function.check_name(name):
-        raise InputError(f"name {name!r}: give a name for C that is none of {', '.join(_TAKEN)}")
+    """Builds the library of `SymbolicModel.export` and returns its path; arguments as of `differentiable`."""
+    if not name.isidentifier() or name in _RESERVED_NAMES or not ca.Function.check_name(name):
+        raise InputError(f"name {name!r}: give a name for C that is none of {', '.join(_RESERVED_NAMES)}")
     compiler = find_compiler()
     if compiler is None:
         raise InputError(f"export: it needs a C compiler that works; {why_no_compiler()}")
@@ -373,7 +375,7 @@ def export(
             sources[-1].write_text(code, encoding="utf-8")
         with tempfile.TemporaryDirectory(dir=folder, prefix="tmp-") as scratch:
             made = Path(scratch) / f"{name}.so"
-            compiler.run(sources[0], made, f"{native.level} {_SEEN}", *sources[1:])
+            compiler.run(sources[0], made, f"{native.level} {_EXPORT_SYMBOLS}", *sources[1:])
             return made.replace(folder / made.name).resolve()
     except (CompileError, OSError) as error:
         raise InputError(f"export to {folder}: {error}") from None

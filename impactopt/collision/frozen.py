@@ -1,29 +1,29 @@
-"""Steps 1b and 2b of the paper: what is computed once, at the moment of contact, and then kept constant.
+"""Frozen dynamics: quantities computed at contact and then kept constant (paper, steps 1b, 2b).
 
-With H the generalized inertia, J_c the fixed soles' Jacobians (c rows), Gamma the diagonal compliance of a
-virtual base (zero for exactly fixed soles) and S the selection of the n joints out of the nv velocities,
+With H the generalized inertia (nv, nv), J_c the Jacobians of the fixed soles and hands (c, nv), Gamma the
+diagonal compliance of a virtual base (zero for exact constraints) and S (n, nv) the selection of the joints,
 
     P = H^-1 - H^-1 J_c' (J_c H^-1 J_c' + Gamma)^-1 J_c H^-1
 
-is the inverse inertia of the robot as held. In place of the paper's H*, J* with the base eliminated, which
-lose the contact force from the base's momentum balance, H is factorized whole and the soles enter by their
-(c, c) Delassus matrix. All that the time loop needs then lives in joint space and at the hand; with
-j = n' J_hand,
+is the inverse inertia of the constrained robot. The paper eliminates the base instead (its H*, J*), which
+loses the contact force from the base's momentum balance. Here H is factorized as a whole, and the constraints
+enter by their Delassus matrix (c, c). The time loop then needs quantities of the joints and of the hand only.
+With j = n' J_hand, joint velocities u, and the hand's speed w along the normal,
 
     du/dt = A tau - s f + d,    A = S P S', s = S P j'
     dw/dt = s' tau - m f + e,   m = j P j' = 1 / effective mass
-    wrenches of what is held = L_tau tau - L_f f + L_0
+    constraint wrenches = L_tau tau - L_f f + L_0
 
-With friction the force on the target is f n + f_t, and the same with J_hand in the place of j (`s_point`,
-`m_point`, `e_point`, `L_point`) tells what f_t does, and the striking point's velocity.
+With friction the force on the target is f n + f_t. `s_point`, `m_point`, `e_point` and `L_point`, with J_hand
+in the place of j, give the effect of f_t and the velocity of the striking point.
 
-The drifts d, e, L_0 are quadratic in the velocity, and the blow changes the velocity within the first few
-milliseconds. So they are frozen at the velocity with which hand and target have met, at the end of
-compression, as two point masses would reach it,
+The drifts d, e, L_0 are quadratic in the velocity, which an impact changes within a few milliseconds. They
+are frozen at the velocity at the end of compression, when hand and target move at one speed, estimated from
+two point masses,
 
-    v_meet = v - P j' v_c / (m + 1 / target's mass),
+    v_meet = v - P j' v_c / (m + 1 / target's mass).
 
-and not at the velocity before: that takes the impulse's error from 2 % to below 1 %.
+Frozen at the velocity before the impact, the impulse has an error of 2 %; so it is below 1 %.
 """
 
 from __future__ import annotations
@@ -45,18 +45,19 @@ __all__ = ["FrozenDynamics", "effective_mass"]
 
 
 class FrozenDynamics:
-    """The frozen quantities as MX expressions of q, v, the normal, and the target's yield [1/kg]: one over
-    its mass, infinite where v is itself the velocity to freeze the drifts at. Each is built when first asked
-    for.
+    """Frozen quantities as MX expressions of q, v, the normal and `target_start`, built on first access.
 
-    Tree-shaped algebra is done in SX, dense algebra in MX, which keeps the code short.
+    `target_start` (2) has the inverse mass of the target's surface [1/kg] and its speed [m/s]; the inverse
+    mass is infinite if v is itself the velocity at which the drifts are frozen.
+
+    Algebra on the kinematic tree is sparse and done in SX; dense algebra is done in MX, for short C code.
 
     Parameters
     ----------
-    robot, stance : what moves, and what holds it.
+    robot, stance : the robot, and its constraints to the world.
     frame : the striking frame of the model.
-    bias : let Coriolis, centrifugal and gravity terms act (paper, eq. 6).
-    jdot : let dJ/dt v act, of hand and soles (paper, eq. 14).
+    bias : with Coriolis, centrifugal and gravity terms (paper, eq. 6).
+    jdot : with dJ/dt v, of hand and constrained frames (paper, eq. 14).
     """
 
     def __init__(self, robot: Robot, stance: Stance, frame: str, *, bias: bool, jdot: bool) -> None:
@@ -85,7 +86,7 @@ class FrozenDynamics:
 
     @cached_property
     def drift_velocity(self) -> Any:
-        """(nv): v when hand and target have met; see above. v itself where the two do not approach."""
+        """Velocity v_meet (nv) at the end of compression; v itself if hand and target do not approach."""
         if not (self.bias or self.jdot):
             return self.v
         w, z = self._roots, self._held
@@ -95,8 +96,8 @@ class FrozenDynamics:
         return self.v - ca.mtimes(self._inverse_root.T, inner) * impulse
 
     # ------------------------------------------------------------ inverse inertias
-    # With H = L' D L, roots W = D^-1/2 L^-T X' of rows X make X H^-1 Y' = W_X' W_Y; and with R R' the
-    # Cholesky factorization of the Delassus matrix and Z = R^-1 W_c' W,  X P Y' = W_X' W_Y - Z_X' Z_Y.
+    # With H = L' D L and W_X = D^-1/2 L^-T X' of a Jacobian X,  X H^-1 Y' = W_X' W_Y. With R R' the Cholesky
+    # factorization of the Delassus matrix and Z_X = R^-1 W_c' W_X,  X P Y' = W_X' W_Y - Z_X' Z_Y.
     @cached_property
     def _cholesky(self) -> Any:
         """R^-1 (c, c)."""
@@ -109,38 +110,39 @@ class FrozenDynamics:
 
     @cached_property
     def _roots(self) -> dict[str, Any]:
+        """W_X of the Jacobians of hand, constrained frames and striking point, and of S."""
         root = self._inverse_root
         names = {"hand": "hand_row", "held": "held_jacobian", "point": "point_jacobian"}
-        rows = {key: self._call(name).T for key, name in names.items()}
-        return {k: ca.mtimes(root, x) for k, x in rows.items()} | {"joints": root[:, -self.robot.n :]}
+        jacobians = {key: self._call(name).T for key, name in names.items()}
+        return {k: ca.mtimes(root, x) for k, x in jacobians.items()} | {"joints": root[:, -self.robot.n :]}
 
     @cached_property
     def _held(self) -> dict[str, Any]:
-        """Z of each root W; without rows where nothing is held."""
+        """Z_X of each W_X; with no rows if nothing is constrained (c = 0)."""
         return {k: self._z(w) for k, w in self._roots.items() if k != "held"}
 
     def _z(self, root: Any) -> Any:
         return ca.mtimes(self._cholesky, ca.mtimes(self._roots["held"].T, root))
 
-    def _form(self, rows: str, columns: str) -> Any:
+    def _form(self, left: str, right: str) -> Any:
         """X P Y'."""
         w, z = self._roots, self._held
-        return ca.mtimes(w[rows].T, w[columns]) - ca.mtimes(z[rows].T, z[columns])
+        return ca.mtimes(w[left].T, w[right]) - ca.mtimes(z[left].T, z[right])
 
     @cached_property
     def A(self) -> Any:
-        """Lower triangle, by columns, of S P S' [1/(kg m2)]: joint accelerations per joint torque."""
+        """Joint accelerations per joint torque, S P S' [1/(kg m2)]: its lower triangle, by columns."""
         dense = ca.densify(self._form("joints", "joints"))
         return ca.project(dense, ca.Sparsity.lower(self.robot.n)).nz[:]
 
     @cached_property
     def s(self) -> Any:
-        """S P j' (n): joint accelerations per normal force at the hand [rad/(kg m)]."""
+        """Joint accelerations per normal force at the hand, S P j' (n) [rad/(kg m)]."""
         return self._form("joints", "hand")
 
     @cached_property
     def m(self) -> Any:
-        """j P j' [1/kg]: one over the effective mass."""
+        """Inverse effective mass at the hand, j P j' [1/kg]."""
         return self._form("hand", "hand")
 
     @cached_property
@@ -158,14 +160,13 @@ class FrozenDynamics:
         """J_hand P J_hand' (3, 3) [1/kg]."""
         return self._form("point", "point")
 
-    # ------------------------------------------------------------ what rounding leaves
+    # ------------------------------------------------------------ conditioning
     @cached_property
     def pivots(self) -> Any:
-        """(c): what is left of each diagonal entry of the constrained frames' Delassus matrix in its
-        factorization.
+        """Pivots of the Delassus matrix's factorization, relative to its diagonal (c).
 
-        Zero where the frame's direction is held already by those before it: a relative rounding error of
-        1e-16 over this is left in all that is computed.
+        A pivot is zero if the constraints before it already imply its constraint. All results have a relative
+        rounding error of 1e-16 over the smallest pivot.
         """
         held = self._roots["held"]
         diagonal = ca.sum1(held**2).T + ca.diag(self._gamma)
@@ -173,93 +174,92 @@ class FrozenDynamics:
 
     @cached_property
     def freedom(self) -> Any:
-        """`m` over what it is with nothing held; zero where the hand is held fast."""
+        """`m` over its value without constraints; zero if the constraints do not let the hand move."""
         return self.m / ca.sumsqr(self._roots["hand"])
 
-    # ------------------------------------------------------------ drifts
-    # Accelerations without torque or contact force.
+    # ------------------------------------------------------------ drifts: accelerations without torque or
+    # force
     @cached_property
     def _bias_root(self) -> Any:
         return ca.mtimes(self._inverse_root, self._call("bias_force", drifting=True))
 
     @cached_property
     def _held_push(self) -> Any:
-        """R^-1 (J_c H^-1 bias - dJ_c/dt v): minus the acceleration of what is held if it were free."""
+        """R^-1 (J_c H^-1 bias - dJ_c/dt v): R^-1 times minus the acceleration of the frames if free."""
         push = self._z(self._bias_root) if self.bias else ca.MX.zeros(6 * len(self.held), 1)
         if not self.jdot:
             return push
         return push - ca.mtimes(self._cholesky, self._call("held_drift", drifting=True))
 
-    def _drift(self, rows: str) -> Any:
-        drift = ca.mtimes(self._held[rows].T, self._held_push)
-        return drift - ca.mtimes(self._roots[rows].T, self._bias_root) if self.bias else drift
+    def _drift(self, jacobian: str) -> Any:
+        drift = ca.mtimes(self._held[jacobian].T, self._held_push)
+        return drift - ca.mtimes(self._roots[jacobian].T, self._bias_root) if self.bias else drift
 
     @cached_property
     def d(self) -> Any:
-        """(n) [rad/s2]: drift of the joint velocities."""
+        """Drift of the joint velocities (n) [rad/s2]."""
         return self._drift("joints")
 
     @cached_property
     def e(self) -> Any:
-        """[m/s2]: drift of the hand's normal speed."""
+        """Drift of the hand's speed along the normal [m/s2]."""
         drift = self._drift("hand")
         return drift + self._call("hand_drift", drifting=True) if self.jdot else drift
 
     @cached_property
     def e_point(self) -> Any:
-        """(3) [m/s2]: drift of the striking point's velocity."""
+        """Drift of the striking point's velocity (3) [m/s2]."""
         drift = self._drift("point")
         return drift + self._call("point_drift", drifting=True) if self.jdot else drift
 
     # ------------------------------------------------------------ wrenches
     @cached_property
     def L_tau(self) -> Any:
-        """(c, n): wrenches [N, N m] of the world on what is held per joint torque."""
+        """Wrenches of the world on the constrained frames per joint torque (c, n) [N/(N m), -]."""
         return -ca.mtimes(self._cholesky.T, self._held["joints"])
 
     @cached_property
     def L_f(self) -> Any:
-        """(c): wrenches lost per normal force at the hand."""
+        """Decrease of these wrenches per normal force at the hand (c) [-, m]."""
         return -ca.mtimes(self._cholesky.T, self._held["hand"])
 
     @cached_property
     def L_point(self) -> Any:
-        """(c, 3): wrenches lost per force at the hand."""
+        """Decrease of these wrenches per force at the striking point (c, 3) [-, m]."""
         return -ca.mtimes(self._cholesky.T, self._held["point"])
 
     @cached_property
     def L_0(self) -> Any:
-        """(c): wrenches without torque or contact force [N, N m]."""
+        """Wrenches without torque or contact force (c) [N, N m]."""
         return ca.mtimes(self._cholesky.T, self._held_push)
 
     @cached_property
     def sole_positions(self) -> Any:
-        """(3, number of fixed soles) [m]: origins of the sole frames in the world."""
+        """Origins of the fixed soles' frames in the world (3, soles) [m]."""
         return self._call("sole_positions")
 
     @cached_property
     def unmodelled_wrench(self) -> Any:
-        """(6) about the world's origin: what carries the weight where `bias` is left out.
+        """Ground wrench (6) about the world's origin that balances the bias if `bias` is off, else zero.
 
-        The whole robot's momentum balance has gravity, Coriolis and centrifugal forces in any case.
+        The momentum balance of the whole robot includes gravity, Coriolis and centrifugal forces in any case.
         """
         return ca.MX.zeros(6) if self.bias else self._call("carrying_wrench")
 
     # ------------------------------------------------------------ whole motion
     @cached_property
     def velocity_change(self) -> Any:
-        """ca.Function (q, drift velocity, normal, torque, force, friction, wrenches, time) -> change of v
-        (nv).
+        """ca.Function (q, drift velocity, normal, torque, force, friction, wrenches, time) -> change of v.
 
-        From time, and integrals over it of torque (n), contact force, friction (3) and wrenches of what is
-        held (c), with what was frozen at (q, drift velocity). With double integrals in their place and
-        time^2 / 2, the change of position.
+        torque (n), force, friction (3) and wrenches (c) are time integrals, with H and the bias frozen at (q,
+        drift velocity). With double integrals, and time^2 / 2 in the place of time, it gives the change of
+        position.
         """
         return self._tree.velocity_change(self.bias)
 
     @cached_property
     def integrate(self) -> Any:
-        """ca.Function (q, d) -> q after moving by d (nv), as pin.integrate."""
+        """ca.Function (q, d) -> q moved by d (nv), as pin.integrate."""
         d = ca.SX.sym("d", self.robot.nv)
         return ca.Function("integrate", [self._tree.rb.q, d], [self._tree.rb.integrate(d)])
 
@@ -275,7 +275,7 @@ class FrozenDynamics:
 
 
 class _TreeQuantities:
-    """Quantities that depend on the robot's tree, each as an SX function of q, v and the normal."""
+    """Quantities of the kinematic tree, each as an SX function of q, v and the normal."""
 
     def __init__(self, robot: Robot, held: tuple[str, ...], soles: tuple[str, ...], frame: str) -> None:
         self.robot, self.held, self.soles, self.frame = robot, held, soles, frame
@@ -301,22 +301,22 @@ class _TreeQuantities:
 
     @cached_property
     def hand_row(self) -> Any:
-        """j (1, nv)."""
+        """Jacobian of the striking point along the normal, j (1, nv)."""
         return ca.mtimes(self.normal.T, self.point_jacobian)
 
     @cached_property
     def point_jacobian(self) -> Any:
-        """J_hand (3, nv)."""
+        """Jacobian of the striking point's position, J_hand (3, nv)."""
         return self.rb.jacobian(self.frame)[:3, :]
 
     @cached_property
     def held_jacobian(self) -> Any:
-        """J_c (c, nv), LOCAL_WORLD_ALIGNED at the constrained frames."""
+        """Jacobians of the constrained frames, J_c (c, nv), LOCAL_WORLD_ALIGNED."""
         return ca.vertcat(ca.SX(0, self.rb.nv), *[self.rb.jacobian(frame) for frame in self.held])
 
     @cached_property
     def bias_force(self) -> Any:
-        """C v + g (nv)."""
+        """Bias C v + g (nv)."""
         return self.rb.rnea(self.rb.v, None)
 
     @property
@@ -346,7 +346,7 @@ class _TreeQuantities:
 
     @property
     def carrying_wrench(self) -> Any:
-        # the base's rows of c + g, carried to a sole by that sole's Jacobian, and on to the origin
+        # the bias on the base, expressed as a wrench at a sole by its Jacobian, then about the world's origin
         J, p, bias = self.rb.jacobian(self.soles[0]), self.rb.frame(self.soles[0])[1], self.bias_force
         R = J[:3, :3]
         force = ca.mtimes(R, bias[:3])
@@ -382,10 +382,11 @@ def _inverse_of_cholesky(size: int) -> Any:
 
 
 def effective_mass(robot: Robot, *, striker: str, normal: ArrayLike, stance: Stance | None = None) -> Any:
-    """Compiled ca.Function q (nq) -> 1 / (n' J P J' n) [kg], the mass that the target meets at first.
+    """Effective mass at the striking point along a normal, as a compiled ca.Function q (nq) -> mass [kg].
 
-    P is the inverse inertia of the robot as held by `stance` (None: all soles, or the fixed base); free
-    joints, no servo. The paper calls it virtual mass (its section III, after Asada and Ogawa, and Khatib).
+    It is 1 / (n' J P J' n) with the inverse inertia P of the robot as constrained by `stance` (None: all
+    soles, or the fixed base), with free joints and without a servo. The paper calls it virtual mass (its
+    section III, after Asada and Ogawa, and Khatib).
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Expression graph of a collision, from configuration and velocity at contact to its outputs and gradient.
 
-All of it is decided when the function is built: what is not in is not computed.
+Effects and outputs are selected when the function is built; others cost nothing.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 import casadi as ca
 
 from impactopt.collision.frozen import FrozenDynamics
-from impactopt.collision.implicit_numpy import implicit_loop
-from impactopt.collision.model import Course, JointSpaceModel, Loop, shape_of
+from impactopt.collision.implicit_numpy import ImplicitLoop
+from impactopt.collision.model import JointSpaceModel, Loop, SegmentedCollision, shape_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, Outputs, frozen_for
 from impactopt.collision.runge_kutta import rk4_step, run
 from impactopt.collision.stepped import SteppedModel, number_of_steps
@@ -35,14 +35,14 @@ __all__ = [
     "target_start",
 ]
 
-# where steps find their own length
+# largest number of implicit steps, which choose their own length
 MOST_STEPS = 5000
 
 
 def joint_space_model(
     collision: SteppedModel, outputs: tuple[str, ...] = (), *, freezes: int = 0
 ) -> JointSpaceModel:
-    """Model that the time loop integrates for these outputs."""
+    """Model that the time loop integrates, with the states that these outputs need."""
     return JointSpaceModel(
         n=collision.n_servos,
         effects=collision.effects,
@@ -60,15 +60,16 @@ def joint_space_model(
 
 
 def frozen_dynamics(collision: SteppedModel) -> FrozenDynamics:
-    """Steps 1b and 2b."""
+    """Frozen dynamics of a collision model (paper, steps 1b and 2b)."""
     frame = collision.robot.striker(collision.striker).model_frame
     effects = collision.effects
     return FrozenDynamics(collision.robot, collision.held_by, frame, bias=effects.bias, jdot=effects.jdot)
 
 
 def target_start(target: Target, numbers: dict[str, Any]) -> Any:
-    """(2) of the target's surface where contact begins: acceleration per contact force [1/kg], which is one
-    over a free mass; speed along the normal [m/s].
+    """Inverse mass [1/kg] and normal speed [m/s] of the target's surface at first contact (2), MX.
+
+    The inverse mass is the acceleration of the surface per contact force.
     """
     z, f = ca.SX.sym("z", target.n_states), ca.SX.sym("f")
     symbols = {name: ca.SX.sym(name) for name in numbers}
@@ -82,7 +83,7 @@ def target_start(target: Target, numbers: dict[str, Any]) -> Any:
 
 
 def columns_of(collision: SteppedModel, fraction: float, every: int) -> int:
-    """Instants of the histories for a fraction of the horizon, where steps find their own length."""
+    """Number of instants of the histories in a fraction of the horizon, with implicit steps."""
     return ceil(fraction * collision.horizon / (every * collision.step_length) - 1e-9) + 1
 
 
@@ -91,7 +92,7 @@ def collision_graph(
 ) -> Any:
     """ca.Function (q, v[, feedforward], *settings) -> outputs, differentiable, not compiled.
 
-    as_compiled : by implicit steps where the compiled function has them; then without derivatives.
+    as_compiled : with implicit steps if the compiled function has them; then it has no derivatives.
     """
     implicit = as_compiled and collision.stepping == "implicit"
     inputs, out = _expressions(collision, outputs, every, implicit=implicit)
@@ -99,11 +100,11 @@ def collision_graph(
 
 
 def gradient_graph(collision: SteppedModel, output: str) -> Any:
-    """ca.Function (q, v[, feedforward], *settings) -> (output, d/dq (nv), d/dv (nv)), both in v's basis."""
+    """ca.Function (q, v[, feedforward], *settings) -> (output, d/dq (nv), d/dv (nv)), in the basis of v."""
     inputs, (value,) = _expressions(collision, (output,), 1)
     rb = RigidBody(collision.robot.model)
     tangent = ca.Function("tangent", [rb.q], [rb.tangent_map()])
-    # one sweep for both
+    # one adjoint sweep for both
     ((by_q, by_v),) = ca.reverse([value], [inputs["q"], inputs["v"]], [[ca.MX(1.0)]])
     by_q = ca.mtimes(tangent(inputs["q"]).T, by_q)
     names = [output, f"{output}_by_q", f"{output}_by_v"]
@@ -113,7 +114,7 @@ def gradient_graph(collision: SteppedModel, output: str) -> Any:
 def _expressions(
     collision: SteppedModel, outputs: tuple[str, ...], every: int, *, implicit: bool = False
 ) -> tuple[dict[str, Any], list[Any]]:
-    """Inputs by name, and the outputs, MX."""
+    """Inputs by name, and outputs, MX."""
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     frozen = frozen_dynamics(collision)
     inputs = {"q": frozen.q, "v": frozen.v}
@@ -122,7 +123,7 @@ def _expressions(
     inputs |= {key: ca.MX.sym(key, *shape_of(value)) for key, value in collision.settings.items()}
     inputs["normal"] = frozen.normal
     record = every if any(output in HISTORIES for output in outputs) else 0
-    course = Course(
+    segmented = SegmentedCollision(
         model,
         frozen,
         loop=(_implicit if implicit else _explicit)(collision, model, record),
@@ -130,14 +131,13 @@ def _expressions(
         freezes=collision.n_freezes,
         names=_frozen_names(collision, model, outputs),
     )
-    gives_way = target_start(model.target, model.target_numbers(inputs))
-    segments = course.run(inputs, gives_way)
+    segments = segmented.run(inputs, target_start(model.target, model.target_numbers(inputs)))
     made = Outputs(model, segments, len(frozen.soles), len(frozen.held), inputs["v"])
     return inputs, [ca.densify(getattr(made, output)) for output in outputs]
 
 
 def _explicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Loop:
-    """The time loop as a graph; `every`: keep every so many of the states, and the last; 0: none."""
+    """Time loop of Runge-Kutta steps as a graph. It records every `every`-th state and the last; 0: none."""
     step = rk4_step(model, collision.step_of_graph)
 
     def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:
@@ -152,49 +152,50 @@ def _explicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Lo
 
 
 def _implicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Loop:
-    """The time loop as a call of NumPy."""
+    """Time loop of implicit steps, which the graph calls in NumPy."""
 
     def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:
-        wanted = record and every > 0
-        function = implicit_loop(
+        recorded = record and every > 0
+        function = ImplicitLoop(
             model,
             tolerance=collision.tolerance,
             most_steps=MOST_STEPS,
             spacing=max(every, 1) * collision.step_length,
-            columns=columns_of(collision, fraction, every) if wanted else 1,
+            columns=columns_of(collision, fraction, every) if recorded else 1,
         )
         final, states = function(start, *data)
-        return final, states if wanted else None
+        return final, states if recorded else None
 
     return loop
 
 
-# term: what it is, and when it may be left out
+# description of each effect, and when it may be left out
 _EFFECTS = {
     "stiffness": "the servo's stiffness (eq. 10): it matters little in contacts of a few milliseconds",
     "feedforward": "the feed-forward torque: it is zero, or no saturation depends on it",
-    "saturation": "the torque limits (eq. 12): no joint reaches its limit, or rows of a plan keep it from it",
-    "friction": "joint friction (eq. 5): its numbers are not known, or small",
-    "bias": "Coriolis, centrifugal and gravity terms (eq. 6): small beside the blow",
-    "jdot": "the Jacobians' rates (eq. 14): small beside the blow",
+    "saturation": "the torque limits (eq. 12): no joint reaches its limit, or the plan's constraints exclude "
+    "it",
+    "friction": "joint friction (eq. 5): its parameters are unknown, or small",
+    "bias": "Coriolis, centrifugal and gravity terms (eq. 6): small beside the impact",
+    "jdot": "the Jacobians' rates (eq. 14): small beside the impact",
 }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Description:
-    """Contents of a collision function, as text by str(), and as numbers.
+    """Contents of a collision function, as text by str(), and as data by `as_dict`.
 
     Attributes
     ----------
-    contents : what is in, by name: plain numbers, text, lists and mappings.
-    left_out : what is not in, and why.
+    contents : what the function includes, by name: plain numbers, text, lists and mappings.
+    left_out : what it omits, and why.
     """
 
     contents: Mapping[str, Any]
     left_out: Mapping[str, str]
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, for JSON."""
+        """Contents and omissions, for JSON."""
         return {**self.contents, "left_out": dict(self.left_out)}
 
     def __str__(self) -> str:
@@ -242,10 +243,10 @@ def _frozen_names(
 
 
 def instructions(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, int]:
-    """Scalar instructions of one freeze and one Runge-Kutta step of the graph, as CasADi counts them.
+    """Scalar instructions, counted by CasADi, of one freeze and of one Runge-Kutta step of the graph.
 
-    Implicit steps, in C alone, have the freeze of the graph, and in place of its step one that costs twice as
-    much, or six times where law or target bend.
+    The handwritten C has the same freeze. Its implicit step costs twice as much as the Runge-Kutta step, or
+    six times as much with a nonlinear law or target.
     """
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     freeze = frozen_dynamics(collision).function("frozen", _frozen_names(collision, model, outputs))
@@ -260,19 +261,20 @@ def _steps(collision: SteppedModel) -> dict[str, float]:
 
 
 def independent_joints(collision: SteppedModel) -> list[str]:
-    """Joints that the blow cannot move, and that move nothing that is asked for: on a fixed base, those of
-    limbs that share no joint with the striking point's, where no joint follows another. H has no entries
-    between the two, nor have gains given one a joint. To lock them in the robot changes nothing of the
-    collision."""
+    """Joints that can be locked without any effect on the collision.
+
+    On a fixed base without couplings, these are the joints of limbs that share no joint with the striking
+    point's. H has no entries between the two, nor have gains that are one number a joint.
+    """
     robot = collision.robot
     gains = [value for name, value in collision.settings.items() if name in ("kp", "kd")]
     if robot.floating or robot.couplings or any(gain.ndim == 2 for gain in gains):
         return []
     model = robot.model
     frame = model.getFrameId(robot.striker(collision.striker).model_frame)
-    hit = {int(j) for j in model.supports[model.frames[frame].parentJoint]} - {0}
-    apart = (j for j in range(1, model.njoints) if not hit & {int(i) for i in model.supports[j]})
-    return [str(model.names[j]) for j in apart]
+    striking = {int(j) for j in model.supports[model.frames[frame].parentJoint]} - {0}
+    independent = (j for j in range(1, model.njoints) if not striking & {int(i) for i in model.supports[j]})
+    return [str(model.names[j]) for j in independent]
 
 
 def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, str]:
@@ -290,20 +292,20 @@ def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, st
     if not held_by.soles(robot):
         out["wrenches and ZMP"] = "nothing holds the robot" if robot.floating else "the base is fixed"
     elif not wanted & {*OF_SOLES}:
-        out["wrenches and ZMP"] = "not asked for"
+        out["wrenches and ZMP"] = "not requested"
     elif not wanted & {"ground_wrench", "zmp"}:
-        out["ZMP"] = "not asked for"
+        out["ZMP"] = "not requested"
     free = [sole.name for sole in robot.soles if sole not in held_by.soles(robot)] if robot.floating else []
     if free:
         out["held soles"] = f"{', '.join(free)}: not held by the stance"
     if not wanted & {*HISTORIES}:
-        out["histories"] = "not asked for"
+        out["histories"] = "not requested"
     if "peak_force" not in wanted:
-        out["peak force"] = "not asked for"
+        out["peak force"] = "not requested"
     if "configuration" not in wanted and not collision.n_freezes:
-        out["second integrals"] = "no configuration asked for, nothing frozen again"
+        out["second integrals"] = "no configuration requested, no further freezes"
     if not wanted & {"configuration", "velocity"}:
-        out["motion of the whole robot"] = "not asked for"
+        out["motion of the whole robot"] = "not requested"
     if collision.contact_friction is None:
         out["friction at the hit"] = "not given (contact_friction)"
     out["derivatives"] = "in `gradient_function`, and in `graph`"

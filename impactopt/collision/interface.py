@@ -1,4 +1,4 @@
-"""Interface of all collision models, from the point mass to full dynamics, and the result of a collision."""
+"""Interface of the collision models, from the point mass to full dynamics, and the result of a collision."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Collision:
-    """Result of a collision from contact to separation. Histories have k entries, at the steps, first at
-    contact, last at separation.
+    """Result of a collision from contact to separation.
+
+    Histories have k entries, at the steps; the first is at contact, the last at separation.
 
     Attributes
     ----------
@@ -34,25 +35,25 @@ class Collision:
     separated : whether the contact ended within the horizon.
     velocity : (nv) Pinocchio's v after the collision.
     configuration : (nq) Pinocchio's q after the collision.
-    target_result : what the target says of itself at separation, by the names in its `results`.
+    target_result : results of the target at separation, by the names in its `results`.
     time : (k) [s] since contact.
     force : (k) [N] on the target along the normal.
     penetration : (k) [m] of the contact law.
     hand_speed, target_speed : (k) [m/s] along the normal.
     joint_velocity : (k, n) [rad/s].
-    torque, demand : (k, n) [N m] of the servo, and what it would be without saturation. These, the joint
-        velocities and all wrenches are None of a point mass and a rigid impact, which know nothing of them.
+    torque, demand : (k, n) [N m] of the servo, after and before saturation. These, the joint velocities and
+        all wrenches are None of a point mass and a rigid impact.
     sole_wrench : (k, soles, 6) [N, N m] of the ground on each fixed sole, world axes, at the sole's frame;
         in the stance's order of soles. None on a fixed base.
     hand_wrench : (k, hands, 6) [N, N m] of the world on each supporting hand, world axes, at its striking
-        point; in the stance's order of hands. None where none is held.
+        point; in the stance's order of hands. None without supporting hands.
     ground_wrench : (k, 6) [N, N m] of the ground on the robot, world axes, about the world's origin; None
         on a fixed base.
     zmp : (k, 2) [m] x and y of the zero-moment point on the ground z = 0; None on a fixed base.
-    freeze_error : relative, what freezing may have cost of the impulse, as an estimate from the same
-        collision frozen more often (see `SDC`): infinite where that does not end by the horizon; 0 where
-        nothing is frozen, nan where it is not estimated, as of a point mass.
-    caution : what to do where freeze_error is above the accuracy that the model was asked for; else "".
+    freeze_error : estimated relative error of the impulse by freezing, from the same collision frozen more
+        often (see `SDC`): infinite if that does not end by the horizon; 0 if nothing is frozen, nan if it is
+        not estimated, as of a point mass.
+    caution : advice if freeze_error is above the required accuracy of the model; else "".
     """
 
     impulse: float
@@ -80,10 +81,9 @@ class Collision:
 
     @classmethod
     def from_outputs(cls, found: dict[str, Array], target: Target) -> Collision:
-        """Makes a result from the arrays of a collision function, without instants that repeat the one
-        before.
+        """Makes a result from the arrays of a collision function.
 
-        What judges a result, `step_error`, is no part of it.
+        Instants that repeat the one before are left out, and `step_error`, which serves to check a result.
         """
         time = found["time"].ravel()
         kept = np.concatenate([[True], np.diff(time) > 0])
@@ -93,8 +93,8 @@ class Collision:
                 continue
             if name in HISTORIES:
                 columns = value.T if value.shape == (time.size, 1) else value
-                rows = np.ascontiguousarray(columns[:, kept].T)
-                out[name] = rows.ravel() if OUTPUTS[name].startswith("(k)") else rows
+                history = np.ascontiguousarray(columns[:, kept].T)
+                out[name] = history.ravel() if OUTPUTS[name].startswith("(k)") else history
             else:
                 out[name] = float(value.item()) if name in SCALARS else value.ravel()
         out["separated"] = bool(round(out["separated"]))
@@ -110,21 +110,20 @@ class Collision:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CollisionModel(ABC):
-    """A robot hits a target: what both do from contact to separation.
+    """A model of the collision of a robot with a target, from contact to the first separation.
 
-    The servo follows a reference that goes on at the joint velocity at contact, unless the setting
-    `reference` says otherwise. With such a reference, legs that move do not keep their soles in place. A
-    plan's reference does; `impactopt.coasting_reference` gives it. The collision ends at the first
-    separation.
+    The servo follows a reference that continues at the joint velocity at contact, unless the setting
+    `reference` gives another one. With constant joint velocities, moving legs would not keep their soles in
+    place. A plan's reference does; `impactopt.coasting_reference` gives it.
 
     Attributes
     ----------
     robot : with servo gains kp, kd and torque limits.
     striker : name of the robot's striking point.
-    normal : (3,) unit vector along the blow, world axes; the target moves along it.
-    law, target : contact law, and what is hit.
-    stance : what holds the robot; None: all soles, or the fixed base.
-    horizon : [s] the contact should end before this.
+    normal : (3,) unit vector along which the target is hit and moves, world axes.
+    law, target : contact law, and target.
+    stance : constraints of the robot; None: all soles, or the fixed base.
+    horizon : [s] time by which the contact should end.
 
     Raises
     ------
@@ -149,13 +148,12 @@ class CollisionModel(ABC):
 
     @property
     def held_by(self) -> Stance:
-        """The stance, or the robot's usual one."""
+        """The stance, or the robot's default one."""
         return usual_stance(self.robot) if self.stance is None else self.stance
 
-    # ------------------------------------------------------------ what all of them refuse
     @staticmethod
     def check_separation(result: Collision) -> None:
-        """InputError for a contact that has not ended."""
+        """InputError if the contact has not ended."""
         if not result.separated:
             raise InputError(
                 f"horizon [s]: the contact has not ended after {result.duration:.3g} s: raise the horizon, "
@@ -172,14 +170,14 @@ class CollisionModel(ABC):
         require_separation: bool = True,
         **overrides: ArrayLike,
     ) -> Collision:
-        """One collision, in numbers.
+        """One collision, evaluated numerically.
 
         Parameters
         ----------
-        q, v : (nq), (nv) at contact, Pinocchio's; v should leave what is held at rest.
-        torque : (n) [N m] feed-forward; a model that has none in it does not use it.
+        q, v : (nq), (nv) at contact, Pinocchio's; constrained frames should be at rest.
+        torque : (n) [N m] feed-forward; ignored by models without it.
         require_separation : refuse a contact that has not ended at the horizon.
-        overrides : numbers other than the defaults, by name (see `SDC.settings`).
+        overrides : values in the place of the default settings, by name (see `SDC.settings`).
 
         Raises
         ------

@@ -22,14 +22,14 @@ __all__ = [
     "frozen_for",
 ]
 
-# name: what it is
+# description of each output
 OUTPUTS = {
     "impulse": "[N s] delivered to the target",
     "peak_force": "[N] largest contact force; of 'rk4' at the steps",
     "duration": "[s] from contact to separation",
     "energy": "[J] given to the target",
-    "step_error": "what the steps of 'rk4' left out of the impulse, relative, as an estimate",
-    "separated": "1 where the contact ended within the horizon, else 0",
+    "step_error": "estimated relative error of the impulse by the steps of 'rk4'",
+    "separated": "1 if the contact ended within the horizon, else 0",
     "velocity": "(nv) after the collision, Pinocchio's v",
     "configuration": "(nq) after the collision, Pinocchio's q",
     "target_result": "the target's `results` at separation",
@@ -49,18 +49,18 @@ OUTPUTS = {
 SCALARS = ("impulse", "peak_force", "duration", "energy", "step_error", "separated")
 HISTORIES = tuple(OUTPUTS)[tuple(OUTPUTS).index("time") :]
 OF_SOLES = ("sole_wrench", "ground_wrench", "zmp")
-# what a point mass and a rigid impact know nothing of
+# outputs that a point mass and a rigid impact do not have
 OF_SERVO = ("joint_velocity", "torque", "demand", "hand_wrench", *OF_SOLES)
 
 
 def check_outputs(names: tuple[str, ...]) -> None:
-    """InputError for an output that there is not."""
+    """InputError for an unknown output."""
     for name in names:
         check_choice("no output", name, OUTPUTS)
 
 
 def check_jacobian(names: tuple[str, ...], method: str, freezes: int) -> None:
-    """InputError for outputs, or a model, without compiled Jacobians."""
+    """InputError for outputs or models without compiled Jacobians."""
     for name in names:
         if name not in (*SCALARS, *HISTORIES):
             raise InputError(f"Jacobian of {name!r}: only of {', '.join((*SCALARS, *HISTORIES))}")
@@ -72,9 +72,10 @@ def check_jacobian(names: tuple[str, ...], method: str, freezes: int) -> None:
 
 
 def frozen_for(names: tuple[str, ...], *, slides: bool = False) -> tuple[str, ...]:
-    """Attributes of FrozenDynamics that these outputs need besides what the model does; slides: as of it.
+    """Attributes of FrozenDynamics that these outputs need, besides those of the model.
 
-    With freezes on the way a collision needs those of "velocity".
+    With further freezes a collision also needs those of "velocity". slides : with friction at the striking
+    point.
     """
     motion = {"velocity", "configuration"} & {*names}
     wrench = {*OF_SOLES, "hand_wrench"} & {*names}
@@ -91,9 +92,9 @@ class Outputs:
 
     Parameters
     ----------
-    model : the collision in joint space.
-    segments : what each freeze has led to.
-    soles, held : number of fixed soles, and of all that is held, the soles first.
+    model : collision in joint space.
+    segments : results of the integration, one a freeze.
+    soles, held : number of fixed soles, and of all constrained frames, of which the soles are first.
     v : velocity at contact (nv).
     """
 
@@ -111,8 +112,8 @@ class Outputs:
     def __getattr__(self, name: str) -> Any:
         if name not in HISTORIES:
             raise AttributeError(name)
-        rows = ca.horzcat(*[getattr(instants, name) for instants in self._instants])
-        return rows.T if rows.size1() == 1 else rows
+        history = ca.horzcat(*[getattr(instants, name) for instants in self._instants])
+        return history.T if history.size1() == 1 else history
 
     def _sum(self, part: str) -> Any:
         return sum(self._model.part(segment.final, part) for segment in self._segments)
@@ -149,7 +150,7 @@ class Outputs:
 
     @cached_property
     def separated(self) -> Any:
-        """No longer in contact at the end of any freeze."""
+        # contact has ended at the end of some segment
         contact = ca.MX(1.0)
         for segment in self._segments:
             contact *= self._model.phase(segment.final, segment.data)[1]
@@ -172,16 +173,16 @@ class Instants:
         self._since = segment.since
         self._n_soles, self._n_held, self._v = soles, held, v
 
-    def _row(self, name: str) -> Any:
+    def _part(self, name: str) -> Any:
         return self._model.part(self._states, name)
 
     @cached_property
     def time(self) -> Any:
-        return self._since + self._row("time")
+        return self._since + self._part("time")
 
     @cached_property
     def penetration(self) -> Any:
-        return self._row("penetration")
+        return self._part("penetration")
 
     @cached_property
     def force(self) -> Any:
@@ -192,11 +193,11 @@ class Instants:
         rates = model.rate(self._states, self._data)
         columns = self._states.size2()
         values = [ca.repmat(value, 1, columns) for value in model.law_numbers(self._data).values()]
-        return law.map(columns)(self._row("penetration"), rates, *values)
+        return law.map(columns)(self._part("penetration"), rates, *values)
 
     @cached_property
     def friction_on_target(self) -> Any:
-        """(3, k) [N]."""
+        """Friction on the target (3, k) [N]."""
         model, velocity, force = self._model, ca.SX.sym("velocity", 3), ca.SX.sym("force")
         names = ("normal", "friction_coefficient", "friction_slip_speed")
         data = {name: ca.SX.sym(name, *model.data[name]) for name in names}
@@ -228,7 +229,7 @@ class Instants:
         velocity = ca.repmat(start, 1, change.size2()) + change
         if "reference_acceleration" not in self._data:
             return velocity
-        return velocity + ca.mtimes(self._data["reference_acceleration"], self._row("time"))
+        return velocity + ca.mtimes(self._data["reference_acceleration"], self._part("time"))
 
     @cached_property
     def demand(self) -> Any:
@@ -240,20 +241,17 @@ class Instants:
         return self._model.saturate(self.demand, self._data)
 
     # ------------------------------------------------------------ ground
-    def _wrench(self, torque: Any, force: Any, time: Any) -> Any:
-        """Wrenches of all that is held for torques (n, k), forces (1, k) and the drift's weight (1, k)."""
-        data = self._data
-        return ca.mtimes(data["L_tau"], torque) - ca.mtimes(data["L_f"], force) + ca.mtimes(data["L_0"], time)
-
     @cached_property
     def _held_wrench(self) -> Any:
-        torque = self.torque
+        """Wrenches on all constrained frames (c, k), L_tau (tau - F) - L_f f + L_0."""
+        torque, data = self.torque, self._data
         if self._model.effects.friction:
-            torque = torque - self._model.friction(self._joint_change, self._data)
-        wrench = self._wrench(torque, self.force, ca.DM.ones(1, torque.size2()))
+            torque = torque - self._model.friction(self._joint_change, data)
+        wrench = ca.mtimes(data["L_tau"], torque) - ca.mtimes(data["L_f"], self.force)
+        wrench += ca.mtimes(data["L_0"], ca.DM.ones(1, torque.size2()))
         if not self._model.slides:
             return wrench
-        return wrench - ca.mtimes(self._data["L_point"], self.friction_on_target)
+        return wrench - ca.mtimes(data["L_point"], self.friction_on_target)
 
     @cached_property
     def sole_wrench(self) -> Any:
@@ -274,5 +272,5 @@ class Instants:
 
     @cached_property
     def zmp(self) -> Any:
-        w = self.ground_wrench
+        w = self.ground_wrench  # ZMP (-M_y, M_x) / F_z: paper, end of section II-B
         return ca.vertcat(-w[4, :] / w[2, :], w[3, :] / w[2, :])

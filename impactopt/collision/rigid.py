@@ -1,4 +1,4 @@
-"""Rigid impact with a coefficient of restitution: the robot as it is held, in no time."""
+"""Rigid impact of the constrained robot, with a coefficient of restitution and without duration."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigidImpact(CollisionModel):
-    """Newton's restitution along the normal between robot and target, whose postures do not change meanwhile.
+    """Newton's law of restitution along the normal between robot and target, at constant positions.
 
-    With P the inverse inertia of the robot as held, v_c the speed of approach and m_t the target's mass,
+    With P the inverse inertia of the constrained robot, v_c the speed of approach and m_t the target's mass,
 
         I = (1 + e) v_c / (n' J P J' n + 1 / m_t),      v+ = v - P J' n I.
 
-    Finite forces do nothing in no time: servo, gravity and the contact law are not in it, and neither are
-    torques, sole wrenches and ZMP (None in its results). The peak force is infinite.
+    Finite forces have no effect without duration: servo, gravity and the contact law are not in the model,
+    and torques, sole wrenches and ZMP are None in its results. The peak force is infinite.
 
     Attributes
     ----------
-    coefficient_of_restitution : e, of the speed of approach: 0, plastic, to 1, elastic.
+    coefficient_of_restitution : e, speed of separation over speed of approach: 0, plastic, to 1, elastic.
 
     Others, and errors, as of `CollisionModel`; also
 
@@ -55,11 +55,11 @@ class RigidImpact(CollisionModel):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Numbers that `collide` may be given instead: those of the target, ``target_mass``."""
+        """Parameters that `collide` can override: those of the target, such as ``target_mass``."""
         return {f"target_{name}": value for name, value in self.target.parameters.items()}
 
     def _by_unit_impulse(self, q: Array) -> tuple[Array, Array]:
-        """n' J (nv,), and P J' n (nv,): the velocities that a unit impulse takes."""
+        """Jacobian n' J (nv,), and P J' n (nv,), the decrease of velocity by a unit impulse."""
         frames = self.held_by.constraint_frames(self.robot)
         body = Held.at(self.robot.model, q, frames, self.robot.striker(self.striker).model_frame)
         hand = np.asarray(self.normal) @ body.hand
@@ -83,10 +83,12 @@ class RigidImpact(CollisionModel):
         state = np.zeros(self.target.n_states)
         before = float(self.target.velocity(state, numbers))
         hand, change = self._by_unit_impulse(q)
-        speed, yields = float(hand @ v), float(hand @ change)
-        gain = np.array(self.target.derivative(state, 1.0, numbers), dtype=float)  # of the target's state
-        lightness = float(self.target.velocity(gain, numbers)) - before
-        impulse = max((1 + self.coefficient_of_restitution) * (speed - before) / (yields + lightness), 0.0)
+        speed, inverse_mass = float(hand @ v), float(hand @ change)
+        # change of the target's state, and of its velocity [1/kg], by a unit impulse
+        gain = np.array(self.target.derivative(state, 1.0, numbers), dtype=float)
+        of_target = float(self.target.velocity(gain, numbers)) - before
+        e = self.coefficient_of_restitution
+        impulse = max((1 + e) * (speed - before) / (inverse_mass + of_target), 0.0)
         after, state = v - change * impulse, gain * impulse
         values = self.target.result(state, numbers)
         at = np.zeros(1)
@@ -102,7 +104,7 @@ class RigidImpact(CollisionModel):
             time=at,
             force=at,
             penetration=at,
-            hand_speed=np.array([speed - yields * impulse]),
+            hand_speed=np.array([speed - inverse_mass * impulse]),
             target_speed=np.array([float(self.target.velocity(state, numbers))]),
             joint_velocity=None,
             torque=None,

@@ -1,6 +1,7 @@
-"""Steps 3b to 7b of the paper as fixed steps of the classical Runge-Kutta method, as in its section III.
+"""Fixed steps of the classical Runge-Kutta method (paper, steps 3b to 7b and section III).
 
-Phases are judged anew in each of the four stages, so a step across an event is of second order only.
+Each of the four stages evaluates the phase of contact by itself, so a step across an event is of second order
+only.
 """
 
 from __future__ import annotations
@@ -14,22 +15,21 @@ from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["BLOCK", "LEFT_OUT_BY_RK4", "rate_of_change", "rk4_step", "run"]
 
-# steps in a block: a block is skipped when the contact is over before it begins
+# steps in a block; a block is skipped if the contact is over before it begins
 BLOCK = 16
 
 
 def run(
     model: JointSpaceModel, step: Any, start: Any, steps: int, data: Sequence[Any], *, record: bool
 ) -> tuple[Any, Any]:
-    """(final state, states at all steps) from the state `start`, MX.
+    """Final state, and with `record` the states at all steps (n_states, steps + 1), else None, MX.
 
-    At least `steps` steps are made, rounded up to whole blocks; the states at all steps, (n_states, steps +
-    1), are in the graph only where `record` asks for them. After the end states repeat the last one.
+    The number of steps is rounded up to whole blocks. After the end of contact the states repeat the last
+    one.
     """
-    block = _block(model, step, record)
-    still = _still(model, record)
-    advance = ca.Function.if_else("advance", block, still)
-    running = _running(model)
+    advance = _skippable_block(model, step, record)
+    symbol, symbols = ca.SX.sym("y", model.n_states), model.small_symbols()
+    running = ca.Function("running", [symbol, *symbols.values()], [model.running(symbol, symbols)])
     small = [x for x, name in zip(data, model.data, strict=True) if name != "A"]
     y = ca.MX(start)
     history = [y]
@@ -40,34 +40,26 @@ def run(
     return y, ca.horzcat(*history) if record else None
 
 
-def _block(model: JointSpaceModel, step: Any, record: bool) -> Any:
+def _skippable_block(model: JointSpaceModel, step: Any, record: bool) -> Any:
+    """ca.Function (flag, y, *data) -> state after `BLOCK` steps[, all states]; y[, copies] if flag is 0."""
     y, data = ca.MX.sym("y", model.n_states), list(model.symbols(ca.MX).values())
     states = [y]
     for _ in range(BLOCK):
         states.append(step(states[-1], *data))
-    out = [states[-1], ca.horzcat(*states[1:])] if record else [states[-1]]
-    return ca.Function("block", [y, *data], out)
+    steps, copies = [states[-1], ca.horzcat(*states[1:])], [y, ca.repmat(y, 1, BLOCK)]
+    block = ca.Function("block", [y, *data], steps[: 1 + record])
+    return ca.Function.if_else("advance", block, ca.Function("still", [y, *data], copies[: 1 + record]))
 
 
-def _still(model: JointSpaceModel, record: bool) -> Any:
-    y, data = ca.MX.sym("y", model.n_states), list(model.symbols(ca.MX).values())
-    out = [y, ca.repmat(y, 1, BLOCK)] if record else [y]
-    return ca.Function("still", [y, *data], out)
-
-
-def _running(model: JointSpaceModel) -> Any:
-    y, data = ca.SX.sym("y", model.n_states), model.small_symbols()
-    return ca.Function("running", [y, *data.values()], [model.running(y, data)])
-
-
-# of |f_2 - f_3| h, of the force at both of a step's middles, summed over steps, what is left out of the
-# impulse: where the force changes by x of itself within a step, half of x^2, as kinks cost. Friction counts
-# too: where it swings from stage to stage, as it does where steps are too long for a point that sticks
+# Error estimate of the impulse: this times |f_2 - f_3| h, summed over steps, of the forces f_2 and f_3 at the
+# two midpoint stages. If the force changes by the fraction x within a step, it is half of x^2, as much as a
+# kink costs. Friction is included: it oscillates from stage to stage if steps are too long for a sticking
+# point.
 LEFT_OUT_BY_RK4 = 2.0
 
 
 def rk4_step(model: JointSpaceModel, length: float) -> Any:
-    """ca.Function step(y, *data) -> y `length` [s] later; y itself after separation."""
+    """ca.Function (y, *data) -> state `length` [s] later; after separation y itself."""
     y, data, u = ca.SX.sym("y", model.n_states), model.small_symbols(), ca.SX.sym("u", model.n)
     rate = ca.Function("rate", [y, *data.values(), u], [rate_of_change(model, y, u, data)])
     time = model.longest(y, data, length) * model.running(y, data)
@@ -99,7 +91,7 @@ def rk4_step(model: JointSpaceModel, length: float) -> Any:
 
 
 def rate_of_change(model: JointSpaceModel, y: Any, u: Any, data: dict[str, Any]) -> Any:
-    """dy/dt, with every phase judged at y; u is the change of the joint velocities at y."""
+    """Time derivative dy/dt in the phase at y; u is the change of the joint velocities at y."""
     rate = model.rate(y, data)
     force = model.law.force(model.part(y, "penetration"), rate, model.law_numbers(data))
     tau = model.saturate(model.with_feedforward(model.servo(y, u, data), data), data)

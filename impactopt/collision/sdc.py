@@ -1,4 +1,4 @@
-"""Simplified dynamics computation of a collision (paper, section II-B), and the point mass beside it."""
+"""Simplified dynamics computation of a collision (paper, section II-B), and the point-mass model."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ __all__ = ["FROZEN", "SDC", "VirtualMass", "frozen_model"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VirtualMass(SymbolicModel):
-    """A point of the robot's effective mass m_a = 1 / (n' J P J' n) meets the target; no servo, no gravity.
+    """Point mass with the robot's effective mass m_a = 1 / (n' J P J' n), without servo and gravity.
 
     The simplest model of the hierarchy (paper, fig. 9, Table III; after Asada and Ogawa, and Khatib): P is
-    the inverse inertia of the robot as held. It knows nothing of joint torques, sole wrenches and ZMP (None
-    in its results); the velocity after the collision is that of free joints. Attributes and errors as of
+    the inverse inertia of the constrained robot. Joint torques, sole wrenches and ZMP are None in its
+    results; the velocity after the collision is that of free joints. Attributes and errors as of
     `SymbolicModel`.
     """
 
@@ -48,18 +48,18 @@ class SDC(SymbolicModel):
     friction : of the joints, with effects.friction.
     kp, kd : servo stiffness [N m/rad] and damping [N m s/rad]: one number a joint (n), one for all, or
         matrices (n, n) (paper, eq. 10); None: the robot's.
-    freezes : how often H, J and the bias are frozen anew on the way; 0: only at contact, as in the paper.
-        The error falls with 1/freezes^2; four take some five times as long as none.
-    accuracy : relative, of the impulse. `collide` estimates the error that freezing makes, from a collision
-        with at least four times as many freezes: `Collision.freeze_error`. Where it is larger than this,
-        `Collision.caution` says so. The estimate makes a collision with one freeze some six times as slow,
-        one with four freezes 1.4 times, and one more function is compiled. None: no estimate. Effects that
-        are left out are not in it.
+    freezes : number of further freezes of H, J and the bias during contact; 0: only at contact, as in the
+        paper. The error falls with 1/freezes^2; four take some five times as long as none.
+    accuracy : required relative accuracy of the impulse. `collide` estimates the error of freezing from a
+        collision with at least twice as many freezes: `Collision.freeze_error`. If it is larger than this,
+        `Collision.caution` warns. The estimate makes a collision frozen at contact only some six times as
+        slow, one with four freezes 1.4 times, and one more function is compiled. None: no estimate. The
+        estimate does not include effects that the model omits.
 
     Raises
     ------
-    InputError : as `SymbolicModel`; friction without its numbers, or the other way round; freezes that are
-        no number >= 0; an accuracy that is not positive.
+    InputError : as `SymbolicModel`; effects.friction without `friction`, or vice versa; freezes that are not
+        a whole number >= 0; an accuracy that is not positive.
     """
 
     friction: JointFriction | None = None
@@ -96,14 +96,13 @@ class SDC(SymbolicModel):
         horizon: float = 0.1,
         report: Callable[[str], None] | None = None,
     ) -> SDC:
-        """The paper's model: servo damping and saturation (eqs. 11, 12), and friction where it is given.
+        """The paper's model: servo damping and saturation (eqs. 11, 12), and friction if it is given.
 
-        Runge-Kutta steps of 1e-4 s, as in its section III.
+        It takes Runge-Kutta steps of 1e-4 s, as in the paper's section III. Defaults of law, target and
+        stance are the paper's: k = 1e4 N/m, d = 300 N s/m, a free mass of 5 kg, and virtual bases of 1e5 kg
+        and 1e5 kg m2.
 
-        The error of freezing is not estimated: the effects that this model leaves out make a larger one.
-
-        Law, target and stance are the paper's unless given: k = 1e4 N/m, d = 300 N s/m, a free
-        mass of 5 kg, and virtual bases of 1e5 kg and 1e5 kg m2.
+        The error of freezing is not estimated, as the effects that this model omits cause a larger one.
         """
         if stance is None:
             stance = BothSoles(base_mass=1e5, base_inertia=1e5) if robot.floating else FixedBase()
@@ -151,10 +150,10 @@ FROZEN = ("virtual-mass", "sdc-paper", "sdc")
 def frozen_model(
     name: str, freezes: int = 0, *, accuracy: float | None = None, **scene: Any
 ) -> SymbolicModel:
-    """The model that a plan with `ImpactProblem.collision` of this name has in it, on its own.
+    """Collision model that plans with `ImpactProblem.collision` of this name contain.
 
-    Its steps find their own length, and "sdc-paper" has no virtual base but that of the stance: soles are
-    held exactly, as plans do. `SDC.paper` by itself is the paper's in these too.
+    As in plans, it takes implicit steps, and "sdc-paper" has the soles of the stance fixed without a virtual
+    base. In these two points `SDC.paper` by itself follows the paper.
 
     Parameters
     ----------
@@ -164,7 +163,7 @@ def frozen_model(
 
     Raises
     ------
-    InputError : an unknown name; what the models refuse.
+    InputError : an unknown name; as the models.
     """
     check_choice("no model with frozen dynamics is called", name, FROZEN)
     if name == "virtual-mass":

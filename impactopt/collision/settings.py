@@ -1,4 +1,4 @@
-"""Numbers of a collision that are inputs of its functions, and the effects that it takes into account."""
+"""Effects of a collision model, and its settings: parameters that its functions take as inputs."""
 
 from __future__ import annotations
 
@@ -21,16 +21,24 @@ from impactopt.errors import (
 )
 from impactopt.robots.robot import Robot
 
-__all__ = ["NO_LIMIT", "REFERENCE_ORDER", "Effects", "JointFriction", "Settings", "no_bend", "servo_settings"]
+__all__ = [
+    "NO_LIMIT",
+    "REFERENCE_ORDER",
+    "Effects",
+    "JointFriction",
+    "Settings",
+    "constant_reference",
+    "servo_settings",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:
-    """Effects that a collision model takes into account. The servo's damping (paper, eq. 11) is always there.
+    """Effects that a collision model takes into account, besides the servo's damping (paper, eq. 11).
 
     Attributes
     ----------
-    stiffness : servo stiffness Kp (phi_ref - phi) (eq. 10); the reference coasts at the joint velocity at
+    stiffness : servo stiffness Kp (phi_ref - phi) (eq. 10); the reference continues at the joint velocity at
         contact, or follows the setting `reference`.
     feedforward : a feed-forward torque, an input of the functions, inside the saturation.
     saturation : the torque limits (eq. 12).
@@ -48,7 +56,7 @@ class Effects:
 
     @classmethod
     def paper(cls, *, friction: bool = False) -> Effects:
-        """The paper's set: damping and saturation, and friction where it is known."""
+        """Effects of the paper: damping and saturation, and friction if it is known."""
         return cls(
             stiffness=False, feedforward=False, saturation=True, friction=friction, bias=False, jdot=False
         )
@@ -61,14 +69,14 @@ class Effects:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointFriction:
-    """F = viscous phidot + coulomb sign(phidot), with the sign made linear at |phidot| < transition.
+    """Joint friction F = viscous phidot + coulomb sign(phidot); the sign is linear for |phidot| < transition.
 
     Attributes
     ----------
     viscous : (n,) or one number for all joints, >= 0 [N m s/rad].
     coulomb : (n,) or one number for all joints, >= 0 [N m].
-    transition : [rad/s] > 0. Inside this band Coulomb friction damps with coulomb / transition [N m s/rad],
-        which the step length has to follow (see `SDC.stable_step`); a joint does not stick, it creeps.
+    transition : [rad/s] > 0. Within this band Coulomb friction is a damping coulomb / transition [N m s/rad],
+        which limits the step length (see `SDC.stable_step`); a joint does not stick, it creeps.
     """
 
     viscous: ArrayLike = 0.0
@@ -85,7 +93,7 @@ class JointFriction:
         check_positive("JointFriction: transition [rad/s]", self.transition, most=MOST)
 
     def arrays(self, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(viscous, coulomb), each (n,)."""
+        """Coefficients (viscous, coulomb), each (n,)."""
         out = []
         for name in ("viscous", "coulomb"):
             value = np.asarray(getattr(self, name), dtype=float)
@@ -96,7 +104,7 @@ class JointFriction:
 
 Array = NDArray[np.float64]
 
-# name: whether it has to be positive, or may be zero too
+# permitted signs of the servo's settings
 _SIGN = {
     "kp": ">= 0",
     "kd": ">= 0",
@@ -107,27 +115,27 @@ _SIGN = {
 }
 
 
-_FOR_EVER = 1e6  # [s]
-# the highest power of time in what bends the servo's reference
+_NEVER = 1e6  # [s] later than the end of any collision
+# highest power of time in the joint velocities of the servo's reference
 REFERENCE_ORDER = 10
 
 
-# infinity would make 0 x infinity out of a limit that is not reached
-NO_LIMIT = 1e12  # [N m]
+# [N m] in the place of infinite torque limits, as 0 x infinity is NaN
+NO_LIMIT = 1e12
 
 
 class Settings(Mapping[str, Array]):
-    """Defaults of a collision's numbers by input name, in the order of the inputs.
+    """Parameters of a collision with their default values, by input name, in the order of the inputs.
 
-    Only numbers that its effects need are there.
+    There are only those that the model's effects need: normal (3); contact_<parameter of the law>;
+    target_<parameter of the target>; with friction at the striking point friction_coefficient and
+    friction_slip_speed [m/s]; and with a servo (`servo_settings`) kd; kp with servo stiffness; torque_limit
+    (n) with saturation; viscous, coulomb (n) with friction. kp and kd are (n), or (n, n) if the model was
+    given matrices.
 
-    normal (3); contact_<number of the law>; target_<number of the target>; with friction at the striking
-    point friction_coefficient and friction_slip_speed [m/s]; and with a servo
-    (`servo_settings`) kd; kp with servo stiffness; torque_limit (n) with saturation; viscous, coulomb (n)
-    with friction. kp and kd are (n), or (n, n) where the model was given matrices. With dJ/dt v, and without
-    friction, reference (n, 10) [rad/s^(k + 1)]: what the joint velocities of the servo's reference gain, of
-    t^k in column k - 1, and reference_until [s], after which they gain no more; without them, the
-    reference keeps the joint velocities at contact.
+    With dJ/dt v, and without friction, there are reference (n, 10) [rad/s^(k + 1)], coefficients of t^k in
+    column k - 1 of the change of the joint velocities of the servo's reference, and reference_until [s],
+    after which these are constant. Without them the reference keeps the joint velocities at contact.
     """
 
     def __init__(
@@ -145,14 +153,14 @@ class Settings(Mapping[str, Array]):
         if friction is not None:
             self._owners["friction_"] = ContactFriction, asdict(friction)
         values: dict[str, Any] = {"normal": normal}
-        for prefix, (_, numbers) in self._owners.items():
-            values |= {prefix + key: number for key, number in numbers.items()}
+        for prefix, (_, parameters) in self._owners.items():
+            values |= {prefix + key: number for key, number in parameters.items()}
         values |= servo
         self._values = {name: np.asarray(value, dtype=float) for name, value in values.items()}
         self._values = {name: self._check(name, value) for name, value in self._values.items()}
 
     def override(self, changes: Mapping[str, ArrayLike]) -> dict[str, Array]:
-        """All values, with some of them changed; a single number for a setting of the joints goes for all.
+        """All values, with some of them changed; a single number for a setting of the joints applies to all.
 
         Raises
         ------
@@ -175,7 +183,7 @@ class Settings(Mapping[str, Array]):
         if name == "torque_limit":
             array = np.minimum(array, NO_LIMIT)
         if name in ("kp", "kd") and array.ndim == 2:
-            # it may not feed energy
+            # a servo must not add energy
             least = float(np.linalg.eigvalsh((array + array.T) / 2).min())
             if least < -1e-9 * np.abs(array).max():
                 raise InputError(f"{name}: not positive semidefinite, it has the eigenvalue {least:.3g}")
@@ -183,10 +191,10 @@ class Settings(Mapping[str, Array]):
         sign = _SIGN.get(name, "")
         if (sign and (array < 0).any()) or (sign == "> 0" and (array == 0).any()):
             raise InputError(f"{name}: has {array.min():g}; all must be {sign}")
-        for prefix, (owner, numbers) in self._owners.items():
+        for prefix, (owner, parameters) in self._owners.items():
             if name.startswith(prefix):
-                # the class knows the ranges of its own numbers
-                owner(**{**numbers, name.removeprefix(prefix): float(array)})
+                # the constructor checks the ranges of law, target and friction
+                owner(**{**parameters, name.removeprefix(prefix): float(array)})
         return array
 
     def __getitem__(self, name: str) -> Array:
@@ -206,8 +214,10 @@ def servo_settings(
     kp: ArrayLike | None = None,
     kd: ArrayLike | None = None,
 ) -> dict[str, ArrayLike]:
-    """The joints' numbers that these effects need; gains are the robot's unless given: one number for all
-    joints, (n), or (n, n)."""
+    """Settings of the joints that these effects need.
+
+    kp, kd : one number for all joints, (n), or (n, n); None: the robot's.
+    """
     values: dict[str, ArrayLike] = {"kd": _gain("kd", kd, robot.kd)}
     if effects.stiffness:
         values["kp"] = _gain("kp", kp, robot.kp)
@@ -215,16 +225,16 @@ def servo_settings(
         values["torque_limit"] = robot.torque_limit
     if effects.friction:
         values["viscous"], values["coulomb"] = friction.arrays(robot.n)
-    elif (
-        effects.jdot
-    ):  # what bends a reference is dJ/dt v; friction goes by velocities that are no differences
-        values |= no_bend(robot.n)
+    elif effects.jdot:
+        # Joint velocities of a reference change because of dJ/dt v. The model's velocities are then relative
+        # to the reference, but friction needs absolute ones.
+        values |= constant_reference(robot.n)
     return values
 
 
-def no_bend(n: int) -> dict[str, Array]:
-    """Settings `reference` (n, 10), `reference_until` of one that keeps the joint velocities at contact."""
-    return {"reference": np.zeros((n, REFERENCE_ORDER)), "reference_until": np.array(_FOR_EVER)}
+def constant_reference(n: int) -> dict[str, Array]:
+    """Settings `reference` (n, 10) and `reference_until` that keep the joint velocities at contact."""
+    return {"reference": np.zeros((n, REFERENCE_ORDER)), "reference_until": np.array(_NEVER)}
 
 
 def _gain(name: str, given: ArrayLike | None, own: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Base of the stepped collision models: all that their functions depend on, and slopes of law and target."""
+"""Base class of the stepped collision models, and linearity and derivatives of law and target."""
 
 from __future__ import annotations
 
@@ -25,48 +25,52 @@ __all__ = ["SteppedModel", "contact_functions", "law_is_linear", "number_of_step
 
 def law_is_linear(law: ContactLaw) -> bool:
     """True if both branches are linear for all values of the law's parameters; a kink counts as nonlinear."""
-    numbers, branches = _law_parts(law)
+    parameters, branches = _law_parts(law)
     slopes = ca.horzcat(*[ca.jacobian(f, x) for f, x in branches])
-    found = [_at(numbers, law.parameters, slopes, branches[0][1], k) for k in range(_DRAWS)]
+    found = [_sampled(parameters, law.parameters, slopes, branches[0][1], k) for k in range(_PARAMETER_SETS)]
     return all((values == values[0]).all() for values in found)
 
 
 def target_is_linear(target: Target) -> bool:
     """True if rates, velocity and switches are linear between switches, for all values of the parameters."""
-    numbers, (whole, x) = _target_part(target)
-    bending = ca.jacobian(ca.vec(ca.jacobian(whole, x)), x)
-    if not bending.nnz():
+    parameters, (outputs, x) = _target_part(target)
+    hessian = ca.jacobian(ca.vec(ca.jacobian(outputs, x)), x)
+    if not hessian.nnz():
         return True
-    return all((_at(numbers, target.parameters, bending, x, k) == 0).all() for k in range(_DRAWS))
+    found = [_sampled(parameters, target.parameters, hessian, x, k) for k in range(_PARAMETER_SETS)]
+    return all((values == 0).all() for values in found)
 
 
-# sets of numbers that law and target are looked at with: their own, and others
-_DRAWS = 3
+# parameter sets for which linearity is tested: those of law or target themselves, and random ones
+_PARAMETER_SETS = 3
 
 
-def _at(numbers: Any, values: dict[str, float], f: Any, x: Any, draw: int) -> NDArray[np.float64]:
-    """f in some hundred places, a row each."""
-    rng, function = np.random.default_rng(draw), ca.Function("f", [numbers, x], [ca.densify(ca.vec(f))])
+def _sampled(parameters: Any, values: dict[str, float], f: Any, x: Any, seed: int) -> NDArray[np.float64]:
+    """Values of f at 132 random points (rows) of all magnitudes.
+
+    The parameters are `values` for seed 0, else random ones.
+    """
+    rng, function = np.random.default_rng(seed), ca.Function("f", [parameters, x], [ca.densify(ca.vec(f))])
     own = np.array(list(values.values()))
-    given = own * rng.uniform(0.5, 2.0, own.size) + rng.uniform(0.1, 0.5, own.size) if draw else own
+    given = own * rng.uniform(0.5, 2.0, own.size) + rng.uniform(0.1, 0.5, own.size) if seed else own
     sizes = np.repeat(np.logspace(-6, 4, 11), 12)
-    places = sizes * rng.uniform(-1.0, 1.0, (x.size1(), sizes.size))
-    return np.array(function(given, places)).T  # all places in one call
+    points = sizes * rng.uniform(-1.0, 1.0, (x.size1(), sizes.size))
+    return np.array(function(given, points)).T  # all points in one call
 
 
 def contact_functions(law: ContactLaw, target: Target) -> list[Any]:
-    """SX functions of law and target; these stand for the columns of their numbers.
+    """SX functions of law and target, whose inputs `law` and `target` are columns of parameters.
 
-    Of a law that is linear
+    For a linear law
 
         law_slopes (law) -> f_0, k, d of f = f_0 + k x + d dx/dt (3, 2): in restitution, in compression
 
-    and of others, each with its slopes by penetration and rate (3):
+    and for a nonlinear one, each value followed by its derivatives by penetration and rate (3):
 
         law_compressing, law_restoring (x, rate, law) -> force, in compression never below zero
-        separation (x, rate, law) -> what falls through zero where contact ends
+        separation (x, rate, law) -> function that becomes negative at the end of contact
 
-    target_slopes (z, force, target) -> d(dz/dt)/dz, d(dz/dt)/df, d(velocity)/dz, of the piece that z is in
+    target_slopes (z, force, target) -> d(dz/dt)/dz, d(dz/dt)/df, d(velocity)/dz, in the mode of z
     switch_slopes (z, force, target) -> switches, and their derivatives by z and force
     """
     of_target, z = ca.SX.sym("target", len(target.parameters)), ca.SX.sym("z", target.n_states)
@@ -103,11 +107,11 @@ def _law_functions(law: ContactLaw) -> list[Any]:
         return [ca.Function("law_slopes", [numbers], [ca.densify(ca.horzcat(*columns))])]
     x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
     p = dict(zip(law.parameters, ca.vertsplit(numbers), strict=True))
-    left = ca.substitute(ca.SX(law.separation(x, rate, p)), ca.vertcat(x, rate), at)
+    separation = ca.substitute(ca.SX(law.separation(x, rate, p)), ca.vertcat(x, rate), at)
     parts = {
         "law_compressing": ca.if_else(compression > 0, compression, 0.0),
         "law_restoring": restitution,
-        "separation": left,
+        "separation": separation,
     }
     made = []
     for name, f in parts.items():
@@ -117,14 +121,14 @@ def _law_functions(law: ContactLaw) -> list[Any]:
 
 
 def _law_parts(law: ContactLaw) -> tuple[Any, list[tuple[Any, Any]]]:
-    """(its numbers, [(force, (x, rate)) in restitution, and in compression])."""
+    """Symbols of the parameters, and (force, (x, rate)) in restitution and in compression."""
     numbers, x = ca.SX.sym("law", len(law.parameters)), ca.SX.sym("x", 2)
     p = dict(zip(law.parameters, ca.vertsplit(numbers), strict=True))
     return numbers, [(ca.SX(law.branch(x[0], x[1], c, p)), x) for c in (False, True)]
 
 
 def _target_part(target: Target) -> tuple[Any, tuple[Any, Any]]:
-    """(its numbers, (rates, velocity and switches, (state, force)))."""
+    """Symbols of the parameters, and ((rates, velocity, switches), (state, force))."""
     numbers, x = ca.SX.sym("target", len(target.parameters)), ca.SX.sym("x", target.n_states + 1)
     p = dict(zip(target.parameters, ca.vertsplit(numbers), strict=True))
     *states, force = [x[i] for i in range(target.n_states + 1)]
@@ -132,29 +136,29 @@ def _target_part(target: Target) -> tuple[Any, tuple[Any, Any]]:
     return numbers, (ca.SX(ca.vertcat(*moved, *target.switches(states, force, p))), x)
 
 
-# [s] by method: of the histories, where steps find their own length; and the paper's
+# default step [s] by method: spacing of the histories of implicit steps; the paper's Runge-Kutta steps
 STEPS = {"implicit": 1e-3, "rk4": 1e-4}
-_MOST_STEPS = 50_000
+_MOST_STEPS = 50_000  # to the horizon
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SteppedModel(CollisionModel):
-    """A collision model with frozen dynamics: its numbers, and how it is integrated.
+    """A collision model with frozen dynamics that is integrated in time.
 
     Attributes
     ----------
-    effects : those that are taken into account.
-    method : how the frozen system is integrated. "implicit" (None): A-stable steps of order eight that end on
-        events and find their own length. Without a C compiler they are done in NumPy: the same numbers, a
-        hundred times slower, and without derivatives. "rk4": the paper's fixed Runge-Kutta steps, exact to
-        1e-2 of the impulse (where contact ends early, of a plastic blow's impulse). `collide` refuses steps
+    effects : effects that are taken into account.
+    method : integration method of the frozen system. "implicit" (None): L-stable steps of order eight that
+        end on events and choose their own length. Without a C compiler they are done in NumPy, with the same
+        results, a hundred times slower, and without derivatives. "rk4": the paper's fixed Runge-Kutta steps,
+        exact to 1e-2 of the impulse (of a plastic impact's, if contact ends early). `collide` refuses steps
         whose estimated error is larger.
     step : [s]. With "rk4" the length of its steps, below `stable_step(q)`; None: the paper's 1e-4. With
         "implicit", which chooses its own steps, the spacing of histories; None: 1e-3.
-    tolerance : of "implicit", the error of one step in the hand's speed and in the impulse, relative to their
-        changes, and in what says when the target breaks, starts or stops, relative to its parts. The impulse
-        is mostly as exact as that. Errors add up in long contacts, where a servo swings undamped or saturates
-        again and again.
+    tolerance : with "implicit", the permitted error of one step: in the hand's speed and in the impulse,
+        relative to their changes, and in the target's switching functions, relative to their terms. The
+        impulse is mostly as exact as that. Errors add up in long contacts in which a servo oscillates
+        undamped or saturates repeatedly.
     contact_friction : of the striking point on the target. Only with "rk4", which is then the method (None).
     report : called with a line of text while functions are compiled.
 
@@ -189,51 +193,50 @@ class SteppedModel(CollisionModel):
                 f"step [s]: {self.step_length:g} takes {steps} steps to the horizon, {self.horizon:g} s, and "
                 f"{_MOST_STEPS} are the most: shorten the horizon, or lengthen the step"
             )
-        # checks the numbers now, and not when they are first used
+        # checks the settings now, and not at their first use
         _ = self.settings
 
-    # ------------------------------------------------------------ what is modelled
+    # ------------------------------------------------------------ contents of the model
     @property
     def joint_friction(self) -> JointFriction:
-        """The joints' friction, or none."""
+        """Friction of the joints; zero unless a model has it."""
         return JointFriction()
 
     @property
     def n_servos(self) -> int:
-        """Joints whose servos act: all, or none of a point mass."""
+        """Number of joints whose servos act: all, or none of a point mass."""
         return self.robot.n
 
     @property
     def n_freezes(self) -> int:
-        """Freezes on the way, besides the one at contact."""
+        """Number of further freezes, besides the one at contact."""
         return 0
 
     @property
     def stepping(self) -> str:
-        """The method, or the usual one."""
+        """The method, or its default."""
         return self.method or ("implicit" if self.contact_friction is None else "rk4")
 
     @property
     def step_length(self) -> float:
-        """The step [s], or the method's own."""
+        """The step [s], or the method's default."""
         return min(STEPS[self.stepping], self.horizon) if self.step is None else self.step
 
     @property
     def step_of_graph(self) -> float:
-        """[s] of the Runge-Kutta steps of `graph`: the model's, or the paper's, as a graph cannot find the
-        lengths of implicit ones on the way."""
+        """Runge-Kutta step of `graph` [s]: the model's or the paper's, as a graph cannot choose its steps."""
         return self.step_length if self.stepping == "rk4" else min(STEPS["rk4"], self.horizon)
 
     @cached_property
     def settings(self) -> Settings:
-        """Numbers that are inputs of the functions, with their defaults."""
+        """Parameters that are inputs of the functions, with their default values."""
         return Settings(self.law, self.target, self.normal, self._servo_settings(), self.contact_friction)
 
     def _servo_settings(self) -> dict[str, ArrayLike]:
         return {}
 
     def check_step(self, longest: float, where: str = "here") -> None:
-        """InputError for a step that is not below the longest stable one [s]."""
+        """InputError if the step is not shorter than the longest stable one [s]."""
         if self.step_length >= longest:
             more = ", or the friction at the hit more slip_speed" if self.contact_friction else ""
             raise InputError(
@@ -258,20 +261,20 @@ class SteppedModel(CollisionModel):
 
     @cached_property
     def _recipe(self) -> tuple[Any, ...]:
-        """All that shapes the functions; numbers that are inputs do not."""
+        """Cache key of the functions: all that their code depends on; the settings' values are inputs."""
         held = (self.held_by.sole_frames(self.robot), self.held_by.hand_frames(self.robot))
         held_by = (*held, tuple(self.held_by.compliance))
         transition = self.joint_friction.transition if self.effects.friction else None
-        bends = (law_is_linear(self.law), target_is_linear(self.target))
-        kinds = (self.law.formula(), self.target.formula(), *bends, self.effects, transition)
+        linear = (law_is_linear(self.law), target_is_linear(self.target))
+        contact = (self.law.formula(), self.target.formula(), *linear, self.effects, transition)
         shapes = tuple((name, value.shape) for name, value in self.settings.items())
         frame = self.robot.striker(self.striker).model_frame
         steps = (self.stepping, self.step_length, self.tolerance, self.step_of_graph)
-        course = (*steps, self.horizon, self.n_freezes, self.contact_friction is not None)
+        integration = (*steps, self.horizon, self.n_freezes, self.contact_friction is not None)
         dynamics = model_hash(self.robot.model, self.robot.springs)
-        return (dynamics, self.n_servos, frame, *held_by, *kinds, shapes, *course)
+        return (dynamics, self.n_servos, frame, *held_by, *contact, shapes, *integration)
 
 
 def number_of_steps(collision: SteppedModel, fraction: float = 1.0) -> int:
-    """Runge-Kutta steps that reach this fraction of the horizon."""
+    """Number of Runge-Kutta steps that reach this fraction of the horizon."""
     return ceil(fraction * collision.horizon / collision.step_of_graph - 1e-9)

@@ -1,4 +1,4 @@
-"""Collision models as CasADi functions: compiled with just the outputs asked for, or graphs to build with."""
+"""Collision models as CasADi functions: compiled with the requested outputs only, or as graphs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from impactopt.collision.checks import (
     FREEZE_ERROR,
     Stability,
     breaks,
-    check_course,
     check_finite,
+    check_steps,
     freeze_error,
     left_out_by_breaking,
 )
@@ -36,7 +36,7 @@ __all__ = ["SymbolicModel"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SymbolicModel(SteppedModel):
-    """A model of a collision that can be differentiated. Attributes and errors as of `SteppedModel`."""
+    """A collision model that can be differentiated. Attributes and errors as of `SteppedModel`."""
 
     _functions: dict[tuple[Any, ...], Any] = field(init=False, repr=False, default_factory=dict)
 
@@ -49,13 +49,14 @@ class SymbolicModel(SteppedModel):
 
         Raises
         ------
-        InputError : the model has freezes on the way.
+        InputError : the model has further freezes.
         """
         self._check_outputs(outputs, every)
         if self.n_freezes:
             raise InputError(
-                "graph: its Runge-Kutta steps say nothing of how the contact's duration changes, which "
-                "freezes on the way go by; give freezes=0, or take `function` and `gradient_function`"
+                "graph: the times of further freezes depend on the contact's duration, which has no "
+                "derivative "
+                "in Runge-Kutta steps; give freezes=0, or take `function` and `gradient_function`"
             )
         return collision_graph(self, tuple(outputs), every=every)
 
@@ -67,32 +68,33 @@ class SymbolicModel(SteppedModel):
         by: tuple[str, ...] | None = None,
         every: int = 1,
     ) -> Any:
-        """The collision as a compiled ca.Function of what it needs, to the outputs asked for.
+        """The collision as a compiled ca.Function with the requested outputs.
 
         Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with effects.feedforward; then the settings
-        that `parameters` name (any of `settings`), in their order; the others are fixed. What no output needs
-        is left out.
-        If an input is NaN, or what holds the robot cannot be told apart at q, all outputs are NaN,
-        `separated` too. So are they if the contact has not ended at the horizon, unless `separated` or
-        `duration` are among them, which tell it: then they are what happened so far. An optimizer whose
-        initial guess may be such a contact needs `separated` among the outputs.
+        that `parameters` name (any of `settings`), in their order. All other settings are fixed. The function
+        computes only what its outputs need.
 
-        CasADi can differentiate it with respect to all inputs (jacobian, forward, reverse), and twice by
-        differences. The code for this is compiled when it is first evaluated. A single scalar output has an
-        adjoint. Scalars and histories have tangents with respect to q, v and feedforward. All other
+        All outputs are NaN, `separated` too, if an input is NaN or the constraints of the held frames depend
+        on each other at q. They are also NaN if the contact has not ended at the horizon. But if `separated`
+        or `duration` is among the outputs, which show this, they have the values reached so far. An optimizer
+        whose initial guess may be such a contact needs `separated` among the outputs.
+
+        CasADi can differentiate the function with respect to all inputs (jacobian, forward, reverse), and
+        twice by differences. The code for this is compiled when it is first evaluated. A single scalar output
+        has an adjoint. Scalars and histories have tangents with respect to q, v and feedforward. All other
         derivatives are differences of two collisions with tight steps for each number of the input: those
-        with respect to settings; those of models with freezes on the way or with "rk4", which is the method
+        with respect to settings; those of models with further freezes or with "rk4", which is the method
         of all with friction at the striking point; and those of configuration, velocity and the target's
         results. The quaternion in q is normalized, so derivatives along its length are zero.
 
         Parameters
         ----------
-        outputs : names out of `impactopt.collision.OUTPUTS`, which says what they are; histories have a
+        outputs : names out of `impactopt.collision.OUTPUTS`, which describes them; histories have a
             column an instant, and repeat the last one after separation.
         parameters : settings that are inputs, in this order.
         by : inputs to differentiate with respect to; None: all. Derivatives by others are zero, and cost
             nothing.
-        every : histories keep each so many-th instant, and the last.
+        every : histories keep every `every`-th instant, and the last.
 
         The function cannot be saved or pickled; `export` makes a library of it.
         """
@@ -112,7 +114,7 @@ class SymbolicModel(SteppedModel):
         every: int = 1,
         name: str = "blow",
     ) -> Path:
-        """A library with what `function` gives, and its first derivatives, for other processes; its path.
+        """Writes a library with `function` and its first derivatives, for other processes; returns its path.
 
         ``ca.external("blow", str(path))`` loads it anywhere, without this package. Beside the library the
         folder has its C, `<name>.c`, `<name>.h` and `<name>_collision*.c`, for CPUs of another kind:
@@ -121,8 +123,8 @@ class SymbolicModel(SteppedModel):
 
         Raises
         ------
-        InputError : as of `function`; a name that is none in C, or taken; no compiler; a folder that cannot
-            be written.
+        InputError : as of `function`; a name that is not valid in C, or reserved; no compiler; a folder that
+            cannot be written.
         """
         self._check_outputs(outputs, every)
         self._check_parameters(parameters)
@@ -139,8 +141,8 @@ class SymbolicModel(SteppedModel):
         """A compiled ca.Function with the inputs of `function`, to a scalar output and its gradients.
 
         Returns (value, d/dq (nv), d/dv (nv)): q's gradient is in the basis of v, as `pin.integrate` moves q.
-        With freezes on the way it comes from differences, 4 nv collisions. If the contact has not ended at
-        the horizon, all are of what happened so far; `function` gives `separated`.
+        With further freezes it comes from differences, 4 nv collisions. If the contact has not ended at
+        the horizon, all are of the values reached so far; `function` gives `separated`.
         """
         self._check_outputs((output,), 1)
         numbers = [name for name in SCALARS if name != "step_error"]
@@ -149,7 +151,7 @@ class SymbolicModel(SteppedModel):
         return self._with_parameters(self._gradient(output), parameters)
 
     def _gradient(self, output: str) -> Any:
-        """Likewise, with its gradients."""
+        """Likewise, with all settings as inputs."""
         return self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
 
     def jacobian_function(
@@ -167,11 +169,11 @@ class SymbolicModel(SteppedModel):
         other. The Jacobian by q is in the basis of v, as `pin.integrate` moves q. The instants of a history
         are fixed in time, except that of separation, which moves with it, and those after it, which repeat
         it. A horizon that is not much longer than the contact keeps the Jacobians small. If the contact has
-        not ended there, all are of what happened so far, as `separated` says if it is among the outputs.
+        not ended there, all are of the values reached so far; the output `separated` shows it.
 
         Raises
         ------
-        InputError : a model with "rk4" or with freezes on the way; the target's results, configuration or
+        InputError : a model with "rk4" or with further freezes; the target's results, configuration or
             velocity among the outputs.
         """
         self._check_outputs(outputs, every)
@@ -192,8 +194,9 @@ class SymbolicModel(SteppedModel):
     def describe(
         self, outputs: tuple[str, ...] = ("impulse",), *, parameters: tuple[str, ...] = ()
     ) -> Description:
-        """Description of `function` for these outputs: its contents with instruction counts, and what was
-        left out and why; text by str(), numbers by `as_dict`.
+        """Description of `function` for these outputs: contents, instruction counts, omissions and reasons.
+
+        str() gives it as text, `as_dict` as data.
         """
         self._check_outputs(outputs, 1)
         return describe(self, tuple(outputs), parameters)
@@ -209,31 +212,32 @@ class SymbolicModel(SteppedModel):
         threads: int | None = None,
         **settings: ArrayLike,
     ) -> dict[str, NDArray[np.float64]]:
-        """Many collisions in compiled code, on several cores: arrays by name of output.
+        """Many collisions in compiled code, on several cores: arrays by output name.
 
         Parameters
         ----------
         q, v : (N, nq), (N, nv) at contact.
         torque : (N, n), or (n) for all [N m]; needed with effects.feedforward.
         outputs : names out of `impactopt.collision.OUTPUTS`; or "freeze_error", which is not computed unless
-            it is named: of one freeze it takes some six times as long as the impulse.
-        every : histories keep each so many-th instant, and the last.
+            it is named: if frozen at contact only, it takes some six times as long as the impulse.
+        every : histories keep every `every`-th instant, and the last.
         threads : cores to use; None: all.
-        settings : other values of any of `settings`, for all, or with a first axis of N, one each.
+        settings : other values of any of `settings`, shared, or with a first axis of N, one each.
 
         Returns
         -------
         Arrays (N, ...): numbers (N), vectors (N, size), histories (N, k), (N, k, size), wrenches (N, k,
         frames, 6), where the last instant is repeated after separation. `separated` (N) of bool is always
-        there; it is False too where numbers are not finite. With "rk4" there is `step_error` (N), an
-        estimate of the impulse's error by its steps. Where this is above 1e-2, or the step is unstable,
-        all numbers are nan. So are those of rows that `collide` refuses: what holds the robot cannot be told
-        apart, events use up the steps, rounding hides the force.
-        `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
+        included; it is False too where values are not finite. With "rk4" there is `step_error` (N), an
+        estimate of the impulse's error by its steps. If this is above 1e-2, or the step is unstable,
+        all values are nan. So are those of collisions that `collide` refuses, as constraints depend on each
+        other, events use up the steps, or rounding hides the force.
+        `freeze_error` (N) is that of `Collision`, nan if the contact has not ended.
 
         Raises
         ------
-        InputError : wrong shapes, NaN, or numbers out of their range; a step that is unstable in every row.
+        InputError : wrong shapes, NaN, or numbers out of their range; a step that is unstable in every
+            collision.
         """
         own = tuple(name for name in outputs if name != FREEZE_ERROR)
         if len(own) < len(outputs):
@@ -317,10 +321,10 @@ class SymbolicModel(SteppedModel):
         (error,) = self._freeze_error(impulse, q[None], v[None], one, values, threads=1)
         return replace(result, freeze_error=float(error), caution=self._caution(float(error)))
 
-    # ------------------------------------------------------------ what freezing costs
+    # ------------------------------------------------------------ error of freezing
     @property
     def _more_often(self) -> SymbolicModel | None:
-        """The model that says what freezing costs, or None: not estimated."""
+        """Model with more freezes that the error of freezing is estimated from; None for no estimate."""
         return None
 
     def _caution(self, error: float) -> str:
@@ -355,17 +359,17 @@ class SymbolicModel(SteppedModel):
         if breaks(self):
             force = values["target_breaking_force"]
             error += float(left_out_by_breaking(self, result.impulse, outputs["target_result"][:, 0], force))
-        # of a plastic blow, where the contact is broken off before
-        numbers = {name: values[f"target_{name}"] for name in self.target.parameters}
-        yields = float(frozen["m"].item()) + float(target_start(self.target, numbers)[0])
-        plastic = float(result.hand_speed[0] - result.target_speed[0]) / max(yields, 1e-300)
-        check_course(self, result, error * result.impulse / max(result.impulse, plastic, 1e-300))
+        # If the contact is broken off early, the error is relative to the impulse of a plastic impact.
+        parameters = {name: values[f"target_{name}"] for name in self.target.parameters}
+        inverse_mass = float(frozen["m"].item()) + float(target_start(self.target, parameters)[0])
+        plastic = float(result.hand_speed[0] - result.target_speed[0]) / max(inverse_mass, 1e-300)
+        check_steps(self, result, error * result.impulse / max(result.impulse, plastic, 1e-300))
         return result
 
     def stable_step(self, q: ArrayLike, **overrides: ArrayLike) -> float:
-        """[s] that steps of "rk4" have to stay below at q: 2.6 over the fastest rate, no joint saturated.
+        """Upper bound [s] of stable steps of "rk4" at q: 2.6 over the fastest rate, with no joint saturated.
 
-        InputError where what holds the robot cannot be told apart.
+        InputError if the constraints of the held frames depend on each other.
         """
         values = self.settings.override(overrides)
         return self._stability.longest(

@@ -1,6 +1,6 @@
 """Contact laws (force from penetration) and targets (motion from force).
 
-One class a file, in `laws/` and `targets/`; `targets/base.py` has numbers that differ from the expected ones.
+One class a file, in `laws/` and `targets/`.
 """
 
 from impactopt.contact import laws, targets

@@ -1,7 +1,7 @@
-"""Fields of laws and targets: their metadata, values, factors, and functions that are written of them.
+"""Metadata of dataclass fields, and expressions that laws and targets are written with.
 
-It is said once, in the field's own metadata. The class checks its numbers by it, its docstring lists it, and
-the sections of problem files are made of it (`impactopt.files.problem_file.values`).
+A field's metadata describe it once: the class checks its values with them, its docstring lists them, and
+the sections of problem files are made from them (`impactopt.files.problem_file.values`).
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ _METADATA = "about"
 class About:
     """Description of a field.
 
-    what : in words; its unit is put before the first semicolon.
+    what : text; the unit is inserted before its first semicolon.
     unit : such as "N m/s", "" for none.
     above, least, most : range of a number: > above, >= least, <= most; None: no such bound.
-    endless : a number may be infinite, where anything is allowed.
+    endless : a number may be infinite, for no limit.
     direction : it is a unit vector.
     by_joint : it is one number for all joints, or a table by joint.
-    none : the word that a file has for None, where that is no default; "": None is left out.
-    choices : all values that a text may have, if there are but some.
-    key : in a file, if it is not the field's name and its unit.
+    none : word for None in a file, if None is not the default; "": None is left out.
+    choices : the permitted values of a text; (): any.
+    key : its key in a file, if it is not the field's name and its unit.
     """
 
     what: str
@@ -66,13 +66,13 @@ class About:
 
     @property
     def text(self) -> str:
-        """Description in words, with the unit in brackets."""
+        """Description with the unit in brackets."""
         words, semicolon, rest = self.what.partition(";")
         return f"{words} [{self.unit}]".lstrip() + semicolon + rest if self.unit else self.what
 
     @property
     def range(self) -> str:
-        """Range of a number in words: "> 0 and <= 1"; "" for any."""
+        """Range of a number as text: "> 0 and <= 1"; "" for any."""
         bounds = ((">", self.above), (">=", self.least), ("<=", self.most))
         return " and ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
 
@@ -85,14 +85,14 @@ class About:
         )
 
     def checked(self, name: str, value: object) -> float:
-        """A number as a float; InputError, which begins with ``name``, if it is none or out of its range."""
+        """Value as a float; InputError, which begins with ``name``, if it is no number or out of range."""
         number = check_number(name, value, most=MOST)
         if not self.allows(number):
             raise InputError(f"{name}: {number:g}; give a number {self.range}")
         return number
 
     def key_of(self, field: str) -> str:
-        """The key of a field in a file: `stiffness` in [N/m^1.5] is `stiffness_N_m1_5`."""
+        """Key of a field in a file: `stiffness` in [N/m^1.5] is `stiffness_N_m1_5`."""
         unit = re.sub(r"[ /.]", "_", self.unit.replace("^", ""))
         return self.key or f"{field}_{unit}".rstrip("_")
 
@@ -106,22 +106,22 @@ def about(what: str, **more: Any) -> dict[str, About]:
 
 
 def abouts(kind: type) -> Iterator[tuple[dataclasses.Field[Any], About]]:
-    """The fields of a dataclass that say what they are."""
+    """Fields of a dataclass that have a description."""
     for field in dataclasses.fields(kind):
-        if (told := field.metadata.get(_METADATA)) is not None:
-            yield field, told
+        if (description := field.metadata.get(_METADATA)) is not None:
+            yield field, description
 
 
 class Described:
-    """Base of dataclasses whose fields say what they are: their docstrings list it."""
+    """Base of dataclasses with described fields, which their docstrings list."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         own = {name: value for name, value in vars(cls).items() if isinstance(value, dataclasses.Field)}
         lines = [
-            f"{name} : " + "; ".join(filter(None, (told.text, told.range))) + "."
+            f"{name} : " + "; ".join(filter(None, (description.text, description.range))) + "."
             for name, field in own.items()
-            if (told := field.metadata.get(_METADATA)) is not None
+            if (description := field.metadata.get(_METADATA)) is not None
         ]
         if lines and cls.__doc__:
             parts = [inspect.cleandoc(cls.__doc__), "", "Attributes", "----------", *lines]
@@ -130,18 +130,18 @@ class Described:
 
 
 def snake_case(name: str) -> str:
-    """`TorqueRate` as `torque_rate`: what a file calls a class."""
+    """Name of a class in files: `TorqueRate` as `torque_rate`."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
 
 
 Parameters = Mapping[str, Any]
 
-# [m] below this a power is taken as zero: where its slopes, by base and by exponent, would be no numbers
+# [m] Below this, powers are zero: at zero their derivatives by base and by exponent would be NaN.
 _TINY = 1e-30
 
 
 def choose(condition: Any, yes: Any, no: Any) -> Any:
-    """`yes` where the condition holds, else `no`."""
+    """Elementwise `yes` if the condition holds, else `no`; of floats, arrays or CasADi expressions."""
     if isinstance(condition, (bool, np.bool_)):
         return yes if condition else no
     if isinstance(condition, np.ndarray):
@@ -150,7 +150,7 @@ def choose(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def power(base: Any, exponent: Any) -> Any:
-    """max(base, 0)^exponent, of floats, arrays and CasADi expressions: what laws write powers with.
+    """Power max(base, 0)^exponent for contact laws, of floats, arrays and CasADi expressions.
 
     For exponents >= 1 all first derivatives are finite everywhere.
     """
@@ -160,7 +160,7 @@ def power(base: Any, exponent: Any) -> Any:
 
 
 def numbers_of(instance: Any) -> dict[str, float]:
-    """The fields of a dataclass by name."""
+    """Values of a dataclass's fields by name."""
     if not dataclasses.is_dataclass(instance):
         kind = type(instance).__name__
         raise InputError(f"{kind} is no dataclass: write @dataclass(frozen=True, kw_only=True) above it")
@@ -168,20 +168,21 @@ def numbers_of(instance: Any) -> dict[str, float]:
 
 
 def check_numbers(instance: Any) -> None:
-    """InputError unless all numbers of a law or a target are such, and in their ranges.
+    """InputError unless all parameters of a law or a target are numbers in their ranges.
 
-    None may be too large, or so small that what is divided by it is.
+    They may not be too large, nor so small that quotients are.
     """
-    for field, told in abouts(type(instance)):
-        name = f"{type(instance).__name__}: {field.name}" + (f" [{told.unit}]" if told.unit else "")
-        number = told.checked(name, getattr(instance, field.name))
-        if 0 < number < 1 / MOST and not told.allows(-1.0):
-            zero = "0, or " if told.allows(0.0) else ""
+    for field, description in abouts(type(instance)):
+        unit = f" [{description.unit}]" if description.unit else ""
+        name = f"{type(instance).__name__}: {field.name}{unit}"
+        number = description.checked(name, getattr(instance, field.name))
+        if 0 < number < 1 / MOST and not description.allows(-1.0):
+            zero = "0, or " if description.allows(0.0) else ""
             raise InputError(f"{name}: {number:g}; give {zero}a number of at least {1 / MOST:g}")
 
 
 def text_of(expressions: Sequence[Any]) -> str:
-    """Expressions as text that tells any two of them apart: with all digits of their constants."""
+    """Expressions as text with all digits of their constants, which distinguishes any two of them."""
     digits = ca.SX.get_precision()
     ca.SX.set_precision(17)
     try:

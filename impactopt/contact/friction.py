@@ -1,4 +1,4 @@
-"""Friction of the striking point on the target: Coulomb's, regularized."""
+"""Regularized Coulomb friction of the striking point on the target."""
 
 from __future__ import annotations
 
@@ -38,24 +38,25 @@ class ContactFriction(Described):
 
     @property
     def parameters(self) -> tuple[float, float]:
-        """coefficient, slip_speed [m/s]."""
+        """Parameters (coefficient, slip_speed [m/s])."""
         return self.coefficient, self.slip_speed
 
     def way(self, normal: NDArray[np.float64], speed: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(3,) Force on the target over its normal part, of a striking point with a speed (3,) [m/s]: the
-        normal (3,), and along the slide.
+        """Force on the target (3,) over its normal part, for a velocity (3,) [m/s] of the striking point.
+
+        It is the normal (3,) plus the friction per normal force, in the direction of sliding.
         """
         return np.asarray(pushed_way(normal, speed, *self.parameters))
 
 
 def check_friction(name: str, given: Any) -> None:
-    """InputError for what is neither a ContactFriction nor None."""
+    """InputError unless it is a ContactFriction or None."""
     if given is not None and not isinstance(given, ContactFriction):
         raise InputError(f"{name} must be a ContactFriction, not {given!r}")
 
 
 def pushed_way(normal: Any, speed: Any, coefficient: Any, slip_speed: Any) -> Any:
-    """`ContactFriction.way`, of arrays or CasADi expressions."""
+    """`ContactFriction.way` for arrays or CasADi expressions."""
     slide = speed - normal * _dot(normal, speed)
     return normal + slide * (coefficient / (_dot(slide, slide) + slip_speed**2) ** 0.5)
 

@@ -20,7 +20,7 @@ from impactopt.collide.contact_states import ContactStates, Posture, States
 from impactopt.collide.single_collision import (
     NOT_ENDED,
     AtContact,
-    Blow,
+    CollisionBatch,
     Measure,
     check_at_contact,
     chosen,
@@ -216,8 +216,7 @@ class CollisionBatch:
         if speed is None and section.speed is not None:
             speed = np.full(count, section.speed)
         normal = np.asarray(model.normal)
-        states = self.states.rows(posture, joints, speed, normal, count, velocity=section.velocity)
-        # collisions whose state at contact is impossible stay nan, with its reason
+        states = self.states.compute(posture, joints, speed, normal, count, velocity=section.velocity)
         out: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in self.measures}
         out["reason"] = states.reason
         good = np.flatnonzero(states.reason == "")
@@ -227,7 +226,7 @@ class CollisionBatch:
         settings = {
             name: x[good] if len(x) == count else x for name, x in self._settings(numbers, count).items()
         }
-        settings |= states.bend
+        settings |= states.reference_settings
         # a point mass has no servo, and the paper's SDC no stiffness
         known = getattr(model, "settings", settings)
         given = {name: x for name, x in settings.items() if name in known}
@@ -235,7 +234,7 @@ class CollisionBatch:
             found, reason = batch(model, self._outputs, states, given, threads)
         else:
             found, reason = one_by_one(model, self._outputs, states, given)
-        blow = Blow(
+        collisions = CollisionBatch(
             found=found,
             states=states,
             torque_limit=settings["torque_limit"],
@@ -243,7 +242,7 @@ class CollisionBatch:
             polygon=posture.polygon,
         )
         for name, measure in self.measures.items():
-            out[name][good] = np.where(reason == "", measure.of(blow), np.nan)
+            out[name][good] = np.where(reason == "", measure.of(collisions), np.nan)
         out["reason"][good] = reason
         return out
 

@@ -97,7 +97,7 @@ _REFUSALS = {
     "steps are used up": "too many events for the steps",
     "diverges": "diverges",
     "ends within": "contact shorter than a step",
-    "cannot be told apart": "held frames depend on each other",
+    "held frames depend on each other": "held frames depend on each other",
     "no motion along the normal": "hand held fast",
     "rounding": "rounding",
 }

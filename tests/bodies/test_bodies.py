@@ -20,7 +20,7 @@ from support.small_plans import arm_problem, biped_problem
 from impactopt import KeepOut, TargetBody, load_problem
 from impactopt.bodies.clearance import FAR, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.convex_hulls import inertia_box, pieces_of
-from impactopt.bodies.file_shapes import lost_meshes, urdf_root
+from impactopt.bodies.file_shapes import lost_meshes
 from impactopt.bodies.robot_bodies import bodies_of, distance
 from impactopt.bodies.world import (
     BEHIND,
@@ -568,6 +568,4 @@ def test_a_mesh_that_is_no_body_is_told(tmp_path: Path, name: str) -> None:
     assert "boxes of the inertia of 1 that have lost their meshes" in source
     elbow = robot.model.getJointId("elbow")
     assert [piece.link for piece in pieces if piece.joint == elbow] == ["elbow"]  # its joint's box
-    root = urdf_root(tmp_path / "robot.urdf")
-    assert root is not None
-    assert said in lost_meshes(robot.model, root, tmp_path / "robot.urdf")[elbow][name]
+    assert said in lost_meshes(robot.model, robot.urdf)[elbow][name]

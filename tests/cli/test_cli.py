@@ -388,8 +388,8 @@ def test_what_was_interrupted_gets_no_baseline_and_an_interrupted_baseline_keeps
 @pytest.mark.parametrize(
     ("status", "off", "told"),
     [
-        (Status.INTERRUPTED, 1e-9, "no replay of what was interrupted"),
-        (Status.TIME_LIMIT, 3e-3, "no replay: what meets its constraints only to 0.003 is no plan"),
+        (Status.INTERRUPTED, 1e-9, "no replay after an interruption"),
+        (Status.TIME_LIMIT, 3e-3, "no replay: the constraints are violated by up to 0.003"),
     ],
 )
 def test_what_is_no_plan_is_not_replayed(

@@ -93,11 +93,12 @@ def test_polynomials_through_the_nodes_are_what_they_go_through() -> None:
     assert at[-1] @ back @ np.ones(NODES) == pytest.approx(1.0) and gamma() > 0
 
 
-def test_what_bends() -> None:
-    assert Contact(HUNT, MASS).law_bends and not Contact(HUNT, MASS).target_bends
-    # whatever its numbers are now; and a kink
+def test_nonlinear_laws_and_targets_are_recognized() -> None:
+    hunt, dragged = Contact(HUNT, MASS), Contact(SPRING, Dragged(mass=1.0))
+    assert hunt.law_is_nonlinear and not hunt.target_is_nonlinear
+    # for any parameters, also those for which the force is linear but for a kink
     assert not law_is_linear(HuntCrossley(stiffness=1e6, dissipation=0.0, exponent=1.0))
-    assert Contact(SPRING, Dragged(mass=1.0)).target_bends and not Contact(SPRING, MASS).law_bends
+    assert dragged.target_is_nonlinear and not Contact(SPRING, MASS).law_is_nonlinear
 
 
 # ------------------------------------------------------------ values

@@ -131,5 +131,5 @@ def test_solve_keeps_and_finds_plans(tmp_path: Path) -> None:
     first = runner.invoke(app, ["solve", str(ARM), *options])
     assert first.exit_code == 0 and "near enough" in first.output, first.output
     again = runner.invoke(app, ["solve", str(ARM), "--set", "target.mass=0.055", *options])
-    assert again.exit_code == 0 and "started from" in again.output, again.output
+    assert again.exit_code == 0 and "warm start from" in again.output, again.output
     assert len(list((tmp_path / "store").iterdir())) == 2

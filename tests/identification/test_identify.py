@@ -319,4 +319,4 @@ def test_the_command_refuses_in_words(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     result = CliRunner().invoke(app, ["identify", str(tmp_path / "none.csv"), "--problem", str(rough)])
-    assert result.exit_code == 2 and "[friction]: laws are fitted to a blow without it" in result.stderr
+    assert result.exit_code == 2 and "[friction]: laws are fitted to impacts without it" in result.stderr

@@ -25,7 +25,7 @@ from impactopt.codegen.compiler import find_compiler
 from impactopt.collide.contact_states import ContactStates, Posture
 from impactopt.collide.single_collision import collide_once, problem_of_result
 from impactopt.collision import SDC, Effects
-from impactopt.collision.settings import REFERENCE_ORDER, no_bend
+from impactopt.collision.settings import REFERENCE_ORDER, constant_reference
 from impactopt.contact import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.output import load_record, record_of, record_of_strike, save_record
@@ -223,7 +223,7 @@ def test_references_that_cannot_be() -> None:
     arm = robot_named("arm")
     on_base = StanceCoordinates(arm, (), arm.posture("start"))
     none = coasting_reference(on_base, arm.posture("start"), np.ones(arm.nv))
-    assert not none["reference"].any() and none.keys() == no_bend(arm.n).keys()
+    assert not none["reference"].any() and none.keys() == constant_reference(arm.n).keys()
 
 
 # ---------------------------------------------------------------- results of the problems that come with us
@@ -317,7 +317,7 @@ def test_a_result_has_one_answer(name: str, kind: str, tmp_path: Path, punch: So
     # models that leave out the servo's stiffness, feed-forward and more say that it is theirs
     # (the paper's steps are too long for the arms' contacts, and refused)
     for model in ("virtual-mass", *(["sdc-paper"] if robot.floating else [])):
-        assert "believe the plan" in answer(model)["believe"]
+        assert "trust the plan" in answer(model)["believe"]
 
 
 @pytest.mark.parametrize("kind", ["solve", "strike"])
@@ -378,16 +378,18 @@ def test_a_slower_result_bends_the_same_way(tmp_path: Path, punch: Solution) -> 
     )
     posture = states.posture("reach", str(tmp_path), tuple(problem.point))
     assert isinstance(posture, Posture) and posture.v is not None
-    whole = states.rows(posture, {}, None, problem.normal, 1)
-    rows = states.rows(posture, {}, 0.8 * whole.speed, problem.normal, 1)
+    whole = states.compute(posture, {}, None, problem.normal, 1)
+    scaled = states.compute(posture, {}, 0.8 * whole.speed, problem.normal, 1)
     c, last = problem.coordinates, int(np.flatnonzero(ref.phase == 0)[-1])
     anew = coasting_reference(c, ref.q[last], 0.8 * ref.v[last], until=2 * punch.plan.collision.time[-1])
     time = np.linspace(0, 0.05, 6)[:, None, None]
     orders = np.arange(1, REFERENCE_ORDER + 1)
-    gained, again = ((x * time**orders).sum(axis=2) for x in (rows.bend["reference"][0], anew["reference"]))
+    gained, again = (
+        (x * time**orders).sum(axis=2) for x in (scaled.reference_settings["reference"][0], anew["reference"])
+    )
     np.testing.assert_allclose(gained, again, atol=2e-4)  # of two fits
-    assert np.abs(again).max() > 0.1 and rows.bend["reference_until"][0] > 0.05
-    assert states.posture("half_sitting", None, tuple(problem.point)).bend is None  # type: ignore[union-attr]
+    assert np.abs(again).max() > 0.1 and scaled.reference_settings["reference_until"][0] > 0.05
+    assert states.posture("half_sitting", None, tuple(problem.point)).reference is None  # type: ignore[union-attr]
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -401,9 +403,9 @@ def test_the_command_shows_both(tmp_path: Path) -> None:
         return done.stdout
 
     shown = run()
-    for text in ("freezes = 16", "planned", "simulated", "its own error"):
+    for text in ("freezes = 16", "planned", "simulated", "errors of this model"):
         assert text in " ".join(shown.split()), text
-    assert "believe the plan" in " ".join(run("--model", "virtual-mass").split())
+    assert "trust the plan" in " ".join(run("--model", "virtual-mass").split())
     found = json.loads(run("--json"))
     assert found["freezes"] == 16 and json.loads(run("--json", "--freezes", "2"))["freezes"] == 2
     # of another blow, the plan's numbers would mislead

@@ -196,7 +196,7 @@ def test_states_move_the_striking_point_and_coast(velocity: str) -> None:
     rng = np.random.default_rng(0)
     joints = {name: rng.uniform(-0.3, 0.3, 300) for name in ("elbow", "shoulder yaw")}
     speed = rng.uniform(0.1, 1.0, 300)
-    found = states.rows(posture, joints, speed, normal, 300, velocity=velocity)
+    found = states.compute(posture, joints, speed, normal, 300, velocity=velocity)
     for i in (0, 255, 299):  # in the first block of rows, and in what is left of the last
         q, v = found.q[i], found.v[i]
         data = robot.model.createData()
@@ -227,7 +227,7 @@ def test_a_continuous_joint_turns() -> None:
     states = ContactStates(robot=robot, striker="hand", stance=FixedBase(), start=start, folder=Path())
     posture = states.posture("start", None, (0.0, 0.0, 0.0))
     assert isinstance(posture, Posture)
-    found = states.rows(posture, {"turn": np.array([0.5, 3.0])}, np.ones(2), np.array([0.0, 1.0, 0.0]), 2)
+    found = states.compute(posture, {"turn": np.array([0.5, 3.0])}, np.ones(2), np.array([0.0, 1.0, 0.0]), 2)
     turned = [robot.joint_positions(q)[0] for q in found.q]
     assert turned == pytest.approx([0.9, 3.4 - 2 * np.pi])
 

@@ -1,6 +1,6 @@
-"""Contact laws, one a file: `base` says what a law has; LAWS are those that problem files know.
+"""Contact laws, one a file: `base` has the interface, LAWS the laws that problem files can name.
 
-A new one is a file here and its lines below.
+A new law is a file here and its lines below.
 """
 
 from impactopt.contact.laws.base import ContactLaw, rough_at
@@ -10,7 +10,7 @@ from impactopt.contact.laws.hunt_crossley import HuntCrossley
 from impactopt.contact.laws.kelvin_voigt import KelvinVoigt
 from impactopt.contact.laws.spring_damper import SpringDamper
 
-# the first is what a file means that names none
+# the first is the default of problem files
 LAWS: tuple[type[ContactLaw], ...] = (SpringDamper, KelvinVoigt, HuntCrossley, HertzDamped)
 
 __all__ = [

@@ -1,8 +1,8 @@
-"""Contact laws: the normal force between hand and target from penetration and its rate.
+"""Contact laws: the normal force f between hand and target from the penetration and its rate.
 
-The normal n is the direction of the blow; the penetration x = n.(p_hand - p_contact) - x_target [m] grows
-while the two approach, its rate is n.v_hand - v_target [m/s]. The target is pushed by +f n, the hand by -f
-n.
+The normal n is the direction in which the target is pushed: the force on it is +f n, that on the hand -f n.
+The penetration x = n.(p_hand - p_contact) - x_target [m] grows while the two approach; its rate is n.v_hand -
+v_target [m/s].
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ __all__ = ["ContactLaw", "rough_at"]
 class ContactLaw(Described, ABC):
     """A contact law with one smooth branch for compression (rate > 0) and one for restitution (rate <= 0).
 
-    To write one, make a frozen dataclass whose fields are its numbers, and give `branch`. The branches have
-    to agree where the rate is zero; contact ends when, in restitution, the branch's force has fallen to
-    zero. Fields with `impactopt.contact.fields.about` as metadata are checked when a law is made.
+    To write one, make a frozen dataclass whose fields are its parameters, and implement `branch`. The
+    branches have to agree where the rate is zero; contact ends when the force of the restitution branch has
+    fallen to zero. Fields with `impactopt.contact.fields.about` as metadata are checked when a law is made.
 
     Attributes
     ----------
-    word : what problem files call it; "" for one that they do not know.
+    word : its name in problem files; "" if they cannot name it.
     """
 
     word: ClassVar[str] = ""
@@ -40,7 +40,7 @@ class ContactLaw(Described, ABC):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The law's numbers by name; a collision model takes each as an input named `contact_<name>`.
+        """Parameters of the law by name; a collision model takes each as an input named `contact_<name>`.
 
         `type(law)(**numbers)` is the same law with other parameters.
         """
@@ -50,31 +50,31 @@ class ContactLaw(Described, ABC):
     def branch(
         self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None
     ) -> Any:
-        """Force [N] of one phase, smooth in penetration [m] and rate [m/s], whatever their signs.
+        """Force [N] of one phase, smooth in penetration [m] and rate [m/s] of either sign.
 
-        A search passes through penetrations below zero, so write powers with `impactopt.contact.power`.
+        Iterates of a solver may have negative penetrations, so write powers with `impactopt.contact.power`.
 
-        `parameters` replace the law's own numbers, and may be CasADi symbols.
+        `parameters` replace the law's own, and may be CasADi symbols.
         """
 
     def separation(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
-        """Expression [N] that falls through zero, with a slope, where contact ends: the force of restitution.
+        """Expression [N] that becomes negative at the end of contact: the force of restitution.
 
-        Plans end contact on it. A law whose force has no slope there gives another expression that is zero at
-        the same place and has one.
+        Plans end contact where it is zero. Its slope there must not be zero: a law whose force has none
+        returns another expression with the same zero.
         """
         return self.branch(penetration, rate, False, parameters)
 
     def formula(self) -> tuple[str, str, str]:
-        """Both branches, and `separation`, as text in symbols of their own: what a compiled model of this law
-        depends on.
-        """
+        """Both branches and `separation` as text in generic symbols, from which cache keys are made."""
         names = {name: ca.SX.sym(name) for name in self.parameters}
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
         forces = [self.branch(x, rate, c, names) for c in (True, False)]
         used = {symbol.name() for symbol in ca.symvar(ca.SX(ca.vertcat(*forces)))}
         unused = [name for name in names if name not in used]
-        own_fields = dataclasses.is_dataclass(type(self))  # a CustomLaw's functions are given all numbers
+        own_fields = dataclasses.is_dataclass(
+            type(self)
+        )  # a CustomLaw's functions get all parameters in any case
         if unused and own_fields:
             raise InputError(
                 f"{type(self).__name__}.branch does not take {', '.join(unused)} from its argument "
@@ -84,7 +84,7 @@ class ContactLaw(Described, ABC):
         return compression, restitution, text_of([self.separation(x, rate, names)])
 
     def force(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
-        """Force f [N] on the target: never adhesive (f >= 0), and zero while apart (penetration < 0).
+        """Force f [N] on the target: never adhesive (f >= 0), and zero without contact (penetration < 0).
 
         Arguments are floats, arrays or CasADi expressions.
         """
@@ -96,9 +96,9 @@ class ContactLaw(Described, ABC):
 
 
 def rough_at(branches: Sequence[Callable[[Any, Any], Any]]) -> float | None:
-    """The first penetration [m] of 0 and -1 mm at which a branch has no finite force, slope or curvature.
+    """First of the penetrations 0 and -1 mm [m] at which a branch has no finite force, slope or curvature.
 
-    branches : functions of penetration and rate.  None: they are smooth at both, as a search needs them.
+    None if all are finite at both, as solvers need.  branches : functions of penetration and rate.
     """
     x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
     both, found = ca.vertcat(x, rate), []

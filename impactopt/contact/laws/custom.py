@@ -1,4 +1,4 @@
-"""A contact law of one's own, without a class of its own."""
+"""Contact law from user-defined functions, without a class."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ __all__ = ["CustomLaw"]
 
 Branch = Callable[..., Any]
 
-# [m] below this a law that is not smooth at zero goes on along its tangent, found by a difference of this
-# part of it
-_ROUNDED, _STEP = 1e-6, 1e-3
+# [m] Below this penetration a law that is not smooth at zero continues along its tangent; and the step of the
+# difference that gives the tangent, relative to it.
+_TANGENT_BELOW, _DIFFERENCE_STEP = 1e-6, 1e-3
 
 
 class CustomLaw(ContactLaw):
@@ -61,12 +61,12 @@ class CustomLaw(ContactLaw):
         or gives anything but one expression; "analytic" for one that has no curvature at zero.
     """
 
-    # Each law made here is a class with these functions, so that type(law)(**numbers) is the same law with
-    # other parameters, as it is for any law.
+    # Each instance gets a class of its own with these functions, so that type(law)(**numbers) is the same law
+    # with other parameters, as for all laws.
     _branches: ClassVar[tuple[Branch, Branch] | None] = None
     analytic: ClassVar[bool] = False
     _numbers: dict[str, float]
-    _rough: bool  # at or below zero
+    _rough: bool  # not smooth at or below zero
 
     def __new__(
         cls,
@@ -138,16 +138,16 @@ class CustomLaw(ContactLaw):
         return f"CustomLaw({', '.join(f'{name}={value!r}' for name, value in self._numbers.items())})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # its class is made on the spot, and has no name to be found by
+        # pickle cannot find its class, which is made at runtime
         assert self._branches is not None
         compression, restitution = self._branches
         return _remake, (compression, restitution, self.analytic, self._numbers)
 
 
 def _rounded(function: Callable[[Any], Any], x: Any) -> Any:
-    """`function` down to `_ROUNDED`, and below it its tangent there: never called with less."""
-    safe = choose(x > _ROUNDED, x, _ROUNDED)
-    less, more = _ROUNDED * (1 - _STEP), _ROUNDED * (1 + _STEP)
+    """`function` above `_TANGENT_BELOW`, and its tangent there for smaller x."""
+    safe = choose(x > _TANGENT_BELOW, x, _TANGENT_BELOW)
+    less, more = _TANGENT_BELOW * (1 - _DIFFERENCE_STEP), _TANGENT_BELOW * (1 + _DIFFERENCE_STEP)
     return function(safe) + (function(more) - function(less)) / (more - less) * (x - safe)
 
 

@@ -13,7 +13,7 @@ from impactopt.errors import InputError, check_array
 
 __all__ = ["HertzDamped"]
 
-# [m] below this the damper is a parabola: x^(1/4) has no slope at zero
+# [m] Below this penetration a parabola replaces x^(1/4), which has no slope at zero.
 _ROUNDED = 1e-6
 
 
@@ -75,17 +75,17 @@ class HertzDamped(ContactLaw):
         return p["stiffness"] * power(penetration, 1.5) + damper
 
     def separation(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
-        """k (x - (d |rate| / k)^0.8): zero with the force, and with a slope there without damping too.
+        """k (x - (d |rate| / k)^0.8): zero where the force is, with a slope there also without damping.
 
-        Where the quarter power is rounded, d is as much less.
+        Where the quarter power is rounded, d is reduced by the same factor.
         """
         p = self.parameters if parameters is None else parameters
-        damping = p["damping"] * _rounded_share(penetration)
+        damping = p["damping"] * _rounding_factor(penetration)
         return p["stiffness"] * (penetration - power(-damping * rate / p["stiffness"], 0.8))
 
 
 def _quarter_power(x: Any) -> Any:
-    """x^(1/4); below `_ROUNDED` the parabola through 0 that meets it with its slope; 0 for x < 0."""
+    """x^(1/4); below `_ROUNDED` the parabola through 0 with the same value and slope there; 0 for x < 0."""
     deep = x > _ROUNDED
     safe = choose(deep, x, _ROUNDED)
     s = x / _ROUNDED
@@ -93,7 +93,7 @@ def _quarter_power(x: Any) -> Any:
     return choose(deep, safe**0.25, parabola)
 
 
-def _rounded_share(x: Any) -> Any:
-    """`_quarter_power` over x^(1/4): 1 above `_ROUNDED`."""
+def _rounding_factor(x: Any) -> Any:
+    """Ratio of `_quarter_power` and x^(1/4): 1 above `_ROUNDED`."""
     s = choose(x > _ROUNDED, 1.0 + 0.0 * x, x / _ROUNDED)
     return power(s, 0.75) * (7 - 3 * s) / 4

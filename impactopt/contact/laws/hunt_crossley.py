@@ -35,8 +35,9 @@ class HuntCrossley(ContactLaw):
         return spring * (1.0 + 1.5 * p["dissipation"] * rate)
 
     def separation(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
-        """k x (1 + 1.5 alpha dx/dt): the force has no slope at x = 0, where contact ends, unless
-        something pulls the bodies apart faster than 1 / (1.5 alpha) before.
+        """Expression k x (1 + 1.5 alpha dx/dt), as the force has no slope at x = 0.
+
+        Contact ends there, unless something pulls the bodies apart faster than 1 / (1.5 alpha) before.
         """
         p = self.parameters if parameters is None else parameters
         return p["stiffness"] * penetration * (1.0 + 1.5 * p["dissipation"] * rate)

@@ -1,6 +1,6 @@
-"""Targets, one a file: `base` says what a target has; TARGETS are those that problem files know.
+"""Targets, one a file: `base` has the interface, TARGETS the targets that problem files can name.
 
-A new one is a file here and its lines below.
+A new target is a file here and its lines below.
 """
 
 from impactopt.contact.targets.base import UNITS, Target
@@ -9,7 +9,7 @@ from impactopt.contact.targets.free_mass import FreeMass
 from impactopt.contact.targets.nail import Nail
 from impactopt.contact.targets.rigid_wall import RigidWall
 
-# the first is what a file means that names none
+# the first is the default of problem files
 TARGETS: tuple[type[Target], ...] = (FreeMass, RigidWall, Nail, Board)
 
 __all__ = ["TARGETS", "UNITS", "Board", "FreeMass", "Nail", "RigidWall", "Target"]

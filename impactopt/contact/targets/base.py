@@ -1,4 +1,4 @@
-"""Targets: how what is hit moves along the normal under the contact force, and in which phases."""
+"""Targets: their motion along the normal under the contact force, and the phases of a contact."""
 
 from __future__ import annotations
 
@@ -24,31 +24,30 @@ __all__ = [
     "scaled_numbers",
 ]
 
-UNITS = {"speed": "m_s", "depth": "m"}  # of targets' results
+UNITS = {"speed": "m_s", "depth": "m"}  # units of targets' results
 
 
 class Target(Described, ABC):
-    """Something that is hit; motion is along the contact normal only. Before contact its speed is constant.
+    """A body that is hit and moves along the contact normal only. Before contact its speed is constant.
 
-    To write one, make a frozen dataclass whose fields are its numbers, and give the methods below. They have
-    to be smooth, except where one of `switches` changes its sign. `state` is a column of `n_states` numbers
-    or CasADi symbols; it is zero when contact begins. Fields with
+    To write one, make a frozen dataclass whose fields are its parameters, and implement the methods below.
+    They have to be smooth, except where one of `switches` changes its sign. `state` is a column of `n_states`
+    numbers or CasADi symbols; it is zero when contact begins. Fields with
     `impactopt.contact.fields.about` as metadata are checked when a target is made.
 
     Attributes
     ----------
-    word : what problem files call it; "" for one that they do not know.
+    word : its name in problem files; "" if they cannot name it.
     n_states : size of the state.
-    results : names of what `result` gives.
-    typical : sizes of the state's numbers, for scaling; ones if not given.
-    guards : names of the transitions that a plan goes through in place of switches, in this order. Each ends
+    results : names of the values of `result`.
+    typical : typical magnitudes of the state, for scaling; ones if not given.
+    guards : names of the transitions in a plan, in order, in the place of switches. Each ends
         a phase of the contact, where `guard` is zero; see `smooth`.
     phases : names of the contact's phases in a plan: two, or three if there are guards. Guards end the first
         ones. If one more is left before the last, it ends with compression. The last ends at separation.
-    at_once : whether the first guard may be met at the first touch, so that the phase before it has no
-        length.
-    stays : whether the target stays where the blow leaves it. The striker must then keep off it afterwards.
-    met_again : whether a plan may have the striker part from it and meet it again before its first guard.
+    at_once : the first guard may be zero at the first touch, so that the phase before it has no duration.
+    stays : the target stays in place after the impact. The striker must then keep off it.
+    met_again : a plan may let the striker separate from it and touch it again before its first guard.
     """
 
     word: ClassVar[str] = ""
@@ -66,12 +65,12 @@ class Target(Described, ABC):
 
     @property
     def turns(self) -> bool:
-        """True if a phase of a plan ends with compression: guards do not end all phases but the last."""
+        """True if a phase of a plan ends with compression: guards do not end all phases before the last."""
         return len(self.guards) < len(self.phases) - 1
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The target's numbers by name; a collision model takes each as an input named `target_<name>`.
+        """Parameters of the target by name; a collision model takes each as an input named `target_<name>`.
 
         `type(target)(**numbers)` is the same target with other parameters.
         """
@@ -82,34 +81,34 @@ class Target(Described, ABC):
         """Velocity of the hit surface along the normal [m/s]."""
 
     def speed_before(self, parameters: Parameters | None = None) -> Any:
-        """Velocity of the surface along the normal [m/s] before contact, and when it begins; 0: at rest."""
+        """Velocity of the surface along the normal [m/s] until contact begins; 0: at rest."""
         return self.velocity([0.0] * self.n_states, parameters)
 
     @abstractmethod
     def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
-        """d(state)/dt, a list of `n_states` expressions, under the contact force [N]."""
+        """Time derivative of the state under the contact force [N], a list of `n_states` expressions."""
 
     @abstractmethod
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Energy [J] that the target has taken: its own, and the work done in it, as against wood."""
+        """Energy [J] that the target has absorbed: its own, and dissipated work, as against wood."""
 
     def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
-        """Expressions whose changes of sign split the motion into smooth modes; steps end there."""
+        """Switching functions: their changes of sign separate smooth modes of the motion. Steps end there."""
         return []
 
     def smooth(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> tuple[Any, list[Any]]:
-        """Velocity [m/s] and d(state)/dt in one phase of a plan's contact, where nothing may switch.
+        """Velocity [m/s] and d(state)/dt in one phase of a plan's contact, without switches.
 
-        Without switches they are `velocity` and `derivative`. With switches, the target goes through its
-        `guards` in their order in a plan, and is smooth in each phase between two of them.
+        By default they are `velocity` and `derivative`. In a plan, a target with switches passes its
+        `guards` in order, and is smooth in each phase between them.
 
         phase : 0 for the first.
 
         Raises
         ------
-        InputError : it has switches, and no method `smooth` of its own.
+        InputError : it has switches, but no implementation of `smooth`.
         """
         if self.switches(state, force, parameters):
             raise InputError(
@@ -121,39 +120,38 @@ class Target(Described, ABC):
     def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
     ) -> Any:
-        """Expression of order 1 that is zero where a phase ends, of those that `guards` end.
+        """Expression of order 1 that is zero at the end of a phase which one of `guards` ends.
 
-        phase : 0 for the first.  late : how much longer the phase lasts than it has to [s].
+        phase : 0 for the first.  late [s] : time by which the phase exceeds its shortest duration.
         """
         raise NotImplementedError(f"{type(self).__name__} has no guards")
 
     def invariant(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> list[Any]:
-        """Expressions of order 1 that are not negative while a phase lasts: one, or none."""
+        """Expressions (one or none) of order 1 that are not negative during a phase."""
         return []
 
     def reserve(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
-        """Expressions of order 1 that are not negative where a phase ends, so that a blow which is a little
-        weaker comes to its end too: one, or none.
+        """Expressions (one or none) of order 1 that are not negative at the end of a phase.
+
+        They ensure that a slightly weaker impact reaches this end too.
         """
         return []
 
     def margin(self, phase: int, place: float) -> float:
-        """Margin by which `invariant` stays from zero at a place in a phase, 0 where it begins and 1 where it
-        ends.
+        """Lower bound of `invariant` at a place in a phase, from 0, its start, to 1, its end.
 
-        So that an event which ends a phase is the first of its kind, and not one that a small error brings
-        earlier.
+        With it a small error cannot cause the event that ends the phase to occur earlier.
         """
         return 0.0
 
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
-        """Effects of the blow on the target, from the state at separation; named by `results`."""
+        """Effects of the impact on the target, named by `results`, from the state at separation."""
         return []
 
     def outcome(self, state: Any, parameters: Parameters | None = None) -> dict[str, float]:
-        """`result` as numbers by name and unit, as reports have them: `speed_m_s`, `depth_m`, `broken`."""
+        """Numeric `result` by name and unit, as in reports: `speed_m_s`, `depth_m`, `broken`."""
         return self.with_units(self.result([float(x) for x in state], parameters))
 
     def with_units(self, values: Iterable[Any]) -> dict[str, float]:
@@ -163,11 +161,11 @@ class Target(Described, ABC):
 
     @property
     def result_names(self) -> list[str]:
-        """`results`, each with its unit."""
+        """Names of `results` with their units."""
         return [f"{name}_{UNITS[name]}" if name in UNITS else name for name in self.results]
 
     def formula(self) -> tuple[str, ...]:
-        """The target as text in symbols of its own: what a compiled model of it depends on."""
+        """All expressions of the target as text in generic symbols, from which cache keys are made."""
         numbers = {name: ca.SX.sym(name) for name in self.parameters}
         state = [ca.SX.sym(f"state_{i}") for i in range(self.n_states)]
         force = ca.SX.sym("force")
@@ -200,14 +198,14 @@ def scaled_numbers(
     stiffness: float = 1.0,
     damping: float = 1.0,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """The contact law's and the target's numbers by name, with factors of some.
+    """Parameters of the contact law and of the target by name, some of them scaled.
 
-    where : what asks for it, for messages.  mass : factor of the target's.  stiffness, damping : of the
+    where : source of the factors, for messages.  mass : factor of the target's.  stiffness, damping : of the
         law's.
 
     Raises
     ------
-    InputError : a factor of a number that they do not have.
+    InputError : a factor of a parameter that they do not have.
     """
     of_law, of_target = dict(law.parameters), dict(target.parameters)
     for name, factor, of, numbers in (
@@ -223,16 +221,16 @@ def scaled_numbers(
     return of_law, of_target
 
 
-TURN, SEPARATION, TOUCH = "end of compression", "separation", "touch"  # ends of phases that no target has
+TURN, SEPARATION, TOUCH = "end of compression", "separation", "touch"  # ends of phases other than guards
 
 
 @dataclass(frozen=True)
 class ContactPhase:
     """One phase of a contact.
 
-    mode : the target's phase whose motion it has (`impactopt.contact.targets.Target.smooth`).
+    mode : phase of the target's motion in it (`impactopt.contact.targets.Target.smooth`).
     end : one of the target's guards, `TURN`, `SEPARATION` or `TOUCH`.
-    apart : whether striker and target are apart in it.
+    apart : striker and target do not touch in it.
     """
 
     name: str
@@ -242,10 +240,10 @@ class ContactPhase:
 
 
 def contact_phases(target: Target, touches: int = 1) -> tuple[ContactPhase, ...]:
-    """Phases of a contact in which the striker meets the target so many times.
+    """Phases of a contact in which the striker touches the target several times.
 
-    With one touch they are the target's. With more, the target's events come in the last touch, and
-    compression and restitution are not told apart.
+    With one touch they are the target's. With more, the target's guards are in the last touch, and
+    compression and restitution are not distinguished.
     """
     if touches == 1:
         last = len(target.phases) - 1

@@ -10,8 +10,8 @@ from impactopt.contact.targets.base import Target
 
 __all__ = ["Board"]
 
-MARGIN = 0.1  # of the breaking force where the board is touched; none where it breaks
-RESERVE = 0.02  # of the deflection at the break
+MARGIN = 0.1  # relative to the breaking force, at the touch; zero at the break
+RESERVE = 0.02  # relative to the deflection at the break
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,19 +67,20 @@ class Board(Target):
     def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
     ) -> Any:
-        """The spring's force over the breaking force, less 1."""
+        """Spring force over breaking force, minus 1."""
         p = self.parameters if parameters is None else parameters
         return p["stiffness"] * state[1] / p["breaking_force"] - 1.0
 
     def invariant(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> list[Any]:
-        """1 minus the spring's force over the breaking force, positive before the break."""
+        """Ratio 1 - spring force / breaking force, positive before the break."""
         return [] if phase else [-self.guard(state, force, 0.0, phase, parameters)]
 
     def reserve(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
-        """Condition that a board which did not break would swing on under the force at the break, by at least
-        a fraction of its deflection: v^2 / (2 |dv/dt|) >= RESERVE F / k, where it slows down.
+        """Condition that an unbroken board would swing on at this force, by a fraction of its deflection.
+
+        If it decelerates, v^2 / (2 |dv/dt|) >= RESERVE F / k.
         """
         if phase:
             return []
@@ -89,8 +90,9 @@ class Board(Target):
         return [p["stiffness"] * p["mass"] * v**2 / F**2 - 2.0 * RESERVE * slows]
 
     def margin(self, phase: int, place: float) -> float:
-        """A board that only just holds may break, so an earlier peak of its swing keeps off the break, and
-        the break is come to with a speed.
+        """Margin that decreases from the touch to the break.
+
+        A board that nearly breaks may break, so earlier peaks of its oscillation stay below the break.
         """
         return MARGIN * (1.0 - place) if phase == 0 else 0.0
 
@@ -98,11 +100,11 @@ class Board(Target):
         return state[1] - p["breaking_force"] / p["stiffness"]
 
     def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
-        """Deflection beyond that of the break."""
+        """Deflection minus that of the break."""
         return [self._beyond(state, self.parameters if parameters is None else parameters)]
 
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Kinetic energy gained, and that of bending; after the break the energy that breaking took."""
+        """Gain of kinetic energy, and elastic energy; after the break that at the break."""
         p = self.parameters if parameters is None else parameters
         beyond, at_break = self._beyond(state, p), p["breaking_force"] / p["stiffness"]
         bent = choose(beyond > 0, at_break + 0.0 * beyond, state[1])

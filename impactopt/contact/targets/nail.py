@@ -10,7 +10,7 @@ from impactopt.contact.targets.base import Target
 
 __all__ = ["Nail"]
 
-SOON, LEFT = 1e-3, 1e-4  # of a plan's start: the unit of time [s], and what is left; see `Nail.guard`
+SOON, LEFT = 1e-3, 1e-4  # time scale [s] and relaxation of the complementarity condition in `Nail.guard`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +49,8 @@ class Nail(Target):
         return p["resistance"] + p["hardening"] * (p["depth"] + state[1])
 
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
-        # a step that ends just beyond the stop leaves v a little below zero; and zero belongs to the side
-        # on which v starts to grow
+        # A step that ends just beyond the stop leaves v slightly below zero. Zero belongs to the branch on
+        # which v starts to grow.
         return choose(state[0] >= 0, state[0], 0.0 * state[0])
 
     def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
@@ -60,7 +60,7 @@ class Nail(Target):
         return [driven, self.velocity(state, p)]
 
     def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
-        """v while the nail moves, f - R while it stands."""
+        """Velocity v while the nail moves, f - R while it is at rest."""
         p = self.parameters if parameters is None else parameters
         beyond = force - self._resistance(state, p)
         return [choose(state[0] > 0, state[0], choose(beyond > 0, state[0], beyond))]
@@ -68,7 +68,7 @@ class Nail(Target):
     def smooth(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> tuple[Any, list[Any]]:
-        """It stands, is driven, and stands again: it moves once in a blow."""
+        """Velocity and rates of the nail: at rest, driven, and at rest again. It moves once in an impact."""
         p = self.parameters if parameters is None else parameters
         if phase != 1:
             return 0.0 * state[0], [0.0 * state[0], 0.0 * state[0]]
@@ -77,10 +77,10 @@ class Nail(Target):
     def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
     ) -> Any:
-        """The nail starts where the force reaches the resistance, or at once if the first force is above it.
+        """Start of the nail, as the force reaches the resistance or is above it at first touch; and its stop.
 
-        The first is f = R and late > 0, the second late = 0 and f > R: complementarity, relaxed to
-        late (f / R - 1) = SOON LEFT, both above zero. It stops at v = 0.
+        The two starts, f = R with late > 0 and late = 0 with f > R, are complementary. The condition is
+        relaxed to late (f / R - 1) = SOON LEFT with both factors positive. The nail stops at v = 0.
         Source: Scholtes, SIAM J. Optim. 11 (2001) 918-936.
         """
         p = self.parameters if parameters is None else parameters
@@ -92,7 +92,7 @@ class Nail(Target):
     def invariant(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> list[Any]:
-        """While driven it does not move back; after that the force stays below the resistance."""
+        """Velocity v while it is driven, which is not negative; then R - f over R."""
         p = self.parameters if parameters is None else parameters
         return [[], [state[0]], [1.0 - force / self._resistance(state, p)]][phase]
 
@@ -105,7 +105,7 @@ class Nail(Target):
 
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
         p = self.parameters if parameters is None else parameters
-        # R s + hardening s^2 / 2 = m v^2 / 2, written so that it holds without hardening too
+        # the root s of R s + hardening s^2 / 2 = m v^2 / 2, in a form that is valid without hardening too
         R, twice_energy = self._resistance(state, p), p["mass"] * self.velocity(state, p) ** 2
         coasted = twice_energy / (R + (R**2 + p["hardening"] * twice_energy) ** 0.5)
         return [state[1] + coasted]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.interface import Collision, CollisionModel
-from impactopt.collision.settings import Effects, JointFriction, Settings, no_bend, servo_settings
+from impactopt.collision.settings import Effects, JointFriction, Settings, constant_reference, servo_settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.contact.friction import check_friction
 from impactopt.errors import InputError, check_array, check_positive
@@ -246,7 +246,7 @@ class ReferenceModel(CollisionModel):
     def _settings(self, kp: ArrayLike | None, kd: ArrayLike | None) -> Settings:
         effects = Effects(friction=self.friction is not None)
         servo = servo_settings(self.robot, effects, self._friction, kp, kd)
-        servo |= no_bend(self.robot.n)  # with friction too
+        servo |= constant_reference(self.robot.n)  # with friction too
         return Settings(self.law, self.target, np.asarray(self.normal), servo)
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.collision.settings import REFERENCE_ORDER, no_bend
+from impactopt.collision.settings import REFERENCE_ORDER, constant_reference
 from impactopt.errors import InputError, check_positive
 from impactopt.kinematics.coordinates import StanceCoordinates, independent_rates
 
@@ -47,7 +47,7 @@ def coasting_reference(
     q, v = robot.check_configuration(q), robot.check_velocity(v)
     check_positive("until [s]", until)
     if not c.legs:
-        return no_bend(robot.n)
+        return constant_reference(robot.n)
     y, legs = c.split(q)
     rates, shortest = independent_rates(c, y, v), until / 2
     _, start, acceleration = c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, legs))

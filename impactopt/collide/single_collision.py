@@ -32,7 +32,7 @@ __all__ = [
     "MEASURES",
     "NOT_ENDED",
     "AtContact",
-    "CollisionBatch",
+    "CollisionResults",
     "Measure",
     "check_at_contact",
     "chosen",
@@ -131,7 +131,7 @@ LEAST_WEIGHT = 1.0  # [N] vertical force on the ground; with less the ZMP is und
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CollisionBatch:
+class CollisionResults:
     """Results of N collisions of a robot, from which measures are computed.
 
     found : outputs by name, as of `SymbolicModel.batch`.  states : at contact.  torque_limit (N, n) or (1, n)
@@ -152,20 +152,20 @@ class Measure:
 
     outputs: tuple[str, ...]
     what: str
-    of: Callable[[CollisionBatch], Array]
+    of: Callable[[CollisionResults], Array]
 
 
-def _torque_ratio(batch: CollisionBatch) -> Array:
+def _torque_ratio(batch: CollisionResults) -> Array:
     demand = np.abs(batch.found["demand"])
     return np.asarray((demand.max(axis=1) / batch.torque_limit).max(axis=1))
 
 
-def _velocity_ratio(batch: CollisionBatch) -> Array:
+def _velocity_ratio(batch: CollisionResults) -> Array:
     joints = np.abs(batch.states.v[:, -batch.velocity_limit.size :])
     return np.asarray((joints / batch.velocity_limit).max(axis=1))
 
 
-def _zmp_margin(batch: CollisionBatch) -> Array:
+def _zmp_margin(batch: CollisionResults) -> Array:
     ground = batch.found["ground_wrench"]
     flat = ground.reshape(-1, 6)
     out = np.full(len(flat), -np.inf)
@@ -240,7 +240,7 @@ def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
 
 
 def _result(k: int) -> Measure:
-    def of(batch: CollisionBatch) -> Array:
+    def of(batch: CollisionResults) -> Array:
         result: Any = batch.found["target_result"]
         return np.asarray(result[:, k])
 
@@ -360,7 +360,7 @@ def collide_once(
         value = getattr(collision, name)
         found[name] = None if value is None else np.asarray(value, dtype=float)[None]
     limit = robot.torque_limit * section.torque_limit_scale
-    batch = CollisionBatch(
+    batch = CollisionResults(
         found=found,
         states=state,
         torque_limit=limit[None],

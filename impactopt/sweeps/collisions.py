@@ -20,7 +20,7 @@ from impactopt.collide.contact_states import ContactStates, Posture, States
 from impactopt.collide.single_collision import (
     NOT_ENDED,
     AtContact,
-    CollisionBatch,
+    CollisionResults,
     Measure,
     check_at_contact,
     chosen,
@@ -234,7 +234,7 @@ class CollisionBatch:
             found, reason = batch(model, self._outputs, states, given, threads)
         else:
             found, reason = one_by_one(model, self._outputs, states, given)
-        collisions = CollisionBatch(
+        collisions = CollisionResults(
             found=found,
             states=states,
             torque_limit=settings["torque_limit"],

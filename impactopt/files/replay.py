@@ -81,7 +81,7 @@ def program_of_record(record: Record, problem: ImpactProblem) -> Transcription |
         )
         for entry in statement["apart"]
     }
-    return t.with_apart(clearances) if clearances else t
+    return t.with_clearance(clearances) if clearances else t
 
 
 def _same_program(t: Transcription, record: Record) -> bool:

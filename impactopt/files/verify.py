@@ -25,7 +25,12 @@ from impactopt.files.output import LARGEST, NUMBERS, SUMMARY, Record, load_recor
 from impactopt.files.replay import problem_of, program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import weight_of
-from impactopt.solvers.program import bound_violations, complementarity, row_violations, scaled_residual
+from impactopt.solvers.program import (
+    bound_violations,
+    complementarity,
+    constraint_violations,
+    scaled_residual,
+)
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.transcription import Transcription, statement_of
 
@@ -158,7 +163,7 @@ class _Found:
         """KKT residual and objective at the record's variables; violations are noted."""
         program, x = t.program, np.asarray(arrays["solver_x"], dtype=float)
         g = program.constraints(x)
-        for origin, amount in zip(t.rows.origins, row_violations(program, g), strict=True):
+        for origin, amount in zip(t.constraints.origins, constraint_violations(program, g), strict=True):
             self.note(origin.term, amount, ", ".join(filter(None, (origin.place.name, origin.component))))
         beyond = bound_violations(program, x)
         worst = int(np.argmax(beyond))

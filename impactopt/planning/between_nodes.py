@@ -114,7 +114,7 @@ class BetweenNodes:
         self._rounds += 1
 
         def guesses() -> Iterator[Guess[Transcription]]:
-            constraints, finer = {**t.apart_rows, **raised}, t
+            constraints, finer = {**t.clearance_constraints, **raised}, t
             if nodes != t.nodes or elements is not None:
                 finer = program_for(
                     t,
@@ -125,7 +125,7 @@ class BetweenNodes:
                     report=self._budget.report,
                 )
             elif raised:
-                finer = t.with_apart(constraints)
+                finer = t.with_clearance(constraints)
             # With the same variables and other clearance constraints, there are three guesses: the solution
             # with its multipliers, without them, and the initial guess of the refinement.
             others = violated is not None and finer.layout.n == len(x)

@@ -31,16 +31,16 @@ from impactopt.problem.terms import (
     TorqueLimit,
     VelocityLimit,
 )
-from impactopt.solvers.program import row_violations
+from impactopt.solvers.program import constraint_violations
 from impactopt.solvers.relaxed import Relaxation
-from impactopt.transcription.layout import Row
+from impactopt.transcription.layout import ConstraintOrigin
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["FEASIBLE", "TYPICAL_DURATION", "Bound", "Cause", "bounds_of", "changed_or_none"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-Selector = Callable[[Row], bool]
+Selector = Callable[[ConstraintOrigin], bool]
 FEASIBLE = 1e-5  # largest violation of the (scaled) constraints that counts as none here
 TYPICAL_DURATION = 1.0  # [s] of a swing or a follow-through
 _NO_INDICES = np.zeros(0, dtype=np.intp)
@@ -164,7 +164,7 @@ def _clearances(t: Transcription) -> Iterator[Bound]:
     kinds = KeepOut.name, SelfCollision.name
     for term, pair in dict.fromkeys((r.term, r.component) for r in t.program.origins if r.term in kinds):
 
-        def select(constraint: Row, term: str = term, pair: str = pair) -> bool:
+        def select(constraint: ConstraintOrigin, term: str = term, pair: str = pair) -> bool:
             return constraint.term == term and constraint.component == pair
 
         def causes(
@@ -200,7 +200,7 @@ def _terms(t: Transcription) -> Iterator[Bound]:
         if isinstance(term, (KeepOut, SelfCollision, PositionLimit)):
             continue
 
-        def select(constraint: Row, term: Term = term) -> bool:
+        def select(constraint: ConstraintOrigin, term: Term = term) -> bool:
             return _TERM_OF.get(constraint.term) is type(term) or constraint.term.startswith(term.name)
 
         if isinstance(term, GearLoad):
@@ -223,7 +223,7 @@ def _gear_loads(t: Transcription, term: GearLoad) -> Iterator[Bound]:
     most, names = np.asarray(term.most(t.robot), dtype=float), t.robot.joint_names
     for k, joint in enumerate(names):
 
-        def select(constraint: Row, joint: str = joint) -> bool:
+        def select(constraint: ConstraintOrigin, joint: str = joint) -> bool:
             return constraint.term == term.name and constraint.component == joint
 
         if not _inequalities(t, select).size:
@@ -253,7 +253,7 @@ def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> It
     section = f"[terms.{snake_case(type_name)}] " if type(term) in TERMS else f"{type_name}."
     about_field = {field.name: about for field, about in abouts(type(term))}
     constraints = _inequalities(t, select).tolist()
-    violations = row_violations(t.program, t.program.constraints(x))
+    violations = constraint_violations(t.program, t.program.constraints(x))
     worst = max(constraints, key=lambda i: violations[i], default=None)
     where = ""
     if worst is not None and violations[worst] > FEASIBLE:
@@ -266,7 +266,9 @@ def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> It
 
         def violation_at(value: float, name: str = field.name) -> float:
             p = changed(t.problem, terms=with_term(t.problem, replace(term, **{name: value})))
-            return _violation(program_for(t.with_apart({}), p), x, select, torques=type(term) is TorqueLimit)
+            return _violation(
+                program_for(t.with_clearance({}), p), x, select, torques=type(term) is TorqueLimit
+            )
 
         needed = _feasible_value(violation_at, old)
         if needed is None:
@@ -312,7 +314,7 @@ def _feasible_value(violation: Callable[[float], float], old: float) -> float | 
 def _violation(t: Transcription, x: Array, select: Selector, *, torques: bool = False) -> float:
     """Largest violation of the selected inequalities, and of the bounds of ``torques``, at variables (n,)."""
     found = _inequalities(t, select)
-    most = row_violations(t.program, t.program.constraints(x))[found].max(initial=0.0)
+    most = constraint_violations(t.program, t.program.constraints(x))[found].max(initial=0.0)
     if torques:
         j = _torques(t)
         beyond = np.maximum(t.program.x_lower[j] - x[j], x[j] - t.program.x_upper[j])

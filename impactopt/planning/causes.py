@@ -178,7 +178,7 @@ class _CauseSearch:
                 continue
             if self._budget.left == 0:
                 return
-            t = program_for(self.t.with_apart({}), new)
+            t = program_for(self.t.with_clearance({}), new)
             if self._run(t.program, first_iterate(t), _ITERATIONS_STIFFNESS) is not None:
                 yield Cause(
                     kind="a soft contact" if factor > 1 else "a stiff contact",

@@ -176,7 +176,7 @@ class Watch:
         # separating directions (K, P, 3), zero if unknown; mask (K, P) of the pairs that have a constraint
         self._directions, self._has = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
         number = {name: k for k, name in enumerate(self._names)}
-        for key, held in t.apart_rows.items():
+        for key, held in t.clearance_constraints.items():
             at = number[key.place], self._shapes.index[key[1:]]
             self._has[at], self._directions[at] = True, held.way
         neighbours = self._shapes.between < NEIGHBOUR_JOINTS
@@ -312,7 +312,7 @@ def _with_near_pairs(
     constraints = watch.constraints()
     if not constraints:
         return t, start
-    new = t.with_apart({**t.apart_rows, **constraints})
+    new = t.with_clearance({**t.clearance_constraints, **constraints})
     if isinstance(start, SolverResult):
         start = replace(start, multipliers=_by_constraint(start.multipliers, t, new, 0.0))
     return new, start
@@ -324,9 +324,9 @@ def _by_constraint(values: Array, old: ContactProgram, new: ContactProgram, fill
     Clearance constraints come last, and a new one may come between the old ones.
     fill : value of the new constraints.
     """
-    others = len(values) - len(old.apart_rows)
-    known = dict(zip(old.apart_rows, values[others:].tolist(), strict=True))
-    return np.append(values[:others], [known.get(key, fill) for key in new.apart_rows])
+    others = len(values) - len(old.clearance_constraints)
+    known = dict(zip(old.clearance_constraints, values[others:].tolist(), strict=True))
+    return np.append(values[:others], [known.get(key, fill) for key in new.clearance_constraints])
 
 
 SAMPLE_STEP = 8e-3  # [s] between the instants at which a solution is checked
@@ -435,7 +435,7 @@ class _RaisedClearances:
         for k in adjacent:
             own = {
                 key: held
-                for key, held in self._t.apart_rows.items()
+                for key, held in self._t.clearance_constraints.items()
                 if key[:3] == (self._nodes.names[k], *pair)
             }
             gaps = {key: float(self._gaps[k, index[key[1:]]]) for key in own}

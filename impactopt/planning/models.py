@@ -55,8 +55,8 @@ def carried_start(
     before, now = ((p.collision, p.freezes, lazy_terms_of(p), p.gains) for p in (start.problem, t.problem))
     if before == now:
         return start.result
-    new = t.with_apart(constraints)
-    found = carried(new, old().with_apart(start.apart), start.result)
+    new = t.with_clearance(constraints)
+    found = carried(new, old().with_clearance(start.apart), start.result)
     return with_factors_of(new, start.problem.robot, found) if now[-1] else found
 
 

@@ -67,6 +67,6 @@ def solution_of(
         nodes=t.nodes,
         elements=t.hit.elements if t.hit.guarded else (),
         shares=t.hit.shares,
-        apart=t.apart_rows,
+        apart=t.clearance_constraints,
         contact=at.contact if outcome.usable else None,
     )

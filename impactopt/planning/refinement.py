@@ -296,7 +296,7 @@ def program_for(
     report: Callable[[str], None] | None = None,
 ) -> Program:
     """Program like ``t`` for another problem, on another mesh, or with other clearance constraints."""
-    constraints = t.apart_rows if constraints is None else constraints
+    constraints = t.clearance_constraints if constraints is None else constraints
     problem = problem or t.problem
     elements = elements or (t.hit.elements if t.hit.guarded else ())
     shares = t.hit.shares if shares is None else shares
@@ -306,7 +306,7 @@ def program_for(
         new = type(t)(problem, problem.coordinates, functions, elements, shares)
     else:
         new = Transcription(problem, problem.coordinates, functions, nodes or t.nodes, elements, shares)
-    return new.with_apart(constraints) if constraints else new
+    return new.with_clearance(constraints) if constraints else new
 
 
 def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> SolverResult:

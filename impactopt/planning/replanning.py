@@ -99,7 +99,7 @@ class ParametricProgram:
         if s.apart:
             if not same_bodies(problem, s.problem):
                 raise InputError("the world has other bodies then: use solve(problem, start=solution)")
-            t = t.with_apart(s.apart)
+            t = t.with_clearance(s.apart)
         if (t.program.n, t.program.m) != (len(s.result.x), len(s.result.multipliers)):
             raise InputError("the program has other constraints then: use solve(problem, start=solution)")
         return t
@@ -270,7 +270,7 @@ def _binding(family: ParametricProgram) -> tuple[Binding, ...]:
     program, out = t.program, list[Binding]()
     inequality = program.g_lower < program.g_upper
     for i in np.flatnonzero(system.rows * inequality):
-        price, origin = abs(float(system.y[i])), t.rows.origins[int(i)]
+        price, origin = abs(float(system.y[i])), t.constraints.origins[int(i)]
         measure = origin.measure
         # the program's constraints are scaled: ``factor`` leads back to the unit of the bound
         unit, factor = ("1", 1.0) if measure is None else (measure.unit, measure.factor)
@@ -424,6 +424,6 @@ def _solution(old: Solution, outcome: Outcome[Transcription], seconds: tuple[flo
         replace(outcome, attempts=(outcome.attempt("moved"),)),
         solver=old.solver,
         seconds=seconds,
-        statement=statement_of(t) if len(t.rows.origins) == t.program.m else old.statement,
+        statement=statement_of(t) if len(t.constraints.origins) == t.program.m else old.statement,
         gains=old.gains,
     )

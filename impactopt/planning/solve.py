@@ -162,7 +162,7 @@ def _planned(
     # refined. Without clearance constraints only the best one is.
     solver = PlanSolver(budget=budget, margins=margins, refined=refined and margins is not None)
     if isinstance(start, Solution) and margins is not None and same_bodies(t.problem, start.problem):
-        t = t.with_apart(start.apart)
+        t = t.with_clearance(start.apart)
     built, guesses = time.perf_counter(), _guesses(t, given, range(which.start, last), seed, solver)
     outcome = best_of(guesses, solver.from_guess, budget, len(which))
     if refined and margins is None:
@@ -247,7 +247,7 @@ class PlanSolver:
         outcome = solve_with_clearance(self.budget, self.margins, guess)
         if not self.refined:
             return outcome if self.margins is not None else self._retried(outcome)
-        if self._stuck(outcome.result) and outcome.program.apart_rows and self.budget.left != 0:
+        if self._stuck(outcome.result) and outcome.program.clearance_constraints and self.budget.left != 0:
             outcome = self._solved_without_clearance(outcome)
         else:
             outcome = self._between(outcome)
@@ -277,7 +277,7 @@ class PlanSolver:
         violated constraints of the first solve name the obstacle.
         """
         self.budget.say("no motion was found with clearance constraints: solving without them first")
-        free = stuck.program.with_apart({})
+        free = stuck.program.with_clearance({})
         found = self._between(Outcome.of(free, self.budget.run(free.program, stuck.origin.x), stuck.origin))
         return stuck.then(found) if found.usable else found.then(stuck)
 

@@ -179,7 +179,7 @@ def _optimized(
         contact=at.contact if outcome.usable else None,
         elements=t.hit.elements if t.hit.guarded else (),
         shares=t.hit.shares,
-        apart=t.apart_rows,
+        apart=t.clearance_constraints,
     )
 
 
@@ -212,7 +212,7 @@ def clear_strike(
 
     outcome = solve(replace(guess, barrier=BARRIER_WARM))
     if guess.warm is not None and outcome.result.status in _STUCK and budget.left != 0:
-        outcome = outcome.then(solve(Guess(program=t.with_apart({}), start=guess.x)))
+        outcome = outcome.then(solve(Guess(program=t.with_clearance({}), start=guess.x)))
     return outcome
 
 

@@ -251,7 +251,7 @@ class ImpactProblem:
         listed = isinstance(self.terms, (list, tuple))
         if not listed or not all(isinstance(t, Term) for t in self.terms):
             raise InputError(f"terms must be a tuple of terms, such as (TorqueLimit(),), not {self.terms!r}")
-        check_known(self.terms, Term, "add_rows")
+        check_known(self.terms, Term, "add_constraints")
         object.__setattr__(self, "terms", tuple(self.terms))
         kinds = [kind_of(t, Term) for t in self.terms]
         for kind in kinds:
@@ -448,12 +448,14 @@ class ImpactProblem:
 
     @property
     def active_terms(self) -> tuple[Term, ...]:
-        """The problem's own terms, and default terms with an `add_rows`; without those that are switched
+        """The problem's own terms, and default terms with an `add_constraints`; without those that are switched
         off.
         """
         given = {type(term) for term in self.terms}
         defaults = [
-            t for t in DEFAULT_TERMS if type(t).add_rows is not Term.add_rows and type(t) not in given
+            t
+            for t in DEFAULT_TERMS
+            if type(t).add_constraints is not Term.add_constraints and type(t) not in given
         ]
         return tuple(term for term in (*self.terms, *defaults) if term.active)
 

@@ -76,7 +76,7 @@ class NonlinearProgram(Protocol):
         """Hessian of sigma f + multipliers . g, full symmetric csc_array (n, n), always the same pattern."""
         ...
 
-    def row_name(self, i: int) -> str:
+    def constraint_name(self, i: int) -> str:
         """Readable name of constraint i: "torque limit, swing, node 7, arm_right_4_joint"."""
         ...
 
@@ -86,10 +86,10 @@ class NonlinearProgram(Protocol):
 
 
 @runtime_checkable
-class SpokenProgram(NonlinearProgram, Protocol):
+class DescribedProgram(NonlinearProgram, Protocol):
     """Program that describes violations of its constraints in words."""
 
-    def row_group(self, i: int) -> tuple[str, str]:
+    def constraint_group(self, i: int) -> tuple[str, str]:
         """Term and node of constraint i; a message has only the worst constraint of each such group."""
         ...
 
@@ -217,7 +217,7 @@ def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
     InputError : wrong shapes, NaN, crossing bounds; the message names the constraint or variable.
     """
     n, m = program.n, program.m
-    sides = (("x", n, program.variable_name), ("g", m, program.row_name))
+    sides = (("x", n, program.variable_name), ("g", m, program.constraint_name))
     for kind, size, name in sides:
         lower = check_array(f"{kind}_lower", getattr(program, f"{kind}_lower"), (size,), finite=False)
         upper = check_array(f"{kind}_upper", getattr(program, f"{kind}_upper"), (size,), finite=False)
@@ -232,7 +232,7 @@ def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
     return check_array("x0", x0, (n,))
 
 
-def row_violations(program: NonlinearProgram, g: Vector) -> Vector:
+def constraint_violations(program: NonlinearProgram, g: Vector) -> Vector:
     """Violation of each constraint's bounds, (m,), >= 0; nan where g is nan."""
     return np.maximum(np.maximum(program.g_lower - g, g - program.g_upper), 0.0)
 
@@ -244,7 +244,7 @@ def bound_violations(program: NonlinearProgram, x: Vector) -> Vector:
 
 def max_violation(program: NonlinearProgram, x: Vector, g: Vector) -> float:
     """Largest violation of a constraint or a bound at x with g = g(x); inf if any is nan."""
-    constraints, bounds = row_violations(program, g), bound_violations(program, x)
+    constraints, bounds = constraint_violations(program, g), bound_violations(program, x)
     worst = max(float(np.max(constraints, initial=0.0)), float(np.max(bounds, initial=0.0)))
     finite = not (np.isnan(constraints).any() or np.isnan(bounds).any())
     return worst if finite else np.inf
@@ -311,22 +311,22 @@ def worst_rows(
 
     Of a term's constraints at a node only the worst is listed; with ``once_a_term``, of all its constraints.
     """
-    violations = np.concatenate([row_violations(program, g), bound_violations(program, x)])
+    violations = np.concatenate([constraint_violations(program, g), bound_violations(program, x)])
     violations = np.where(np.isnan(violations), np.inf, violations)
     m, out, seen = program.m, list[Violation](), set[tuple[str, str]]()
-    described = program if isinstance(program, SpokenProgram) else None
+    described = program if isinstance(program, DescribedProgram) else None
     for i in np.argsort(-violations, kind="stable").tolist():
         amount = float(violations[i])
         if not amount > tolerance or len(out) == count:
             break
         what, by = f"bound of {program.variable_name(i - m)}" if i >= m else "", f"by {amount:.3g}"
         if i < m and described is not None:
-            term, place = described.row_group(i)
+            term, place = described.constraint_group(i)
             if (group := (term, "" if once_a_term else place)) in seen:
                 continue
             seen.add(group)
             what, by = described.describe_violation(i, x, amount)
-        out.append(Violation(what or program.row_name(i), by, amount))
+        out.append(Violation(what or program.constraint_name(i), by, amount))
     return out
 
 
@@ -343,7 +343,7 @@ def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, 
     listed = "; ".join(str(violation) for violation in worst)
     heading = _HEADINGS[status is Status.INFEASIBLE]
     more = int(
-        np.sum(~(row_violations(program, g) <= tolerance))
+        np.sum(~(constraint_violations(program, g) <= tolerance))
         + np.sum(~(bound_violations(program, x) <= tolerance))
     )
     tail = f"; {more} constraints in all" if more > len(worst) else ""
@@ -428,7 +428,11 @@ class Point:
     @cached_property
     def violation(self) -> float:
         """Weighted sum of the constraints' violations; inf if not finite."""
-        return float(self.program.weights @ row_violations(self.program, self.g)) if self.finite else np.inf
+        return (
+            float(self.program.weights @ constraint_violations(self.program, self.g))
+            if self.finite
+            else np.inf
+        )
 
     @cached_property
     def max_violation(self) -> float:
@@ -451,7 +455,7 @@ class TimedProgram:
         self.x_lower, self.x_upper = np.asarray(program.x_lower, float), np.asarray(program.x_upper, float)
         self.g_lower, self.g_upper = np.asarray(program.g_lower, float), np.asarray(program.g_upper, float)
         self.weights = np.ones(program.m)
-        self.row_name, self.variable_name = program.row_name, program.variable_name
+        self.constraint_name, self.variable_name = program.constraint_name, program.variable_name
         for name in ("objective", "gradient", "constraints", "jacobian", "hessian"):
             setattr(self, name, self._timed(getattr(program, name)))
 

@@ -139,10 +139,12 @@ class RelaxedProgram:
         indptr = np.concatenate([found.indptr, np.full(self._more, found.nnz, dtype=found.indptr.dtype)])
         return sp.csc_array((found.data, found.indices, indptr), shape=(self.n, self.n))
 
-    def row_name(self, i: int) -> str:
+    def constraint_name(self, i: int) -> str:
         source = int(self._source[i])
         inside = source < self._program.m
-        return self._program.row_name(source) if inside else self.variable_name(source - self._program.m)
+        return (
+            self._program.constraint_name(source) if inside else self.variable_name(source - self._program.m)
+        )
 
     def variable_name(self, j: int) -> str:
         return self._program.variable_name(j) if j < self._program.n else f"relaxation {j - self._program.n}"

@@ -14,7 +14,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription import blocks as symbolic
 from impactopt.transcription.batched import Block
-from impactopt.transcription.layout import Array, Group, Index, Layout, Limits, Measure, Place, Rows
+from impactopt.transcription.layout import Array, Constraints, Group, Index, Layout, Limits, Measure, Place
 
 
 class Builder:
@@ -26,7 +26,7 @@ class Builder:
     functions : compiled blocks by name.
     ny, nl, nw : number of coordinates, of the constrained legs' joints, of sole wrenches' components.
     y0 (ny,), legs0 (nl,) : posture of the stance; the start posture if no sole has stepped.
-    layout, rows, blocks : variables, constraints and blocks so far.
+    layout, constraints, blocks : variables, constraints and blocks so far.
     lifted : variables of :meth:`lift`, with the indices of the outputs that they equal.
     followers : functions that :meth:`follow` has been given.
     """
@@ -38,7 +38,7 @@ class Builder:
         self.functions, self.limits = functions, Limits(problem, coordinates)
         self.ny, self.nl, self.nw = coordinates.ny, coordinates.nl, 6 * len(coordinates.legs)
         self.y0, self.legs0 = coordinates.start, coordinates.start_legs
-        self.layout, self.rows = Layout(), Rows()
+        self.layout, self.constraints = Layout(), Constraints()
         self.blocks: list[Block] = []
         self.lifted: list[tuple[Group, Index]] = []
         self.followers: list[Callable[[Builder], None]] = []
@@ -46,7 +46,7 @@ class Builder:
     def copy(self) -> Builder:
         """Copy to which other blocks and constraints can be added, but no variables."""
         other = copy.copy(self)
-        other.blocks, other.rows = [block.copy() for block in self.blocks], self.rows.copy()
+        other.blocks, other.constraints = [block.copy() for block in self.blocks], self.constraints.copy()
         return other
 
     def standing(self, coordinates: StanceCoordinates, node: str) -> Builder:
@@ -119,7 +119,7 @@ class Builder:
         size = len(outputs)
         labels = labels or ([name] if size == 1 else [f"{name} {k}" for k in range(size)])
         group = self.layout.add(name, 1, size, lower=lower, upper=upper, scale=scale, labels=labels)
-        self.rows.add(
+        self.constraints.add(
             term=term or name,
             place=place,
             components=labels,
@@ -141,7 +141,7 @@ class Builder:
         measure: Measure | Sequence[Measure] | None = None,
     ) -> None:
         """Constrain outputs of blocks to zero."""
-        self.rows.add(
+        self.constraints.add(
             term=term,
             place=place,
             components=components,

@@ -25,7 +25,7 @@ from impactopt.robots.couplings import Axis, axis_of
 from impactopt.robots.robot import Robot
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import Affine, Array, Index, Place, Row, millimetres, stack
+from impactopt.transcription.layout import Affine, Array, ConstraintOrigin, Index, Place, millimetres, stack
 
 TOO_NEAR = millimetres("too near")
 
@@ -294,7 +294,9 @@ def add_clearance_constraints(
         term = (SelfCollision if key.other >= 0 else KeepOut).name
         # each pair of pieces of two bodies has a name of its own, by which multipliers are mapped
         piece = f"{name} {key.number + 1}" if key.number else name
-        group.origins.append(Row(term, spots[spot_of[key.place]][0], piece, TOO_NEAR, whole=name))
+        group.origins.append(
+            ConstraintOrigin(term, spots[spot_of[key.place]][0], piece, TOO_NEAR, whole=name)
+        )
     # z is a selection of the coordinates at all nodes, which are affine in the variables
     for length, group in groups.items():
         size, count = length + 3, len(group.pairs)
@@ -312,7 +314,7 @@ def add_clearance_constraints(
         )
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
         first = b.append(SeparationBlock.of_separations(f"apart{length}", of, lift))
-        b.rows.add_each(group.origins, outputs=first + np.arange(count), lower=0.0)
+        b.constraints.add_each(group.origins, outputs=first + np.arange(count), lower=0.0)
     return [key for group in groups.values() for key in group.keys]
 
 
@@ -372,7 +374,7 @@ class _Group:
     keys: list[ClearanceKey] = field(default_factory=list)
     pairs: list[int] = field(default_factory=list)
     ways: list[tuple[float, ...]] = field(default_factory=list)
-    origins: list[Row] = field(default_factory=list)
+    origins: list[ConstraintOrigin] = field(default_factory=list)
     patterns: list[tuple[Index, Index, Array]] = field(default_factory=list)
     spots: list[int] = field(default_factory=list)
     parameters: list[Array] = field(default_factory=list)

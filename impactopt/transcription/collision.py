@@ -49,7 +49,7 @@ from impactopt.transcription.layout import (
     rates,
 )
 from impactopt.transcription.mesh import CollocationPoint
-from impactopt.transcription.motion_phase import add_cone_rows
+from impactopt.transcription.motion_phase import add_cone_constraints
 from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
 
 ACCELERATION_SCALE = 100.0  # [rad/s^2] of the jump
@@ -86,7 +86,7 @@ class FirstInstant:
         parameters = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
         return slots, np.concatenate([*parameters, friction_parameters(b.problem)])
 
-    def add_rows(self, at: int) -> None:
+    def add_constraints(self, at: int) -> None:
         """Add the constraints.  at : index of the first output of this instance of the block ``first``."""
         b, part = self._b, self._b.parts("first")
         term, of_limit = "jump of acceleration", percent("of the joint's limit off")
@@ -99,7 +99,7 @@ class FirstInstant:
     def rotors(self) -> Index:
         """Indices of the outputs (n,) that are the rotors' part of the gears' load.
 
-        They are known after :meth:`add_rows`.
+        They are known after :meth:`add_constraints`.
         """
         return np.asarray(self._rotors)
 
@@ -278,10 +278,10 @@ class Collocated:
             name = f"torque in collision, {place.name}"
             self.torques.append(b.lift(name, outputs, labels=b.robot.joint_names, **common)[0])
         else:
-            b.rows.add(components=b.robot.joint_names, outputs=outputs, **common)
+            b.constraints.add(components=b.robot.joint_names, outputs=outputs, **common)
 
     def drives(self) -> list[DrivePoint]:
-        """Torques and joint motions at each stage, if a term is about drives; after `Collision.add_rows`."""
+        """Torques and joint motions at each stage, if a term is about drives; after `Collision.add_constraints`."""
         pairs = zip(self.stages, self.torques, strict=True)
         return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
 
@@ -323,7 +323,7 @@ class Collocated:
             integral = integral - rate[m] * w
         if not s.new_phase:
             integral = integral - integrals[s.previous]
-        self._b.rows.add(
+        self._b.constraints.add(
             term="collision kinematics",
             place=place,
             components=labels,
@@ -543,7 +543,7 @@ class Collision(ContactParameters, Collocated):
         return out
 
     # ------------------------------------------------------------------ constraints
-    def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
+    def add_constraints(self, at: dict[str, tuple[int, int]]) -> None:
         """Add the constraints of all stages and of the ends of phases.
 
         at : by block, the index of this collision's first output, and the number of outputs a stage.
@@ -594,7 +594,7 @@ class Collision(ContactParameters, Collocated):
         self._bound_torques(place, first["collision"] + part["torque"], self.torque_fraction)
         if self.cone_margin is not None:
             minimum = b.limits.cone.minimum_force if self.scenario is None else 0.0
-            add_cone_rows(b, self.w[i], place, self.cone_margin, minimum)
+            add_cone_constraints(b, self.w[i], place, self.cone_margin, minimum)
         self._add_target(i, place, first["force"])
 
     def _add_target(self, i: int, place: Place, first: int) -> None:
@@ -618,7 +618,7 @@ class Collision(ContactParameters, Collocated):
         if i in self.end and (ends_by_guard or once):
             # The constraint that ends the phase stands for rate and invariant there.
             if ends_by_guard and target.reserve(at_rest, 0.0, k):
-                b.rows.add(
+                b.constraints.add(
                     term=phase.end,
                     place=place,
                     components=["reserve"],
@@ -631,7 +631,7 @@ class Collision(ContactParameters, Collocated):
             # The phase's branch of the law is right while bodies approach, or, in the last phase, recede.
             self._bound_rate(i, first, receding=self.stages[i].phase == len(self.end) - 1)
         if target.invariant(at_rest, 0.0, k):
-            b.rows.add(
+            b.constraints.add(
                 term=target.guards[min(k, len(target.guards) - 1)],
                 place=place,
                 components=["target"],
@@ -645,7 +645,7 @@ class Collision(ContactParameters, Collocated):
 
         first : index of the stage's first output of the block ``force``.
         """
-        self._b.rows.add(
+        self._b.constraints.add(
             term="approach speed",
             place=self._place(self.stages[i]),
             components=["striker and target"],

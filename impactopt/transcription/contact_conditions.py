@@ -60,7 +60,7 @@ def add_balance(
     for i, (_, margin, place) in enumerate(states):
         start = at + i * (edges + 4)  # outputs of a state: edges, vertical speed, angular momentum (3)
         if margin is not None:
-            b.rows.add(
+            b.constraints.add(
                 term="capture point",
                 place=place,
                 components=[f"edge {k}" for k in range(edges)],
@@ -70,7 +70,7 @@ def add_balance(
                 whole="",
             )
         most_speed, most_momentum = balance.vertical_speed, balance.angular_momentum
-        b.rows.add(
+        b.constraints.add(
             term="vertical speed",
             place=place,
             components=["z"],
@@ -91,7 +91,7 @@ def add_balance(
                 upper=most_momentum,
             )
             continue
-        b.rows.add(
+        b.constraints.add(
             term="angular momentum",
             place=place,
             components=["x", "y", "z"],
@@ -129,7 +129,7 @@ def _add_conditions(b: Builder, state: ContactState, block: str, number: int) ->
     prefix = f"{striker} " if number else ""
     at = b.add_block(block, [[state.y, state.y1, state.T]], rotation_rows(p.normal).ravel())
     if p.extra(HitRegion) is None:
-        b.rows.add(
+        b.constraints.add(
             term="hit point",
             place=Place("contact", ""),
             components=[f"{prefix}{axis}" for axis in "xyz"],
@@ -138,14 +138,14 @@ def _add_conditions(b: Builder, state: ContactState, block: str, number: int) ->
             upper=point,
             measure=millimetres("away"),
         )
-        hit_point = len(b.rows.lower) - 1
+        hit_point = len(b.constraints.lower) - 1
 
         def update_point(b: Builder) -> None:
             at = b.problem.contacts[number][1]
-            b.rows.bound(hit_point, at, at)
+            b.constraints.bound(hit_point, at, at)
 
         b.follow(update_point)
-    b.rows.add(
+    b.constraints.add(
         term="approach speed",
         place="contact",
         components=[f"{prefix}normal"],
@@ -153,10 +153,10 @@ def _add_conditions(b: Builder, state: ContactState, block: str, number: int) ->
         lower=_least_speed(b),
         measure=Measure("m/s", 1.0, "too slow"),
     )
-    approach = len(b.rows.lower) - 1
-    b.follow(lambda b: b.rows.bound(approach, _least_speed(b), np.inf))
+    approach = len(b.constraints.lower) - 1
+    b.follow(lambda b: b.constraints.bound(approach, _least_speed(b), np.inf))
     if p.extra(HitCone) is None:
-        b.rows.add(
+        b.constraints.add(
             term=incidence.name,
             place="contact",
             components=[f"{prefix}tangent 1", f"{prefix}tangent 2"],
@@ -199,7 +199,7 @@ def _add_clearance(
     b: Builder, swing: MotionPhase, follow: MotionPhase, block: str, number: int, travel: Affine | None
 ) -> None:
     """Add the clearance of one striker.  travel [m] : of the target in the follow-through."""
-    p, before, after, start = b.problem, swing.nodes[:-1], follow.nodes, len(b.rows.lower)
+    p, before, after, start = b.problem, swing.nodes[:-1], follow.nodes, len(b.constraints.lower)
     striker, point = b.problem.contacts[number]
     motions = [swing.at(s)[0] for s in before]
     if travel is not None:
@@ -224,7 +224,7 @@ def _add_clearance(
     name = f"target left by {striker}" if number else "target left"
     there = b.lift(name, np.array([first]), place=place(0.0), measure=TOO_NEAR)[0]
     spots = [(first + i, place(s), s * behind) for i, s in enumerate(after) if i]
-    left = len(b.rows.lower)
+    left = len(b.constraints.lower)
     for s, spot in zip(after[1:], spots, strict=True):
         _add_plane_distance(b, "no touch after contact", number, spot, there + travel * float(s))
     distances_after = [distance for _, _, distance in spots]
@@ -240,7 +240,7 @@ def _add_plane_distance(
     plane : position of the target's plane along the normal [m].
     """
     output, place, distance = spot
-    b.rows.add(
+    b.constraints.add(
         term=term,
         place=place,
         components=[b.problem.contacts[number][0]],
@@ -261,9 +261,9 @@ def _update_distances(
     """
     most, surface = _most_clearance(b, number), float(b.problem.normal @ b.problem.contacts[number][1])
     for k, distance in enumerate(distances, start=start):
-        b.rows.bound(k, -np.inf, -min(most, distance))
+        b.constraints.bound(k, -np.inf, -min(most, distance))
         if planes:
-            b.rows.affine[k] = replace(b.rows.affine[k], const=np.full(1, -surface))
+            b.constraints.affine[k] = replace(b.constraints.affine[k], const=np.full(1, -surface))
 
 
 def _most_clearance(b: Builder, number: int) -> float:

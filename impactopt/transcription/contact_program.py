@@ -32,12 +32,12 @@ from impactopt.transcription.frozen_collision import InstantImpact
 from impactopt.transcription.layout import (
     Affine,
     Array,
+    Constraints,
     Group,
     Index,
     Layout,
     Measure,
     Place,
-    Rows,
     Turn,
     by_choice,
     determined,
@@ -77,7 +77,7 @@ class ContactProgram(ABC):
     problem, coordinates, robot, functions, y0, legs0 : the builder's.
     angular_momentum : after contact, a group of three variables, if it is in the objective.
     objectives : of the problem, as far as this program has them, with their quantities.
-    apart_rows : clearance constraints, in the program's order; they are its last constraints.
+    clearance_constraints : clearance constraints, in the program's order; they are its last constraints.
     """
 
     def __init__(self, builder: Builder, hit: ContactSet) -> None:
@@ -86,7 +86,7 @@ class ContactProgram(ABC):
         self.functions, self.y0, self.legs0 = builder.functions, builder.y0, builder.legs0
         self.angular_momentum: Group | None = None
         self.objectives: list[tuple[Objective, Quantity]] = []
-        self.apart_rows: Mapping[ClearanceKey, SeparatingDirection] = {}
+        self.clearance_constraints: Mapping[ClearanceKey, SeparatingDirection] = {}
 
     # ------------------------------------------------------------------ for terms and objectives
     @property
@@ -94,8 +94,8 @@ class ContactProgram(ABC):
         return self.builder.layout
 
     @property
-    def rows(self) -> Rows:
-        return self.builder.rows
+    def constraints(self) -> Constraints:
+        return self.builder.constraints
 
     @property
     def blocks(self) -> list[Block]:
@@ -219,8 +219,10 @@ class ContactProgram(ABC):
         if self.builder.robot.hinges.any():
             add_hinges(self.builder, [(place, torque) for place, torque, _ in self._nodes()])
         for term in terms:
-            if type(term).add_rows is not Term.add_rows:  # the parts have those of the other terms
-                term.add_rows(self)
+            if (
+                type(term).add_constraints is not Term.add_constraints
+            ):  # the parts have those of the other terms
+                term.add_constraints(self)
         self.objectives = quantities(self, objectives)
         self._objective = assemble(self.layout, self.objectives, self._prices())
         self._without_clearance = self.builder
@@ -229,12 +231,14 @@ class ContactProgram(ABC):
     def program(self) -> StructuredProgram:
         """The program for a solver."""
         objective, quadratic, linear = self._objective
-        if self.apart_rows:  # one structure for all sets of clearance constraints, which solvers can reuse
+        if (
+            self.clearance_constraints
+        ):  # one structure for all sets of clearance constraints, which solvers can reuse
             quadratic = coupled(quadratic, self.body_spots())
         return StructuredProgram(
             self.layout,
             self.blocks,
-            self.rows,
+            self.constraints,
             objective=objective,
             quadratic=quadratic,
             linear=linear,
@@ -243,13 +247,13 @@ class ContactProgram(ABC):
             ),
         )
 
-    def with_apart(self: Program, constraints: Mapping[ClearanceKey, SeparatingDirection]) -> Program:
+    def with_clearance(self: Program, constraints: Mapping[ClearanceKey, SeparatingDirection]) -> Program:
         """The same program with exactly these clearance constraints."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
         other.builder = self._without_clearance.copy()
         order = add_clearance_constraints(other.builder, self.body_spots(), constraints)
-        other.apart_rows = {key: constraints[key] for key in order}
+        other.clearance_constraints = {key: constraints[key] for key in order}
         return other
 
     def body_spots(self) -> list[tuple[Place, list[Affine]]]:
@@ -275,8 +279,8 @@ class ContactProgram(ABC):
             for update in b.followers:
                 update(b)
         own = len(self._without_clearance.blocks)
-        move_bodies(problem, self.blocks[own:], self.apart_rows)
-        self.program.take_numbers(self.layout, self.blocks, self.rows)
+        move_bodies(problem, self.blocks[own:], self.clearance_constraints)
+        self.program.take_numbers(self.layout, self.blocks, self.constraints)
 
     def with_lifted(self, x: Array) -> Array:
         """Variables (n,) with lifted ones set to the outputs of blocks that they equal; 0 for NaN and inf."""

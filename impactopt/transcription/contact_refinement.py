@@ -136,7 +136,7 @@ class _FinerContact:
         self.hit = ContactSet(
             b, Contact(given, *add_coasting(b)), halved(t.hit.elements), t.hit.shares, after=False
         )
-        self.hit.add_rows()
+        self.hit.add_constraints()
         # In a plan contact ends where the force is zero, without a constraint of the law. Here the last stage
         # may be elsewhere, and has the law.
         last = len(self.hit.stages) - 1
@@ -148,7 +148,7 @@ class _FinerContact:
         self.program = StructuredProgram(
             b.layout,
             b.blocks,
-            b.rows,
+            b.constraints,
             objective=Affine.zeros(1),
             quadratic=sp.csr_array((n, n)),
             linear=np.zeros(n),

@@ -87,7 +87,7 @@ class ContactSet:
         return mass_at_contact(self._b.problem)
 
     # ------------------------------------------------------------------ constraints
-    def add_rows(self) -> None:
+    def add_constraints(self) -> None:
         """Add the blocks, each with instances of all collisions, and the constraints."""
         b = self._b
         slots: dict[str, list[Any]] = {}
@@ -104,7 +104,7 @@ class ContactSet:
             b.follow(self._update_force)
         sizes = {block.name: block.n_out for block in b.blocks}
         for collision, index in zip(self.collisions, first, strict=True):
-            collision.add_rows(
+            collision.add_constraints(
                 {name: (self._at[name] + k * sizes[name], sizes[name]) for name, k in index.items()}
             )
         if self.first:
@@ -112,11 +112,11 @@ class ContactSet:
             at = b.add_block("first", list(instances), np.array(first_parameters))
             b.follow(self._update_first)
             for k, instant in enumerate(self.first):
-                instant.add_rows(at + k * b.blocks[-1].n_out)
+                instant.add_constraints(at + k * b.blocks[-1].n_out)
 
-    def add_feedforward_rows(self, torque: Index) -> None:
+    def add_feedforward_constraints(self, torque: Index) -> None:
         """Constrain the feed-forward to the torque at the node at contact, whose outputs (n,) are given."""
-        self._b.rows.add(
+        self._b.constraints.add(
             term="feed-forward that makes the robot coast",
             place="contact",
             components=self._b.robot.joint_names,
@@ -147,7 +147,7 @@ class ContactSet:
     def output(self, collision: int, stage: int, part: str) -> Index:
         """Indices of the outputs ``part`` of the block ``force``, at a stage of a collision that lasts.
 
-        They are known after :meth:`add_rows`.
+        They are known after :meth:`add_constraints`.
         """
         size = self._b.block("force").n_out
         at = self._at["force"] + (collision * len(self.stages) + stage) * size

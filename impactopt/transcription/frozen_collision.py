@@ -103,7 +103,7 @@ class InstantImpact:
         groups = (self.du, self.w, self.impulse_group)
         return [determined(Turn.ELEMENT, np.concatenate([g.index(0) for g in groups]))]
 
-    def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
+    def add_constraints(self, at: dict[str, tuple[int, int]]) -> None:
         b, (start, _) = self._b, at["impact"]
         part = b.parts("impact")
         base, joints = start + part["base"], start + part["joints"]
@@ -416,20 +416,20 @@ class FrozenCollision(Collision):
         return [*([] if self._meeting is None else self._meeting.determined()), *out]
 
     # ------------------------------------------------------------------ constraints
-    def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
+    def add_constraints(self, at: dict[str, tuple[int, int]]) -> None:
         """Add the constraints, as of `Collision`.
 
         Those of the freezes are first, as they determine variables in which all others are written.
         """
         if self._meeting is not None:
-            self._meeting.add_rows(at)
+            self._meeting.add_constraints(at)
         self._add_freezes(*at["moved"])
         if "coasting" in at:
             self._add_coasting(*at["coasting"])
         if "carried" in at:
             self._add_carried(at["carried"][0])
         # of the full model, each stage has an instance of ``coasting``; here only the instants above
-        super().add_rows({name: found for name, found in at.items() if name != "coasting"})
+        super().add_constraints({name: found for name, found in at.items() if name != "coasting"})
 
     def _add_freezes(self, start: int, size: int) -> None:
         """Equate the states of freezes, and the hand's speeds at the beginnings of segments, to the motion.
@@ -443,7 +443,7 @@ class FrozenCollision(Collision):
         for group, instance, name in parts:
             outputs = start + instance * size + part[name]
             measure = along(group.labels, "off") if name == "y" else Measure("m/s", 1.0, "off")
-            b.rows.add(
+            b.constraints.add(
                 term="state to freeze at",
                 place=group.name,
                 components=group.labels,
@@ -455,7 +455,7 @@ class FrozenCollision(Collision):
             )
             b.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
         for group, legs in zip(self.frozen_legs, self._legs_at, strict=True):
-            b.rows.add(
+            b.constraints.add(
                 term="state to freeze at",
                 place=group.name,
                 components=group.labels,
@@ -488,7 +488,7 @@ class FrozenCollision(Collision):
         b.equal(term, place, DIRECTIONS[: b.coordinates.base], outputs, b.limits.unbalanced)
         more = self.carried[0] - self.contact.state.w
         for k in range(1, len(b.coordinates.legs)):
-            b.rows.add(
+            b.constraints.add(
                 term=term,
                 place=place,
                 components=self.carried.labels[6 * k : 6 * k + 6],

@@ -21,7 +21,7 @@ from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import map_contact, same_places
-from impactopt.transcription.layout import Array, Group, Row
+from impactopt.transcription.layout import Array, ConstraintOrigin, Group
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.plan import drifting_reference
@@ -254,7 +254,9 @@ def _model(t: ContactProgram) -> tuple[str, int]:
     return t.problem.collision, t.problem.freezes
 
 
-def _mapped_multipliers(constraints: Sequence[Row], known: Sequence[Row], multipliers: Array) -> Array:
+def _mapped_multipliers(
+    constraints: Sequence[ConstraintOrigin], known: Sequence[ConstraintOrigin], multipliers: Array
+) -> Array:
     """Multipliers of constraints by name, from those of known constraints; 0 for names that are new."""
     # most programs share their first constraints, and differ in those that come after them
     differ = (k for k, (one, other) in enumerate(zip(constraints, known, strict=False)) if one is not other)
@@ -263,7 +265,7 @@ def _mapped_multipliers(constraints: Sequence[Row], known: Sequence[Row], multip
     return np.concatenate([multipliers[:same], [of_names.get(k, 0.0) for k in _keys(constraints[same:])]])
 
 
-def _keys(constraints: Sequence[Row]) -> Iterator[tuple[tuple[str, str, str], int]]:
+def _keys(constraints: Sequence[ConstraintOrigin]) -> Iterator[tuple[tuple[str, str, str], int]]:
     """Name of each constraint, and the number of earlier ones with that name."""
     seen: dict[tuple[str, str, str], int] = {}
     for constraint in constraints:

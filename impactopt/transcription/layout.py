@@ -44,14 +44,14 @@ __all__ = [
     "DIRECTIONS",
     "Affine",
     "Array",
+    "ConstraintOrigin",
+    "Constraints",
     "Group",
     "Index",
     "Layout",
     "Limits",
     "Measure",
     "Place",
-    "Row",
-    "Rows",
     "Turn",
     "add",
     "along",
@@ -279,7 +279,7 @@ def _is_length(label: str) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class ConstraintOrigin:
     """Origin of a constraint: its term, place and component, and the measure of its violation.
 
     whole : name that messages use in place of the component, such as the sole of a facet; None: the
@@ -307,7 +307,7 @@ def _joined(*parts: str) -> str:
 
 
 @dataclass
-class Rows:
+class Constraints:
     """Constraints under construction.
 
     A constraint is  lower <= out[output] + affine <= upper,  with one output of a block (number -1: none) and
@@ -319,18 +319,18 @@ class Rows:
     affine: list[Affine] = field(default_factory=list)
     lower: list[Array] = field(default_factory=list)
     upper: list[Array] = field(default_factory=list)
-    origins: list[Row] = field(default_factory=list)
+    origins: list[ConstraintOrigin] = field(default_factory=list)
 
-    def copy(self) -> Rows:
+    def copy(self) -> Constraints:
         """Copy to which other constraints can be added."""
-        return Rows(*(list(getattr(self, f.name)) for f in fields(self)))
+        return Constraints(*(list(getattr(self, f.name)) for f in fields(self)))
 
     def bound(self, k: int, lower: ArrayLike, upper: ArrayLike) -> None:
         """Replace the bounds of the constraints of call number ``k`` of :meth:`add`, which dropped none."""
         for sides, given in ((self.lower, lower), (self.upper, upper)):
             sides[k] = np.broadcast_to(np.asarray(given, dtype=float), sides[k].shape)
 
-    def add_each(self, origins: Sequence[Row], *, outputs: Index, lower: float) -> None:
+    def add_each(self, origins: Sequence[ConstraintOrigin], *, outputs: Index, lower: float) -> None:
         """Append constraints  lower <= out[outputs],  with their origins."""
         n = len(origins)
         self.outputs.append(np.asarray(outputs, dtype=np.intp))
@@ -355,7 +355,7 @@ class Rows:
         """Append ``len(components)`` constraints  lower <= out[outputs] + affine <= upper.
 
         measure : one for all constraints, or one for each.  place : text is a place without a time.
-        whole : as of :class:`Row`. Constraints without a finite bound are dropped.
+        whole : as of :class:`ConstraintOrigin`. Constraints without a finite bound are dropped.
         """
         n = len(components)
         lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
@@ -376,7 +376,9 @@ class Rows:
         self.upper.append(hi)
         spot = Place.plain(place) if isinstance(place, str) else place
         measures = [measure] * n if measure is None or isinstance(measure, Measure) else measure
-        self.origins.extend(Row(term, spot, components[int(k)], measures[int(k)], whole) for k in keep)
+        self.origins.extend(
+            ConstraintOrigin(term, spot, components[int(k)], measures[int(k)], whole) for k in keep
+        )
 
 
 GRAVITY = 9.81  # [m/s^2] for the robot's weight, which scales forces; its model may have another gravity

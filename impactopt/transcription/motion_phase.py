@@ -68,7 +68,7 @@ def add_nodes(
         ):
             if name == "closure" and i >= len(instances) - closed:
                 continue
-            b.rows.add(
+            b.constraints.add(
                 term=term,
                 place=place,
                 components=components,
@@ -77,7 +77,7 @@ def add_nodes(
                 upper=bound,
                 measure=measure,
             )
-        b.rows.add(
+        b.constraints.add(
             term=b.limits.extension.name,
             place=place,
             components=[leg.limb for leg in c.legs],
@@ -85,7 +85,7 @@ def add_nodes(
             lower=b.limits.extension.minimum,
             measure=percent("too near to straight", of=b.limits.extension.minimum),
         )
-        add_cone_rows(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force, fading)
+        add_cone_constraints(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force, fading)
         torques.append(at + part["torque"])
     return torques
 
@@ -96,7 +96,7 @@ def node_numbers(b: Builder) -> Array:
     return np.concatenate([limits, rates, b.limits.units, b.coordinates.start_determinants])
 
 
-def add_cone_rows(
+def add_cone_constraints(
     b: Builder,
     wrench: Affine,
     place: Place | str,
@@ -117,7 +117,7 @@ def add_cone_rows(
         facets = contact_wrench_cone(leg.sole.polygon, b.limits.cone.friction, margin=margin)
         facets = facets / b.limits.weight
         normal, sole = w[2:3] * (1 / b.limits.weight), leg.end
-        b.rows.add(
+        b.constraints.add(
             term=b.limits.cone.name,
             place=place,
             components=[f"{sole}, facet {i}" for i in range(len(facets))],
@@ -128,7 +128,7 @@ def add_cone_rows(
         )
         if leg.name in fading:
             continue
-        b.rows.add(
+        b.constraints.add(
             term="normal force",
             place=place,
             components=[sole],
@@ -344,7 +344,7 @@ class MotionPhase:
                     (f"{name}, backward", -step - time, -np.inf, 0.0),
                 ]
             for own_name, affine, lower, upper in constraints:
-                b.rows.add(
+                b.constraints.add(
                     term=velocity.name,
                     place=replace(place, name=own_name),
                     components=names,
@@ -373,7 +373,7 @@ class MotionPhase:
         # the block divides by the weight, m * GRAVITY
         gravity = np.append(np.array(b.robot.model.gravity.linear) / GRAVITY, np.zeros(3))
         for s, out in list(zip(fractions, outputs, strict=True))[len(start) :]:
-            b.rows.add(
+            b.constraints.add(
                 term="momentum",
                 place=self.place_at(s),
                 components=DIRECTIONS,

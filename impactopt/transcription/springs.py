@@ -136,7 +136,7 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
     position = np.array([int(np.flatnonzero(own == k)[0]) for k in passive])  # in the block's outputs (m,)
     names = [robot.joint_names[k] for k in passive]
     for k, point in enumerate(points):
-        b.rows.add(
+        b.constraints.add(
             term="spring of a joint",
             place=point.place,
             components=names,
@@ -155,7 +155,7 @@ def add_hinges(b: Builder, points: Sequence[tuple[Place, Affine]]) -> None:
     """
     free = np.flatnonzero(b.robot.hinges)
     for place, torque in points:
-        b.rows.add(
+        b.constraints.add(
             term="hinge of a sole",
             place=place,
             components=[b.robot.joint_names[k] for k in free],

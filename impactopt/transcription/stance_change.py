@@ -158,7 +158,7 @@ class PhaseSequence:
             b, (slots, places) = self.builders[k], phase.instances()
             torques = add_nodes(b, slots, places, fading=self.fading(k))
             for place, torque in zip(places, torques, strict=True):
-                b.rows.add(
+                b.constraints.add(
                     term=b.limits.torque.name,
                     place=place,
                     components=names,
@@ -188,7 +188,7 @@ class PhaseSequence:
         position = np.zeros(mine.base + b.robot.n, dtype=np.intp)
         position[np.append(np.arange(mine.base), mine.base + mine.independent)] = np.arange(mine.ny)
         shared = select(rate, np.append(position[: its.base], position[its.base + its.independent]))
-        b.rows.add(
+        b.constraints.add(
             term=term,
             place=place,
             components=its.labels,
@@ -215,7 +215,7 @@ class PhaseSequence:
         freed = np.flatnonzero(~np.isin(its.dependent, mine.dependent))
         limit = b.robot.velocity_limit[its.dependent[freed]]
         labels = [its.leg_labels[k] for k in freed]
-        b.rows.add(
+        b.constraints.add(
             term=term,
             place=place,
             components=labels,
@@ -230,7 +230,7 @@ class PhaseSequence:
         torque = b.lift(
             f"torque {place}", torques[heavy], term=term, place=place, labels=names, measure=strong
         )[0]
-        b.rows.add(
+        b.constraints.add(
             term=term,
             place=place,
             components=names,
@@ -266,7 +266,7 @@ class PhaseSequence:
             foothold = [leg.placement.translation[:2] for leg in legs if leg.name == sole.name]
             for number, j in enumerate(airborne):
                 outputs, place = at + number * (corners + 2), phase.place_at(float(phase.nodes[j]))
-                b.rows.add(
+                b.constraints.add(
                     term="swing foot off the ground",
                     place=place,
                     components=[f"{sole.name}, corner {corner}" for corner in range(corners)],
@@ -278,7 +278,7 @@ class PhaseSequence:
                 if until[j] >= RAMP_TIME:
                     continue
                 distance = FOOTHOLD_DISTANCE * (until[j] / RAMP_TIME) ** 3
-                b.rows.add(
+                b.constraints.add(
                     term="swing foot above its foothold",
                     place=place,
                     components=[f"{sole.name}, {axis}" for axis in "xy"],

@@ -57,9 +57,9 @@ class StrikeTranscription(ContactProgram):
         node = [state.y, state.y1, state.y2, state.legs, state.w, state.T]
         (torque,) = add_nodes(b, [node], ["contact"])
         self._node = node
-        self.hit.add_feedforward_rows(torque)
+        self.hit.add_feedforward_constraints(torque)
         add_conditions(b, state)
-        self.hit.add_rows()
+        self.hit.add_constraints()
         self._add_after(fastest)
         if c.legs:
             after = self.expected.state_after
@@ -91,7 +91,7 @@ class StrikeTranscription(ContactProgram):
             for k, hit in enumerate(hits):
                 outputs = at + 3 * (k * b.ny + np.arange(b.ny)) + 1
                 b.equal("state after contact", f"position{hit.suffix}", labels, outputs, far)
-        b.rows.add(
+        b.constraints.add(
             term=b.limits.velocity.name,
             place="after contact",
             components=labels,

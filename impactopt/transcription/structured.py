@@ -35,7 +35,7 @@ from impactopt.kinematics.coordinates import solve_in_order
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.program import Determined
 from impactopt.transcription.batched import BatchedFunction, Block
-from impactopt.transcription.layout import Affine, Array, Index, Layout, Rows, stack
+from impactopt.transcription.layout import Affine, Array, Constraints, Index, Layout, stack
 
 __all__ = [
     "Runs",
@@ -352,28 +352,28 @@ class StructuredProgram:
         self,
         layout: Layout,
         blocks: Sequence[Block],
-        rows: Rows,
+        constraints: Constraints,
         *,
         objective: Affine,
         quadratic: sp.spmatrix | sp.sparray,
         linear: Array,
         determined: Sequence[Determined] = (),
     ) -> None:
-        """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to constraints ``rows`` and the layout's bounds.
+        """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``constraints`` and the layout's bounds.
 
         determined : variables that the solver can eliminate by equality constraints.
         """
         self.determined = tuple(determined)
-        self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(rows.origins)
+        self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(constraints.origins)
         n = self.n = layout.n
         self.x_lower, self.x_upper = layout.lower, layout.upper
         lift = stack([b.lift for b in blocks])
         self._lift, self._lift_const = lift.matrix(n), lift.const
         self._z_offset = np.cumsum([0] + [b.count * b.n_in for b in blocks])
         self._out_offset = np.cumsum([0] + [b.count * b.n_out for b in blocks])
-        affine = stack(rows.affine)
+        affine = stack(constraints.affine)
         # number of the block output in each constraint; -1: the constraint is affine
-        output_of = np.concatenate([np.zeros(0, dtype=np.intp), *rows.outputs])
+        output_of = np.concatenate([np.zeros(0, dtype=np.intp), *constraints.outputs])
         self._nonlinear = np.flatnonzero(output_of >= 0)  # constraints with an output
         self._of_nonlinear = output_of[self._nonlinear]  # and that output
         outputs, uses = np.unique(self._of_nonlinear, return_counts=True)
@@ -386,8 +386,8 @@ class StructuredProgram:
             )
         self.m = len(output_of)
         self._affine_matrix, self._affine_const = affine.matrix(n), affine.const
-        self.g_lower = np.concatenate([np.zeros(0), *rows.lower])
-        self.g_upper = np.concatenate([np.zeros(0), *rows.upper])
+        self.g_lower = np.concatenate([np.zeros(0), *constraints.lower])
+        self.g_upper = np.concatenate([np.zeros(0), *constraints.upper])
         self._at: tuple[Array, list[Array]] | None = None  # last x with its lift, which all functions need
         self._c = np.zeros(n)
         np.add.at(self._c, objective.cols, objective.vals)
@@ -398,7 +398,7 @@ class StructuredProgram:
         self._curvature.eliminate_zeros()
         self.seconds = 0.0  # spent on evaluations
 
-    def take_numbers(self, layout: Layout, blocks: Sequence[Block], rows: Rows) -> None:
+    def take_numbers(self, layout: Layout, blocks: Sequence[Block], constraints: Constraints) -> None:
         """Take over bounds, constants and parameters of another program of the same structure.
 
         Its blocks and constraints correspond to the first ones of this program; the rest is kept. Variables,
@@ -409,10 +409,10 @@ class StructuredProgram:
             mine.take_parameters(other.parameters)
         offset = np.concatenate([np.zeros(0), *(b.lift.const for b in blocks)])
         self._lift_const = np.concatenate([offset, self._lift_const[len(offset) :]])
-        for name, given in (("g_lower", rows.lower), ("g_upper", rows.upper)):
+        for name, given in (("g_lower", constraints.lower), ("g_upper", constraints.upper)):
             found = np.concatenate([np.zeros(0), *given])
             setattr(self, name, np.concatenate([found, getattr(self, name)[len(found) :]]))
-        constants = np.concatenate([np.zeros(0), *(affine.const for affine in rows.affine)])
+        constants = np.concatenate([np.zeros(0), *(affine.const for affine in constraints.affine)])
         self._affine_const = np.concatenate([constants, self._affine_const[len(constants) :]])
         self._at = None
 
@@ -499,10 +499,10 @@ class StructuredProgram:
         return out
 
     # ------------------------------------------------------------------ names
-    def row_name(self, i: int) -> str:
+    def constraint_name(self, i: int) -> str:
         return str(self.origins[i])
 
-    def row_group(self, i: int) -> tuple[str, str]:
+    def constraint_group(self, i: int) -> tuple[str, str]:
         """Term and place of constraint i; a message names one constraint of such a group."""
         return self.origins[i].term, self.origins[i].place.name
 

@@ -177,7 +177,7 @@ class Transcription(ContactProgram):
         self._add_motions()
         add_conditions(b, contact.state)
         add_clearance(b, self.swing, self.follow, self.hit.expected.target_state)
-        self.hit.add_rows()
+        self.hit.add_constraints()
         self._add_links()
         if coordinates.drifts:  # after the links, whose constraints determine the start of the follow-through
             self.swing.add_momentum_conservation(b)
@@ -246,7 +246,7 @@ class Transcription(ContactProgram):
         self._add_torque_limits(places, outputs)
         joints = np.arange(self.coordinates.base, b.ny)
         # the swing's last control point is no variable, so its position limits are no bounds of variables
-        b.rows.add(
+        b.constraints.add(
             term=limits.position.name,
             place="contact",
             components=self.coordinates.labels[self.coordinates.base :],
@@ -292,7 +292,7 @@ class Transcription(ContactProgram):
                 )
                 self.torques.append(group[0])
             else:
-                b.rows.add(
+                b.constraints.add(
                     term=torque_limit.name,
                     place=place,
                     components=names,
@@ -301,7 +301,7 @@ class Transcription(ContactProgram):
                     upper=limit,
                     measure=strong,
                 )
-        self.hit.add_feedforward_rows(outputs[contact])
+        self.hit.add_feedforward_constraints(outputs[contact])
 
     def _add_links(self) -> None:
         """Adds constraints that link motions after contact to the end of the contact, or of coasting.
@@ -461,7 +461,9 @@ def statement_of(t: Transcription) -> str:
     """
     component_lists: dict[tuple[str, ...], int] = {}  # each list once, with its index
     constraints = []
-    for (term, place), found in groupby(t.rows.origins, lambda origin: (origin.term, origin.place.name)):
+    for (term, place), found in groupby(
+        t.constraints.origins, lambda origin: (origin.term, origin.place.name)
+    ):
         components = tuple(origin.component for origin in found)
         constraints.append([term, place, component_lists.setdefault(components, len(component_lists))])
     collisions = [c for c in t.hit.collisions if isinstance(c, Collision)]
@@ -472,7 +474,7 @@ def statement_of(t: Transcription) -> str:
     ]
     clearance: list[dict[str, Any]] = [
         {**constraint._asdict(), **held._asdict(), "way": direction}
-        for (constraint, held), direction in zip(t.apart_rows.items(), directions, strict=True)
+        for (constraint, held), direction in zip(t.clearance_constraints.items(), directions, strict=True)
     ]
     return json.dumps(
         {

@@ -15,7 +15,7 @@ from impactopt.problem.problem import Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import SpokenProgram, Status, Violation, explain, worst_rows
+from impactopt.solvers.program import DescribedProgram, Status, Violation, explain, worst_rows
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.layout import Layout, Measure, Place, along, degrees, millimetres, percent
 from impactopt.transcription.transcription import Transcription
@@ -38,7 +38,7 @@ def test_every_row_has_a_measure_and_can_be_told(
 ) -> None:
     transcription = changed(request.getfixturevalue(f"{robot}_transcription"), **changes)
     program, x = transcription.program, first_iterate(transcription)
-    assert isinstance(program, SpokenProgram)
+    assert isinstance(program, DescribedProgram)
     for i, row in enumerate(program.origins):
         assert row.measure is not None, str(row)
         what, by = program.describe_violation(i, x, 0.1)
@@ -53,7 +53,7 @@ def test_times_are_those_of_the_solution(biped_transcription: Transcription) -> 
     t, x = biped_transcription, first_iterate(biped_transcription)
 
     def what(name: str, at: Array) -> str:
-        i = next(i for i in range(t.program.m) if t.program.row_name(i).startswith(name))
+        i = next(i for i in range(t.program.m) if t.program.constraint_name(i).startswith(name))
         return t.program.describe_violation(i, at, 0.1)[0]
 
     hit = t.hit.collisions[0]
@@ -105,7 +105,7 @@ def test_rows_of_a_term_at_a_place_are_told_once_by_the_worst(biped_transcriptio
     t.swing.legs.write(x, t.legs0 + 0.1)
     g = t.program.constraints(x)
     over = np.maximum(np.maximum(t.program.g_lower - g, g - t.program.g_upper), 0)
-    groups = {t.program.row_group(i) for i in np.flatnonzero(over > 1e-6)}
+    groups = {t.program.constraint_group(i) for i in np.flatnonzero(over > 1e-6)}
     found = told(t, x, count=t.program.m)
     assert len(found) == len(groups) < np.count_nonzero(over > 1e-6)
     assert [v.amount for v in found] == sorted((v.amount for v in found), reverse=True)

@@ -347,7 +347,7 @@ def test_what_is_made_of_functions_cannot_be_written(nailing: ImpactProblem) -> 
     class MyLimit(terms.Term):
         name = "mine"
 
-        def add_rows(self, program: Any) -> None:
+        def add_constraints(self, program: Any) -> None:
             pass
 
     with pytest.raises(InputError, match="no section for MyLimit"):

@@ -79,7 +79,7 @@ def check_rows(t: Transcription) -> None:
             if np.isfinite(low) or np.isfinite(high):
                 found.setdefault(name, []).append((g - low, high - g))
     g, lower, upper = t.program.constraints(x), t.program.g_lower, t.program.g_upper
-    for row, below, above in zip(t.rows.origins, g - lower, upper - g, strict=True):
+    for row, below, above in zip(t.constraints.origins, g - lower, upper - g, strict=True):
         own = found[row.term, row.place.name, row.component].pop(0)
         assert own == pytest.approx((below, above), abs=1e-9, rel=1e-9), str(row)
     assert not any(found.values())
@@ -102,7 +102,7 @@ def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> No
     t = changed(biped_transcription)
     rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).constraints(0.15)
     assert len(rows) > 100
-    check_rows(t.with_apart(rows))
+    check_rows(t.with_clearance(rows))
 
 
 @pytest.mark.parametrize("make", [arm_problem, biped_problem])
@@ -164,7 +164,7 @@ def test_of_a_striking_link_with_corners() -> None:
     p = load_problem(PROBLEMS / "arm7.toml")
     kept = tuple(term for term in p.terms if not isinstance(term, FirstTouch))
     t = _drawn(dataclasses.replace(p, terms=(*kept, FirstTouch())))
-    assert any(row.term == FirstTouch.name for row in t.rows.origins)
+    assert any(row.term == FirstTouch.name for row in t.constraints.origins)
     check_rows(t)
 
 
@@ -183,7 +183,7 @@ def test_all_that_a_problem_states_is_known(name: str) -> None:
 def test_of_a_head_that_looks_at_the_hit_point() -> None:
     problem = load_problem(PROBLEMS / "nailing.toml")
     t = _drawn(problem)
-    assert any(row.term == Gaze.name for row in t.rows.origins)
+    assert any(row.term == Gaze.name for row in t.constraints.origins)
     check_rows(t)
 
 
@@ -207,7 +207,7 @@ def test_slopes_are_those_of_the_program(arm_transcription: Transcription) -> No
     program, v = second(t, x)
     y = np.random.default_rng(1).standard_normal(t.program.m)
     left: dict[tuple[str, str, str], list[float]] = {}
-    for row, weight in zip(t.rows.origins, y, strict=True):
+    for row, weight in zip(t.constraints.origins, y, strict=True):
         left.setdefault((row.term, row.place.name, row.component), []).append(weight)
     weights = [np.array([left[n].pop(0) if n in left else 0.0 for n in p.names]) for p in program.rows]
     pieces = [*program.rows, *program.worth]
@@ -269,7 +269,7 @@ def test_of_soles_that_change(name: str) -> None:
     t = _drawn(problem)
     rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).constraints(0.05)
     assert any(row.place.startswith("on ") for row in rows)
-    check_rows(t.with_apart(rows))
+    check_rows(t.with_clearance(rows))
 
 
 def test_of_tendons_while_soles_change() -> None:

@@ -161,9 +161,9 @@ def test_programs_follow_their_problem(arm: Solution, more: dict[str, Any]) -> N
 class _OwnTerm(Slide):
     """One that reads the point and does not say so."""
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         place = float(program.problem.point[2])
-        program.rows.add(term="own", components=["x"], affine=program.swing_T[0], lower=place - 10.0)
+        program.constraints.add(term="own", components=["x"], affine=program.swing_T[0], lower=place - 10.0)
 
 
 def test_a_program_that_does_not_follow_is_built_anew(arm: Solution) -> None:
@@ -172,7 +172,7 @@ def test_a_program_that_does_not_follow_is_built_anew(arm: Solution) -> None:
     bent = parametric_program(solution)
     assert bent._movable is None
     moved = solution.moved(point=problem.point + np.array([0.01, 0.0, 0.01]), polish=False)
-    own = [i for i, row in enumerate(bent.program.rows.origins) if row.term == "own"]
+    own = [i for i, row in enumerate(bent.program.constraints.origins) if row.term == "own"]
     lower = bent.program_for(moved.problem).program.g_lower[own]
     assert lower == pytest.approx([moved.problem.point[2] - 10.0])
 

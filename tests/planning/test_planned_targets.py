@@ -194,7 +194,7 @@ def test_what_stays_is_not_touched_again(target: Target) -> None:
     p = problem(KelvinVoigt(stiffness=1e5, damping=100.0), target)
     transcription = transcribed(p)
     program = transcription.program
-    rows = [i for i in range(program.m) if program.row_name(i).startswith("no touch after contact")]
+    rows = [i for i in range(program.m) if program.constraint_name(i).startswith("no touch after contact")]
     assert bool(rows) == target.stays
     if not target.stays:
         return
@@ -233,7 +233,7 @@ def test_programs_are_sound(target: Target) -> None:
     x = first_iterate(t) + 1e-4 * np.random.default_rng(0).standard_normal(t.layout.n)
     x = np.clip(x, program.x_lower, program.x_upper)
     check_program(program, x)
-    names = [program.row_name(i) for i in range(program.m)]
+    names = [program.constraint_name(i) for i in range(program.m)]
     assert len(set(names)) == program.m
     used = np.asarray(abs(program.jacobian(x)).sum(axis=0)).ravel() + np.abs(program.gradient(x))
     fixed = program.x_lower == program.x_upper  # the force at separation
@@ -266,7 +266,7 @@ def test_what_determines_no_variables_of_its_own_is_where_and_when(target: Targe
         np.zeros(program.n, dtype=bool),
         Kernels(),
     )
-    left = {program.row_name(int(i)).split(",")[0] for i in condenser.remaining[condenser.equal]}
+    left = {program.constraint_name(int(i)).split(",")[0] for i in condenser.remaining[condenser.equal]}
     turn = {"end of compression"} if target.turns else set()
     assert left == {"hit point", "separation", *target.guards, *turn}
 
@@ -450,7 +450,9 @@ def test_lifted_variables_are_found_beside_rows_on_demand() -> None:
     x = t.with_lifted(first_iterate(t))
     rows = t.program.constraints(x)
     lifted = [
-        i for i in range(t.program.m) if t.program.row_name(i).startswith(("target's way", "target left"))
+        i
+        for i in range(t.program.m)
+        if t.program.constraint_name(i).startswith(("target's way", "target left"))
     ]
     assert len(lifted) == 2 and np.abs(rows[lifted]).max() < 1e-9
 

@@ -101,7 +101,7 @@ def test_rows_and_variables_have_names_of_their_own_and_all_are_used(
     transcription: StrikeTranscription,
 ) -> None:
     program = transcription.program
-    for count, name in ((program.m, program.row_name), (program.n, program.variable_name)):
+    for count, name in ((program.m, program.constraint_name), (program.n, program.variable_name)):
         assert len({name(i) for i in range(count)}) == count
     x = strike_iterate(transcription) + 0.01 * np.random.default_rng(1).standard_normal(program.n)
     used = np.asarray(abs(program.jacobian(x)).sum(axis=0)).ravel() + np.abs(program.gradient(x))
@@ -111,7 +111,7 @@ def test_rows_and_variables_have_names_of_their_own_and_all_are_used(
 def test_it_is_smaller_than_the_motion_and_has_no_swing(biped_transcription: Transcription) -> None:
     strike = of_strike(biped_transcription)
     assert strike.program.n < 0.7 * biped_transcription.program.n
-    names = [strike.program.row_name(i) for i in range(strike.program.m)]
+    names = [strike.program.constraint_name(i) for i in range(strike.program.m)]
     assert not [name for name in names if "swing" in name or "follow-through" in name]
     for term in ("hit point", "incidence", "capture point", "contact law", "closed legs, contact"):
         assert any(name.startswith(term) for name in names), term
@@ -375,7 +375,7 @@ def test_a_motion_starts_from_the_strikes_state_at_contact(robot_plan: Planned) 
     if t.robot.floating:
         np.testing.assert_allclose(mine, rates, atol=1e-6)
     # the collision is the strike's own: its rows hold at once
-    g, names = t.program.constraints(start), [t.program.row_name(i) for i in range(t.program.m)]
+    g, names = t.program.constraints(start), [t.program.constraint_name(i) for i in range(t.program.m)]
     hit = [i for i, name in enumerate(names) if name.startswith(("contact law", "collision dynamics"))]
     off = np.maximum(t.program.g_lower - g, g - t.program.g_upper)[hit]
     assert off.max() <= 1e-4

@@ -84,7 +84,7 @@ def test_it_ends_with_bodies_apart_though_it_began_with_no_constraint_for_them(
     outcome = strikes.clear_strike(budget, margins, Guess(program=t, start=strike_iterate(t)))
     t, result = outcome.program, outcome.result
     assert result.status is Status.SOLVED and result.kkt <= 1e-6 and result.max_violation <= 1e-6
-    assert t.apart_rows and deepest_penetration(t, result.x, margins)[0] <= 0
+    assert t.clearance_constraints and deepest_penetration(t, result.x, margins)[0] <= 0
     assert result.multipliers.size == t.program.m
     assert result.iterations == result.history[-1].iteration, "the effort of all is told"
 

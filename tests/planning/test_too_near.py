@@ -41,7 +41,9 @@ def with_peg(problem: ImpactProblem, x: float, z: float) -> ImpactProblem:
 
 def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
     c = problem.coordinates
-    return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_apart(solution.apart)
+    return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_clearance(
+        solution.apart
+    )
 
 
 def hammer(solution: Solution, time: float) -> Array:
@@ -70,7 +72,7 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
         assert violated is not None and violated.depth > 0
         if violated.nodes == t.nodes:
             rows = {**Watch(t, margins, free.result.x).constraints(), **violated.constraints}
-            assert violation(t.with_apart(rows), free.result.x) > 1e-3
+            assert violation(t.with_clearance(rows), free.result.x) > 1e-3
         else:
             functions = block_functions(problem, problem.coordinates)
             finer = Transcription(problem, problem.coordinates, functions, violated.nodes)
@@ -78,7 +80,7 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
             rows = Watch(finer, margins, there).constraints()
             known = set(node_placements(t, free.result.x).names)
             assert any(row.place not in known for row in rows)
-            assert violation(finer.with_apart(rows), there) > 1e-3
+            assert violation(finer.with_clearance(rows), there) > 1e-3
         looked += 1
     assert looked > 3
 
@@ -93,8 +95,8 @@ def test_rounds_end_with_bodies_that_are_apart(free: Solution, monkeypatch: pyte
 
     def watched(budget: Budget, margins: Margins, guess: Guess[Transcription]) -> Outcome[Transcription]:
         t = guess.program
-        rows = {**Watch(t, margins, guess.x).constraints(), **t.apart_rows}
-        began.append(violation(t.with_apart(rows), guess.x))
+        rows = {**Watch(t, margins, guess.x).constraints(), **t.clearance_constraints}
+        began.append(violation(t.with_clearance(rows), guess.x))
         return solved(budget, margins, guess)
 
     monkeypatch.setattr(between_nodes, "solve_with_clearance", watched)

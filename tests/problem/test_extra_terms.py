@@ -64,7 +64,7 @@ def test_loosening_a_term_that_binds_raises_the_optimum(solved: Any, name: str) 
     assert loose.status is Status.SOLVED
     assert tight.result.objective > loose.objective + 1e-4
     program, term = tight.transcription.program, CASES[name].tight.name
-    rows = [i for i in range(program.m) if program.row_name(i).startswith(term)]
+    rows = [i for i in range(program.m) if program.constraint_name(i).startswith(term)]
     g = program.constraints(tight.result.x)[rows]
     slack = np.minimum(g - program.g_lower[rows], program.g_upper[rows] - g)
     assert slack.min() == pytest.approx(0, abs=1e-5)
@@ -118,7 +118,7 @@ def test_derivatives_with_all_terms_agree_with_differences(
     swing = Phase(duration=(0.4, 0.7), intervals=6)
     t = changed(request.getfixturevalue(f"{robot}_transcription"), terms=terms, swing=swing)
     program, rng, h = t.program, np.random.default_rng(0), 1e-6
-    names = [program.row_name(i) for i in range(program.m)]
+    names = [program.constraint_name(i) for i in range(program.m)]
     assert len(set(names)) == len(names)
     assert all(any(name.startswith(term.name) for name in names) for term in terms)
     x = first_iterate(t)

@@ -157,7 +157,7 @@ def test_first_iterates_agree_with_what_is_lifted(biped_transcription: Transcrip
     program, x = transcription.program, first_iterate(transcription)
     g = program.constraints(x)
     of = ("peak force", "target energy", "deepest penetration", "effort of a node")
-    rows = [i for i in range(program.m) if program.row_name(i).startswith(of)]
+    rows = [i for i in range(program.m) if program.constraint_name(i).startswith(of)]
     assert len(rows) == 3 + len(transcription.swing_nodes) + len(transcription.follow_nodes)
     np.testing.assert_allclose(g[rows], 0, atol=1e-9)
 

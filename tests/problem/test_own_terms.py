@@ -54,11 +54,11 @@ class Ceiling(Term):
     def blocks(self, problem: Any, coordinates: Any) -> dict[str, Any]:
         return {"ceiling": height_of(self.frame, coordinates)}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         spots = [*program.swing_spots(), *program.follow_spots()]
         at = program.add_block("ceiling", [slots for _, slots in spots], np.zeros(0))
         for k, (place, _) in enumerate(spots):
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=place,
                 components=[self.frame],
@@ -166,7 +166,7 @@ def test_a_strike_takes_what_says_something_of_it(arm_transcription: Transcripti
     t = changed(arm_transcription, **own)
     strike = StrikeTranscription(t.problem, t.coordinates, t.functions)
     assert [o.name for o, _ in strike.objectives] == ["impulse"]
-    names = [strike.program.row_name(i) for i in range(strike.program.m)]
+    names = [strike.program.constraint_name(i) for i in range(strike.program.m)]
     assert [name for name in names if name.startswith("ceiling")] == [
         "ceiling, contact, hand",
         "ceiling, after contact, hand",
@@ -197,7 +197,9 @@ def test_a_subclass_of_one_of_the_packages_is_that_one(arm_transcription: Transc
     look = {"frame": "elbow", "axis": (0, 0, 1)}
     mine = program(Stare(**look), Weak(), effort=Thrift())
     same = program(Gaze(**look, angle=0.3), TorqueLimit(fraction=0.5), effort=Effort(weight=3.0))
-    assert [mine.row_name(i) for i in range(mine.m)] == [same.row_name(i) for i in range(same.m)]
+    assert [mine.constraint_name(i) for i in range(mine.m)] == [
+        same.constraint_name(i) for i in range(same.m)
+    ]
     x = np.random.default_rng(0).normal(size=mine.n)
     np.testing.assert_array_equal(mine.constraints(x), same.constraints(x))
     assert mine.objective(x) == same.objective(x)
@@ -224,8 +226,8 @@ def test_what_a_program_would_know_nothing_of_is_refused(arm_transcription: Tran
 
     problem = arm_transcription.problem
     for terms, words in (
-        ((Silent(),), r"Silent has no add_rows\(program\).*docs/extending.md"),
-        ((Term(),), r"Term has no add_rows\(program\)"),
+        ((Silent(),), r"Silent has no add_constraints\(program\).*docs/extending.md"),
+        ((Term(),), r"Term has no add_constraints\(program\)"),
         ((Nameless(height=1.0),), "Nameless.name is empty"),
         ((Ceiling(height=1.0), Ceiling(height=2.0)), "two terms of kind Ceiling"),
         ((Ceiling(height=1.0, frame="hnd"),), "no frame 'hnd'.*did you mean 'hand'"),
@@ -281,17 +283,21 @@ def test_mistakes_in_rows_are_told_where_they_are_made(arm_transcription: Transc
         numbers: ClassVar[int] = 0
         rows: ClassVar[list[Any]] = []
 
-        def add_rows(self, program: Any) -> None:
+        def add_constraints(self, program: Any) -> None:
             (_, slots), *_ = program.follow_spots()
             at = program.add_block(self.block, [slots], np.zeros(self.numbers))
             for components, outputs in self.rows:
-                program.rows.add(term=self.name, components=components, outputs=at + outputs, upper=1.0)
+                program.constraints.add(
+                    term=self.name, components=components, outputs=at + outputs, upper=1.0
+                )
 
     def program() -> Any:
         return changed(arm_transcription, terms=(Wrong(height=1.0),)).program
 
     Wrong.rows = [("a", 0)]
-    assert program().row_name(program().m - 1) == "ceiling, a", "a number is as good as an array of one"
+    assert program().constraint_name(program().m - 1) == "ceiling, a", (
+        "a number is as good as an array of one"
+    )
     for attribute, value, words in (
         ("rows", [("ab", np.zeros(1, dtype=int))], "ceiling: outputs are 1, components 2"),
         ("rows", [("a", 0), ("b", 0)], "in two constraints, ceiling, a and ceiling, b: "),

@@ -172,7 +172,7 @@ def test_a_missing_target_finds_the_robot_balanced_at_contact(biped: Planned, bi
 def test_only_a_missing_target_asks_for_balance_at_contact(biped_transcription: Transcription) -> None:
     def rows(scenarios: tuple[Scenario, ...]) -> set[str]:
         program = changed(biped_transcription, scenarios=scenarios).program
-        return {program.row_name(i) for i in range(program.m)}
+        return {program.constraint_name(i) for i in range(program.m)}
 
     added = rows((MISSING,)) - rows(())
     kinds = {row.split(", contact, if missing")[0] for row in added}
@@ -182,7 +182,7 @@ def test_only_a_missing_target_asks_for_balance_at_contact(biped_transcription: 
 
 def test_rows_of_a_scenario_say_so(biped: Planned) -> None:
     program = biped.transcription.program
-    rows = [program.row_name(i) for i in range(program.m)]
+    rows = [program.constraint_name(i) for i in range(program.m)]
     for term in (TorqueLimit.name, ContactWrenchCone.name, "capture point", "end of compression"):
         assert any(row.startswith(term) and "if heavy" in row for row in rows)
     assert any(program.variable_name(j).startswith("heavy: contact force") for j in range(program.n))
@@ -256,7 +256,7 @@ def test_balance_has_the_rows_that_it_asks_for(
     biped_transcription: Transcription, term: Balance, left: set[str]
 ) -> None:
     program = changed(biped_transcription, terms=(term,)).program
-    names = {program.row_name(i).split(",")[0] for i in range(program.m)}
+    names = {program.constraint_name(i).split(",")[0] for i in range(program.m)}
     assert names & {"capture point", "vertical speed", "angular momentum"} == left
     x = first_iterate(biped_transcription)
     assert np.isfinite(program.constraints(x)).all()

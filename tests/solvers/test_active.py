@@ -36,7 +36,7 @@ class Nearest:
     def hessian(self, x: Vector, sigma: float, multipliers: Vector) -> sp.csc_array:
         return sp.csc_array(sigma * np.eye(2))
 
-    def row_name(self, i: int) -> str:
+    def constraint_name(self, i: int) -> str:
         return "sum"
 
     def variable_name(self, j: int) -> str:

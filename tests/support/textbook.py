@@ -68,7 +68,7 @@ class Textbook:
         self.evaluations["hessian"] += 1
         return _csc(self._hessian(x, sigma, multipliers))
 
-    def row_name(self, i):
+    def constraint_name(self, i):
         return f"row {i + 1}"
 
     def variable_name(self, j):

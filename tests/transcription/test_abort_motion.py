@@ -60,12 +60,12 @@ def test_its_nodes_have_the_constraints_of_a_follow_through(biped_transcription:
     program = changed(biped_transcription, scenarios=(scenario,)).program
     places: dict[str, set[str]] = {}
     for i in range(program.m):
-        term, place, *_ = program.row_name(i).split(", ")
+        term, place, *_ = program.constraint_name(i).split(", ")
         places.setdefault(place, set()).add(term)
     assert places["abort"] == places["follow-through"]
     assert {"contact wrench cone", "torque limit"} < places["end of coasting"]
     before = biped_transcription.program
-    assert not any("abort" in before.row_name(i) for i in range(before.m))
+    assert not any("abort" in before.constraint_name(i) for i in range(before.m))
 
 
 def test_the_punch_into_the_air_stands(punch: Solution) -> None:

@@ -156,7 +156,7 @@ def programs(
         bare = changed(shared)
         x, rng = first_iterate(bare), np.random.default_rng(0)
         rows = Watch(bare, margins_of(bare), x).constraints(0.2)
-        t = bare.with_apart(rows)
+        t = bare.with_clearance(rows)
         out[name] = t, x + 0.02 * rng.standard_normal(t.program.n)
     return out
 
@@ -164,8 +164,8 @@ def programs(
 @pytest.mark.parametrize("name", ["arm", "biped"])
 def test_slopes_of_programs_with_such_rows_agree_with_differences(programs: Any, name: str) -> None:
     t, x = programs[name]
-    assert len(t.apart_rows) > 20 and any(row.other < 0 for row in t.apart_rows)
-    assert name == "arm" or any(row.other >= 0 for row in t.apart_rows)
+    assert len(t.clearance_constraints) > 20 and any(row.other < 0 for row in t.clearance_constraints)
+    assert name == "arm" or any(row.other >= 0 for row in t.clearance_constraints)
     check_derivatives(t.program, x)
 
 
@@ -173,9 +173,9 @@ def test_slopes_of_programs_with_such_rows_agree_with_differences(programs: Any,
 def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any, name: str) -> None:
     """By coal, whose distance theirs is less by what is rounded; where bodies are in each other, at most."""
     t, x = programs[name]
-    names = [t.program.row_name(i) for i in range(t.program.m)]
+    names = [t.program.constraint_name(i) for i in range(t.program.m)]
     g, spots, bodies = t.program.constraints(x), node_placements(t, x), t.problem.bodies
-    for row, held in t.apart_rows.items():
+    for row, held in t.clearance_constraints.items():
         k = spots.names.index(row.place)
         one, two = pieces(bodies, row)
         at = [coal.Transform3s(*bodies.placement(spots.at, k, body)) for body in (row.joint, row.other)]
@@ -194,7 +194,7 @@ def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any,
         assert t.program.g_lower[i] == 0 and t.program.g_upper[i] == np.inf
         told, by = t.program.describe_violation(i, x, 0.012)
         assert told.startswith(term) and told.endswith(what) and by == "12 mm too near"
-    assert len(t.apart_rows) == t.program.m - len(without(t).program.origins)
+    assert len(t.clearance_constraints) == t.program.m - len(without(t).program.origins)
 
 
 def pieces(bodies: Any, row: ClearanceKey) -> tuple[Any, Any]:
@@ -210,7 +210,7 @@ def test_a_program_stays_as_it_is_when_one_with_more_rows_is_made_of_it(
 ) -> None:
     t = changed(arm_transcription)
     x = first_iterate(t)
-    more = t.with_apart(Watch(t, margins_of(t), x).constraints(0.2))
+    more = t.with_clearance(Watch(t, margins_of(t), x).constraints(0.2))
     assert more.program.m > t.program.m
     for program in (more.program, t.program):
         check_derivatives(program, x + 0.01)
@@ -224,7 +224,7 @@ def test_a_program_with_such_rows_takes_the_numbers_of_another_problem(
     problem = bare.problem
     other = parameter_of(problem, "contact.stiffness").at(1.3 * problem.law.parameters["stiffness"])
     moving, whole = (
-        program_on(p, bare.nodes, bare.hit.elements, bare.hit.shares).with_apart(rows)
+        program_on(p, bare.nodes, bare.hit.elements, bare.hit.shares).with_clearance(rows)
         for p in (problem, other)
     )
     assert moving.program.m > bare.program.m
@@ -234,7 +234,7 @@ def test_a_program_with_such_rows_takes_the_numbers_of_another_problem(
 
 
 def without(t: Transcription) -> Transcription:
-    return t.with_apart({})
+    return t.with_clearance({})
 
 
 def test_margins_are_less_where_bodies_are_near_at_the_start(arm_transcription: Transcription) -> None:
@@ -356,7 +356,9 @@ def test_a_solution_is_a_start_in_another_world_too(free: Solution, barred: Solu
 
 def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
     c = problem.coordinates
-    return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_apart(solution.apart)
+    return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_clearance(
+        solution.apart
+    )
 
 
 def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, barred: Solution) -> None:
@@ -380,7 +382,7 @@ def test_constraints_enter_before_bodies_can_touch(free: Solution) -> None:
     free = solve(rod_hammer(free.problem))
     barred = solve(dataclasses.replace(free.problem, obstacles=(BAR,)))
     problem = barred.problem
-    margins, t = Margins(problem), program_of(free, problem).with_apart({})
+    margins, t = Margins(problem), program_of(free, problem).with_clearance({})
     x = first_iterate(t)
     watch = Watch(t, margins, x)
     bar = -1 - [body.name for body in problem.bodies.world].index("bar")

@@ -16,7 +16,7 @@ from impactopt.kinematics.stages import Stage
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import NonlinearProgram, Status
 from impactopt.transcription.batched import Block, pattern
-from impactopt.transcription.layout import Affine, Layout, Rows, select, stack
+from impactopt.transcription.layout import Affine, Constraints, Layout, select, stack
 from impactopt.transcription.structured import StructuredProgram, derivative_functions
 
 Array = NDArray[np.float64]
@@ -67,7 +67,7 @@ class Pair:
         one, one_out = block("one", (2, 3), 3, 2, 3)
         two, two_out = block("two", (1, 2), 2, 0, 1)
         self.blocks, outputs = [one, two], ca.vertcat(one_out, two_out)
-        rows, wanted = Rows(), []
+        rows, wanted = Constraints(), []
         # not all outputs are in constraints, their order is mixed; a constraint may be affine, or both
         chosen = rng.permutation(outputs.numel())[:-3]
         for k, some in enumerate(np.array_split(chosen, 3)):
@@ -180,7 +180,7 @@ def test_outputs_are_by_block_and_instance() -> None:
 def test_a_program_of_affine_constraints_alone() -> None:
     layout = Layout()
     x = layout.add("x", 1, 2)
-    rows = Rows()
+    rows = Constraints()
     rows.add(term="sum", components=["s"], affine=x[0].apply([[1.0, 1.0]]), lower=2.0, upper=2.0)
     program = StructuredProgram(
         layout, [], rows, objective=Affine.constant(5.0), quadratic=sp.eye_array(2), linear=np.zeros(2)
@@ -197,7 +197,7 @@ def test_a_program_of_affine_constraints_alone() -> None:
 def test_constraints_without_bounds_are_dropped_and_the_others_keep_their_names() -> None:
     layout = Layout()
     x = layout.add("x", 1, 3)
-    rows = Rows()
+    rows = Constraints()
     rows.add(
         term="torque limit",
         place="swing, node 7",
@@ -211,7 +211,7 @@ def test_constraints_without_bounds_are_dropped_and_the_others_keep_their_names(
     program = StructuredProgram(
         layout, [], rows, objective=Affine.constant(0.0), quadratic=sp.csr_array((3, 3)), linear=np.zeros(3)
     )
-    assert [program.row_name(i) for i in range(program.m)] == [
+    assert [program.constraint_name(i) for i in range(program.m)] == [
         "torque limit, swing, node 7, hip",
         "torque limit, swing, node 7, ankle",
         "no place",
@@ -227,7 +227,7 @@ def test_dropped_constraints_of_a_block_leave_the_others_in_place() -> None:
     z, p = ca.SX.sym("z", 3), ca.SX.sym("p", 0)
     functions = {f.name(): f for f in derivative_functions("square", z, p, z**2)}
     block = Block.make("square", functions, [[group[0]]], np.zeros(0))
-    rows = Rows()
+    rows = Constraints()
     bounds = np.array([1.0, np.inf, 3.0])
     rows.add(
         term="square", components=list("abc"), outputs=np.array([2, 1, 0]), affine=group[0], upper=bounds
@@ -243,7 +243,7 @@ def test_dropped_constraints_of_a_block_leave_the_others_in_place() -> None:
     x = np.array([2.0, 3.0, 5.0])
     np.testing.assert_array_equal(program.constraints(x), [25 + 2, 4 + 5])
     np.testing.assert_array_equal(program.jacobian(x).toarray(), [[1, 0, 10], [4, 0, 1]])
-    assert program.row_name(1) == "square, c"
+    assert program.constraint_name(1) == "square, c"
 
 
 def test_a_block_takes_as_many_inputs_as_it_has() -> None:

@@ -80,7 +80,7 @@ def test_jacobian_and_hessian_agree_with_differences(transcription: Transcriptio
 
 def test_every_constraint_and_every_variable_has_a_unique_name(transcription: Transcription) -> None:
     program = transcription.program
-    for count, name in ((program.m, program.row_name), (program.n, program.variable_name)):
+    for count, name in ((program.m, program.constraint_name), (program.n, program.variable_name)):
         names = [name(i) for i in range(count)]
         assert all(names)
         assert len(set(names)) == count
@@ -88,7 +88,7 @@ def test_every_constraint_and_every_variable_has_a_unique_name(transcription: Tr
 
 def test_names_say_what_where_and_which(biped_transcription: Transcription) -> None:
     program = biped_transcription.program
-    names = [program.row_name(i) for i in range(program.m)]
+    names = [program.constraint_name(i) for i in range(program.m)]
     problem = biped_transcription.problem
     for term in (TorqueLimit, VelocityLimit, ContactWrenchCone, Incidence):
         assert any(name.startswith(problem.term(term).name) for name in names)
@@ -411,8 +411,8 @@ def test_the_soles_constraints_in_contact_can_be_left_out(biped_transcription: T
         swinging = row.place.name.startswith(("swing", "follow", "start", "end"))
         return row.term in (cone.name, "normal force") and not swinging
 
-    names = [str(row) for row in biped_transcription.rows.origins if not in_contact(row)]
-    assert [str(row) for row in without.rows.origins] == names
+    names = [str(row) for row in biped_transcription.constraints.origins if not in_contact(row)]
+    assert [str(row) for row in without.constraints.origins] == names
     assert without.program.m < biped_transcription.program.m
 
 

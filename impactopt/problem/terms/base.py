@@ -21,7 +21,7 @@ _NO_METADATA = About(what="", least=0)  # of fields without metadata
 class Term(Described):
     """Base of all terms. ``name`` stands in reports and messages; ``unit`` is that of the constraints.
 
-    A term has :meth:`add_rows`, and :meth:`blocks` if its constraints are not linear. Most terms in
+    A term has :meth:`add_constraints`, and :meth:`blocks` if its constraints are not linear. Most terms in
     DEFAULT_TERMS have neither, as the transcription adds their constraints. The metadata of fields
     (`impactopt.contact.fields.about`) describes them, and their values are checked by it; numbers without
     metadata must not be negative.
@@ -48,7 +48,7 @@ class Term(Described):
         """
         return {}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         """Add the constraints to a program under construction,
         :class:`impactopt.transcription.contact_program.ContactProgram`.
         """

@@ -63,7 +63,7 @@ class FirstTouch(Term):
             if face_of(problem, striker) is not None
         }
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         p, spots = program.problem, late_spots(program)
         for number, (name, (striker, _)) in enumerate(zip(NAMES, p.contacts, strict=False)):
             face = face_of(p, striker)
@@ -85,7 +85,7 @@ class FirstTouch(Term):
             )
             for k, (place, _) in enumerate(spots):
                 outputs = at + k * len(vectors) + np.arange(len(vectors))
-                program.rows.add(
+                program.constraints.add(
                     term=self.name,
                     place=place,
                     components=[f"{striker}, corner {i}" for i in range(len(face.corners))],
@@ -94,7 +94,7 @@ class FirstTouch(Term):
                     measure=millimetres("beyond the target's plane"),
                     whole=striker,
                 )
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=spots[-1][0],
                 components=[f"{striker}'s face"],

@@ -50,7 +50,7 @@ class Gaze(Term):
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"gaze": BlockRecipe(lambda: gaze(coordinates, self.frame), (self.frame,))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         nodes = program.swing_spots(self.since)
 
         def numbers(point: Any) -> Any:
@@ -59,7 +59,7 @@ class Gaze(Term):
         at = program.add_block("gaze", [slots for _, slots in nodes], numbers(program.problem.point))
         program.builder.follow(lambda b: b.block("gaze").take_parameters(numbers(b.problem.point)))
         for i, (place, _) in enumerate(nodes):
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=place,
                 components=[self.frame],

@@ -56,7 +56,7 @@ class GearLoad(Term):
             return robot.gear_limit
         return np.where(robot.passive, np.inf, of_joints(self.limit, robot.joint_names))
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         robot, names = program.robot, program.robot.joint_names
         most = self.most(robot)
         points, first = program.drive_points(), program.first_instants()
@@ -69,7 +69,7 @@ class GearLoad(Term):
         torques = [*(p.torque for p in points), *(program.feedforward[0] for _ in first)]
         places = [*(p.place for p in points), *(place for place, _ in first)]
         for place, torque, output in zip(places, torques, outputs, strict=True):
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=place,
                 components=names,

@@ -25,7 +25,7 @@ class Grip(Term):
     force: float = field(metadata=about("largest force along each axis", unit="N", above=0))
     moment: float = field(metadata=about("largest moment about each axis", unit="N m", above=0))
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         most = np.repeat([self.force, self.moment], 3)
         measure = [
             Measure(unit, m, "too much") for unit, m in zip(["N"] * 3 + ["N m"] * 3, most, strict=True)
@@ -34,7 +34,7 @@ class Grip(Term):
             for k, leg in enumerate(program.coordinates.legs):
                 if leg.sole is not None:
                     continue
-                program.rows.add(
+                program.constraints.add(
                     term=self.name,
                     place=place,
                     components=[f"{leg.end} {name}" for name in WRENCH],

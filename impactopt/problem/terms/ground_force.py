@@ -40,7 +40,7 @@ class GroundForce(Term):
 
     enabled: bool = field(default=True, metadata=about("false: soles may be unloaded, and land hard"))
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         legs, weight = program.coordinates.legs, program.builder.limits.weight
         soles = [k for k, leg in enumerate(legs) if leg.sole is not None]
         if not soles:
@@ -56,7 +56,7 @@ class GroundForce(Term):
             row[6 * np.array(indices) + 2] = 1 / weight
         alone = len(sets) - 1
         for place, wrench in program.wrenches():
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=place,
                 components=[name for name, _ in sets],

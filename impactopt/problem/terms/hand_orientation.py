@@ -41,11 +41,11 @@ class HandOrientation(Term):
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"hand_orientation": BlockRecipe(lambda: hand_orientation(coordinates, problem.striker))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         direction = program.problem.normal if self.direction is None else self.direction
         numbers = np.array([*self.axis, *direction, np.sin(self.angle)])
         at = program.add_block("hand_orientation", [[program.contact_state[0]]], numbers)
-        program.rows.add(
+        program.constraints.add(
             term=self.name,
             place="contact",
             components=[program.problem.striker],

@@ -39,11 +39,11 @@ class HitCone(Term):
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"hit_cone": BlockRecipe(lambda: hit_cone(coordinates, problem.striker))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         y, y1, _ = program.contact_state
         numbers = np.append(face_axes(program.problem.normal).ravel(), np.tan(self.angle))
         at = program.add_block("hit_cone", [[y, y1, program.contact_T]], numbers)
-        program.rows.add(
+        program.constraints.add(
             term=self.name,
             place="contact",
             components=["across the normal"],

@@ -57,7 +57,7 @@ class HitRegion(Term):
         disc = self.size is None
         return {"hit_region": BlockRecipe(lambda: hit_region(coordinates, problem.striker, disc), (disc,))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         """Add the constraints, which replace those of a fixed hit point."""
 
         def numbers(problem: Any) -> Any:
@@ -70,7 +70,7 @@ class HitRegion(Term):
         program.equal("hit point", Place("contact", ""), ["along the normal"], np.array([at]), off_plane)
         names = ["disc"] if self.size is None else ["across", "up"]
         most = np.zeros(1) if self.size is None else np.array(self.size) / 2
-        program.rows.add(
+        program.constraints.add(
             term=self.name,
             place="contact",
             components=names,

@@ -36,13 +36,13 @@ class JointAcceleration(Term):
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"joint_acceleration": BlockRecipe(lambda: joint_acceleration(coordinates))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         names = program.robot.joint_names
         limit = of_joints(self.limit, names)
         spots = program.swing_motion()
         at = program.add_block("joint_acceleration", [slots for _, slots in spots], np.zeros(0))
         for k, (place, _) in enumerate(spots):
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=place,
                 components=names,

@@ -36,7 +36,7 @@ class MotorCurve(Term):
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"motor_speed": BlockRecipe(lambda: motor_speed(coordinates))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         robot = program.robot
         stall, idle, viscous, coulomb = (
             numbers_of(robot.actuators, name)
@@ -58,7 +58,7 @@ class MotorCurve(Term):
         for k, point in enumerate(points):
             torque = (point.torque * (robot.torque_limit / np.where(np.isfinite(stall), stall, 1.0)))[known]
             for j, (word, sign) in enumerate((("driving", 1.0), ("braking", -1.0))):
-                program.rows.add(
+                program.constraints.add(
                     term=self.name,
                     place=point.place,
                     components=[f"{label} {word}" for label in labels],

@@ -26,7 +26,7 @@ class PositionLimit(Term):
     unit: ClassVar[str] = "rad"
     margin: float = field(default=0.02, metadata=about("distance from each limit", unit="rad", least=0))
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         """Add the constraints of the tendons; joints have bounds of variables."""
         c, own = program.coordinates, program.robot.ranges
         lower, upper = (limit[program.robot.n :] for limit in inside(program.robot, self.margin))
@@ -35,7 +35,7 @@ class PositionLimit(Term):
         # tendon lengths are of_y @ y + (matrix of the legs) @ legs
         of_y = np.pad(own.matrix[:, c.independent], ((0, 0), (c.base, 0)))
         for place, (y, legs) in program.body_spots():
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=place,
                 components=own.names[program.robot.n :],

@@ -49,7 +49,7 @@ class PowerLimit(Term):
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"motor_power": BlockRecipe(lambda: motor_power(coordinates))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         robot, n = program.robot, program.robot.n
         most = numbers_of(robot.actuators, "power_limit")
         if self.limit is not None:
@@ -69,7 +69,7 @@ class PowerLimit(Term):
                 continue
             word = "giving" if servo > 0 else "taking"
             word += ("" if friction > 0 else ", backwards") if coulomb.any() else ""
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=point.place,
                 components=[f"{robot.joint_names[i]} {word}" for i in known],

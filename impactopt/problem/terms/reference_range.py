@@ -45,7 +45,7 @@ class ReferenceRange(Term):
         phases = len(problem.contact_phases)
         return {"coasted": BlockRecipe(lambda: coasted(coordinates, phases), key=(phases,))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         if not program.problem.lasts:
             return
         c, hit = program.coordinates, program.expected
@@ -57,7 +57,7 @@ class ReferenceRange(Term):
             "place": "end of contact",
             "measure": Measure("rad", 1.0, "too far"),
         }
-        program.rows.add(
+        program.constraints.add(
             components=c.labels[c.base :],
             outputs=at + np.arange(c.ny - c.base),
             lower=lower[c.independent],
@@ -65,7 +65,7 @@ class ReferenceRange(Term):
             **bounds,
         )
         if c.legs:  # their angles at the end of contact are variables already
-            program.rows.add(
+            program.constraints.add(
                 components=c.leg_labels,
                 affine=hit.coast_legs[hit.coast_legs.count - 1],
                 lower=lower[c.dependent],

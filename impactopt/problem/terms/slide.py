@@ -30,14 +30,14 @@ class Slide(Term):
     most: float = field(default=0.1, metadata=about("largest offset along each tangent", unit="m", above=0))
     enabled: bool = field(default=True, metadata=about("false: the offset is not bounded"))
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         problem = program.problem
         after = program.follow_spots()[0][1][0]
         for k, tangent in enumerate(across(problem.normal), start=1):
             hit = float(tangent @ problem.point)
-            index = len(program.rows.lower)
+            index = len(program.constraints.lower)
             program.builder.follow(partial(self._follow, index=index, tangent=tangent))
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place="after contact",
                 components=[f"tangent {k}"],
@@ -50,4 +50,4 @@ class Slide(Term):
     def _follow(self, b: Any, index: int, tangent: Any) -> None:
         """Move the bounds of a constraint to another hit point."""
         hit = float(tangent @ b.problem.point)
-        b.rows.bound(index, hit - self.most, hit + self.most)
+        b.constraints.bound(index, hit - self.most, hit + self.most)

@@ -41,7 +41,7 @@ class TargetSpeed(Term):
             "target_way": BlockRecipe(lambda: way(problem.target), formula),
         }
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
 
         def numbers(target: Target) -> Any:
             return np.array(list(target.parameters.values()))
@@ -50,7 +50,7 @@ class TargetSpeed(Term):
             "target_speed", [[program.expected.target_state]], numbers(program.problem.target)
         )
         program.builder.follow(lambda b: b.block("target_speed").take_parameters(numbers(b.problem.target)))
-        program.rows.add(
+        program.constraints.add(
             term=self.name,
             place="separation",
             components=["normal"],

@@ -29,7 +29,7 @@ class TorqueRate(Term):
         metadata=about("largest rate, of all or by joint", unit="N m/s", above=0, by_joint=True)
     )
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         """Add the constraints, which are linear in torques and duration, both variables."""
         names = program.robot.joint_names
         limit = of_joints(self.limit, names)
@@ -43,7 +43,7 @@ class TorqueRate(Term):
                 place = course.place_at((a + b) / 2)
                 place = replace(place, name=f"{place.name}, from {100 * a:.1f} %")
                 for word, sign in (("rising", 1.0), ("falling", -1.0)):
-                    program.rows.add(
+                    program.constraints.add(
                         term=self.name,
                         place=place,
                         components=[f"{label} {word}" for label in labels],

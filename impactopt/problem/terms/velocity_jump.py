@@ -36,7 +36,7 @@ class VelocityJump(Term):
             return {}
         return {"leg_jump": BlockRecipe(lambda: leg_jump(coordinates))}
 
-    def add_rows(self, program: Any) -> None:
+    def add_constraints(self, program: Any) -> None:
         """Add the constraints: linear ones in the rates of independent joints, and a block's for the legs."""
         c = program.coordinates
         robot = program.robot
@@ -47,7 +47,7 @@ class VelocityJump(Term):
         if c.legs:
             at = program.add_block("leg_jump", [[*e.before, *e.after] for e in ends], np.zeros(0))
         for k, end in enumerate(ends):
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=end.place,
                 components=c.labels[c.base :],
@@ -56,7 +56,7 @@ class VelocityJump(Term):
                 upper=most[c.independent],
                 measure=measure,
             )
-            program.rows.add(
+            program.constraints.add(
                 term=self.name,
                 place=end.place,
                 components=c.leg_labels,

@@ -27,7 +27,7 @@ from impactopt.solvers.program import (
     Status,
     Vector,
     complementarity,
-    row_violations,
+    constraint_violations,
     stationarity,
 )
 from impactopt.solvers.qp.registry import make_qp_solver
@@ -401,7 +401,7 @@ class ReducedRun(Run[SQPOptions]):
         """
         if self._restoration is None:
             return False
-        violated = row_violations(self.program, self.point.g) > self.options.violation_tolerance
+        violated = constraint_violations(self.program, self.point.g) > self.options.violation_tolerance
         steepest = float((self.program.weights * self.point.row_norms)[violated].sum())
         reduction = self.point.violation - qp_step.linear_violation
         return reduction <= _STATIONARY * qp_step.longest * steepest

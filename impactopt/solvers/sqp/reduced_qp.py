@@ -25,7 +25,7 @@ import scipy.sparse as sp
 from impactopt.solvers.elimination.condense import Condenser, Elimination, find_eliminations
 from impactopt.solvers.elimination.kernels import kernels
 from impactopt.solvers.options import SQPOptions
-from impactopt.solvers.program import Determined, Matrix, Point, TimedProgram, Vector, row_violations
+from impactopt.solvers.program import Determined, Matrix, Point, TimedProgram, Vector, constraint_violations
 from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
 
 Index = npt.NDArray[np.intp]
@@ -530,7 +530,7 @@ class ReducedQP:
             d,
             y,
             z,
-            linear_violation=float(p.weights @ row_violations(p, g + point.jacobian @ d)),
+            linear_violation=float(p.weights @ constraint_violations(p, g + point.jacobian @ d)),
             constraints=which.size,
             elastic=qp.n - guess.size,
             iterations=iterations,

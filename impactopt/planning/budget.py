@@ -19,7 +19,7 @@ from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.options import OPTIONS
 from impactopt.solvers.program import Callback, IterationRecord, NonlinearProgram, SolverResult, Status
-from impactopt.solvers.run import Path, Watch
+from impactopt.solvers.run import BarrierState, Watch
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
 
 Array = NDArray[np.float64]
@@ -152,7 +152,7 @@ class Budget:
         most: int | None = None,
         watch: Watch | None = None,
         *,
-        path: Path | None = None,
+        state: BarrierState | None = None,
     ) -> SolverResult:
         """Solve a program in the remaining time.
 
@@ -160,7 +160,7 @@ class Budget:
         solvers use too.
         barrier : first one of "ipm" for a warm start, if that is farther from the solution than it seems.
         most : largest number of iterations of our solvers, unless the options set it.
-        watch, path : as of `solve_ipm`.
+        watch, state : as of `solve_ipm`.
         """
         left, y, z = None if self.stop.asked else self.left, None, None
         if isinstance(start, SolverResult):
@@ -181,7 +181,7 @@ class Budget:
             return solve_sqp(program, x0, options=SQPOptions(**settings), **common)
         if barrier is not None and z is not None:
             settings.setdefault("barrier_warm", barrier)
-        return solve_ipm(program, x0, options=IPMOptions(**settings), watch=watch, path=path, **common)
+        return solve_ipm(program, x0, options=IPMOptions(**settings), watch=watch, state=state, **common)
 
 
 def rank_of(result: SolverResult) -> tuple[bool, float]:

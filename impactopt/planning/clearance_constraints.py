@@ -28,7 +28,7 @@ from impactopt.planning.refinement import Guess, Outcome, Program
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import SolverResult
-from impactopt.solvers.run import Path
+from impactopt.solvers.run import BarrierState
 from impactopt.transcription.clearance import ClearanceKey, SeparatingDirection
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.layout import stack
@@ -160,7 +160,7 @@ class Watch:
     Attributes
     ----------
     left : whether the last iterate that was checked lacks constraints.
-    path : the solver's state when it stopped there.
+    state : the solver's state when it stopped there.
     """
 
     def __init__(self, t: ContactProgram, margins: Margins, x: Array) -> None:
@@ -186,7 +186,7 @@ class Watch:
         # the last accepted trial: variables, directions, placements and gaps
         self._next: tuple[Array, Array, tuple[Placed, Looked]] | None = None
         self._interruptions, self.left = 0, False
-        self.path: Path | None = None
+        self.state: BarrierState | None = None
         self._go_to(x)
 
     def constraints(self, within: float = INCLUDE) -> Constraints:
@@ -208,12 +208,12 @@ class Watch:
         self.left = False
         return out
 
-    def leave(self, path: Path) -> None:
-        self.path = path
+    def leave(self, state: BarrierState) -> None:
+        self.state = state
 
     def lacks(self, x: Array) -> bool:
         self._go_to(x)
-        self.left, self.path = False, None
+        self.left, self.state = False, None
         if self._interruptions < _MAX_INTERRUPTIONS and self._bare(self._found[1], self._trigger).any():
             self._interruptions += 1
             self.left = True
@@ -296,11 +296,13 @@ def solve_with_clearance(budget: Budget, margins: Margins | None, guess: Guess[P
     result = budget.run(t.program, start, guess.barrier, guess.most, watch=watch)
     # only the interior-point method calls the watch during the solve; other solvers' results are checked here
     while watch.left or (not budget.interior and result.status.usable and watch.lacks(result.x)):
-        last, before, path = result, t, watch.path
+        last, before, state = result, t, watch.state
         t, start = _with_near_pairs(t, watch, last)
-        if path is not None:
-            path = replace(path, rows=_by_constraint(path.rows, before, t, np.nan))  # NaN: a new slack
-        new = budget.run(t.program, start, None, guess.most, watch=watch, path=path)
+        if state is not None:
+            state = replace(
+                state, constraints=_by_constraint(state.constraints, before, t, np.nan)
+            )  # NaN: a new slack
+        new = budget.run(t.program, start, None, guess.most, watch=watch, state=state)
         result = one_after_the_other(last, new)
     return Outcome.of(t, result, guess)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from impactopt.planning.budget import VIOLATED, Budget, one_after_the_other, rank_of, with_effort_of
 from impactopt.planning.contact_replay import ContactReplay, PlannedContact, checked, planned_contact
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.program import SolverResult, Status, Violation, max_violation, worst_rows
+from impactopt.solvers.program import SolverResult, Status, Violation, max_violation, worst_violations
 from impactopt.transcription.clearance import ClearanceKey, SeparatingDirection
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import ContactError, contact_error
@@ -167,7 +167,7 @@ class Outcome(Generic[Program]):
         """Violated constraints, worst first."""
         x, program = self.result.x, self.program.program
         g = program.constraints(x)
-        return tuple(worst_rows(program, x, g, tolerance=VIOLATED, count=MAX_VIOLATIONS))
+        return tuple(worst_violations(program, x, g, tolerance=VIOLATED, count=MAX_VIOLATIONS))
 
     def attempt(self, name: str) -> Attempt:
         r = self.result

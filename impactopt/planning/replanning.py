@@ -220,7 +220,7 @@ def sensitivity_of(solution: Solution, parameter: str) -> Sensitivity:
     n, m = len(x), len(solution.result.multipliers)
     # implicit function theorem: KKT matrix times dz/dp = -(derivative of the KKT residual by p at fixed z)
     change = family.system.step(
-        Offset(dual=residual[:n], rows=residual[n : n + m], variables=residual[n + m :])
+        Offset(dual=residual[:n], constraints=residual[n : n + m], variables=residual[n + m :])
     )
     # total derivatives: impulse and objective may also depend on the parameter itself, at the same x
     program = family.program
@@ -269,7 +269,7 @@ def _binding(family: ParametricProgram) -> tuple[Binding, ...]:
     t, system = family.program, family.system
     program, out = t.program, list[Binding]()
     inequality = program.g_lower < program.g_upper
-    for i in np.flatnonzero(system.rows * inequality):
+    for i in np.flatnonzero(system.constraints * inequality):
         price, origin = abs(float(system.y[i])), t.constraints.origins[int(i)]
         measure = origin.measure
         # the program's constraints are scaled: ``factor`` leads back to the unit of the bound
@@ -388,7 +388,10 @@ def _by_active_set(solution: Solution, t: Transcription, family: ParametricProgr
     assert best is not None
     # a multiplier of the wrong sign: its inequality or bound is no longer active
     inequality, free = program.g_lower < program.g_upper, program.x_lower < program.x_upper
-    released_y, released_z = inequality & (system.rows * best.y < 0), free & (system.bounds * best.z < 0)
+    released_y, released_z = (
+        inequality & (system.constraints * best.y < 0),
+        free & (system.bounds * best.z < 0),
+    )
     released = int(released_y.sum() + released_z.sum())
     message = f"By {steps} first-order steps: constraints are violated by {worst:.1g} at most"
     message += f"; {released} active constraints have multipliers of the wrong sign." if released else "."

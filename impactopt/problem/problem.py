@@ -448,9 +448,7 @@ class ImpactProblem:
 
     @property
     def active_terms(self) -> tuple[Term, ...]:
-        """The problem's own terms, and default terms with an `add_constraints`; without those that are switched
-        off.
-        """
+        """The problem's own terms and the default terms that add constraints, but not those switched off."""
         given = {type(term) for term in self.terms}
         defaults = [
             t

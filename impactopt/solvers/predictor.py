@@ -48,21 +48,21 @@ class Offset:
     """Residual of a solution's KKT conditions in a program with other parameters.
 
     dual (n,) : grad f + J'y + z.
-    rows (m,) : g minus the bound at which each constraint is active; 0 if it is inactive.
+    constraints (m,) : g minus the bound at which each constraint is active; 0 if it is inactive.
     variables (n,) : likewise of x.
     """
 
-    PARTS: ClassVar[tuple[str, ...]] = ("dual", "rows", "variables")
+    PARTS: ClassVar[tuple[str, ...]] = ("dual", "constraints", "variables")
 
     dual: Vector
-    rows: Vector
+    constraints: Vector
     variables: Vector
 
     def less(self, other: Offset) -> Offset:
         """Difference of two residuals."""
         return Offset(
             dual=self.dual - other.dual,
-            rows=self.rows - other.rows,
+            constraints=self.constraints - other.constraints,
             variables=self.variables - other.variables,
         )
 
@@ -85,7 +85,7 @@ class ActiveSystem:
     Attributes
     ----------
     x, y, z : of the solution, as of `impactopt.solvers.program.SolverResult`.
-    rows (m,), bounds (n,) : side at which each constraint and variable is active; 1 for equalities.
+    constraints (m,), bounds (n,) : side at which each constraint and variable is active; 1 for equalities.
     """
 
     def __init__(
@@ -94,11 +94,11 @@ class ActiveSystem:
         """proximal : added to the diagonal of H, so that a step moves variables little that hardly matter."""
         self.x, self.y, self.z = x, y, z
         g = program.constraints(x)
-        self.rows, self._soft_rows = _active_sides(g, program.g_lower, program.g_upper, y)
+        self.constraints, self._soft_constraints = _active_sides(g, program.g_lower, program.g_upper, y)
         self.bounds, self._soft_bounds = _active_sides(x, program.x_lower, program.x_upper, z)
         n = program.n
-        self._rows, self._bounds = np.flatnonzero(self.rows), np.flatnonzero(self.bounds)
-        jacobian = sp.csr_array(program.jacobian(x))[self._rows]
+        self._constraints, self._bounds = np.flatnonzero(self.constraints), np.flatnonzero(self.bounds)
+        jacobian = sp.csr_array(program.jacobian(x))[self._constraints]
         active_bounds = sp.csr_array(
             (np.ones(len(self._bounds)), (np.arange(len(self._bounds)), self._bounds)),
             shape=(len(self._bounds), n),
@@ -107,7 +107,7 @@ class ActiveSystem:
         H = sp.csc_array(program.hessian(x, 1.0, y))
         if proximal:
             H = sp.csc_array(H + proximal * sp.eye_array(n))
-        soft = np.concatenate([self._soft_rows[self._rows], self._soft_bounds[self._bounds]])
+        soft = np.concatenate([self._soft_constraints[self._constraints], self._soft_bounds[self._bounds]])
         # A dx - (slack / multiplier) dy = -off: the linearization of slack x multiplier = mu
         self._matrix = sp.csc_array(sp.block_array([[H, A.T], [A, sp.diags_array(-soft)]]))
         self._factors: dict[float, Any] = {}
@@ -133,8 +133,8 @@ class ActiveSystem:
         x, g = point.x, program.constraints(point.x)
         return Offset(
             dual=np.asarray(program.gradient(x) + program.jacobian(x).T @ point.y + point.z),
-            rows=_bound_residual(g, program.g_lower, program.g_upper, self.rows)
-            - self._soft_rows * (point.y - self.y),
+            constraints=_bound_residual(g, program.g_lower, program.g_upper, self.constraints)
+            - self._soft_constraints * (point.y - self.y),
             variables=_bound_residual(x, program.x_lower, program.x_upper, self.bounds)
             - self._soft_bounds * (point.z - self.z),
         )
@@ -146,7 +146,9 @@ class ActiveSystem:
         ------
         InputError : the active constraints are linearly dependent.
         """
-        given = -np.concatenate([offset.dual, offset.rows[self._rows], offset.variables[self._bounds]])
+        given = -np.concatenate(
+            [offset.dual, offset.constraints[self._constraints], offset.variables[self._bounds]]
+        )
         for regularization in _REGULARIZATIONS:
             factor = self._factor(regularization)
             found = factor.solve(given)
@@ -160,9 +162,9 @@ class ActiveSystem:
                 break
         else:
             raise InputError(_SINGULAR)
-        n, k = len(self.x), len(self._rows)
+        n, k = len(self.x), len(self._constraints)
         y, z = np.zeros(len(self.y)), np.zeros(n)
-        y[self._rows], z[self._bounds] = found[n : n + k], found[n + k :]
+        y[self._constraints], z[self._bounds] = found[n : n + k], found[n + k :]
         return Change(x=found[:n], y=y, z=z)
 
 

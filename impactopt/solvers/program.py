@@ -298,7 +298,7 @@ def is_stationary_violation(
     return bool(np.linalg.norm(slope) <= tolerance * max(float(row_norms @ np.abs(v)), 1e-300))
 
 
-def worst_rows(
+def worst_violations(
     program: NonlinearProgram,
     x: Vector,
     g: Vector,
@@ -335,7 +335,7 @@ _HEADINGS = ("Constraints not met", "Constraints that cannot be met")  # the sec
 
 def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, tolerance: float) -> str:
     """Message of a status: a sentence, then each term's worst violation in words."""
-    worst = worst_rows(program, x, g, tolerance=tolerance, once_a_term=True)
+    worst = worst_violations(program, x, g, tolerance=tolerance, once_a_term=True)
     if not worst:
         return status.message
     # constraints are of order one, so a much smaller violation is only a consequence of the others

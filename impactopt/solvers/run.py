@@ -123,17 +123,17 @@ def threads() -> ThreadpoolController:
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class BarrierState:
     """State of an interior-point solve that was ended early, from which another one continues.
 
     barrier : parameter mu.
-    rows (m,) : slacks of the constraints, or their values if they have none; NaN for a new constraint.
-    bounds (n,) : likewise of the variables' bounds.
+    constraints (m,) : slacks of the constraints, or their values if they have none; NaN for a new constraint.
+    variables (n,) : likewise of the variables' bounds.
     """
 
     barrier: float
-    rows: Vector
-    bounds: Vector
+    constraints: Vector
+    variables: Vector
 
 
 class Watch(Protocol):
@@ -145,7 +145,7 @@ class Watch(Protocol):
     def lacks(self, x: Vector) -> bool:
         """True if the program lacks constraints that an iterate (n,) needs: the solve ends."""
 
-    def leave(self, path: Path) -> None:
+    def leave(self, state: BarrierState) -> None:
         """Receive the state in which the solve ended for that."""
 
     def limit(self, x: Vector, step: Vector, most: float) -> float:

@@ -281,7 +281,10 @@ class Collocated:
             b.constraints.add(components=b.robot.joint_names, outputs=outputs, **common)
 
     def drives(self) -> list[DrivePoint]:
-        """Torques and joint motions at each stage, if a term is about drives; after `Collision.add_constraints`."""
+        """Torques and joint motions at each stage, if a term is about drives.
+
+        Call it after `Collision.add_constraints`.
+        """
         pairs = zip(self.stages, self.torques, strict=True)
         return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
 

@@ -15,7 +15,7 @@ from impactopt.problem.problem import Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import DescribedProgram, Status, Violation, explain, worst_rows
+from impactopt.solvers.program import DescribedProgram, Status, Violation, explain, worst_violations
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.layout import Layout, Measure, Place, along, degrees, millimetres, percent
 from impactopt.transcription.transcription import Transcription
@@ -28,7 +28,7 @@ SCENARIOS = (
 
 
 def told(t: Transcription, x: Array, *, count: int = 1000) -> list[Violation]:
-    return worst_rows(t.program, x, t.program.constraints(x), tolerance=1e-6, count=count)
+    return worst_violations(t.program, x, t.program.constraints(x), tolerance=1e-6, count=count)
 
 
 @pytest.mark.parametrize("robot", ["arm", "biped"])
@@ -110,7 +110,7 @@ def test_rows_of_a_term_at_a_place_are_told_once_by_the_worst(biped_transcriptio
     assert len(found) == len(groups) < np.count_nonzero(over > 1e-6)
     assert [v.amount for v in found] == sorted((v.amount for v in found), reverse=True)
     assert found[0].amount == over.max()
-    worst = worst_rows(t.program, x, g, tolerance=1e-6, count=t.program.m, once_a_term=True)
+    worst = worst_violations(t.program, x, g, tolerance=1e-6, count=t.program.m, once_a_term=True)
     assert len(worst) == len({term for term, _ in groups})
     assert worst == [v for v in found if v in worst]
     message = explain(t.program, Status.INFEASIBLE, x, g, tolerance=1e-6)

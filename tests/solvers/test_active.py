@@ -75,7 +75,7 @@ def test_a_weakly_active_bound_is_left() -> None:
     p = Nearest(2.0, 1.0, 1.5, 1.25 + 1e-4)
     x, y, _ = solved(p)
     system = ActiveSystem(p, x, y, np.array([1e-6, 0.0]))
-    step = system.step(Offset(dual=np.array([-0.1, 0.1]), rows=np.zeros(1), variables=np.zeros(2)))
+    step = system.step(Offset(dual=np.array([-0.1, 0.1]), constraints=np.zeros(1), variables=np.zeros(2)))
     assert step.x == pytest.approx([0.1, -0.1], rel=0.02)
 
 

@@ -57,14 +57,14 @@ class HalvingWatch:
     """Watch that ends a solve at an iterate of this number, and halves all steps."""
 
     def __init__(self, at: int) -> None:
-        self.at, self.asked, self.path = at, [], None
+        self.at, self.asked, self.state = at, [], None
 
     def lacks(self, x):
         self.asked.append(x.copy())
         return len(self.asked) == self.at + 1
 
-    def leave(self, path):
-        self.path = path
+    def leave(self, state):
+        self.state = state
 
     def limit(self, x, step, most):
         return 0.5 * most
@@ -89,7 +89,7 @@ def test_a_solve_that_was_ended_early_is_continued():
         multipliers=left.multipliers,
         bound_multipliers=left.bound_multipliers,
         watch=on,
-        path=first.path,
+        state=first.state,
     )
     assert again.status is Status.SOLVED
     np.testing.assert_array_equal(on.asked[0], left.x)

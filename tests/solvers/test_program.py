@@ -18,7 +18,7 @@ from impactopt.solvers.program import (
     is_stationary_violation,
     max_violation,
     stationarity,
-    worst_rows,
+    worst_violations,
 )
 
 
@@ -57,7 +57,7 @@ def test_violations_count_rows_and_bounds_and_nan():
     assert max_violation(program, np.array([3.0, -1.5]), np.array([3.0])) == 2
     assert max_violation(program, np.array([0.5, -4]), np.array([0.5])) == 3
     assert max_violation(program, np.array([0.5, 0]), np.array([np.nan])) == np.inf
-    assert worst_rows(program, np.array([3.0, -4]), np.array([3.0]), tolerance=1e-6) == [
+    assert worst_violations(program, np.array([3.0, -4]), np.array([3.0]), tolerance=1e-6) == [
         Violation("bound of x2", "by 3", 3.0),
         Violation("row 1", "by 2", 2.0),
     ]

@@ -22,7 +22,7 @@ import numpy as np
 from impactopt.solvers.ipm.newton import acquire, release
 from impactopt.solvers.options import IPMOptions
 from impactopt.solvers.program import Determined, Point, TimedProgram, Vector, scaled_residual
-from impactopt.solvers.run import Path
+from impactopt.solvers.run import BarrierState
 
 _KAPPA_SIGMA = 1e10  # multipliers of bounds stay within this factor of mu / distance (eq. 16)
 
@@ -385,18 +385,18 @@ class BarrierProblem:
         z: Vector,
         *,
         warm: bool,
-        path: Path | None = None,
+        state: BarrierState | None = None,
         determined: Sequence[Determined],
     ):
         """point : is moved inside its bounds.  y (m,), z (n,) : initial multipliers, if it is ``warm``.
 
-        path : state of an earlier solve, to be continued.
+        state : the state of an earlier solve, to be continued.
         """
         self.program, self.options, self.warm = program, options, warm
-        self._lower_at_once = warm and path is None and options.barrier_warm < _MIN_BARRIER_OF_PATH
+        self._lower_at_once = warm and state is None and options.barrier_warm < _MIN_BARRIER_OF_PATH
         self.sigma = 1.0
         self.mu = options.barrier_warm if warm else options.barrier
-        self.mu = self.mu if path is None else path.barrier
+        self.mu = self.mu if state is None else state.barrier
         self.elastic: Elastic | None = None
         p, x = program, point.x
         moves = p.x_upper - p.x_lower > 1e-12
@@ -416,12 +416,12 @@ class BarrierProblem:
         lower, upper = all_lower[c.remaining], all_upper[c.remaining]
         self._eliminated_level, self._equal_level = all_lower[c.eliminated], lower[c.equal]
         self._unequal = np.flatnonzero(lower < upper)  # into c.remaining: those with a slack
-        push = options.push if path is None else _PUSH_CONTINUED
-        if warm and path is None:
+        push = options.push if state is None else _PUSH_CONTINUED
+        if warm and state is None:
             # as far as a bound is whose multiplier is of order one: farther, constraints would be violated
             push = min(push, self.mu)
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
-        kept = path is not None
+        kept = state is not None
         self.x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self.mu, kept=kept)
         x = x.copy()
         x[c.free] = self.x.values
@@ -431,8 +431,8 @@ class BarrierProblem:
         self.eliminated_y = multipliers[c.eliminated]
         self.constraint_multipliers, self.bound_multipliers = y, z
         slacks = self._values(point)
-        if path is not None:
-            saved = np.concatenate([path.rows, path.bounds[c.bounded]])
+        if state is not None:
+            saved = np.concatenate([state.constraints, state.variables[c.bounded]])
             least = np.where(np.isfinite(all_lower), all_lower, -np.inf) + _MIN_NEW_SLACK
             slacks = np.where(np.isnan(saved), np.maximum(slacks, least), saved)
         self.s = Bounded(
@@ -453,13 +453,13 @@ class BarrierProblem:
         """Return the Newton system to the cache, for the next program of the same structure."""
         release(self.newton)
 
-    def path(self) -> Path:
+    def state(self) -> BarrierState:
         """State of this solve, for one that continues it."""
         c, slacks, of_variables = self._condenser, self._values(self.point), self.point.x.copy()
         slacks[c.remaining[self._unequal]] = self.s.values
         m = self.program.m
         of_variables[c.bounded] = slacks[m:]
-        return Path(self.mu, slacks[:m], of_variables)
+        return BarrierState(self.mu, slacks[:m], of_variables)
 
     def _values(self, point: Point) -> Vector:
         """Values of all constraints: the program's, then the bounded eliminated variables."""

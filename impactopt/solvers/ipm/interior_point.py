@@ -35,7 +35,7 @@ from impactopt.solvers.program import (
     is_stationary_violation,
     stationarity,
 )
-from impactopt.solvers.run import Path, Run, Watch
+from impactopt.solvers.run import BarrierState, Run, Watch
 
 _MAX_CORRECTIONS = 4  # p_max of Waechter and Biegler, step A-5.9: second-order corrections of a step
 _KAPPA_SOC = 0.99  # a correction that leaves more than this fraction of the violation is the last (A-5.9)
@@ -300,7 +300,7 @@ def solve_ipm(
     multipliers: npt.ArrayLike | None = None,
     bound_multipliers: npt.ArrayLike | None = None,
     watch: Watch | None = None,
-    path: Path | None = None,
+    state: BarrierState | None = None,
 ) -> SolverResult:
     """Solve a nonlinear program by the interior-point method.
 
@@ -313,7 +313,7 @@ def solve_ipm(
     multipliers, bound_multipliers : initial guess of the multipliers (m,), (n,), from a similar program.
     watch : may end the solve at an iterate, with the status `ACCEPTABLE`, because the program lacks
         constraints there; may limit the length of steps.
-    path : state in which an earlier solve ended at x0 with these multipliers; this one continues it.
+    state : the state in which an earlier solve ended at x0 with these multipliers; this one continues it.
 
     Returns
     -------
@@ -324,15 +324,15 @@ def solve_ipm(
     InputError : wrong shapes, NaN, crossing bounds.
     """
     given = program, x0, options or IPMOptions(), callback, multipliers, bound_multipliers
-    return InteriorRun(*given, watch=watch, path=path).solve()
+    return InteriorRun(*given, watch=watch, state=state).solve()
 
 
 class InteriorRun(Run[IPMOptions]):
     """One solve: the loop over `BarrierProblem`, `LineSearch`, `ElasticPhase`."""
 
-    def __init__(self, *given: Any, watch: Watch | None, path: Path | None):
+    def __init__(self, *given: Any, watch: Watch | None, state: BarrierState | None):
         super().__init__(*given)
-        self._watch, self._path = watch, path
+        self._watch, self._state = watch, state
         self._search, self._phase = LineSearch(watch), ElasticPhase(self.options)
 
     def iterate(self) -> Status:
@@ -379,10 +379,10 @@ class InteriorRun(Run[IPMOptions]):
             self.y,
             self.z,
             warm=self._warm,
-            path=self._path,
+            state=self._state,
             determined=self.determined,
         )
-        self.point, self._path = self._problem.point, None
+        self.point, self._state = self._problem.point, None
         self._phase.begin()
         self._search.reset_filter()
 
@@ -439,7 +439,7 @@ class InteriorRun(Run[IPMOptions]):
             return False
         if not self._watch.lacks(self.point.x):
             return False
-        self._watch.leave(self._problem.path())
+        self._watch.leave(self._problem.state())
         return True
 
     def _advance(self, residual: Vector) -> str | Status:

@@ -16,7 +16,7 @@ from impactopt.contact.fields import abouts, snake_case
 from impactopt.errors import InputError
 from impactopt.planning.parameter_changes import changed, with_term
 from impactopt.planning.refinement import program_for
-from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -44,7 +44,6 @@ Selector = Callable[[ConstraintOrigin], bool]
 FEASIBLE = 1e-5  # largest violation of the (scaled) constraints that counts as none here
 TYPICAL_DURATION = 1.0  # [s] of a swing or a follow-through
 _NO_INDICES = np.zeros(0, dtype=np.intp)
-_PHASE_NAMES = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}
 # A reported value is beyond the least one by this part of the change: with the least one the feasible set is
 # a single point, which no solver finds.
 _RESERVE = 0.02
@@ -105,22 +104,21 @@ def bounds_of(t: Transcription) -> list[Bound]:
 
 
 def _durations(t: Transcription) -> Iterator[Bound]:
-    """Bounds on the durations of swing, follow-through and the phases of contact."""
+    """Bounds on the durations of swing, follow-through, other stance phases and the phases of contact."""
     p = t.problem
     found: dict[str, list[int]] = {}
     for name, group in t.layout.groups.items():
         if name.endswith(" duration"):
-            kind = {"swing": "swing", "follow": "follow", "abort": "follow"}.get(name.split()[0], "contact")
+            kind = name.split()[0].removesuffix("-abort").replace("abort", "follow")
+            kind = kind if kind in ("swing", "follow") or kind.startswith("stance") else "contact"
             found.setdefault(kind, []).append(group.offset)
     # [s] units of the duration variables, as of the transcription
     scale = {kind: 0.01 if kind == "contact" else 0.1 for kind in found}
     for kind, numbers in found.items():
-        field = "contact_duration" if kind == "contact" else kind
         at = np.array(numbers, dtype=np.intp)
 
-        def causes(x: Array, at: Index = at, kind: str = kind, field: str = field) -> Iterator[Cause]:
-            own = getattr(p, field)
-            low, high = own if kind == "contact" else own.duration
+        def causes(x: Array, at: Index = at, kind: str = kind) -> Iterator[Cause]:
+            low, high = p.contact_duration if kind == "contact" else _motion_phase(p, kind).duration
             times = x[at] * scale[kind]
             longer = times.max() > high
             value = float(times.max() if longer else times.min())
@@ -144,6 +142,13 @@ def _durations(t: Transcription) -> Iterator[Bound]:
         )
 
 
+def _motion_phase(p: ImpactProblem, kind: str) -> Phase:
+    """Duration and spline of "swing", "follow" or a stance phase, "stance0" and so on."""
+    phase = p.stances[int(kind[6:])].phase if kind.startswith("stance") else getattr(p, kind)
+    assert isinstance(phase, Phase)
+    return phase
+
+
 def _duration_cause(
     p: ImpactProblem, value: float, *, name: str, low: float, high: float, longer: bool
 ) -> Cause:
@@ -151,12 +156,18 @@ def _duration_cause(
     bound = high if longer else low
     value = _outward(value, bound)
     both = (value, value) if low == high else (low, value) if longer else (value, high)
-    text = f"{_PHASE_NAMES[name]}: {value:.3g} s for {bound:.3g} s"
+    new: dict[str, object]
     if name == "contact":
-        new = changed_or_none(p, contact_duration=both)
-        return Cause(kind="time", text=f"{text} ([collision] duration_s)", problem=new)
-    new = changed_or_none(p, **{name: replace(getattr(p, name), duration=both)})
-    return Cause(kind="time", text=f"{text} ([{name}] duration_s)", problem=new)
+        phase, key, new = "each phase of contact", "[collision]", {"contact_duration": both}
+    elif name.startswith("stance"):
+        k, stances = int(name[6:]), list(p.stances)
+        stances[k] = replace(stances[k], phase=replace(_motion_phase(p, name), duration=both))
+        phase, key, new = f"stance phase {k + 1}", f"[[stances]] number {k + 1},", {"stances": tuple(stances)}
+    else:
+        phase, key = {"swing": "swing", "follow": "follow-through"}[name], f"[{name}]"
+        new = {name: replace(_motion_phase(p, name), duration=both)}
+    text = f"{phase}: {value:.3g} s for {bound:.3g} s ({key} duration_s)"
+    return Cause(kind="time", text=text, problem=changed_or_none(p, **new))
 
 
 def _clearances(t: Transcription) -> Iterator[Bound]:

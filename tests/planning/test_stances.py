@@ -17,6 +17,7 @@ from impactopt.files.output import Record
 from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
 from impactopt.files.verify import motion_of_record
 from impactopt.kinematics.stance import FixedBase
+from impactopt.planning.bounds import bounds_of
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.stances import StancePhase
@@ -75,6 +76,17 @@ def ways(plan: Plan) -> tuple[Trajectory, Trajectory]:
 @pytest.fixture(scope="module")
 def held(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> Simulation:
     return simulate_pinocchio(plan.problem.robot, ways[0], scene_of(plan.problem), settle=0.1)
+
+
+def test_a_duration_that_would_have_to_be_longer_is_that_of_its_phase(program: Transcription) -> None:
+    (bound,) = (b for b in bounds_of(program) if b.name == "stance0")
+    x = first_iterate(program)
+    x[bound.variables] = 1.5 / 0.1  # durations of motions are in tenths of a second
+    (cause,) = bound.causes(x)
+    assert cause.text.startswith("stance phase 1: 1.5") and "s for 0.9 s ([[stances]] number 1" in cause.text
+    assert cause.problem is not None and cause.problem.stances[0].phase is not None
+    assert cause.problem.stances[0].phase.duration[1] == pytest.approx(1.5, rel=0.05)
+    assert cause.problem.stances[1:] == program.problem.stances[1:]
 
 
 def test_derivatives_are_those_of_differences(program: Transcription) -> None:

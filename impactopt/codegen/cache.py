@@ -168,7 +168,7 @@ def cached_groups(groups: Sequence[FunctionGroup], *, report: Report | None = No
 
     While one group is compiled the next is built.
 
-    report : told what is going on, one line a call, while functions are compiled.
+    report : called with a line of text for each step, while functions are compiled.
 
     Returns
     -------
@@ -176,20 +176,20 @@ def cached_groups(groups: Sequence[FunctionGroup], *, report: Report | None = No
     compiler, or with IMPACTOPT_NO_COMPILER=1 in the environment, they run in CasADi's virtual machine and a
     NoCompilerWarning says so once a process.
     """
-    tell = report if report is not None else _ignore
+    report = report if report is not None else _ignore
     compiler = find_compiler()
     if compiler is None:
         _warn_no_compiler()
         return {name: f for group in groups for name, f in _graphs(_by_name(group.build())).items()}
     try:
-        return _found(usable_directory(), groups, compiler, tell)
+        return _found(usable_directory(), groups, compiler, report)
     except UnsafePath as error:
         warn(f"{error}; compiling into a temporary directory, for this process only")
-        return _found(temporary_private_directory(), groups, compiler, tell)
+        return _found(temporary_private_directory(), groups, compiler, report)
 
 
 def _found(
-    directory: Path, groups: Sequence[FunctionGroup], compiler: Compiler, tell: Report
+    directory: Path, groups: Sequence[FunctionGroup], compiler: Compiler, report: Report
 ) -> dict[str, ca.Function]:
     """The functions of all groups in a directory, where those that are missing are put."""
     entries = [f"{slug(g.name)}-{_entry_key(g.name, g.recipe, compiler)}" for g in groups]
@@ -212,13 +212,13 @@ def _found(
 
                 def waits(name: str = group.name) -> None:
                     finish()  # of two processes none is to wait for what the other holds while it waits
-                    tell(f"{name}: another process is compiling, waiting")
+                    report(f"{name}: another process is compiling, waiting")
 
                 own = locks.enter_context(contextlib.ExitStack())
                 own.enter_context(locked(directory / f"{entry}.lock", on_wait=waits))
                 found[k] = _load_entry(directory, entry)
                 if found[k] is None:
-                    works[k] = _Work(directory, entry, group, compiler, pool, own, tell)
+                    works[k] = _Work(directory, entry, group, compiler, pool, own, report)
                 else:
                     own.close()
             finish()
@@ -272,12 +272,12 @@ class _Work:
         compiler: Compiler,
         pool: ThreadPoolExecutor,
         held: contextlib.ExitStack,
-        tell: Report,
+        report: Report,
     ) -> None:
         """held : what is to be given back when all is done, such as the entry's lock."""
-        self._directory, self._entry, self._name, self._tell = directory, entry, group.name, tell
+        self._directory, self._entry, self._name, self._report = directory, entry, group.name, report
         self._start, self._held = time.monotonic(), held
-        tell(f"{group.name}: building the functions")
+        report(f"{group.name}: building the functions")
         self._functions = _by_name(group.build())
         self._jobs: dict[Future[tuple[str, str]], list[str]] = {}
         self._error: Exception | None = None
@@ -324,8 +324,8 @@ class _Work:
         for done, job in enumerate(as_completed(self._jobs), start=1):
             names, seconds = self._jobs[job], time.monotonic() - self._start
             listing |= dict.fromkeys(names, job.result())
-            told = ", ".join(names)
-            self._tell(f"{self._name}: compiled {told} ({done} of {len(self._jobs)}, {seconds:.0f} s)")
+            listed = ", ".join(names)
+            self._report(f"{self._name}: compiled {listed} ({done} of {len(self._jobs)}, {seconds:.0f} s)")
         ordered = {"functions": {function: listing[function] for function in self._functions}}
         put(self._directory / f"{self._entry}.json", json.dumps(ordered, indent=1).encode())
         return listing

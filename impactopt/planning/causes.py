@@ -33,7 +33,7 @@ from impactopt.problem.scenario import LONGEST, SHORTEST, Phase
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.program import NonlinearProgram, SolverResult, max_violation
 from impactopt.solvers.relaxed import RelaxedProgram
-from impactopt.transcription.initial_guess import carried_over, first_iterate
+from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["Cause", "Search", "search"]
@@ -97,7 +97,7 @@ class _CauseSearch:
         p = with_lazy_constraints(t.problem, names)
         self.t = program_for(t, p)
         zero_multipliers = np.zeros(t.program.m), np.zeros(t.layout.n)
-        own = carried_over(self.t, t, result.x, *zero_multipliers)[0]
+        own = warm_start(self.t, t, result.x, *zero_multipliers)[0]
         shortest, longest = p.contact_duration
         loose = changed(
             p,

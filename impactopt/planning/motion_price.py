@@ -32,7 +32,7 @@ def with_first_scale(t: Transcription) -> Transcription:
     p = t.problem
     if p.price_scale != 1.0 or p.style_prices == MotionPrices():
         return t
-    objective = t.worth(first_iterate(t))
+    objective = t.objective_sum(first_iterate(t))
     scale = float(np.clip(objective / _REFERENCE_OBJECTIVE, _MIN_SCALE, 1.0))
     if not np.isfinite(objective) or scale == 1.0:
         return t

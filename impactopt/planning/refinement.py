@@ -22,7 +22,7 @@ from impactopt.solvers.program import SolverResult, Status, Violation, max_viola
 from impactopt.transcription.clearance import ClearanceKey, SeparatingDirection
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import ContactError, contact_error
-from impactopt.transcription.initial_guess import carried_over
+from impactopt.transcription.initial_guess import warm_start
 from impactopt.transcription.mesh import Elements, MoreNodes, Shares
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -89,7 +89,7 @@ class Guess(Generic[Program]):
 
     @classmethod
     def mapped(cls, new: Program, old: Program, result: SolverResult, **more: Any) -> Guess[Program]:
-        """A program's result as the warm start of another one (`carried_over`)."""
+        """A program's result as the warm start of another one (`warm_start`)."""
         return cls(program=new, start=carried(new, old, result), **more)
 
 
@@ -310,13 +310,13 @@ def program_for(
 
 
 def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> SolverResult:
-    """Result of a program mapped to another one, see `carried_over`."""
+    """Result of a program mapped to another one, see `warm_start`."""
     if new is old:
         return result
-    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
+    x, y, z = warm_start(new, old, result.x, result.multipliers, result.bound_multipliers)
     return replace(result, x=x, multipliers=y, bound_multipliers=z)
 
 
 def start_of(new: Program, old: Program, x: Array) -> Array:
     """Variables (n,) of a program mapped to another one."""
-    return carried_over(new, old, x, np.zeros(old.program.m), np.zeros(old.layout.n))[0]
+    return warm_start(new, old, x, np.zeros(old.program.m), np.zeros(old.layout.n))[0]

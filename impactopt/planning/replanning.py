@@ -91,7 +91,7 @@ class ParametricProgram:
         except InputError:
             return None
         t.move_to(problem)
-        return t if t.program.same_numbers(self.program.program) else None
+        return t if t.program.same_parameters(self.program.program) else None
 
     def _built(self, problem: ImpactProblem, report: Callable[[str], None] | None = None) -> Transcription:
         s = self.solution
@@ -277,7 +277,7 @@ def _binding(family: ParametricProgram) -> tuple[Binding, ...]:
         if measure is not None and measure.over is not None:
             factor /= max(float(measure.over.evaluate(system.x)[0]), measure.least)
         if price > _MIN_PRICE:
-            out.append(Binding(row=origin.told(system.x, 0.0)[0], price=price / factor, unit=unit))
+            out.append(Binding(row=origin.describe(system.x, 0.0)[0], price=price / factor, unit=unit))
     free = program.x_lower < program.x_upper
     for j in np.flatnonzero(system.bounds * free):
         price = abs(float(system.z[j]))

@@ -169,10 +169,10 @@ class Solution(Solved):
         """
         if any(o.name not in self.objectives for o in self.problem.objectives):
             return np.nan
-        worth = sum(
+        total = sum(
             (-o.weight if o.cost else o.weight) * self.objectives[o.name] for o in self.problem.objectives
         )
-        return 100 * (self.result.objective + worth) / abs(worth) if worth else np.nan
+        return 100 * (self.result.objective + total) / abs(total) if total else np.nan
 
     @property
     def trajectory(self) -> Trajectory:

@@ -37,7 +37,7 @@ class Place:
         """Place without a time, whose text is its name."""
         return cls(name, name.replace("{", "{{").replace("}", "}}"))
 
-    def told(self, x: Array) -> str:
+    def describe(self, x: Array) -> str:
         """Text with the time at solver variables (n,)."""
         t = float(self.time.evaluate(x)[0]) if self.time is not None else np.nan
         return self.text.format(s=f"{t:.2f} s", ms=f"{1e3 * t:.0f} ms")
@@ -56,7 +56,7 @@ class Measure:
     over: Expression | None = None
     least: float = 1e-3
 
-    def told(self, x: Array, amount: float) -> str:
+    def describe(self, x: Array, amount: float) -> str:
         """Text for an amount, at solver variables (n,)."""
         by = max(float(self.over.evaluate(x)[0]), self.least) if self.over is not None else 1.0
         value = abs(amount * self.factor / by)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.files.output import replay_name
-from impactopt.robots.loads import SHARE, least_kept
+from impactopt.robots.loads import SHARE, margin_between_nodes
 from impactopt.solvers.program import MINOR
 
 __all__ = [
@@ -123,7 +123,7 @@ def _sole_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
         for phase in dict.fromkeys(name for by_phase in own for name in by_phase):
             of, half = "", -np.inf
             if phase in required:
-                of, half = f" (of {required[phase]:g})", 1e3 * least_kept(1e-3 * required[phase])
+                of, half = f" (of {required[phase]:g})", 1e3 * margin_between_nodes(1e-3 * required[phase])
             label = f"{sole} CoP margin [mm], {phase}{of}"
             least = np.where(free, 0.0, half) - TOLERANCE
             yield number_row(label, [by_phase.get(phase) for by_phase in own], 1, least=least)

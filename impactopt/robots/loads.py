@@ -13,14 +13,14 @@ from impactopt.robots.actuators import numbers_of
 from impactopt.robots.robot import Robot
 
 __all__ = [
-    "BEARS",
+    "MIN_LOAD_FRACTION",
     "SHARE",
     "DriveLoads",
     "cop_margin",
     "fading",
     "gear_torque",
-    "least_kept",
     "least_margins",
+    "margin_between_nodes",
     "motor_power",
     "motor_use",
     "shortfalls",
@@ -128,7 +128,7 @@ def _peak(values: Array, n: int) -> Array:
     return np.abs(values).max(axis=0) if len(values) else np.full(n, np.nan)
 
 
-BEARS = 0.02  # a sole with a smaller fraction of the weight counts as unloaded
+MIN_LOAD_FRACTION = 0.02  # a sole with a smaller fraction of the weight counts as unloaded
 ROUNDING = 0.01  # [mm, N]
 # Constraints hold at nodes. Between them a margin may fall to this share of its bound, or by so much [m].
 SHARE, FREE = 0.5, 1e-3
@@ -155,7 +155,7 @@ def cop_margin(robot: Robot, corners: Sequence[Array], wrench: Array) -> Array:
     for k, polygon in enumerate(corners):
         # centre of pressure times force: (-m_y, m_x)
         force, moment = wrench[:, k, 2], np.stack([-wrench[:, k, 4], wrench[:, k, 3]], axis=1)
-        lacking = np.maximum(BEARS * weight_of(robot) - force, 0.0)
+        lacking = np.maximum(MIN_LOAD_FRACTION * weight_of(robot) - force, 0.0)
         cop = (moment + lacking[:, None] * polygon.mean(axis=0)) / (force + lacking)[:, None]
         # distances (k, c) from the edges, along their inward normals
         edge = np.roll(polygon, -1, axis=0) - polygon
@@ -164,7 +164,7 @@ def cop_margin(robot: Robot, corners: Sequence[Array], wrench: Array) -> Array:
     return out
 
 
-def least_kept(asked: float) -> float:
+def margin_between_nodes(asked: float) -> float:
     """Least margin [m] between nodes if `asked` [m] is required at the nodes: half of it, or 1 mm less than
     it, whichever is smaller.
     """
@@ -216,7 +216,10 @@ def shortfalls(numbers: Mapping[str, Any]) -> list[str]:
     asked, found = numbers.get("sole_cop_margin_asked_mm") or {}, []
     for name, phases in (numbers.get("sole_cop_margin_mm") or {}).items():
         for phase, kept in phases.items():
-            if phase in asked and kept < (least := 1e3 * least_kept(1e-3 * asked[phase])) - ROUNDING:
+            if (
+                phase in asked
+                and kept < (least := 1e3 * margin_between_nodes(1e-3 * asked[phase])) - ROUNDING
+            ):
                 what = f"centre of pressure of the sole {name!r}, {phase}"
                 found.append((kept - least, f"{what}: {kept:.1f} mm kept of {asked[phase]:g} mm"))
     force = numbers.get("sole_force_asked_N") or 0.0

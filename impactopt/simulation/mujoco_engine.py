@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, check_choice, check_positive
-from impactopt.robots.loads import BEARS, weight_of
+from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
 from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import UnintendedContacts
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
@@ -312,7 +312,7 @@ class _Replay(MujocoRobot):
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STANDING_SPEED:
             return f"still moves at the end: base at {speed:.2f} m/s"
-        least = BEARS * weight_of(self.robot)
+        least = MIN_LOAD_FRACTION * weight_of(self.robot)
         normal, slip = simulation.sole_normal[-1], simulation.slip.max(axis=0)
         for name, force, slid in zip(simulation.soles, normal, slip, strict=True):
             if force < least:

@@ -265,7 +265,7 @@ class ContactProgram(ABC):
 
         anew : update the least durations of contact phases, too (`ContactParameters.update_parameters`).
 
-        All functions registered by `Builder.follow` are called. `StructuredProgram.same_numbers` tells
+        All functions registered by `Builder.follow` are called. `StructuredProgram.same_parameters` tells
         whether that has updated everything that depends on the problem.
         """
         self.problem = problem
@@ -280,7 +280,7 @@ class ContactProgram(ABC):
                 update(b)
         own = len(self._without_clearance.blocks)
         move_bodies(problem, self.blocks[own:], self.clearance_constraints)
-        self.program.take_numbers(self.layout, self.blocks, self.constraints)
+        self.program.update_parameters(self.layout, self.blocks, self.constraints)
 
     def with_lifted(self, x: Array) -> Array:
         """Variables (n,) with lifted ones set to the outputs of blocks that they equal; 0 for NaN and inf."""

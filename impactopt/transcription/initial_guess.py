@@ -181,7 +181,7 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
     return _finished(t, out)
 
 
-def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
+def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
     """Solution of an old program, mapped to one that differs: warm start of the solver.
 
     The new program may have more nodes or collocation elements, another collision model with duration, or
@@ -197,9 +197,10 @@ def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: 
     if isinstance(t, Transcription) and isinstance(old, Transcription):
         nodes = {"swing": (old.swing_nodes, t.swing_nodes)}
         nodes |= dict.fromkeys(("follow", "abort"), (old.follow_nodes, t.follow_nodes))
-        for course, old_course in zip((t.before, *t.after), (old.before, *old.after), strict=True):
+        for sequence, old_sequence in zip((t.before, *t.after), (old.before, *old.after), strict=True):
             nodes |= {
-                phase.kind: (old_course.stands[k].nodes, phase.nodes) for k, phase in course.stands.items()
+                phase.kind: (old_sequence.stands[k].nodes, phase.nodes)
+                for k, phase in sequence.stands.items()
             }
     new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
     for name, group in t.layout.groups.items():
@@ -296,9 +297,9 @@ def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
     x = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
     for phase, spline in ((t.swing, curve), *((follow, back) for follow in t.follows)):
         _write(t.builder, x, phase, spline)
-    for course in (t.before, *t.after):
-        for k, phase in course.stands.items():
-            b, T = course.builders[k], float(np.mean(phase.phase.duration))
+    for sequence in (t.before, *t.after):
+        for k, phase in sequence.stands.items():
+            b, T = sequence.builders[k], float(np.mean(phase.phase.duration))
             (start, end), at_rest = _ends(t.problem, b.coordinates, k), np.zeros(b.ny)
             values = quintic(start, at_rest, end, at_rest, T, phase.breaks)
             _write(b, x, phase, CubicSpline.fit(values, phase.breaks, at_rest, at_rest, T))

@@ -295,11 +295,11 @@ class ConstraintOrigin:
     def __str__(self) -> str:
         return _joined(self.term, self.place.name, self.component)
 
-    def told(self, x: Array, amount: float) -> tuple[str, str]:
+    def describe(self, x: Array, amount: float) -> tuple[str, str]:
         """Name of this constraint, and the amount of its violation in words, at solver variables x (n,)."""
-        by = f"by {amount:.3g}" if self.measure is None else self.measure.told(x, amount)
+        by = f"by {amount:.3g}" if self.measure is None else self.measure.describe(x, amount)
         component = self.component if self.whole is None else self.whole
-        return _joined(self.term, self.place.told(x), component), by
+        return _joined(self.term, self.place.describe(x), component), by
 
 
 def _joined(*parts: str) -> str:

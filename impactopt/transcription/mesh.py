@@ -19,7 +19,7 @@ from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, PositionLimit, TorqueLimit
-from impactopt.robots.loads import BEARS, cop_margin, fading, least_kept, weight_of
+from impactopt.robots.loads import MIN_LOAD_FRACTION, cop_margin, fading, margin_between_nodes, weight_of
 from impactopt.robots.tools import inside
 from impactopt.transcription.contact_guess import mass_at_contact, natural_durations
 from impactopt.transcription.plan import Piece, Plan, Trajectory, gear_share
@@ -118,12 +118,12 @@ def _soles_violated(problem: ImpactProblem, number: int, wrenches: Array) -> NDA
     the phase is not checked while it carries almost nothing.
     """
     robot, cone = problem.robot, problem.term(ContactWrenchCone)
-    least, standing = least_kept(cone.margin), problem.standing
+    least, standing = margin_between_nodes(cone.margin), problem.standing
     on, fades = np.flatnonzero(standing[number]), fading(standing)[number]
     soles, own = problem.soles, wrenches.reshape(len(wrenches), -1, 6)
     violated = (cop_margin(robot, [soles[k].polygon for k in on], own[:, on]) < least).any(axis=1)
     for k in on:
-        loaded = own[:, k, 2] >= (BEARS * weight_of(robot) if fades[k] else -np.inf)
+        loaded = own[:, k, 2] >= (MIN_LOAD_FRACTION * weight_of(robot) if fades[k] else -np.inf)
         if not fades[k]:
             violated |= own[:, k, 2] < _MARGIN_LOSS * cone.minimum_force
         friction = _FRICTION_EXCESS * cone.friction

@@ -22,7 +22,14 @@ from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.stances import places_of_soles
 from impactopt.problem.terms import ContactWrenchCone, GearLoad
-from impactopt.robots.loads import BEARS, DriveLoads, cop_margin, gear_torque, least_margins, weight_of
+from impactopt.robots.loads import (
+    MIN_LOAD_FRACTION,
+    DriveLoads,
+    cop_margin,
+    gear_torque,
+    least_margins,
+    weight_of,
+)
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
@@ -84,7 +91,7 @@ def complete_reference(
     n = len(y)
     q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
     torque, corrected = np.zeros((n, robot.n)), np.zeros((n, 6 * len(c.legs)))
-    cost = _correction_costs(c, wrench, BEARS * weight_of(robot))
+    cost = _correction_costs(c, wrench, MIN_LOAD_FRACTION * weight_of(robot))
     # a robot at rest repeats its state over many instants: each distinct state is computed once
     state = np.hstack([y, yd, ydd, wrench])
     changes = np.append(True, (state[1:] != state[:-1]).any(axis=1))[:n]

@@ -398,7 +398,7 @@ class StructuredProgram:
         self._curvature.eliminate_zeros()
         self.seconds = 0.0  # spent on evaluations
 
-    def take_numbers(self, layout: Layout, blocks: Sequence[Block], constraints: Constraints) -> None:
+    def update_parameters(self, layout: Layout, blocks: Sequence[Block], constraints: Constraints) -> None:
         """Take over bounds, constants and parameters of another program of the same structure.
 
         Its blocks and constraints correspond to the first ones of this program; the rest is kept. Variables,
@@ -416,15 +416,15 @@ class StructuredProgram:
         self._affine_const = np.concatenate([constants, self._affine_const[len(constants) :]])
         self._at = None
 
-    def same_numbers(self, other: StructuredProgram) -> bool:
+    def same_parameters(self, other: StructuredProgram) -> bool:
         """True if bounds, constants, coefficients and parameters equal another program's, up to rounding."""
-        mine, its = self._numbers(), other._numbers()
+        mine, its = self._parameters(), other._parameters()
         return len(mine) == len(its) and all(
             a.shape == b.shape and np.allclose(a, b, rtol=1e-12, atol=1e-12)
             for a, b in zip(mine, its, strict=True)
         )
 
-    def _numbers(self) -> list[Array]:
+    def _parameters(self) -> list[Array]:
         matrices = self._lift, self._affine_matrix, self._Q
         return [
             *(self.x_lower, self.x_upper, self.g_lower, self.g_upper),
@@ -508,7 +508,7 @@ class StructuredProgram:
 
     def describe_violation(self, i: int, x: Array, amount: float) -> tuple[str, str]:
         """Name of constraint i with its time at x, and the amount of its violation in words."""
-        return self.origins[i].told(x, amount)
+        return self.origins[i].describe(x, amount)
 
     def variable_name(self, j: int) -> str:
         return self.layout.name(j)

@@ -218,7 +218,7 @@ class Transcription(ContactProgram):
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         return [spot for follow in self.follows for spot in follow.spots()]
 
-    def torque_courses(self) -> list[TorqueProfile]:
+    def torque_profiles(self) -> list[TorqueProfile]:
         """Torques over limit of all motions; the program must have them as variables."""
         return torque_profiles(self.builder, self.swing, self.follows, self.torques)
 
@@ -373,16 +373,16 @@ class Transcription(ContactProgram):
         return [*found, determined(Turn.RATE, self.u0.index(0))]
 
     # ------------------------------------------------------------------ solution
-    def worth(self, x: Array) -> float:
+    def objective_sum(self, x: Array) -> float:
         """Weighted sum of the objectives [N s] at solver variables x (n,), without prices."""
         return sum((-o.weight if o.cost else o.weight) * q.evaluate(x) for o, q in self.objectives)
 
     def price_shares(self, x: Array) -> tuple[float, float]:
         """Prices of the motion over the objectives' sum, at solver variables x (n,): all, and style only."""
-        worth = self.worth(x)
-        if not worth:
+        total = self.objective_sum(x)
+        if not total:
             return np.inf, np.inf
-        return (self.program.objective(x) + worth) / abs(worth), self._style.evaluate(x) / abs(worth)
+        return (self.program.objective(x) + total) / abs(total), self._style.evaluate(x) / abs(total)
 
     def body_states(self, x: Array) -> list[BodyState]:
         plan, found = self.decode(x), self.swing_spots()

@@ -178,17 +178,17 @@ def test_a_point_that_is_out_of_time_is_told_in_millimetres(arm_transcription: T
     ],
 )
 def test_measures(measure: Measure, amount: float, text: str) -> None:
-    assert measure.told(np.zeros(0), amount) == text
+    assert measure.describe(np.zeros(0), amount) == text
 
 
 def test_a_measure_over_an_expression_and_a_place_with_a_time() -> None:
     layout = Layout()
     force, time = layout.add("force", 1, 1, scale=100.0), layout.add("time", 1, 1)
     x = np.array([2.0, 0.5])
-    assert Measure("mm", 1e3, "outside", force[0]).told(x, 1.0) == "5 mm outside"
-    assert Measure("mm", 1e3, "outside", force[0], 400.0).told(x, 1.0) == "2.5 mm outside"
-    assert Place("p", "{ms} after contact", time[0] * 0.1).told(x) == "50 ms after contact"
-    assert Place.plain("a {b}").told(x) == "a {b}"
+    assert Measure("mm", 1e3, "outside", force[0]).describe(x, 1.0) == "5 mm outside"
+    assert Measure("mm", 1e3, "outside", force[0], 400.0).describe(x, 1.0) == "2.5 mm outside"
+    assert Place("p", "{ms} after contact", time[0] * 0.1).describe(x) == "50 ms after contact"
+    assert Place.plain("a {b}").describe(x) == "a {b}"
     assert [m.unit for m in along(["base x", "base roll", "elbow", "left sole z"], "off")] == [
         "mm",
         "deg",

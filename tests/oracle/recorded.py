@@ -13,7 +13,7 @@ from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.terms import ContactWrenchCone
-from impactopt.robots.loads import SHARE, cop_margin, least_kept
+from impactopt.robots.loads import SHARE, cop_margin, margin_between_nodes
 from oracle.motions import Way
 from oracle.program import Program
 from oracle.stances import fading_soles
@@ -219,7 +219,7 @@ def _balanced(
         corners = [leg.sole.polygon for leg, *_ in robot.soles if leg.sole is not None]
         own, cone = wrenches.reshape(-1, 6)[: robot.standing], p.problem.term(ContactWrenchCone)
         kept = float(cop_margin(robot.robot, corners, own[None]).min())
-        yield "margin of a sole's centre of pressure", least_kept(cone.margin) - kept
+        yield "margin of a sole's centre of pressure", margin_between_nodes(cone.margin) - kept
         fades = fading_soles(p.problem, way.number)
         bears = [k for k in range(robot.standing) if robot.soles[k][0].name not in fades]
         if bears:

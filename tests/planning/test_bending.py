@@ -153,9 +153,9 @@ def test_programs_follow_their_problem(arm: Solution, more: dict[str, Any]) -> N
         law=dataclasses.replace(problem.law, stiffness=3e5),
     )
     moving, whole = program_on(problem, arm.nodes, (), ()), program_on(other, arm.nodes, (), ())
-    assert not moving.program.same_numbers(whole.program)
+    assert not moving.program.same_parameters(whole.program)
     moving.move_to(other)
-    assert moving.program.same_numbers(whole.program)
+    assert moving.program.same_parameters(whole.program)
 
 
 class _OwnTerm(Slide):

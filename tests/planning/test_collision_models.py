@@ -23,7 +23,7 @@ from impactopt.planning.solution import ModelError
 from impactopt.problem.problem import COLLISIONS, ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.transcription.initial_guess import carried_over, strike_iterate
+from impactopt.transcription.initial_guess import strike_iterate, warm_start
 from impactopt.transcription.mesh import contact_elements, guessed_shares, place_of
 from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
@@ -53,7 +53,7 @@ def planned(problem: ImpactProblem) -> tuple[StrikeTranscription, PlannedStrike]
             return t, t.decode(result.x)
         old, elements = t, contact_elements(problem, shares)
         t = StrikeTranscription(problem, t.coordinates, t.functions, elements, shares)
-        x = carried_over(t, old, result.x, result.multipliers, result.bound_multipliers)[0]
+        x = warm_start(t, old, result.x, result.multipliers, result.bound_multipliers)[0]
     pytest.fail("the shares of the phases do not settle")
 
 

@@ -31,7 +31,7 @@ from impactopt.simulation import (
     simulate_pinocchio,
 )
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.transcription.initial_guess import carried_over, first_iterate
+from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.transcription import Transcription
@@ -218,7 +218,7 @@ def test_nodes_are_added_in_phases_beside_the_one_with_the_blow(plan: Plan, prog
     finer = changed_nodes(program, more)
     names = set(finer.layout.groups)
     assert finer.program.n > program.program.n and names == set(program.layout.groups)
-    x = carried_over(finer, program, first_iterate(program), *no_multipliers(program))[0]
+    x = warm_start(finer, program, first_iterate(program), *no_multipliers(program))[0]
     assert np.abs(finer.decode(x).before[0].spline.control).max() > 0.1
 
 

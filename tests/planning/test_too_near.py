@@ -20,7 +20,7 @@ from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.solve import PlanSolver
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status, max_violation
-from impactopt.transcription.initial_guess import carried_over
+from impactopt.transcription.initial_guess import warm_start
 from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
         else:
             functions = block_functions(problem, problem.coordinates)
             finer = Transcription(problem, problem.coordinates, functions, violated.nodes)
-            there, _, _ = carried_over(finer, t, free.result.x, np.zeros(t.program.m), np.zeros(t.layout.n))
+            there, _, _ = warm_start(finer, t, free.result.x, np.zeros(t.program.m), np.zeros(t.layout.n))
             rows = Watch(finer, margins, there).constraints()
             known = set(node_placements(t, free.result.x).names)
             assert any(row.place not in known for row in rows)

@@ -228,9 +228,9 @@ def test_a_program_with_such_rows_takes_the_numbers_of_another_problem(
         for p in (problem, other)
     )
     assert moving.program.m > bare.program.m
-    assert not moving.program.same_numbers(whole.program)
+    assert not moving.program.same_parameters(whole.program)
     moving.move_to(other)
-    assert moving.program.same_numbers(whole.program)
+    assert moving.program.same_parameters(whole.program)
 
 
 def without(t: Transcription) -> Transcription:

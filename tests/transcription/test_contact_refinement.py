@@ -29,7 +29,7 @@ from impactopt.transcription.contact_refinement import (
     refined_elements,
     same_places,
 )
-from impactopt.transcription.initial_guess import carried_over, first_iterate
+from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.mesh import Elements, contact_elements, contact_mesh, halved
 from impactopt.transcription.transcription import Transcription
 
@@ -194,7 +194,7 @@ def test_finer_elements_start_where_the_old_ones_ended(biped_plan: Planned) -> N
     new = Transcription(
         old.problem, old.coordinates, old.functions, old.nodes, halved(contact_elements(old.problem))
     )
-    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
+    x, y, z = warm_start(new, old, result.x, result.multipliers, result.bound_multipliers)
     g = new.program.constraints(x)
     assert np.maximum(new.program.g_lower - g, g - new.program.g_upper).max() < 0.2
     pairs = same_places(new.hit.stages, old.hit.stages)
@@ -216,7 +216,7 @@ def test_the_old_contact_is_a_warm_start(transcription: Transcription) -> None:
     t = changed(transcription, collision_elements=((0.25,) * 4, (0.25,) * 4))
     first = solve_ipm(t.program, first_iterate(t))
     new = Transcription(t.problem, t.coordinates, t.functions, elements=halved(t.hit.elements))
-    x, y, z = carried_over(new, t, first.x, first.multipliers, first.bound_multipliers)
+    x, y, z = warm_start(new, t, first.x, first.multipliers, first.bound_multipliers)
     again = solve_ipm(new.program, x, multipliers=y, bound_multipliers=z)
     assert again.status is Status.SOLVED and again.iterations < first.iterations
     assert again.objective == pytest.approx(first.objective, rel=0.02)

@@ -46,7 +46,7 @@ from impactopt.simulation.result import distance_inside
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.program import Status
 from impactopt.transcription import mesh as between
-from impactopt.transcription.initial_guess import carried_over, first_iterate
+from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.transcription.plan import Plan, complete_reference
 from impactopt.transcription.transcription import Transcription
@@ -175,7 +175,7 @@ def test_a_program_with_more_nodes_starts_where_the_old_one_ended(biped_plan: Pl
     new = finer(old)
     assert len(new.swing_nodes) == len(old.swing_nodes) + 2
     assert len(new.follow_nodes) == len(old.follow_nodes) + 1
-    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
+    x, y, z = warm_start(new, old, result.x, result.multipliers, result.bound_multipliers)
     plan = new.decode(x)
     np.testing.assert_array_equal(plan.swing.control, biped_plan.plan.swing.control)
     np.testing.assert_array_equal(plan.follow.control, biped_plan.plan.follow.control)
@@ -200,7 +200,7 @@ def test_the_old_solution_is_a_warm_start(arm_plan: Planned) -> None:
     old = arm_plan.transcription
     first = solve_ipm(old.program, arm_plan.result.x)
     new = finer(old)
-    x, y, z = carried_over(new, old, first.x, first.multipliers, first.bound_multipliers)
+    x, y, z = warm_start(new, old, first.x, first.multipliers, first.bound_multipliers)
     again = solve_ipm(new.program, x, multipliers=y, bound_multipliers=z)
     assert again.status is Status.SOLVED
     assert again.objective == pytest.approx(first.objective, rel=0.02)
@@ -236,7 +236,7 @@ def check_carried_over(old: Transcription) -> None:
     x = old.with_lifted(first_iterate(old) + 0.02 * rng.standard_normal(old.program.n))
     y, z = rng.standard_normal(old.program.m), rng.standard_normal(old.program.n)
     x = np.clip(x, old.layout.lower, old.layout.upper)  # as iterates are; what is lifted may be off by then
-    there, of_rows, of_bounds = carried_over(new, old, x, y, z)
+    there, of_rows, of_bounds = warm_start(new, old, x, y, z)
     places = {"swing": (old.swing_nodes, new.swing_nodes)}
     places |= dict.fromkeys(("follow", "abort"), (old.follow_nodes, new.follow_nodes))
     lifted = {group.name for group, _ in old.builder.lifted}
@@ -279,7 +279,7 @@ def test_more_nodes_go_together_with(arm_transcription: Transcription, name: str
     first = solve_ipm(old.program, first_iterate(old))
     assert first.status is Status.SOLVED
     new = finer(old)
-    x, y, z = carried_over(new, old, first.x, first.multipliers, first.bound_multipliers)
+    x, y, z = warm_start(new, old, first.x, first.multipliers, first.bound_multipliers)
     again = solve_ipm(new.program, x, multipliers=y, bound_multipliers=z)
     assert again.status is Status.SOLVED and again.iterations < first.iterations
     assert again.objective == pytest.approx(first.objective, rel=0.02)

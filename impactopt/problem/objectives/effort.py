@@ -32,7 +32,7 @@ class Effort(Objective):
 
     def quantity(self, program: Any) -> Any:
         """Trapezoidal sum of T sum(tau^2), which is a lifted variable at each node."""
-        swing, follow = program.torque_courses()[:2]
+        swing, follow = program.torque_profiles()[:2]
         slots = [[tau, swing.T] for tau in swing.torques[1:]] + [[tau, follow.T] for tau in follow.torques]
         at = program.add_block("effort", slots, np.zeros(0))
         places = [*map(swing.place_at, swing.nodes[1:]), *map(follow.place_at, follow.nodes)]

@@ -36,11 +36,14 @@ class TorqueRate(Term):
         joints = np.flatnonzero(np.isfinite(limit))
         rate = limit[joints] / program.robot.torque_limit[joints]
         labels = [names[j] for j in joints]
-        for course in program.torque_courses():
-            steps = zip(pairwise(course.nodes), pairwise(course.torques), strict=True)
+        for profile in program.torque_profiles():
+            steps = zip(pairwise(profile.nodes), pairwise(profile.torques), strict=True)
             for (a, b), (one, two) in steps:
-                step, most = (two - one)[joints], course.T.apply(np.ones((len(joints), 1))) * (rate * (b - a))
-                place = course.place_at((a + b) / 2)
+                step, most = (
+                    (two - one)[joints],
+                    profile.T.apply(np.ones((len(joints), 1))) * (rate * (b - a)),
+                )
+                place = profile.place_at((a + b) / 2)
                 place = replace(place, name=f"{place.name}, from {100 * a:.1f} %")
                 for word, sign in (("rising", 1.0), ("falling", -1.0)):
                     program.constraints.add(
@@ -49,5 +52,5 @@ class TorqueRate(Term):
                         components=[f"{label} {word}" for label in labels],
                         affine=step * sign - most,
                         upper=0,
-                        measure=[Measure("%", 100 / r, "over its limit", course.T * (b - a)) for r in rate],
+                        measure=[Measure("%", 100 / r, "over its limit", profile.T * (b - a)) for r in rate],
                     )

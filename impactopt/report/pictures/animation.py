@@ -23,7 +23,7 @@ from impactopt.files.output import write_file
 from impactopt.files.replay import Replay
 from impactopt.kinematics.support import corners_at
 from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
-from impactopt.robots.loads import BEARS, weight_of
+from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
 from impactopt.simulation import scene_of
 from impactopt.simulation.result import centre_of_pressure
 
@@ -98,7 +98,7 @@ class _Drawing:
             corners_at(sole.polygon, frame) for sole, frame in zip(self.robot.soles, frames, strict=True)
         ]
         cops, ground = sim.sole_cop()[k], sim.sole_ground[k]
-        loaded = sim.sole_normal[k] >= BEARS * weight_of(self.robot)
+        loaded = sim.sole_normal[k] >= MIN_LOAD_FRACTION * weight_of(self.robot)
         feet = [
             (np.array([*cop, 0.0]), self.per_newton * wrench[:3])
             for cop, wrench, is_loaded in zip(cops, ground, loaded, strict=True)

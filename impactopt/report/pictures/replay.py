@@ -25,7 +25,7 @@ from impactopt.report.pictures.style import (
     styled,
     title,
 )
-from impactopt.robots.loads import BEARS
+from impactopt.robots.loads import MIN_LOAD_FRACTION
 
 SOLE_COLOURS = (BLUE, VERMILION)
 PHASE_COLOURS = (ORANGE, BLACK, GREEN)
@@ -94,7 +94,7 @@ def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
     normal = a["replayed_sole_ground"][:, :, 2]
     for k in range(normal.shape[1]):
         # the median is the weight, because most of the motion is slow
-        loaded = normal[:, k] >= BEARS * np.median(normal.sum(axis=1))
+        loaded = normal[:, k] >= MIN_LOAD_FRACTION * np.median(normal.sum(axis=1))
         for which, colour in enumerate(PHASE_COLOURS):
             keep = loaded & (phase == which)
             points: Array = zmp(a["replayed_sole_ground"][keep, k])

@@ -1,22 +1,22 @@
-/* Signed distances of convex bodies by their rounded support functions; bodies/separation.py says what they are,
- * bodies/separation_numpy.py does the same without a compiler. */
+/* Signed distances of convex bodies by rounded support functions. Theory: bodies/separation.py. The same without a
+ * compiler: bodies/separation_numpy.py. */
 #include <math.h>
 #include <stdint.h>
 
 #define EXPORT __attribute__((visibility("default")))
-#define MOST_JOINTS 64
-#define FAR_DOWN 36.0 /* exponents below the largest that count for nothing */
+#define MAX_JOINTS 64
+#define MAX_EXPONENT 36.0 /* exp(-36) = 2e-16: vertices with larger exponents do not count */
 
-/* of one direction: rounded support, mean and covariance of the points that carry it */
+/* Rounded support in one direction; mean and covariance of the vertices, weighted by their share of it. */
 typedef struct { double h, mean[3], cov[6]; } Support;
 
-/* Vertices stand in blocks of EIGHT: their x, their y, their z; the last block is filled up with copies. */
+/* Vertices are stored in blocks of EIGHT: eight x, eight y, eight z. The last block is padded with copies. */
 #define EIGHT 8
 #define BLOCK (3 * EIGHT)
 #define COORDINATE(p, i, k) (p)[BLOCK * ((i) / EIGHT) + EIGHT * (k) + (i) % EIGHT]
 
-/* The largest of n vertices' heights in direction u; all of them in far. Copies count for nothing there. */
-static inline double heights(int64_t n, const double *restrict p, const double *u, double *restrict far) {
+/* Heights of n vertices in direction u, written to far; returns the largest. */
+static inline double support_heights(int64_t n, const double *restrict p, const double *u, double *restrict far) {
     double most[EIGHT], top;
     const double x = u[0], y = u[1], z = u[2];
     for (int j = 0; j < EIGHT; ++j) most[j] = -1e300;
@@ -31,8 +31,8 @@ static inline double heights(int64_t n, const double *restrict p, const double *
     return top;
 }
 
-/* exp(x) of x <= 0 to an ulp or two, without branches, so that loops over it are vectorized: x = n log 2 + r, a polynomial
- * in r, and n into the exponent's bits by way of a sum whose last bit is 1. */
+/* exp(x) for x <= 0 within 2 ulp, without branches, so that loops over it are vectorized: x = n log 2 + r, Taylor's
+ * polynomial in r, and n added to the exponent's bits. Adding 1.5 * 2^52 rounds to the integer n. */
 static inline double decay(double x) {
     const double whole = 0x1.8p52, c = x < -700.0 ? -700.0 : x, shifted = c * 0x1.71547652b82fep0 + whole, n = shifted - whole;
     const double r = (c - n * 0x1.62e42fefa39efp-1) - n * 0x1.abc9e3b39803fp-56;
@@ -45,15 +45,15 @@ static inline double decay(double x) {
     return e * out.d;
 }
 
-/* of n vertices in direction u; sharp: 1 / rounding */
+/* Support of n vertices in direction u.  sharp [1/m]: 1 / rounding. */
 static void support(int64_t n, const double *restrict p, const double *u, double sharp, double *restrict far,
                     Support *out) {
-    const double most = heights(n, p, u, far), least = most - FAR_DOWN / sharp;
+    const double most = support_heights(n, p, u, far), least = most - MAX_EXPONENT / sharp;
     double s[10][EIGHT] = {{0}}, t[10] = {0};
     int64_t top = 0;
     while (far[top] != most) ++top;
     const double ox = COORDINATE(p, top, 0), oy = COORDINATE(p, top, 1), oz = COORDINATE(p, top, 2);
-    for (int64_t i = n; i % EIGHT; ++i) far[i] = -1e300; /* copies */
+    for (int64_t i = n; i % EIGHT; ++i) far[i] = -1e300; /* copies do not count */
     for (int64_t i = 0; i < n; i += EIGHT, p += BLOCK, far += EIGHT) {
         double near = far[0];
         for (int j = 1; j < EIGHT; ++j) near = far[j] > near ? far[j] : near;
@@ -90,10 +90,10 @@ static inline void symmetric(const double *c, const double *x, double *y) {
     y[2] = c[2] * x[0] + c[4] * x[1] + c[5] * x[2];
 }
 
-/* both bodies in one direction u from the second to the first, in the second's frame */
+/* Separation of two bodies along a direction u from the second to the first, in the second's frame. */
 typedef struct {
-    double s, w[3], point[3], cov_one[6], cov[6]; /* separation, its slope, the first's point, covariances */
-    double basis[6], bend[3], slope[2];           /* tangents; -Hessian on them (xx, xy, yy), slope on them */
+    double s, w[3], point[3], cov_one[6], cov[6]; /* separation, its gradient by u, support point of the first, covariances */
+    double basis[6], neg_hessian[3], slope[2];           /* tangents of the sphere at u; minus Hessian (xx, xy, yy) and gradient on them */
     double u[3];
 } Side; /* SIDE numbers */
 
@@ -126,44 +126,44 @@ static void side(const double *R, const double *t, int64_t n1, const double *p1,
     cross(u, x, y);
     const double along = dot(u, out->w);
     symmetric(out->cov, x, turned);
-    out->bend[0] = sharp * dot(turned, x) + along; out->bend[1] = sharp * dot(turned, y);
+    out->neg_hessian[0] = sharp * dot(turned, x) + along; out->neg_hessian[1] = sharp * dot(turned, y);
     symmetric(out->cov, y, turned);
-    out->bend[2] = sharp * dot(turned, y) + along;
+    out->neg_hessian[2] = sharp * dot(turned, y) + along;
     out->slope[0] = dot(x, out->w); out->slope[1] = dot(y, out->w);
 }
 
-/* make bend positive definite: its inverse (xx, xy, yy) */
-static void inverse(const double *bend, double floor, double *out) {
-    double mean = 0.5 * (bend[0] + bend[2]), diff = 0.5 * (bend[0] - bend[2]);
-    double radius = sqrt(diff * diff + bend[1] * bend[1]), low = mean - radius, more = low < floor ? floor - low : 0.0;
-    double a = bend[0] + more, c = bend[2] + more, b = bend[1], d = a * c - b * b;
+/* Inverse (xx, xy, yy) of minus the Hessian, shifted so that its least eigenvalue is at least `floor`. */
+static void inverse(const double *neg_hessian, double floor, double *out) {
+    double mean = 0.5 * (neg_hessian[0] + neg_hessian[2]), diff = 0.5 * (neg_hessian[0] - neg_hessian[2]);
+    double radius = sqrt(diff * diff + neg_hessian[1] * neg_hessian[1]), low = mean - radius, more = low < floor ? floor - low : 0.0;
+    double a = neg_hessian[0] + more, c = neg_hessian[2] + more, b = neg_hessian[1], d = a * c - b * b;
     out[0] = c / d; out[1] = -b / d; out[2] = a / d;
 }
 
-/* Where a stationary direction is no maximum, as bodies are in each other: a step along the way that it curves up.
- * Returns whether there is one. */
-static int off_saddle(const Side *at, double *step) {
-    double mean = 0.5 * (at->bend[0] + at->bend[2]), diff = 0.5 * (at->bend[0] - at->bend[2]);
-    double radius = sqrt(diff * diff + at->bend[1] * at->bend[1]), low = mean - radius;
+/* Step off a stationary direction that is no maximum, which occurs if bodies penetrate: along the direction of
+ * positive curvature. Returns 0 at a maximum. */
+static int leave_saddle(const Side *at, double *step) {
+    double mean = 0.5 * (at->neg_hessian[0] + at->neg_hessian[2]), diff = 0.5 * (at->neg_hessian[0] - at->neg_hessian[2]);
+    double radius = sqrt(diff * diff + at->neg_hessian[1] * at->neg_hessian[1]), low = mean - radius;
     if (low > -1e-9) return 0;
-    double a = at->bend[1], b = low - at->bend[0];
+    double a = at->neg_hessian[1], b = low - at->neg_hessian[0];
     if (fabs(a) + fabs(b) < 1e-14) { a = 1.0; b = 0.0; }
     double length = sqrt(a * a + b * b), way = a * at->slope[0] + b * at->slope[1] < 0.0 ? -0.1 : 0.1;
     step[0] = way * a / length; step[1] = way * b / length;
     return 1;
 }
 
-/* The largest separation near direction u (3), which moves there: Newton's method on the sphere. */
+/* Local maximum of the separation over directions, from u (3) on, which moves there: Newton's method on the sphere. */
 static void separate(const double *R, const double *t, int64_t n1, const double *p1, int64_t n2, const double *p2,
                     double *u, double sharp, double *far, Side *at) {
     side(R, t, n1, p1, n2, p2, u, sharp, far, at);
     for (int taken = 0; taken < 100; ++taken) {
         double inv[3], step[2], next[3];
-        inverse(at->bend, 1e-4, inv);
+        inverse(at->neg_hessian, 1e-4, inv);
         step[0] = inv[0] * at->slope[0] + inv[1] * at->slope[1];
         step[1] = inv[1] * at->slope[0] + inv[2] * at->slope[1];
         double size = sqrt(step[0] * step[0] + step[1] * step[1]), gain = step[0] * at->slope[0] + step[1] * at->slope[1];
-        if (size < 1e-9 && off_saddle(at, step)) { size = 0.1; gain = 0.0; }
+        if (size < 1e-9 && leave_saddle(at, step)) { size = 0.1; gain = 0.0; }
         if (size < 1e-11) break;
         double part = size > 0.5 ? 0.5 / size : 1.0;
         Side found;
@@ -178,11 +178,11 @@ static void separate(const double *R, const double *t, int64_t n1, const double 
         if (!moved) break;
         for (int i = 0; i < 3; ++i) u[i] = next[i];
         *at = found;
-        if (part * size < 1e-7 && !off_saddle(at, step)) break;
+        if (part * size < 1e-7 && !leave_saddle(at, step)) break;
     }
 }
 
-/* The chain's frames: rotation R (9), translation t (3) of the end; axes and origins (n, 3) of joints. */
+/* Forward kinematics of a chain: rotation R (9) and translation t (3) of its end; axes and origins (n, 3) of its joints. */
 static void chain(int64_t n, const double *z, const double *p, double *R, double *t, double *axis, double *origin) {
     const double *turns = p + 12 * (n + 1);
     for (int i = 0; i < 9; ++i) R[i] = p[i];
@@ -206,17 +206,19 @@ static void chain(int64_t n, const double *z, const double *p, double *R, double
     }
 }
 
-/* Separations less reach of count pairs, whose chains have n joints.
- * z (count, n + 3); p (count, 13 n + 13): chain, then reach.  hulls (count, 4): first point and number of points of
- * both, firsts multiples of EIGHT; points: blocks.  u (count, 3): directions to begin at, moved where derivatives are asked for.
- * known (count, SIDE), seen (count, n + 3): what was found last, and at which z.  far: room for the largest hull.
- * what 0: values (count,); 1: gradients (count, n + 3); 2: lam times Hessians, lower triangles by columns. */
+/* Separation minus required distance of `count` pairs, each along a chain of n joints.
+ * z (count, n + 3): base translation, joint angles.  p (count, 13 n + 13): chain, required distance.
+ * hulls (count, 4): first vertex and number of vertices of both bodies; first vertices are multiples of EIGHT.
+ * points: vertices in blocks.  u (count, 3): initial directions, updated if derivatives are requested.
+ * known (count, SIDE), seen (count, n + 3): last results, and the z that they belong to.
+ * far: work memory for the largest hull.
+ * what: 0 values (count,); 1 gradients (count, n + 3); 2 lam times Hessians, lower triangles by columns. */
 EXPORT void separation(int64_t count, int64_t n, const double *z, const double *p, const int64_t *hulls,
-                          const double *points, double sharp, double *u, double *known, double *seen, double *far, int64_t what, const double *lam,
-                          double *out) {
+                          const double *points, double sharp, double *u, double *known, double *seen, double *far,
+                          int64_t what, const double *lam, double *out) {
     const int64_t size = n + 3, width = 13 * n + 13;
     for (int64_t row = 0; row < count; ++row) {
-        double R[9], t[3], axis[3 * MOST_JOINTS], origin[3 * MOST_JOINTS];
+        double R[9], t[3], axis[3 * MAX_JOINTS], origin[3 * MAX_JOINTS];
         const double *mine = p + row * width, *turns = mine + 12 * (n + 1);
         const int64_t *h = hulls + 4 * row;
         double way[3], *last = seen + row * size;
@@ -236,7 +238,7 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
         }
         if (what) for (int i = 0; i < 3; ++i) u[3 * row + i] = way[i];
         if (what == 0) { out[row] = at.s - mine[13 * n + 12]; continue; }
-        double arm[3 * MOST_JOINTS];
+        double arm[3 * MAX_JOINTS];
         for (int64_t k = 0; k < n; ++k) {
             double from[3] = {at.point[0] - origin[3 * k], at.point[1] - origin[3 * k + 1], at.point[2] - origin[3 * k + 2]};
             if (turns[k] > 0.5) cross(axis + 3 * k, from, arm + 3 * k);
@@ -251,9 +253,9 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
         const double by = lam[row];
         double *H = out + row * size * (size + 1) / 2;
         if (by == 0.0) { for (int64_t i = 0; i < size * (size + 1) / 2; ++i) H[i] = 0.0; continue; }
-        /* what a variable turns the direction by: cross (2,) of slopes; f = u x axis, C f */
-        double f[3 * MOST_JOINTS], Cf[3 * MOST_JOINTS], mixed[2 * (MOST_JOINTS + 3)], spread[2 * (MOST_JOINTS + 3)], inv[3];
-        inverse(at.bend, 1e-4, inv);
+        /* mixed (2,): derivative of the gradient on the tangents by each variable; f = u x axis, C f */
+        double f[3 * MAX_JOINTS], Cf[3 * MAX_JOINTS], mixed[2 * (MAX_JOINTS + 3)], spread[2 * (MAX_JOINTS + 3)], inv[3];
+        inverse(at.neg_hessian, 1e-4, inv);
         for (int i = 0; i < 3; ++i) { mixed[2 * i] = at.basis[i]; mixed[2 * i + 1] = at.basis[3 + i]; }
         for (int64_t k = 0; k < n; ++k) {
             double m[3];
@@ -275,11 +277,12 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
     }
 }
 
-/* ---- which pairs are near: places of joints (K, J, 12) and of the world's bodies (K, W, 12), rotation by rows, translation.
- * pairs (P, 2): joint, and joint or -1 - the world's body.  balls (P, 8): centre and radius of both; of the world's: half
- * sides and radius.  hulls (P, 4).  extra (P,): inflation of the second.  present (K, W).
- * ways (K, P, 3): directions, which move; zero: none known.  gaps (K, P): lower bounds of separations, or the separations
- * where those are below within.  Returns the number of pairs below `within`, in near (2 each), at most `most`. */
+/* ---- search for near pairs. Placements of joints (K, J, 12) and of the world's bodies (K, W, 12): rotation by rows,
+ * translation.  pairs (P, 2): joint, and joint or -1 - the world's body.  balls (P, 8): centre and radius of both; of a
+ * body of the world half sides and radius.  hulls (P, 4).  extra (P,): inflation of the second body.  present (K, W).
+ * ways (K, P, 3): directions, updated; zero if unknown.  gaps (K, P): separations, or lower bounds of those that are not
+ * below `within`.  Returns the number of pairs below `within`; their indices are in near (2 each), at most `most`. */
+/* Placement of a in b's frame. */
 static void relative(const double *a, const double *b, double *R) {
     double d[3] = {a[9] - b[9], a[10] - b[10], a[11] - b[11]};
     for (int i = 0; i < 3; ++i) {
@@ -331,7 +334,7 @@ EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, const double *jo
         const int64_t *h = hulls + 4 * i;
         double down[3] = {-u[0], -u[1], -u[2]}, local[3];
         times_t(R, down, local);
-        double rough = dot(u, R + 9) - heights(h[1], points + 3 * h[0], local, far) - heights(h[3], points + 3 * h[2], u, far) - extra[i];
+        double rough = dot(u, R + 9) - support_heights(h[1], points + 3 * h[0], local, far) - support_heights(h[3], points + 3 * h[2], u, far) - extra[i];
         rough -= 10.0 / sharp;
         if (rough > within) { *gap = rough; continue; }
         Side at;
@@ -341,8 +344,8 @@ EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, const double *jo
     }
     return found;
 }
-/* Whether bodies may have met on the way between two sets of places: for pairs that are apart at both, by how far the
- * first's ball moves as the second sees it.  Returns the number of pairs that may have, in met (2 each). */
+/* Pairs that may have collided between two sets of placements: they are separated at both, but the ball of the first
+ * moved farther, relative to the second, than both gaps together.  Returns their number; indices are in met (2 each). */
 EXPORT int64_t may_meet(int64_t K, int64_t J, int64_t W, int64_t P, const double *joints0, const double *world0,
                         const double *joints1, const double *world1, const int64_t *pairs, const double *balls,
                         const uint8_t *wanted, const double *gaps0, const double *gaps1, int64_t most, int64_t *met) {

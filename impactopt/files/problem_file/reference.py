@@ -126,7 +126,7 @@ This page is made by `impactopt new --reference`.
 # quantity and its largest value, or range
 _LIMITS = (
     ("a file", f"{LONGEST_TEXT / 2**20:g} MiB"),
-    ("tables and lists in each other", f"{DEEPEST} deep"),
+    ("nesting of tables and lists", f"{DEEPEST} deep"),
     ("a key of `--set`", f"{LONGEST_KEY} characters"),
     ("any number", f"{MOST:g}"),
     ("parameters of law and target, where not 0", f"at least {1 / MOST:g}"),

@@ -11,7 +11,7 @@ import pytest
 import impactopt
 from impactopt import InputError, load_problem
 from impactopt import api as by_file
-from impactopt.files.problem_file.names import problem_file
+from impactopt.files.named_problems import problem_file
 from impactopt.problem.problem import ImpactProblem
 
 FILE = """

@@ -241,7 +241,7 @@ def _give(text: str, out: Path | None, as_json: bool = False) -> None:
 def problems(as_json: AsJson = False) -> None:
     """List the problems that come with the package: `impactopt solve NAME`."""
     with plain_errors("interrupted"):
-        from impactopt.files.problem_file.names import problem_file, problem_names, problem_summary
+        from impactopt.files.named_problems import problem_file, problem_names, problem_summary
 
         found = {name: problem_summary(name) for name in problem_names()}
         if as_json:

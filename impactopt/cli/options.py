@@ -25,13 +25,13 @@ def complete_problem(incomplete: str) -> list[str]:
 
 def complete_sweep(incomplete: str) -> list[str]:
     """Completions of a sweep's name or file, for the shell."""
-    from impactopt.files.folders import SWEEPS
+    from impactopt.files.named_problems import SWEEPS
 
     return _complete(incomplete, SWEEPS)
 
 
 def _complete(incomplete: str, folder: str) -> list[str]:
-    from impactopt.files.folders import named_files
+    from impactopt.files.named_problems import named_files
 
     typed = Path(incomplete)
     inside = typed if incomplete.endswith("/") else typed.parent
@@ -48,7 +48,7 @@ def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
     change.
     """
     from impactopt.codegen.files import kept
-    from impactopt.files.folders import named_files
+    from impactopt.files.named_problems import named_files
 
     # if the option's value is still missing, click has not assigned the words before it to parameters
     name = str(context.params.get("file") or next(iter(context.args), ""))

@@ -18,9 +18,8 @@ from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
 from impactopt.planning.gain_selection import ChosenGains, with_chosen
 from impactopt.planning.lazy_constraints import gear_caution, with_lazy_constraints
-from impactopt.planning.reconstruction import program_on, solution_of
 from impactopt.planning.refinement import Outcome
-from impactopt.planning.solution import Solution
+from impactopt.planning.solution import Solution, program_on, solution_of
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate

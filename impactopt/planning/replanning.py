@@ -21,10 +21,9 @@ from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.clearance_constraints import Margins, same_bodies
 from impactopt.planning.lazy_constraints import LazyTerms
 from impactopt.planning.parameter_changes import Parameter, changed, moved_problem, parameter_of
-from impactopt.planning.reconstruction import program_on, solution_of
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.refinement import refine as refine_with
-from impactopt.planning.solution import Solution
+from impactopt.planning.solution import Solution, program_on, solution_of
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.predictor import ActiveSystem, Change, Offset, Prediction, Predictor
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation

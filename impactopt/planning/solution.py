@@ -1,9 +1,9 @@
-"""Solutions of planned problems, and their summaries for ``summary.json``."""
+"""Solutions of planned problems, their summaries for ``summary.json``, and the programs that they are of."""
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -18,7 +18,7 @@ from impactopt.planning.causes import Cause
 from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
 from impactopt.planning.lazy_constraints import gear_caution, lazy_terms_of, slide, slide_caution
-from impactopt.planning.refinement import Attempt
+from impactopt.planning.refinement import Attempt, Outcome
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
@@ -26,6 +26,7 @@ from impactopt.transcription.contact_refinement import ContactError
 from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares, contact_elements
 from impactopt.transcription.motion_measures import first_touch, motion_measures
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, Trajectory, motion_loads
+from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 
@@ -332,3 +333,59 @@ def versions() -> dict[str, str]:
     """Versions of the packages that computed the results."""
     names = ("casadi", "pin", "numpy", "scipy", "osqp")
     return {"impactopt": __version__, "python": platform.python_version(), **{n: version(n) for n in names}}
+
+
+def program_on(
+    problem: ImpactProblem,
+    nodes: MoreNodes,
+    elements: Elements,
+    shares: Shares,
+    report: Callable[[str], None] | None = None,
+) -> Transcription:
+    """Program of a problem on a given mesh, without clearance constraints."""
+    functions = block_functions(problem, problem.coordinates, report, elements)
+    return Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
+
+
+def program_of(solution: Solution) -> Transcription:
+    """Program of a solution, without clearance constraints."""
+    return program_on(solution.problem, solution.nodes, solution.elements, solution.shares)
+
+
+def solution_of(
+    outcome: Outcome[Transcription],
+    *,
+    solver: str,
+    seconds: tuple[float, float],
+    statement: str,
+    gains: tuple[ChosenGains, ...] = (),
+    causes: tuple[Cause, ...] = (),
+    window: str = "",
+    contact_error: ContactError | None = None,
+) -> Solution:
+    """The `Solution` of a refinement's outcome.
+
+    seconds [s] : to build the program, and to solve it.
+    """
+    t, at = outcome.program, outcome.at
+    return Solution(
+        problem=t.problem,
+        result=outcome.result,
+        solver=solver,
+        build_seconds=seconds[0],
+        solve_seconds=seconds[1],
+        violations=outcome.violations,
+        objectives=t.achieved(at.x),
+        attempts=outcome.attempts,
+        statement=statement,
+        gains=gains,
+        causes=causes,
+        window=window,
+        contact_error=contact_error,
+        plan=at.planned,
+        nodes=t.nodes,
+        elements=t.hit.elements if t.hit.guarded else (),
+        shares=t.hit.shares,
+        apart=t.clearance_constraints,
+        contact=at.contact if outcome.usable else None,
+    )

@@ -37,9 +37,8 @@ from impactopt.planning.multistart import (
     check_starts,
     drawn_guesses,
 )
-from impactopt.planning.reconstruction import program_of, program_on, solution_of
 from impactopt.planning.refinement import Guess, Oracle, Outcome, refine
-from impactopt.planning.solution import Solution
+from impactopt.planning.solution import Solution, program_of, program_on, solution_of
 from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.motion_style import MotionPrices

@@ -17,9 +17,9 @@ from pydantic import ValidationError
 
 from impactopt.codegen.files import is_plain_file, read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
+from impactopt.files.named_problems import problem_file, sweep_file
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
 from impactopt.files.problem_file.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
-from impactopt.files.problem_file.names import problem_file, sweep_file
 from impactopt.files.problem_file.toml import (
     LONGEST_TEXT,
     Place,

@@ -20,7 +20,7 @@ from benchmarks.pictures.feedback import feedback_picture
 from benchmarks.planning import controller_in, solved
 from benchmarks.report import Report, Say, columns_table
 from impactopt import Solution
-from impactopt.files.problem_file.names import problem_file
+from impactopt.files.named_problems import problem_file
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Balance, ContactWrenchCone
 from impactopt.simulation import Perturbation

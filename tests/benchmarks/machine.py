@@ -19,7 +19,7 @@ from benchmarks.planning import solved
 from benchmarks.report import Report, Say, columns_table
 from impactopt import Solution
 from impactopt.errors import InputError
-from impactopt.files.problem_file.names import problem_file, problem_names
+from impactopt.files.named_problems import problem_file, problem_names
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
 from impactopt.robots.robot import Robot

@@ -18,7 +18,7 @@ from benchmarks.planning import solved
 from benchmarks.report import Report, Say, columns_table
 from impactopt import Solution
 from impactopt.errors import InputError, check_number
-from impactopt.files.problem_file.names import problem_file
+from impactopt.files.named_problems import problem_file
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.gains import GainFactor, scaled_gains
 

@@ -19,8 +19,8 @@ from benchmarks.kept import Kept
 from benchmarks.report import Report, Say, columns_table
 from benchmarks.solvers import SOLVERS
 from impactopt.errors import InputError, did_you_mean
+from impactopt.files.named_problems import problem_file, problem_names
 from impactopt.files.problem_file import read_problem_file
-from impactopt.files.problem_file.names import problem_file, problem_names
 from impactopt.solvers.program import NonlinearProgram, Status, Vector
 
 __all__ = ["ATTEMPTS", "KINDS", "planning_program", "run", "strike_program", "summary"]

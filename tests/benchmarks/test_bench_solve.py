@@ -205,7 +205,7 @@ def textbook(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.chdir(tmp_path)
     for name in ("HS71", "infeasible"):
         (tmp_path / f"{name}.toml").write_text(PROBLEM_FILE, encoding="utf-8")
-    monkeypatch.setattr("impactopt.files.folders.FOLDERS", (tmp_path,))
+    monkeypatch.setattr("impactopt.files.named_problems.FOLDERS", (tmp_path,))
     return tmp_path
 
 

@@ -22,6 +22,7 @@ import impactopt
 from impactopt.cli.app import app
 from impactopt.cli.options import complete_problem
 from impactopt.collide.single_collision import collide_once
+from impactopt.files.named_problems import problem_file
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import (
     key_place,
@@ -31,7 +32,6 @@ from impactopt.files.problem_file import (
     read_toml,
     write_toml,
 )
-from impactopt.files.problem_file.names import problem_file
 from impactopt.report.console import output
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics

@@ -33,9 +33,9 @@ from impactopt.contact.laws import LAWS, CustomLaw
 from impactopt.errors import InputError
 from impactopt.files.export import FORMATS, export_planned
 from impactopt.files.export import player as formulas
+from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import load_problem
-from impactopt.files.problem_file.names import problem_file
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import FirstTouch

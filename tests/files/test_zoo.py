@@ -26,8 +26,8 @@ from impactopt import (
 )
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.files import folders
-from impactopt.files.problem_file import names, read_problem_file
+from impactopt.files import named_problems
+from impactopt.files.problem_file import read_problem_file
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem, Phase
@@ -46,7 +46,7 @@ HAMMER = Tool.hammer(frame="wrist")
 def test_every_file_has_a_name_and_every_name_says_what_it_is_about() -> None:
     assert set(problem_names()) == set(FILES) and len(FILES) > 10
     for name in problem_names():
-        summary = names.problem_summary(name)
+        summary = named_problems.problem_summary(name)
         assert 20 < len(summary) < 130, (name, summary)
         assert "\n" not in summary
 
@@ -66,12 +66,12 @@ def test_every_problem_loads_and_is_sound(name: str) -> None:
 
 def test_names_and_paths_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert names.problem_file("punch") == FILES["punch"]
-    assert names.problem_file("problems/punch.toml") == Path("problems/punch.toml")
+    assert named_problems.problem_file("punch") == FILES["punch"]
+    assert named_problems.problem_file("problems/punch.toml") == Path("problems/punch.toml")
     with pytest.raises(InputError, match=r"no problem 'pucnh' .did you mean 'punch'.*arm7.*path of a file"):
         load_problem("pucnh")
     (tmp_path / "punch").write_text("[problem]\n", encoding="utf-8")
-    assert names.problem_file("punch") == Path("punch")
+    assert named_problems.problem_file("punch") == Path("punch")
 
 
 def test_a_wheel_has_them_inside_the_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -79,16 +79,16 @@ def test_a_wheel_has_them_inside_the_package(monkeypatch: pytest.MonkeyPatch, tm
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     kept = wheel["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert {str(ROOT / inside): ROOT / folder for folder, inside in kept.items()} == {
-        str(folders.FOLDERS[0]): FILES["punch"].parent
+        str(named_problems.FOLDERS[0]): FILES["punch"].parent
     }
     (tmp_path / "_problems").mkdir()
     (tmp_path / "_problems" / "inside.toml").write_text("# What it is.\n", encoding="utf-8")
     (tmp_path / "_problems" / "sweeps").mkdir()
     (tmp_path / "_problems" / "sweeps" / "many.toml").touch()
-    monkeypatch.setattr(folders, "FOLDERS", (tmp_path / "_problems", *folders.FOLDERS[1:]))
-    assert problem_names() == ("inside",) and names.problem_summary("inside") == "What it is"
-    assert names.sweep_names() == ("many",)
-    assert names.sweep_file("many") == tmp_path / "_problems" / "sweeps" / "many.toml"
+    monkeypatch.setattr(named_problems, "FOLDERS", (tmp_path / "_problems", *named_problems.FOLDERS[1:]))
+    assert problem_names() == ("inside",) and named_problems.problem_summary("inside") == "What it is"
+    assert named_problems.sweep_names() == ("many",)
+    assert named_problems.sweep_file("many") == tmp_path / "_problems" / "sweeps" / "many.toml"
 
 
 # ---- one foot

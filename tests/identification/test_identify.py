@@ -31,8 +31,8 @@ from impactopt import (
 )
 from impactopt.cli.app import app
 from impactopt.contact.laws import LAWS
+from impactopt.files.named_problems import problem_file
 from impactopt.files.problem_file import problem_data, problem_from_data, read_toml
-from impactopt.files.problem_file.names import problem_file
 from impactopt.identification.fitting import TwoMassModel
 
 MASS = 3.0

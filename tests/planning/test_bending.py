@@ -15,8 +15,8 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.budget import Budget
 from impactopt.planning.parameter_changes import changed, parameter_of
-from impactopt.planning.reconstruction import program_on
 from impactopt.planning.replanning import parametric_program
+from impactopt.planning.solution import program_on
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import GearLoad, HitRegion, Slide, TargetSpeed

@@ -32,7 +32,7 @@ from impactopt.files.replay import problem_of, resumed
 from impactopt.files.verify import verify
 from impactopt.planning.gain_selection import with_room_for_gains
 from impactopt.planning.models import carried_start
-from impactopt.planning.reconstruction import program_of
+from impactopt.planning.solution import program_of
 from impactopt.report.result_rows import result_columns, result_rows
 from impactopt.robots.gains import with_room
 from impactopt.solvers.program import max_violation

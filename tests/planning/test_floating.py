@@ -31,8 +31,8 @@ from impactopt import (
     solve,
     space_arm,
 )
+from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
-from impactopt.files.problem_file.names import problem_file
 from impactopt.files.verify import verify
 from impactopt.planning.minimum_jerk import minimum_jerk_baseline
 from impactopt.solvers.program import Status

@@ -388,7 +388,7 @@ def test_a_motion_is_solved_from_several_starts(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch, start: str
 ) -> None:
     t = arm_transcription
-    monkeypatch.setattr("impactopt.planning.reconstruction.block_functions", lambda *_: t.functions)
+    monkeypatch.setattr("impactopt.planning.solution.block_functions", lambda *_: t.functions)
     found = solve(t.problem, start=start, starts=2)
     assert found.status is Status.SOLVED
     assert [attempt.start for attempt in found.attempts] == [f"{start} 1", f"{start} 2"]
@@ -404,7 +404,7 @@ def test_no_start_ends_with_bodies_in_each_other(
 ) -> None:
     """Where one of these three would hit harder with the elbow in the target."""
     t = arm_transcription
-    monkeypatch.setattr("impactopt.planning.reconstruction.block_functions", lambda *_: t.functions)
+    monkeypatch.setattr("impactopt.planning.solution.block_functions", lambda *_: t.functions)
     problem = dataclasses.replace(t.problem, point=t.problem.point + np.array([0.0, 0.0, 0.01]))
     found = solve(problem, starts=3)
     assert found.status is Status.SOLVED and found.clearance()["contacts_besides"] == []
@@ -415,7 +415,7 @@ def test_a_solution_starts_its_neighbour(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     t = changed(arm_transcription, terms=BODILESS)  # whose rows know them as they were at the first one's
-    monkeypatch.setattr("impactopt.planning.reconstruction.block_functions", lambda *_: t.functions)
+    monkeypatch.setattr("impactopt.planning.solution.block_functions", lambda *_: t.functions)
     first = solve(t.problem)
     assert solve(t.problem, start=first).result.iterations == 0
     moved = dataclasses.replace(t.problem, point=t.problem.point + np.array([0.0, 0.0, 0.01]))
@@ -431,9 +431,7 @@ def test_a_start_that_is_none_is_refused(
         solve(arm_transcription.problem, start="strik")
     with pytest.raises(InputError, match="leave one of the two out"):
         solve(arm_transcription.problem, start=np.zeros(3), starts=2)
-    monkeypatch.setattr(
-        "impactopt.planning.reconstruction.block_functions", lambda *_: arm_transcription.functions
-    )
+    monkeypatch.setattr("impactopt.planning.solution.block_functions", lambda *_: arm_transcription.functions)
     with pytest.raises(InputError, match="start: expected shape"):
         solve(arm_transcription.problem, start=np.zeros(3))
 

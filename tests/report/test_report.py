@@ -23,8 +23,8 @@ from impactopt.bodies.world import Obstacle
 from impactopt.cli.app import app
 from impactopt.contact import Board, KelvinVoigt
 from impactopt.errors import InputError
+from impactopt.files.named_problems import problem_file
 from impactopt.files.output import Record, record_of, save_record
-from impactopt.files.problem_file.names import problem_file
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report import animation_of, bodies_page, report_of
 from impactopt.report.page import unpack

@@ -108,7 +108,7 @@ target.mass_kg = [0.05, 0.1]  # dots or quotes
 
 
 def written(folder: Path, text: str = TEXT) -> Path:
-    from impactopt.files.problem_file.names import problem_file
+    from impactopt.files.named_problems import problem_file
 
     (folder / "arm.toml").write_bytes(problem_file("arm_planar").read_bytes())
     (folder / "sweep.toml").write_text(text, encoding="utf-8")

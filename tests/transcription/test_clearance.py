@@ -29,8 +29,8 @@ from impactopt.planning.clearance_constraints import (
     solve_with_clearance,
 )
 from impactopt.planning.parameter_changes import parameter_of
-from impactopt.planning.reconstruction import program_on
 from impactopt.planning.refinement import Guess
+from impactopt.planning.solution import program_on
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos

@@ -16,7 +16,7 @@ from support.small_robots import table
 from impactopt import Solution
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.kinematics.stance import FixedBase
-from impactopt.planning import reconstruction
+from impactopt.planning import solution as solutions
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
@@ -91,7 +91,7 @@ def transcription() -> Transcription:
 
 @pytest.fixture
 def functions(transcription: Transcription, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconstruction, "block_functions", lambda *_: transcription.functions)
+    monkeypatch.setattr(solutions, "block_functions", lambda *_: transcription.functions)
 
 
 def off(solution: Solution) -> float:

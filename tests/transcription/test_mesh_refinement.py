@@ -16,7 +16,8 @@ from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
-from impactopt.planning import between_nodes, reconstruction
+from impactopt.planning import between_nodes
+from impactopt.planning import solution as solutions
 from impactopt.planning.solve import solve
 from impactopt.problem.objectives import (
     OBJECTIVES,
@@ -306,7 +307,7 @@ def test_more_nodes_go_together_with_everything_on_two_legs(biped_transcription:
 @pytest.fixture
 def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A problem whose torques are a little over their limit between the nodes, where nothing is given up."""
-    monkeypatch.setattr(reconstruction, "block_functions", lambda *_: arm_transcription.functions)
+    monkeypatch.setattr(solutions, "block_functions", lambda *_: arm_transcription.functions)
     monkeypatch.setattr(between, "_MARGIN_LOSS", 0.0)
     monkeypatch.setattr(between, "_TORQUE_LOSS", 1e-6)
     return dataclasses.replace(
@@ -344,7 +345,7 @@ def test_nodes_are_added_where_effort_counts(
     """Each node's effort is a variable, so there are more of them then."""
     objectives = (Impulse(), Effort(weight=0.1))
     functions = changed(arm_transcription, objectives=objectives).functions
-    monkeypatch.setattr(reconstruction, "block_functions", lambda *_: functions)
+    monkeypatch.setattr(solutions, "block_functions", lambda *_: functions)
     solution = solve(dataclasses.replace(coarse, objectives=objectives))
     assert solution.status is Status.SOLVED and solution.nodes.total > 0
     assert len(solution.attempts) > 1 and solution.attempts[-1].kept
@@ -368,7 +369,7 @@ def test_bodies_that_are_near_at_the_start_are_kept_apart(
     """
     objectives = (Impulse(), Effort(weight=0.1))
     functions = changed(arm_transcription, objectives=objectives).functions
-    monkeypatch.setattr(reconstruction, "block_functions", lambda *_: functions)
+    monkeypatch.setattr(solutions, "block_functions", lambda *_: functions)
     problem = dataclasses.replace(coarse, objectives=objectives, terms=coarse.terms[:1])
     solution = solve(problem)
     assert solution.status is Status.SOLVED and solution.clearance()["contacts_besides"] == []
@@ -378,7 +379,7 @@ def test_bodies_that_are_near_at_the_start_are_kept_apart(
     told: list[str] = []
     barred = solve(dataclasses.replace(problem, obstacles=(post,)), report=told.append)
     assert barred.status is Status.INFEASIBLE
-    assert any("first without them" in line for line in told)
+    assert any("solving without them first" in line for line in told)
     assert "post" in barred.result.message or barred.causes
 
 

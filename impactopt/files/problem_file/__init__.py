@@ -10,7 +10,7 @@
 * names.py      the package's own files, by name
 """
 
-from impactopt.files.problem_file.names import problem_names
+from impactopt.files.named_problems import problem_names
 from impactopt.files.problem_file.reading import (
     ProblemFile,
     SolverSettings,

@@ -19,8 +19,8 @@ from pydantic import ValidationError
 
 from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
+from impactopt.files.named_problems import problem_file
 from impactopt.files.problem_file.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
-from impactopt.files.problem_file.names import problem_file
 from impactopt.files.problem_file.sections import File, SolverSettings, with_kinds
 from impactopt.files.problem_file.toml import (
     LONGEST_TEXT,

@@ -11,8 +11,8 @@ from pydantic import AfterValidator, BaseModel, PlainValidator
 from pydantic.fields import FieldInfo
 
 from impactopt.errors import FARTHEST, MOST
+from impactopt.files.named_problems import problem_file, problem_summary
 from impactopt.files.problem_file.diagnostics import range_of, section_at
-from impactopt.files.problem_file.names import problem_file, problem_summary
 from impactopt.files.problem_file.reading import LONGEST_KEY, read_problem_file
 from impactopt.files.problem_file.sections import (
     LAWS,

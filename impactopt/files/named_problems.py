@@ -1,4 +1,7 @@
-"""Names of the package's own problem and sweep files."""
+"""The package's own problem and sweep files by name; a module without heavy imports, for shell completion.
+
+In git they are in `problems/` beside the package; a wheel has them inside it, in `_problems`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ from pathlib import Path
 
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
-from impactopt.files.folders import FOLDERS, SWEEPS, named_files
 
 __all__ = [
     "FOLDERS",
@@ -20,6 +22,16 @@ __all__ = [
     "sweep_file",
     "sweep_names",
 ]
+
+SWEEPS = "sweeps"  # subfolder of the problems
+_PACKAGE = Path(__file__).resolve().parents[1]
+FOLDERS = (_PACKAGE / "_problems", _PACKAGE.parent / "problems")
+
+
+def named_files(inside: str = "") -> dict[str, Path]:
+    """Paths of the problem files by name, sorted; inside : a subfolder."""
+    folder = next((folder for folder in FOLDERS if folder.is_dir()), None)
+    return {} if folder is None else {path.stem: path for path in sorted((folder / inside).glob("*.toml"))}
 
 
 def problem_names() -> tuple[str, ...]:

@@ -86,6 +86,19 @@ def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path,
         _drafted(tmp_path, text, motion=motion)
 
 
+def test_an_elbow_that_drives_no_nail_is_told_why_its_strikes_fail(tmp_path: Path) -> None:
+    """A posture in front, which its one joint has not either, is not what it lacks."""
+    parts = [
+        urdfs.link("base", 1.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.05)),
+        urdfs.link("forearm", 1.5, (0.3, 0.06, 0.06), (0.15, 0.0, 0.0)),
+    ]
+    parts += [urdfs.joint("elbow", "base", "forearm", "0 1 0", (0.0, 0.0, 0.5), (-1.5, 1.5), effort=40.0)]
+    elbow = urdfs.robot("elbow", *parts)
+    with pytest.raises(InputError, match=r"no strike of 'hand' is found; .*[Cc]onstraints"):
+        _drafted(tmp_path, elbow, motion="nail")
+    assert optimize_strike(_problem(tmp_path, elbow)).status.usable
+
+
 @pytest.mark.parametrize(
     ("text", "motion", "kind"),
     [(urdfs.arm(), "nail", Nail), (urdfs.biped(), "chop", Board)],

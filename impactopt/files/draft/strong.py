@@ -23,6 +23,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import Blow, Strength, drawn_blows
 from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
+from impactopt.solvers.program import SolverResult
 
 __all__ = ["ITERATIONS", "SECONDS", "Strong", "duration", "strongest", "touches"]
 
@@ -52,16 +53,18 @@ class Strong:
     unit: str
 
 
-def strongest(robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = True) -> list[Strong]:
-    """Strikes of the blows that are estimated best, the hardest first; none: check finds a fault with all of
-    them, or none of the strikes is solved.
+def strongest(
+    robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = True
+) -> tuple[list[Strong], str]:
+    """Strikes of the blows that are estimated best, the hardest first, and the message of the unsolved one
+    that is nearest to a solution; none, and "": check finds a fault with all of them.
 
     q (nq,) : what does not strike stays as in it.  with_face : the link's face meets the target; else any
     part of it may touch first.
     """
     given = {**hit.given, "terms": () if with_face else (FirstTouch(enabled=False),)}
     strength = Strength(robot=robot, striker=arm.name, law=hit.law, target=hit.target)
-    found = []
+    found, unsolved = list[Strong](), list[SolverResult]()
     blows = drawn_blows(strength, q, hit.normals, with_face=with_face)
     for problem, blow in _sound(robot, arm, blows, given):
         with warnings.catch_warnings():
@@ -78,7 +81,10 @@ def strongest(robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = T
                     unit=problem.objectives[0].unit,
                 )
             )
-    return sorted(found, key=lambda strong: -strong.objective)
+        else:
+            unsolved.append(solved.result)
+    nearest = min(unsolved, key=lambda result: result.max_violation, default=None)
+    return sorted(found, key=lambda strong: -strong.objective), "" if nearest is None else nearest.message
 
 
 def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:

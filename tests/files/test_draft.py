@@ -29,6 +29,7 @@ from impactopt.files.draft.robot import draft_robot
 from impactopt.files.draft.strikers import find_striker
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.toml import read_toml
+from impactopt.kinematics.operational_space import striking_point
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
@@ -84,6 +85,33 @@ def test_a_robot_whose_one_joint_moves_no_striking_point_is_told(tmp_path: Path,
         text = text.replace(f'<joint name="{name}" type="revolute">', f'<joint name="{name}" type="fixed">')
     with pytest.raises(InputError, match="no posture is found with 'hand' in front"):
         _drafted(tmp_path, text, motion=motion)
+
+
+def test_a_hand_waits_ahead_of_its_shoulder_wherever_on_its_axis_a_joint_is_given(tmp_path: Path) -> None:
+    """The same robot, with the frames of both first shoulder joints in the middle of the trunk."""
+    text = moved = urdfs.biped()
+    for y in ("0.", "-0."):
+        for old, new in ((f"{y}2 0.4", "0.0 0.4"), (f"{y}05 0.0", f"{y}25 0.0")):
+            assert f'<origin xyz="0.0 {old}"/>' in moved
+            moved = moved.replace(f'<origin xyz="0.0 {old}"/>', f'<origin xyz="0.0 {new}"/>')
+    there = [
+        striking_point(problem.robot, problem.striker, problem.start_posture)
+        for problem in (_problem(tmp_path, text), _problem(tmp_path, moved))
+    ]
+    assert there[0][1] < -0.15 and there[1] == pytest.approx(there[0], abs=0.02)
+
+
+def test_an_elbow_that_drives_no_nail_is_told_why_its_strikes_fail(tmp_path: Path) -> None:
+    """A posture in front, which its one joint has not either, is not what it lacks."""
+    parts = [
+        urdfs.link("base", 1.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.05)),
+        urdfs.link("forearm", 1.5, (0.3, 0.06, 0.06), (0.15, 0.0, 0.0)),
+    ]
+    parts += [urdfs.joint("elbow", "base", "forearm", "0 1 0", (0.0, 0.0, 0.5), (-1.5, 1.5), effort=40.0)]
+    elbow = urdfs.robot("elbow", *parts)
+    with pytest.raises(InputError, match=r"no strike of 'hand' is found; .*[Cc]onstraints"):
+        _drafted(tmp_path, elbow, motion="nail")
+    assert optimize_strike(_problem(tmp_path, elbow)).status.usable
 
 
 @pytest.mark.parametrize(

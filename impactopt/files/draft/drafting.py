@@ -33,7 +33,7 @@ from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.files.problem_file.writing import sole_data, striker_data, tool_data
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
-from impactopt.planning.strike import optimize_strike
+from impactopt.planning.strike import StrikeSolution, optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import shape_doubts
 from impactopt.problem.problem import ImpactProblem
@@ -54,6 +54,7 @@ START = "ready"
 FROM_ABOVE = ("chop", "nail")
 MOTIONS = ("punch", "kick", *FROM_ABOVE)
 UNSOLVED = "none of the strikes tried is solved: if `solve` finds no motion, move the target or ease it"
+NEAREST = "; the nearest strike: "
 EDGEWISE = (
     "no strike with the striking link's face to the target is found: [terms.first_touch] is off, so another "
     "part of the link may touch first"
@@ -190,11 +191,11 @@ def _bolted(
     say(f"{robot.name}: {robot.n} joints, on a fixed base; trying strikes (compiles the first time)")
     q = eased(robot, [arm.limb for arm in arms[1:]], rested(robot))
     targets = hits(motion, robot)
-    strong, hit, edgewise = _hardest(robot, arms[0], q, targets)
+    strong, hit, edgewise, why = _hardest(robot, arms[0], q, targets)
     pegged = not strong and motion not in FROM_ABOVE
     if pegged:  # the striking point may be behind the links: try again with one ahead of it
         other, with_peg = robot.with_tool(_peg(robot, arms[0])), replace(arms[0], name="peg")
-        strong, hit, edgewise = _hardest(other, with_peg, q, targets)
+        strong, hit, edgewise, _ = _hardest(other, with_peg, q, targets)
         robot, arms = (other, [with_peg, *arms[1:]]) if strong else (robot, arms)
     if strong:
         tries = [
@@ -209,24 +210,31 @@ def _bolted(
         result = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
         messages = [result, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
     else:
-        q, way = ready(robot, arms, q, ways=[tuple(DOWN)] if motion in FROM_ABOVE else WAYS)
-        data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
-        data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
-        messages = [UNSOLVED]
+        try:
+            q, way = ready(robot, arms, q, ways=[tuple(DOWN)] if motion in FROM_ABOVE else WAYS)
+            data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
+            data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
+        except InputError as no_target:
+            if not why:
+                raise
+            raise InputError(f"{drafted.path}: no strike of {arms[0].name!r} is found{why}") from no_target
+        messages = [UNSOLVED + why]
     return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
 
 
-def _hardest(robot: Robot, arm: Arm, q: Array, targets: list[Hit]) -> tuple[list[Strong], Hit, bool]:
-    """Solved strikes, their target, and True if they are edgewise: those of the first target that has some;
-    without any, an empty list and the last target.
+def _hardest(robot: Robot, arm: Arm, q: Array, targets: list[Hit]) -> tuple[list[Strong], Hit, bool, str]:
+    """Solved strikes of the first target that has some, the target, True if edgewise, and "".
+
+    Without any an empty list, the last target, and why; "" if there was nothing to try.
     """
-    strong: list[Strong] = []
+    why = ""
     # edgewise last: for an arm of few joints, which cannot turn the link's face to its direction of motion
     for edgewise, hit in product((False, True), targets):
-        strong = strongest(robot, arm, q, hit, with_face=not edgewise)
+        strong, message = strongest(robot, arm, q, hit, with_face=not edgewise)
         if strong:
             break
-    return strong, hit, edgewise
+        why = f"{NEAREST}{message}" if message else why
+    return strong, hit, edgewise, why
 
 
 def _slower(data: dict[str, Any]) -> dict[str, Any]:
@@ -295,17 +303,19 @@ def _stroke(
     robot, _, q = _standing(drafted, soles, strikers, forward)
     (hand,) = _renumbered([Arm(limb=arm.limb, name=name, axis=below)], drafted, robot)
     q, way = ready(robot, [hand], q, ways=[tuple(DOWN)])
-    data: dict[str, Any] = {}
-    messages = [UNSOLVED]
-    for k, (hit, edgewise) in enumerate(product(hits(motion, robot), (False, True)), start=1):
-        say(f"trying strike {k}")
-        if not edgewise:
-            data = {**_data(drafted, robot, soles, strikers, q, folder), **hit.data}
-            data = _aimed(data, name, aims(robot, hand, q, way), way, folder)
-        tried = _edgewise(data) if edgewise else data
-        if _strike_solved(tried, folder):
-            data, messages = tried, [EDGEWISE] if edgewise else []
-            break
+    # the easiest target: on soles, a strike alone is far harder than the strike of a whole motion
+    data = {**_data(drafted, robot, soles, strikers, q, folder), **hits(motion, robot)[-1].data}
+    data = _aimed(data, name, aims(robot, hand, q, way), way, folder)
+    edgewise, messages = _edgewise(data), list[str]()
+    say("trying a strike with any part of the hand (compiles the first time)")
+    solved = _strike(edgewise, folder)
+    if not solved.status.usable:
+        messages = [f"{UNSOLVED}{NEAREST}{solved.result.message}"]
+    else:
+        # with the face to the target, most strikes are only solved from this one as the initial guess
+        say("turning the hand's face to the target")
+        square = _strike(data, folder, start=solved).status.usable
+        data, messages = (data, []) if square else (edgewise, [EDGEWISE])
     return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
 
 
@@ -314,12 +324,12 @@ def _edgewise(data: dict[str, Any]) -> dict[str, Any]:
     return {**data, "terms": {**data.get("terms", {}), "first_touch": {"enabled": False}}}
 
 
-def _strike_solved(data: dict[str, Any], folder: Path) -> bool:
-    """True if the strike of drafted data is solved."""
+def _strike(data: dict[str, Any], folder: Path, *, start: StrikeSolution | None = None) -> StrikeSolution:
+    """Strike of drafted data, from the plain initial guess or another strike."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a failed trial is no result
         options = {"max_iterations": ITERATIONS}
-        return optimize_strike(_built(data, folder), options=options, time_limit=SECONDS).status.usable
+        return optimize_strike(_built(data, folder), start=start, options=options, time_limit=SECONDS)
 
 
 def _kick(

@@ -142,9 +142,27 @@ def arm_length(robot: Robot, arm: Limb, striker: str) -> float:
 
 
 def _upper(robot: Robot, arm: Limb) -> int:
-    """Index of the last of an arm's own joints before its first long link."""
-    steps = [float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in arm.own[1:]]
-    return next((k for k, step in enumerate(steps) if step > UPPER_ARM * sum(steps)), 0)
+    """Index of the last of an arm's own joints before its first long link.
+
+    Only the part of a link that one of these joints turns counts: if the first joint turns about the line
+    through both shoulders, its link along that line is a part of the shoulder.
+    """
+    model, data = robot.model, robot.model.createData()
+    pin.forwardKinematics(model, data, neutral(model))
+    pin.computeJointJacobians(model, data)
+    places = [np.array(data.oMi[joint].translation) for joint in arm.own]
+    axes = [
+        np.reshape(pin.getJointJacobian(model, data, joint, pin.WORLD), (6, model.nv))[
+            3:, model.joints[joint].idx_v
+        ]
+        for joint in arm.own
+    ]
+    steps = np.diff(places, axis=0)
+    length = sum(map(np.linalg.norm, steps))
+    turned = (
+        max(np.linalg.norm(np.cross(axis, step)) for axis in axes[: k + 1]) for k, step in enumerate(steps)
+    )
+    return next((k for k, part in enumerate(turned) if part > UPPER_ARM * length), 0)
 
 
 def _leg(

@@ -23,6 +23,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import Blow, Strength, drawn_blows
 from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
+from impactopt.solvers.program import SolverResult
 
 __all__ = ["ITERATIONS", "SECONDS", "Strong", "duration", "strongest", "touches"]
 
@@ -53,15 +54,19 @@ class Strong:
     unit: str
 
 
-def strongest(robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = True) -> list[Strong]:
-    """Solved strikes of the impacts with the best estimates, the hardest first; may be empty.
+def strongest(
+    robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = True
+) -> tuple[list[Strong], str]:
+    """Solved strikes of the impacts with the best estimates, the hardest first, and a message.
+
+    The message is that of the unsolved strike nearest to a solution, "" if `check` refuses all of them.
 
     q (nq,) : configuration of the joints that do not strike.  with_face : the striking link's face meets the
     target; else any part of it may touch first.
     """
     given = {**hit.given, "terms": () if with_face else (FirstTouch(enabled=False),)}
     strength = Strength(robot=robot, striker=arm.name, law=hit.law, target=hit.target)
-    found = []
+    found, unsolved = list[Strong](), list[SolverResult]()
     blows = drawn_blows(strength, q, hit.normals, with_face=with_face)
     for problem, blow in _candidates(robot, arm, blows, given):
         with warnings.catch_warnings():
@@ -78,7 +83,10 @@ def strongest(robot: Robot, arm: Arm, q: Array, hit: Hit, *, with_face: bool = T
                     unit=problem.objectives[0].unit,
                 )
             )
-    return sorted(found, key=lambda strong: -strong.objective)
+        else:
+            unsolved.append(solved.result)
+    nearest = min(unsolved, key=lambda result: result.max_violation, default=None)
+    return sorted(found, key=lambda strong: -strong.objective), "" if nearest is None else nearest.message
 
 
 def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:

@@ -79,7 +79,7 @@ def test_the_robots_own_weight(arm: ImpactProblem) -> None:
     bears = np.abs(pin.rnea(robot.model, robot.model.createData(), q, np.zeros(3), np.zeros(3)))
     share = bears / robot.torque_limit
     k = int(share.argmax())
-    for more, told in ((1.01, ""), (0.99, f"{robot.joint_names[k]} bears {share[k]:.3g} of its limit")):
+    for more, told in ((1.01, ""), (0.99, f"{robot.joint_names[k]} needs {share[k]:.3g} of its limit")):
         terms = (*arm.terms, TorqueLimit(fraction=more * share[k]))
         text = too_weak(dataclasses.replace(arm, terms=terms))
         assert told in text

@@ -159,7 +159,7 @@ def test_a_file_says_which_hands_hold_on(problem: ImpactProblem) -> None:
 def test_what_cannot_hold_on_is_refused(problem: ImpactProblem) -> None:
     others = tuple(term for term in problem.terms if not isinstance(term, Grip))
     for changes, told in (
-        ({"terms": others}, "what its grip bears"),
+        ({"terms": others}, "give the limits of its grip"),
         ({"stance": BothSoles()}, "none does"),
         ({"striker": "left_hand"}, "cannot carry the striker"),
         ({"collision": "sdc"}, 'needs collision="full"'),

@@ -53,7 +53,6 @@ Index = NDArray[np.intp]
 _MAX_STEPS = 50
 _LARGEST_STEP = 0.3  # [rad] of a joint
 _CONVERGED = 1e-6  # [m, rad] error before the last step: quadratic convergence leaves about its square
-_TOLERANCE = 1e-6  # [m, rad] error that is accepted after the last permitted step
 _DAMPING = 1e-12 * np.eye(6)  # a stretched leg's Jacobian is singular
 # weights of the last one, two or three solutions that extrapolate them by a polynomial to the next instant
 _EXTRAPOLATION = ((1.0,), (-1.0, 2.0), (1.0, -3.0, 3.0))
@@ -130,10 +129,8 @@ class LegClosure:
                 step = dgesv(jac.T @ jac + _DAMPING, jac.T @ error)[2]
                 legs[own] += np.minimum(np.maximum(step, -_LARGEST_STEP), _LARGEST_STEP)
             if worst < _CONVERGED:
-                break
-        if worst < _TOLERANCE:
-            self._set_legs(q, y, legs)
-            return legs
+                self._set_legs(q, y, legs)
+                return legs
         raise InputError(
             f"the legs cannot hold the soles in place here (off by {worst:.2g} m or rad): the base is out of "
             "the legs' reach"
@@ -520,9 +517,8 @@ class StanceCoordinates:
         out = []
         for leg in self.legs:
             rotation, point = self.rb_frame(leg.frame, q)
-            d = ca.mtimes(
-                rotation, ca.DM(leg.placement.rotation.T)
-            )  # error rotation; w: its antisymmetric part
+            # error rotation, and the vector of its antisymmetric part
+            d = ca.mtimes(rotation, ca.DM(leg.placement.rotation.T))
             w = 0.5 * ca.vertcat(d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1])
             out += [point - ca.DM(leg.placement.translation), w]
         return ca.vertcat(*out)

@@ -94,10 +94,9 @@ def check_stances(problem: Any) -> None:
             robot.sole(name)
     of_impact = [stance for stance in stances if stance.phase is None]
     if len(of_impact) != 1:
-        found = "none" if not of_impact else str(len(of_impact))
         raise InputError(
-            f"stances: the impact is in one phase, which has no duration of its own, but {found} of "
-            f"{names_of(stances)} have none: give all other phases a duration"
+            f"stances: the impact is in one phase, the only one without a duration, but {len(of_impact)} of "
+            f"{names_of(stances)} have none: leave out the duration of this phase, and give one to all others"
         )
     if len(stances) == 1:
         raise InputError("stances: a single phase is no sequence: give `stance` in its place")
@@ -163,13 +162,13 @@ def stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64
     for (one, a), (other, b) in combinations(corners.items(), 2):
         if overlap(a, b):
             raise InputError(f"stances: soles {one} and {other} overlap after steps of {steps}")
-    closing = LegClosure(c.model, c.data, limbs, base=c.base, independent=c.base + c.independent, join=c.join)
+    closure = LegClosure(c.model, c.data, limbs, base=c.base, independent=c.base + c.independent, join=c.join)
     mean = np.mean([moved.get(leg.name, np.zeros(2)) for leg in c.legs], axis=0)
     lower, upper = c.robot.lower[c.dependent], c.robot.upper[c.dependent]
     for descent in _DESCENTS:
         y = c.start + np.concatenate([mean, [-descent], np.zeros(c.ny - 3)])
         try:
-            legs = closing.legs(y, c.start_legs)
+            legs = closure.legs(y, c.start_legs)
         except InputError:
             continue
         if ((lower <= legs) & (legs <= upper)).all():

@@ -86,9 +86,8 @@ class Replanning:
         common: dict[str, Any] = {"callback": stop, "time_limit": self.time_limit, "options": _LOOSE}
         try:
             moved = moved_solution(self.first, **changes, **common)
-        except (
-            InputError
-        ):  # the program has other constraints, or the problem is wrong: the solve raises again
+        except InputError:
+            # the program has other constraints; or the problem is wrong, and the solve below raises again
             moved = None
         if moved is not None and (moved.status.usable or stale()):
             return moved

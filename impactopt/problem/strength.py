@@ -67,8 +67,8 @@ class Strength:
 
         The impulse is mu s. mu is the reduced mass of target and effective mass. s is the largest speed along
         the normal, without speed across it, within three limits: of the joints' velocities; of the torques,
-        which accelerate all joints evenly from their limits of position; and of the gear loads, from the
-        rotors' deceleration under the peak force.
+        which accelerate all joints evenly, each over its travel from a limit of position, at most
+        `MAX_SWING`; and of the gear loads, from the rotors' deceleration under the peak force.
         """
         robot = self.robot
         model, data = robot.model, robot.model.createData()
@@ -135,9 +135,8 @@ class Strength:
         robot = self.robot
         stiffness = float(self.law.force(STIFFNESS_DEPTH, 0.0)) / STIFFNESS_DEPTH
         damping = float(self.law.force(STIFFNESS_DEPTH, 1.0)) - float(self.law.force(STIFFNESS_DEPTH, 0.0))
-        force = max(
-            np.sqrt(stiffness * mass), damping
-        )  # [N] peak at 1 m/s, of the spring or the damper alone
+        # [N] peak at 1 m/s, of the spring or the damper alone
+        force = max(np.sqrt(stiffness * mass), damping)
         size = np.maximum(np.abs(jump), 1e-12)
         gears = robot.gear_limit * robot.torque_limit / np.maximum(robot.armature * size, 1e-12)
         return float(gears.min()) / force

@@ -288,7 +288,7 @@ def batch(
     reason = np.where(found["separated"], "", NOT_ENDED).astype(object)
     finite = np.ones(len(reason), dtype=bool)
     for name in outputs:
-        if name == FREEZE_ERROR:  # infinity is a result: with other freezes the contact does not end
+        if name == FREEZE_ERROR:  # infinity is a result: frozen more often, the contact does not end
             continue
         finite &= np.isfinite(found[name]).reshape(len(reason), -1).all(axis=1)
     reason[~finite] = NO_NUMBER

@@ -215,7 +215,7 @@ class Found:
     """Result of a unit.
 
     columns : values (count,) of the table's columns by name. ``reason`` says why a case has no usable result,
-        and is "" if it has one; cases that are solves have a ``status``.
+        and is "" if it has one; solves, strikes and failed cases have a ``status``.
     records : full results by case, if they are kept.
     peak_mb [MB] : peak memory of the worker so far.
     """

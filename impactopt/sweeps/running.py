@@ -85,7 +85,7 @@ def sweep(
         evaluate the cases. They need this version of impactopt, one thread each, and access to the files that
         the problem file names.
     again : repeat cases that crashed, raised an internal error or exceeded their time limit in an earlier
-    run.
+        run.
     report : called with messages.  progress : called after every unit. With True messages and progress are
         printed, with False they are not, with None on a terminal or in a notebook, unless `report` is given.
         Other messages go to the logger "impactopt".

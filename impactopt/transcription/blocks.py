@@ -259,7 +259,7 @@ def builders(
 ) -> dict[str, Callable[[], BlockExpression]]:
     """Functions that build the expressions of the blocks, by name.
 
-    They take seconds, and are called only if the compiled library is not in the cache.
+    They are slow, and are called only if the compiled library is not in the cache.
 
     edges : of the support polygon.  instant : for an impact without duration.
     frozen, freezes : terms of a model with frozen dynamics, and its number of freezes during contact.

@@ -66,7 +66,7 @@ class Chain:
 
         z = position of the base (3) in the axes of the other body; coordinates of the joints (n,).
 
-        rotation : axes, as columns, of the world's body that the chain ends at.
+        rotation : axes, as columns, of the world's body that the chain begins at.
         """
         index = _coordinate_indices(c)
         slots = [3 + k for k in range(len(self.columns))]

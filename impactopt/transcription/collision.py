@@ -248,9 +248,8 @@ class Collocated:
         start : value at contact.  each_phase : the group has this value at the beginning of each phase.
         """
         s = self.stages[i]
-        # Slope of the polynomial through the element's beginning and its stages, by the inverse of Radau's A
-        # (Hairer and Wanner II, table IV.5.6): `weights` of the stages' values, weight `start` of the
-        # beginning's.
+        # Slope of the polynomial through the element's beginning and its stages, by the inverse of Radau's A:
+        # `weights` of the stages' values, weight `start` of the beginning's.
         slope = Affine.zeros(group.size)
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + group[m] * w
@@ -402,8 +401,8 @@ class Collision(ContactParameters, Collocated):
         self.d = add("collision travel", b.ny, labels=c.labels)
         self.legs = add("collision legs", b.nl, **limits.of_legs)
         # In contact chatter a driven nail jumps ahead of the hammer. A plan has no events for that: the force
-        # may pull meanwhile, and the check of the plan in full dynamics reports the difference. An objective
-        # on the peak force would exploit such a force.
+        # may pull meanwhile, and the check of the plan in full dynamics reports the difference. The peak
+        # force of such a plan is wrong, so an objective on it excludes this.
         self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
         least, most = self._least_force(guarded), np.where(self.forceless, 0.0, np.inf)[:, None]
         self.f = add("contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most)
@@ -701,9 +700,8 @@ class Collision(ContactParameters, Collocated):
         self.state.write(x, found.state)
         self.xt.write(x, found.travel[:, None] * per_time)
         self.f.write(x, np.where(self.forceless, 0.0, found.force)[:, None])
-        self.p.write(
-            x, len(p.strikers) * found.impulse[:, None]
-        )  # the point mass is in place of each striker
+        # the point mass is in place of each striker
+        self.p.write(x, len(p.strikers) * found.impulse[:, None])
         for joined, each in ((self.joined, d[self.end]), (self.joined_x, self.xt.read(x)[self.end])):
             means = [(times[:k, None] / before[k] * each[:k]).sum(axis=0) for k in range(2, len(times))]
             joined.write(x, np.reshape(means, (joined.count, joined.size)))

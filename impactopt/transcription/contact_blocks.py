@@ -265,7 +265,7 @@ def force(
         invariant = of_phase([target.invariant(state, total, k, parameters) for k in phases])
         reserve = ca.SX(of_phase([target.reserve(state, total, k, parameters) for k in phases]))
     of_hands = []  # residual of the law, rate, penetration and separation of each striker
-    # equation (17) with one branch of the law, and (14) to (16) as penetration and its rate
+    # f_r of equation (17) by one branch of the law, from positions and velocities along the normal
     for k, (position, velocity) in enumerate(hands):
         penetration, rate = position - surface, velocity - speed
         compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))

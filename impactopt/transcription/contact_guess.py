@@ -258,7 +258,7 @@ def guessed_contact(
 
     x, v, travel, force = values[0], values[1], values[2], values[-1]
     states = [np.interp(times, time, state) for state in values[3:-1]]
-    # A mass that comes towards the robot cannot be pushed: its travel would begin inside the hand.
+    # Not for a mass that comes towards the robot: under such a push it would pass through the hand.
     comes = float(target.speed_before()) < 0
     if isinstance(target, FreeMass) and ends[-1] > MAX_IMPACT_TIME and not comes:
         return _push(target, phase, place)
@@ -401,7 +401,7 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
 
 
 def _phases(found: _History, target: Target) -> Array | None:
-    """Start and ends (phases + 1,) of the contact phases [s]; None if events are out of order."""
+    """Start and ends (phases + 1,) of the contact phases [s]; None unless all events happen, in order."""
     time, values, switched = found
     if switched:  # several touches, and the event in the last of them
         first = _first_event(found, target)

@@ -219,9 +219,8 @@ class ContactProgram(ABC):
         if self.builder.robot.hinges.any():
             add_hinges(self.builder, [(place, torque) for place, torque, _ in self._nodes()])
         for term in terms:
-            if (
-                type(term).add_constraints is not Term.add_constraints
-            ):  # the parts have those of the other terms
+            # the parts have the constraints of the other terms
+            if type(term).add_constraints is not Term.add_constraints:
                 term.add_constraints(self)
         self.objectives = quantities(self, objectives)
         self._objective = assemble(self.layout, self.objectives, self._prices())
@@ -231,9 +230,8 @@ class ContactProgram(ABC):
     def program(self) -> StructuredProgram:
         """The program for a solver."""
         objective, quadratic, linear = self._objective
-        if (
-            self.clearance_constraints
-        ):  # one structure for all sets of clearance constraints, which solvers can reuse
+        # one structure for all sets of clearance constraints, which solvers can reuse
+        if self.clearance_constraints:
             quadratic = coupled(quadratic, self.body_spots())
         return StructuredProgram(
             self.layout,

@@ -21,8 +21,8 @@ from impactopt.transcription.mesh import CollocationPoint
 
 # Least durations of contact phases, as fractions of that of compression or restitution (`contact_duration`).
 # Phases into which events split compression may last the first fraction. A first phase whose event may come
-# at first touch may last the second: short, as nothing moves in it, but not zero, as its constraints are
-# divided by its duration.
+# at first touch may last the second: short, as hardly anything happens in it, but not zero, as accelerations
+# are divided by its duration.
 EVENT_PHASE_FRACTION, IMMEDIATE_PHASE_FRACTION = 0.1, 0.05
 TOUCH_PHASE_FRACTION = 0.01  # of each phase where striker and target separate and meet again
 # Where no least duration is given, it is the least of a fraction of a point mass's restitution, a time [s],

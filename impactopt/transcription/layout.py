@@ -310,7 +310,7 @@ def _joined(*parts: str) -> str:
 class Constraints:
     """Constraints under construction.
 
-    A constraint is  lower <= out[output] + affine <= upper,  with one output of a block (number -1: none) and
+    A constraint is  lower <= out[output] + affine <= upper,  with one output of a block (index -1: none) and
     an affine expression. Each call of :meth:`add` appends an entry to the lists, and as many origins as
     constraints.
     """

@@ -37,8 +37,8 @@ def motion_measures(problem: ImpactProblem, reference: Trajectory) -> dict[str, 
     before = reference.phase == 0
     power = np.maximum(reference.torque * rate, 0.0).sum(axis=1)[before]
     idle = problem.idle_joints
-    outside = [k for k in (before, reference.phase == 2) if k.sum() > 1]
-    jerk = [_slope(reference.time[k], acceleration[k]) for k in outside]
+    phases = [k for k in (before, reference.phase == 2) if k.sum() > 1]
+    jerk = [_slope(reference.time[k], acceleration[k]) for k in phases]
     reversals = [_reversals(column) for column in angle[before].T]
     return {
         "idle_travel_rad": float(np.abs(np.diff(angle[:, idle], axis=0)).sum()),

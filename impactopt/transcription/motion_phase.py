@@ -283,7 +283,7 @@ class MotionPhase:
         return Place(f"{self.name}, {percentage(s, self.more)}", f"{self.name} at {{s}}", self.T[0] * s)
 
     def instances(self) -> tuple[list[list[Affine]], list[Place]]:
-        """Inputs of the block ``node`` at each node, and the nodes' places."""
+        """Slots of the block ``node`` at each node, and the nodes' places."""
         slots = [[*self.at_node(k), self.legs[k], self.wrench(k), self.T[0]] for k in range(len(self.nodes))]
         return slots, [self.place_at(s) for s in self.nodes]
 
@@ -478,13 +478,13 @@ class AbortMotion(FollowThrough):
         self.coast_w = b.layout.add("coasting sole wrench", 1, b.nw, **b.limits.of_wrenches)
 
     def coasting_node(self) -> tuple[list[Affine], Place]:
-        """Inputs of the block ``node`` at the end of coasting, where y'' = 0, and the node's place."""
+        """Slots of the block ``node`` at the end of coasting, where y'' = 0, and the node's place."""
         y, y1, T = self.start
         slots = [y, y1, Affine.zeros(y.size), self.legs[0], self.coast_w[0], T]
         return slots, Place.plain("end of coasting, if nothing is hit")
 
     def link(self, contact: Contact) -> list[list[Affine]]:
-        """Inputs of the block ``link``: the motion starts at the end of coasting."""
+        """Slots of the block ``link``: the motion starts at the end of coasting."""
         u0 = contact.u0[0]
         return contact.link(self.start, (Affine.constant(self.after), Affine.zeros(1)), (u0, u0), u0)
 

@@ -121,8 +121,8 @@ def _priced(
 ) -> Prices:
     """Cost of prices of integrals over motions, and of the end posture.
 
-    Integrals become sums over the nodes, |M x + constants|^2 / 2. With the duration as a variable they were
-    not quadratic, so each phase's mean permitted duration T stands for it.
+    Integrals become sums over the nodes, |M x + constants|^2 / 2. With the duration as a variable they would
+    not be quadratic, so each phase's mean permitted duration T stands for it.
     """
     n, c = b.layout.n, b.coordinates
     speeds = np.full(b.ny, prices.speed)

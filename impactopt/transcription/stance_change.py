@@ -242,7 +242,7 @@ class PhaseSequence:
         )
 
     def _rates(self, k: int, s: float) -> Index:
-        """Numbers (ny) of block outputs: the rates y'/T of a phase at s."""
+        """Indices (ny,) of block outputs: the rates y'/T of a phase at s."""
         b, phase = self.builders[k], self.phases[k]
         y1, T = phase.at(s)[1], phase.T[0]
         return b.add_block("pace", [[y1[i : i + 1], T] for i in range(b.ny)], np.zeros(0)) + np.arange(b.ny)

@@ -190,7 +190,7 @@ class JacobianMap:
         self, blocks: Sequence[Block], lift: sp.csr_array, constraint_of: Index, linear: sp.csr_array
     ):
         """lift : S, of the inputs of all blocks.  linear : A (m, n).
-        constraint_of : number of the constraint that each output is in; -1: none.
+        constraint_of : index of the constraint that each output is in; -1: none.
         """
         self._entries, starts = _shared([b.jacobian for b in blocks])
         self._shape = m, _ = linear.shape
@@ -372,7 +372,7 @@ class StructuredProgram:
         self._z_offset = np.cumsum([0] + [b.count * b.n_in for b in blocks])
         self._out_offset = np.cumsum([0] + [b.count * b.n_out for b in blocks])
         affine = stack(constraints.affine)
-        # number of the block output in each constraint; -1: the constraint is affine
+        # index of the block output in each constraint; -1: the constraint is affine
         output_of = np.concatenate([np.zeros(0, dtype=np.intp), *constraints.outputs])
         self._nonlinear = np.flatnonzero(output_of >= 0)  # constraints with an output
         self._of_nonlinear = output_of[self._nonlinear]  # and that output

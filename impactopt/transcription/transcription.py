@@ -271,7 +271,7 @@ class Transcription(ContactProgram):
         return any(o.needs_torques for o in p.objectives)
 
     def _add_torque_limits(self, places: list[Place], outputs: list[Index]) -> None:
-        """Adds torque limits.  outputs : for each node, numbers (n,) of its torques among block outputs."""
+        """Adds torque limits.  outputs : for each node, indices (n,) of its torques among block outputs."""
         b, torque_limit = self.builder, self.builder.limits.torque
         limit, names = torque_limit.fraction, self.robot.joint_names
         strong = percent("over its limit", of=limit)

@@ -72,9 +72,8 @@ class ContactLaw(Described, ABC):
         forces = [self.branch(x, rate, c, names) for c in (True, False)]
         used = {symbol.name() for symbol in ca.symvar(ca.SX(ca.vertcat(*forces)))}
         unused = [name for name in names if name not in used]
-        own_fields = dataclasses.is_dataclass(
-            type(self)
-        )  # a CustomLaw's functions get all parameters in any case
+        # a CustomLaw's functions get all parameters in any case
+        own_fields = dataclasses.is_dataclass(type(self))
         if unused and own_fields:
             raise InputError(
                 f"{type(self).__name__}.branch does not take {', '.join(unused)} from its argument "

@@ -240,7 +240,7 @@ class ContactPhase:
 
 
 def contact_phases(target: Target, touches: int = 1) -> tuple[ContactPhase, ...]:
-    """Phases of a contact in which the striker touches the target several times.
+    """Phases of a contact in which the striker touches the target ``touches`` times.
 
     With one touch they are the target's. With more, the target's guards are in the last touch, and
     compression and restitution are not distinguished.

@@ -1,4 +1,4 @@
-"""Energy of the target after the impact."""
+"""Energy that the target absorbs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impactopt.problem.objectives.base import WEIGHT, Objective
 
 @dataclass(frozen=True, kw_only=True)
 class TargetEnergy(Objective):
-    """The energy that the target has at separation, with the work done in it.
+    """The energy that the target has absorbed at separation, with the work done in it.
 
     In J: ``Target.energy``.
     """

@@ -417,7 +417,10 @@ class Collision(ContactParameters, Collocated):
         self.after = b.layout.add(f"{prefix}position after contact", count, b.ny, **(after or {}))
 
     def _least_force(self, guarded: bool) -> Any:
-        """Lower bound of the forces at the stages [N]: zero where law or target might make bodies pull."""
+        """Lower bound of the forces at the stages [N]: zero if law or target might make bodies pull.
+
+        There is none while a nail is driven, if the collision ``holds``.
+        """
         p = self._b.problem
         if self.holds:
             driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])

@@ -27,7 +27,7 @@ EVENT_PHASE_FRACTION, IMMEDIATE_PHASE_FRACTION = 0.1, 0.05
 TOUCH_PHASE_FRACTION = 0.01  # of each phase where striker and target separate and meet again
 # Where no least duration is given, it is the least of a fraction of a point mass's restitution, a time [s],
 # and a fraction of the longest duration.
-NATURAL_FRACTION, MOST_LEAST_DURATION, LONGEST_FRACTION = 0.15, 2e-3, 0.5
+NATURAL_FRACTION, MAX_LEAST_DURATION, LONGEST_FRACTION = 0.15, 2e-3, 0.5
 SIMILAR_FACTOR = 3.0  # parameters within this factor share least durations
 
 
@@ -105,7 +105,7 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     """
     target, (shortest, longest) = problem.target, problem.contact_duration
     if not shortest:  # none is given: far below the duration of an impact, as constraints are divided by it
-        shortest = min(NATURAL_FRACTION * natural, MOST_LEAST_DURATION, LONGEST_FRACTION * longest)
+        shortest = min(NATURAL_FRACTION * natural, MAX_LEAST_DURATION, LONGEST_FRACTION * longest)
     before = EVENT_PHASE_FRACTION if target.guards else 1.0
     fractions = [before] * (len(problem.contact_phases) - 1) + [1.0]
     if problem.planned_touches > 1:

@@ -62,7 +62,7 @@ def strike_rates(
 
 
 @dataclass(frozen=True)
-class ContactGuess:
+class ReachedState:
     """State at contact: coordinates y and rates ydot (ny,), legs (nl,)."""
 
     y: Array
@@ -70,7 +70,7 @@ class ContactGuess:
     legs: Array
 
 
-def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> ContactGuess:
+def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> ReachedState:
     """State at contact by inverse kinematics.
 
     speed : of the striking points [m/s]; less if joints are not that fast. If the target's speed after the
@@ -89,7 +89,7 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
         speed = speed_that_leaves(p.law, p.target, mass, speed, bounds.least, bounds.most)
     options = {"base": 0.0} if c.drifts else {}  # momentum determines the rates of a floating base
     rates = strike_rates(c, p.strikers, y, legs, speed * p.normal, **options)
-    return ContactGuess(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
+    return ReachedState(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
 
 
 def _within(rates: Array, limit: Array) -> float:
@@ -117,7 +117,7 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     return _finished(t, x)
 
 
-def _drifting(problem: ImpactProblem, curve: CubicSpline, since: ContactGuess | None = None) -> CubicSpline:
+def _drifting(problem: ImpactProblem, curve: CubicSpline, since: ReachedState | None = None) -> CubicSpline:
     """Spline with the joints' motion of another one, and the base's motion that conserves momentum.
 
     since : state in which it begins; None: that of the spline.

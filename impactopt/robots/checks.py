@@ -431,7 +431,7 @@ def repair_inertias(model: pin.Model) -> list[str]:
     """Change inertias that no body of this mass can have, in place; messages about the changes.
 
     Mass and centre of mass stay. The second moments of mass along the principal axes are raised to those of a
-    slab 1 cm thick. If all three are smaller than that, the body becomes a ball of 2000 kg/m3. Physical
+    slab 1 cm thick. If all three are smaller than that, the body becomes a ball of 2000 kg/m3. Other physical
     inertias are not changed.
     """
     messages = []

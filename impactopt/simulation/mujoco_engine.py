@@ -99,7 +99,7 @@ class _Replay(MujocoRobot):
         self.last_depths: Array | None = None
         # speeds of the striking points in the last step, and forces on them
         self.last_step: tuple[Array, Array] | None = None
-        # accelerations (h, nv) of the robot by a unit of each contact force; None: no contact is near
+        # decelerations (h, nv) of the robot by a unit of each contact force; None: no contact is near
         self.response: Array | None = None
         self.sole_index = {name: k for k, name in enumerate(scene.soles)}
         # of each geom: index of the scene's sole that it is a corner of, or -1
@@ -175,9 +175,7 @@ class _Replay(MujocoRobot):
             if place is None:
                 continue
             if np.linalg.norm(place - d.site_xpos[site]) > NEW_POINT:
-                self.last_step = (
-                    None  # the speeds are those of another point: no acceleration follows from them
-                )
+                self.last_step = None  # of another point: its speeds give no acceleration
             body = self.world.site_bodyid[site]
             self.world.site_pos[site] = d.xmat[body].reshape(3, 3).T @ (place - d.xpos[body])
             d.site_xpos[site] = place

@@ -274,7 +274,8 @@ MOMENT_ARM = 0.1  # [m] that makes the moments of a sole comparable with its for
 RECOVERY_TORQUE_WEIGHT = 1e-3  # of torques over their limits; the recovery has no feed-forward to follow
 SWING_FOOT_BANDWIDTH = 40.0  # [rad/s]
 CLEARANCE_SCALE = 10.0  # [m/s^2] over which clearance constraints are of order one
-# Weights of the slacks. The linear one is an exact penalty: cones are left only where they cannot be kept.
+# Weights of the slacks: the linear one, large enough to leave cones only where they cannot be kept, and that
+# of the squares.
 SLACK_WEIGHT, SLACK_SQUARE_WEIGHT = 1e3, 1e3
 MAX_SLACK = 1e3  # no limit in practice
 
@@ -488,9 +489,8 @@ class WholeBodyController:
             strict=True,
         ):
             error, acceleration = goal[0] - point, goal[2]
-            if (
-                self.has_soft_grip
-            ):  # no torque controls the tool's swing in the grip: take it out of the errors
+            if self.has_soft_grip:
+                # no torque controls the tool's swing in the grip: take it out of the errors
                 swing, J = J * (1.0 - self.actuated), J * self.actuated
                 error, acceleration = error - swing @ q_error, acceleration - swing @ aim.a
             if draws_back:  # the tool swings on in its grip, and would touch again

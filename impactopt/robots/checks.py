@@ -281,10 +281,10 @@ def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
 
 
 def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]]) -> None:
-    """InputError with all gripping hands, (name, frame) each, without an arm of their own.
+    """InputError with all supporting hands, (name, frame) each, without an arm of their own.
 
     The last six joints before a hand are its arm. None of them may move a fixed sole, by its frame, or
-    another gripping hand.
+    another supporting hand.
     """
     found = Mistakes()
     chains = {frame: robot.limb(frame) for frame in (*soles, *(frame for _, frame in hands))}

@@ -1,4 +1,4 @@
-"""Replay in MuJoCo with a free robot: only hands that hold on are fixed.
+"""Replay in MuJoCo with a free robot: only supporting hands are fixed.
 
 Soles have unilateral contact with friction at their corners, the servo saturates, and the contact law's force
 moves the target. The engine shares no code with the planner: it reads a reference (times, positions,
@@ -141,7 +141,7 @@ class _Replay(MujocoRobot):
         return demand, np.clip(demand, -self.servo.limit, self.servo.limit)
 
     def start(self, q: Array) -> None:
-        """Puts the robot at q (nq,), and welds gripping hands there."""
+        """Puts the robot at q (nq,), and welds supporting hands there."""
         self.put(q)
         if self.scene.soles:
             self.data.qpos[2] -= INITIAL_SINK
@@ -265,7 +265,7 @@ class _Replay(MujocoRobot):
         return out
 
     def ground(self) -> Array:
-        """Wrenches (soles and gripping hands, 6) of the world on them, about its origin.
+        """Wrenches (soles and supporting hands, 6) of the world on them, about its origin.
 
         To be called once the step's forces are known.
         """

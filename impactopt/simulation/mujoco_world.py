@@ -98,7 +98,7 @@ def build_world(
       its corners, which collides with the floor.
     * Solids are the geoms ``solid <number>``: hulls of links, and bodies of the world. Those that move with
       the target are on the mocap body ``target``.
-    * Hands that hold on are welded.
+    * Supporting hands are welded.
     """
     spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver, scene.solids.floor)
     _solids(mujoco_module(), spec, bodies, scene, near, in_contact)

@@ -97,9 +97,9 @@ _AXES = pin.LOCAL_WORLD_ALIGNED
 
 
 class ConstrainedDynamics:
-    """Dynamics of a robot with its soles and gripping hands fixed, affine in the torques tau (n,).
+    """Dynamics of a robot with its soles and supporting hands fixed, affine in the torques tau (n,).
 
-    frames = soles, then gripping hands; h = number of striking points.
+    frames = soles, then supporting hands; h = number of striking points.
 
     A (nv, n), a0 (nv,) : accelerations A tau + a0
     B (6 frames, n), b0 : wrenches of the ground on the frames at their origins, world axes
@@ -242,7 +242,7 @@ class WrenchCones:
         """C (m, n + 1) and c (m,) with C x >= c; x: n torques over their limits, and a slack over the weight.
 
         B (6 frames, n), b0 : wrenches B x + b0 in world axes.  placements : of the frames.  The soles come
-        first; gripping hands, which come after them, have no cone.
+        first; supporting hands, which come after them, have no cone.
         """
         rotation, local = self._rotation, self._local
         for k, placement in enumerate(placements[: self._soles]):

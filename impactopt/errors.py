@@ -77,7 +77,7 @@ class CacheWarning(UserWarning):
 
 
 class NotSolvedWarning(UserWarning):
-    """The result is not a solution: its numbers are those of the best iterate, which violates constraints."""
+    """The result is not a solution: its numbers are those of the best iterate."""
 
 
 def did_you_mean(name: str, options: Iterable[str]) -> str:

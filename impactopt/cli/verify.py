@@ -1,4 +1,4 @@
-"""Command `impactopt verify`: independent check of a saved result."""
+"""Command `impactopt verify`: check of a saved result, whose program is evaluated again."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def verify(
 
         check_loudness(quiet, verbose)
         with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
-            progress.say(f"{result}: computing its constraints, and their derivatives by differences")
+            progress.say(f"{result}: evaluating its program again")
             verdict = verified(result, problem_file=problem)
         if as_json:
             print_json(plain(verdict.describe()), verdict.ok)

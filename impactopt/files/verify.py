@@ -43,9 +43,7 @@ OBJECTIVE_TOLERANCE = 1e-9  # relative to the objective's size, at least to one
 MAX_REPORTED = 3  # violations in a reason
 # prefixes of the arrays, and keys of the summary, that can be computed from the program's variables
 RECOMPUTED = ("plan_", "swing_", "follow_", "collision_", "reference_", "missed_")
-SUMMARY_KEYS = (
-    *("impulse_Ns", "contact_ms", "hand_speed_m_s", "duration_s", "target", "objectives", "scenarios"),
-)
+KEYS = ("impulse_Ns", "contact_ms", "hand_speed_m_s", "duration_s", "target", "objectives", "scenarios")
 CONTACT = 1  # phase
 
 
@@ -212,7 +210,7 @@ def _deviations(t: Transcription, record: Record) -> Iterator[Deviation]:
     for name in sorted(again.arrays.keys() & record.arrays.keys()):
         if name.startswith(RECOMPUTED):
             yield "record", _difference(record.arrays[name], again.arrays[name]), name
-    for key in SUMMARY_KEYS:
+    for key in KEYS:
         if key in record.summary:
             yield from _differences(record.summary[key], again.summary.get(key), key)
     clearance = again.summary.get("clearance_mm")
@@ -224,7 +222,7 @@ def _deviations(t: Transcription, record: Record) -> Iterator[Deviation]:
 
 
 def _difference(recorded: Any, computed: Any) -> float:
-    """Largest difference, relative to the largest number or to one; inf for other shapes, text or NaN."""
+    """Largest difference, relative to the largest number or to one; inf if shapes, texts or NaNs differ."""
     if np.asarray(computed).dtype.kind not in "fiub":
         return 0.0 if np.array_equal(recorded, computed) else np.inf
     one, two = np.asarray(recorded, dtype=float), np.asarray(computed, dtype=float)
@@ -288,7 +286,7 @@ def motion_of_record(
         for leg in legs_of_stance[stance[i]]:
             frame, at = model.getFrameId(leg.frame), columns[leg.frame]
             error = float(np.abs(pin.log6(leg.placement.actInv(data.oMf[frame])).vector).max())
-            yield f"{prefix}: held soles", error, where
+            yield f"{prefix}: fixed soles", error, where
             if wrench.size:
                 jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL)
                 tau -= jacobian.T @ wrench[i, at : at + 6]

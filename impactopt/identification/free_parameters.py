@@ -93,7 +93,7 @@ def _defaulted(kind: type[ContactLaw]) -> set[str]:
 
 
 def _compression(impact: MeasuredImpact) -> tuple[float, float]:
-    """Largest penetration [m], and rate [m/s] half-way to it, if the penetration is half a sine.
+    """Largest penetration [m] if it is half a sine, and half of the speed at contact [m/s] as a typical rate.
 
     A sine with this slope at first reaches 2 / pi = 0.64 times the slope times the time of compression.
     """

@@ -281,10 +281,10 @@ def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
 
 
 def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]]) -> None:
-    """InputError with all gripping hands, (name, frame) each, without an arm of their own.
+    """InputError with all supporting hands, (name, frame) each, without an arm of their own.
 
     The last six joints before a hand are its arm. None of them may move a fixed sole, by its frame, or
-    another gripping hand.
+    another supporting hand.
     """
     found = Mistakes()
     chains = {frame: robot.limb(frame) for frame in (*soles, *(frame for _, frame in hands))}
@@ -431,7 +431,7 @@ def repair_inertias(model: pin.Model) -> list[str]:
     """Change inertias that no body of this mass can have, in place; messages about the changes.
 
     Mass and centre of mass stay. The second moments of mass along the principal axes are raised to those of a
-    slab 1 cm thick. If all three are smaller than that, the body becomes a ball of 2000 kg/m3. Physical
+    slab 1 cm thick. If all three are smaller than that, the body becomes a ball of 2000 kg/m3. Other physical
     inertias are not changed.
     """
     messages = []

@@ -331,8 +331,8 @@ class _Reader(Compiled):
         if len(self.roots) > 1 and floating:
             raise InputError(f"{what} has several bodies with joints on the ground: it cannot float")
         self.floating = bool(free) if floating is None else floating
-        # Followers by joint equalities have one coordinate even without limits, which a continuous joint of
-        # Pinocchio, with (cos, sin), has not.
+        # Followers by joint equalities need one coordinate even without limits, not Pinocchio's (cos, sin) of
+        # continuous joints.
         joints = (mj.eq_type == self.mujoco.mjtEq.mjEQ_JOINT) & (mj.eq_obj2id >= 0)
         self.followers = set(map(int, mj.eq_obj1id[joints]))
         self.model.name = mj.names[: mj.names.index(b"\0")].decode() or "robot"

@@ -166,8 +166,8 @@ def errors_against(
     * torque_error_pct : largest difference of the servos' torques over `torque_limit` (n,) [N m], of all
       joints; None without limits.
 
-    The last two are evaluated at the result's instants, as long as both are in contact, with linear
-    interpolation of the reference; ZMPs only while both normal forces exceed 50 N.
+    The last two are evaluated at the result's instants while both are in contact, at equal times since
+    contact, with linear interpolation of the reference; ZMPs only while both normal forces exceed 50 N.
     """
     time = result.time[result.time <= reference.time[-1]]
     k = time.size

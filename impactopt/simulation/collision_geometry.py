@@ -16,9 +16,7 @@ __all__ = ["FLOOR", "Solid", "Solids", "UnintendedContact", "UnintendedContacts"
 
 Array = NDArray[np.float64]
 FLOOR = -1  # in place of a solid's number
-NEAR = (
-    0.05  # [m] between the enclosing balls of two solids in the reference's motion; other pairs are ignored
-)
+NEAR = 0.05  # [m] between the enclosing balls of two solids in the reference's motion; others are ignored
 SAMPLING = 0.02  # [s] between the instants of the reference that are checked
 
 

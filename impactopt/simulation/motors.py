@@ -124,9 +124,9 @@ class Motors:
     """Torque that motors produce for a demand; joints without motor data produce all of it.
 
     At speed w, full voltage gives the torque stall_torque (1 - w / no_load_speed), and full reverse voltage
-    -stall_torque (1 + w / no_load_speed): a motor brakes harder than it drives. Friction reduces both.
-    Between these lines the torque approaches the demand as a current through an inductance does, with the
-    rate 2 pi bandwidth.
+    -stall_torque (1 + w / no_load_speed): a motor brakes harder than it drives. Friction shifts both lines
+    against the motion. Between them the torque approaches the demand as a current through an inductance does,
+    with the rate 2 pi bandwidth.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -153,8 +153,7 @@ class Motors:
         """Torque (n,) [N m], clipped to the motors' lines at joint rates (n,)."""
         if not self.lines:
             return torque
-        # back-EMF and viscous friction are linear in the rate; all of them shift both limits against the
-        # motion
+        # back-EMF and viscous friction, linear in the rate, and dry friction
         lost = self._slope * rates + self._coulomb * np.sign(rates)
         return np.clip(torque, -self._stall - lost, self._stall - lost)
 
@@ -172,7 +171,8 @@ class Motors:
         """Mean torque (n,) [N m] during a time [s], for a constant wanted torque (n,)."""
         if not self._slow:
             return wanted
-        decay = self._rate * time  # integral of the exponential in `after`, over the time
+        decay = self._rate * time
+        # the exponential in `after`, integrated and divided by the time
         return wanted - np.expm1(-decay) / decay * (torque - wanted)
 
 

@@ -1,4 +1,4 @@
-"""Replay in MuJoCo with a free robot: only hands that hold on are fixed.
+"""Replay in MuJoCo with a free robot: only supporting hands are fixed.
 
 Soles have unilateral contact with friction at their corners, the servo saturates, and the contact law's force
 moves the target. The engine shares no code with the planner: it reads a reference (times, positions,
@@ -99,7 +99,7 @@ class _Replay(MujocoRobot):
         self.last_depths: Array | None = None
         # speeds of the striking points in the last step, and forces on them
         self.last_step: tuple[Array, Array] | None = None
-        # accelerations (h, nv) of the robot by a unit of each contact force; None: no contact is near
+        # decelerations (h, nv) of the robot by a unit of each contact force; None: no contact is near
         self.response: Array | None = None
         self.sole_index = {name: k for k, name in enumerate(scene.soles)}
         # of each geom: index of the scene's sole that it is a corner of, or -1
@@ -141,7 +141,7 @@ class _Replay(MujocoRobot):
         return demand, np.clip(demand, -self.servo.limit, self.servo.limit)
 
     def start(self, q: Array) -> None:
-        """Puts the robot at q (nq,), and welds gripping hands there."""
+        """Puts the robot at q (nq,), and welds supporting hands there."""
         self.put(q)
         if self.scene.soles:
             self.data.qpos[2] -= INITIAL_SINK
@@ -175,9 +175,7 @@ class _Replay(MujocoRobot):
             if place is None:
                 continue
             if np.linalg.norm(place - d.site_xpos[site]) > NEW_POINT:
-                self.last_step = (
-                    None  # the speeds are those of another point: no acceleration follows from them
-                )
+                self.last_step = None  # of another point: its speeds give no acceleration
             body = self.world.site_bodyid[site]
             self.world.site_pos[site] = d.xmat[body].reshape(3, 3).T @ (place - d.xpos[body])
             d.site_xpos[site] = place
@@ -267,7 +265,7 @@ class _Replay(MujocoRobot):
         return out
 
     def ground(self) -> Array:
-        """Wrenches (soles and gripping hands, 6) of the world on them, about its origin.
+        """Wrenches (soles and supporting hands, 6) of the world on them, about its origin.
 
         To be called once the step's forces are known.
         """

@@ -98,7 +98,7 @@ def build_world(
       its corners, which collides with the floor.
     * Solids are the geoms ``solid <number>``: hulls of links, and bodies of the world. Those that move with
       the target are on the mocap body ``target``.
-    * Hands that hold on are welded.
+    * Supporting hands are welded.
     """
     spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver, scene.solids.floor)
     _solids(mujoco_module(), spec, bodies, scene, near, in_contact)
@@ -468,7 +468,8 @@ class Welds:
             first = 6 * k + self.world.neq - len(self.frames)
             its = slice(first, first + 6)
             self.mujoco.mj_jacSite(self.world, d, J[:3], J[3:], frame)
-            # MuJoCo scales a weld's constraints its own way: find the wrench of the same generalized forces
+            # MuJoCo's constraints of a weld are in coordinates of its own: find the wrench with the same
+            # generalized forces
             out[k] = np.linalg.lstsq(J.T, efc_J[its].T @ d.efc_force[its], rcond=None)[0]
             places[k] = d.site_xpos[frame]
         return out, places

@@ -17,7 +17,7 @@ MIN_PAYLOAD = 1e-6  # [kg] if not 0: MuJoCo takes no body without inertia
 
 @dataclass(frozen=True, kw_only=True)
 class Perturbation:
-    """Differences of a replay's world from the planned one; by default only the floor's friction, 0.9.
+    """Differences of a replay's world from the planned one; by default none, with a floor's friction of 0.9.
 
     mass : of the target, as a factor of the planned one.
     stiffness, damping : of the contact law, as factors.

@@ -131,7 +131,7 @@ class Simulation:
         :func:`impactopt.robots.loads.cop_margin`
     slip, lift (k, soles) [m] : motion along the ground, and rise, of the corner that moved most since the
         sole began to stand
-    grip_force (k, hands) [N] : on each hand that holds on
+    grip_force (k, hands) [N] : on each supporting hand
     stance (k,) : number of the reference's stance phase; (0,): there is one
 
     Contact and target:
@@ -559,7 +559,7 @@ def simulation_of(
     """Simulation from recorded instants.
 
     recorded : of each instant: time, q, v, force, target speed, hand speed, demand, torque, wrenches of soles
-        and of hands that hold on, positions of the soles' corners, torque through the gears since the instant
+        and of supporting hands, positions of the soles' corners, torque through the gears since the instant
         before, number of the stance phase.
     rest : the other fields of the simulation.
 

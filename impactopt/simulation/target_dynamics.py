@@ -202,7 +202,7 @@ class TargetContact:
     def moved(self, state: Array, force: float, length: float) -> Array:
         """State after a time [s] under a constant force, by the classical Runge-Kutta method of order four.
 
-        A lower order would let the oscillation of an unbroken board grow.
+        Unlike Euler's method, it does not let the oscillation of an unbroken board grow.
         """
         if not any(self.target.derivative(state, force, self._target_parameters)):
             return state  # at rest, as before the impact

@@ -323,9 +323,9 @@ def test_a_verdict_holds_the_soles_of_each_phase_to_their_places(
     found = list(motion_of_record(plan.problem, arrays))
     worst = max(found, key=lambda off: off[1])
     assert worst[1] < 2e-2, worst  # [1] of its size: what a program's tolerance leaves
-    assert max(off for name, off, _ in found if name.endswith("held soles")) < 1e-6
+    assert max(off for name, off, _ in found if name.endswith("fixed soles")) < 1e-6
     moved = {**arrays, "reference_stance": np.zeros_like(ways[0].stance)}
-    assert max(off for name, off, _ in motion_of_record(plan.problem, moved) if "held soles" in name) > 0.01
+    assert max(off for name, off, _ in motion_of_record(plan.problem, moved) if "fixed soles" in name) > 0.01
 
 
 def test_an_export_says_which_sole_stands(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> None:

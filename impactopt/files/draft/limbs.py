@@ -27,7 +27,7 @@ FINGER_MASS, FINGER_LENGTH = 0.03, 0.25
 # Fractions of the robot's height: largest height of a foot's lowest point above the lowest of all, and least
 # height of the root link's.
 FOOT_HEIGHT, ROOT_HEIGHT = 0.05, 0.1
-TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: height of the foot above the toe
+TOE = 0.03  # [m] from an ankle to a toe's joint, at least; half of it: largest height of foot over toe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +117,7 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
     feet = (
         limb
         for limb in limbs_of(model)
-        # arms on a common trunk are no legs, which have no joints in common
+        # limbs on a common trunk are no legs if their joints' names are those of arms
         if len(limb.own) > 1
         and not _is_head(model, limb)
         and (limb.own == limb.path or not _named(model, limb, _ARMS))

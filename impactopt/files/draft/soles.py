@@ -90,7 +90,7 @@ def find_soles(
 def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> Array:
     """Forward direction (3,), an axis of the root: that in which the knees point, else that of the feet.
 
-    feet (3,) [m] : sum of the horizontal vectors from the root to the centres of the feet.
+    feet (3,) [m] : sum of the horizontal vectors from the ankles to the centres of the feet.
     """
     back = np.zeros(3)
     pin.computeJointJacobians(model, data, neutral(model))

@@ -122,8 +122,7 @@ class Export:
     smooth : limits of a smoothed motion and its impulse in a replay; None: it is not smoothed.
     motion : as planned, or smoothed.
     missed : the motion if nothing is hit, on the same time axis; None for a plan without an abort motion.
-        From contact on both have constant joint velocities, `motion` until its contact ends, `missed` until
-        the abort motion begins.
+        From contact on both coast, `motion` until its contact ends, `missed` until the abort motion begins.
     """
 
     planned: Planned

@@ -136,7 +136,7 @@ def _stances(reference: Trajectory, time: Array) -> NDArray[np.intp] | None:
 def with_passive_at_rest(motion: Motion, passive: NDArray[np.bool_]) -> Motion:
     """The motion with constant references of passive joints (n,): position and effort are those at the start.
 
-    Springs move these joints, which servos cannot.
+    They have no servos.
     """
     if not passive.any():
         return motion

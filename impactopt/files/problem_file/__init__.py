@@ -7,7 +7,6 @@
 * reading.py    file to problem, with changed values by key paths; writing.py: problem to file
 * toml.py       text from and to plain data
 * reference.py  docs/problem_files.md, and the comments of `impactopt new`
-* names.py      the package's own files, by name
 """
 
 from impactopt.files.named_problems import problem_names

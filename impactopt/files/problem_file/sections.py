@@ -230,7 +230,7 @@ class SecondSection(Section):
 
 
 class StanceSection(Section):
-    """Fixed soles, and gripping hands."""
+    """Fixed soles, and supporting hands."""
 
     soles: str = Field(
         default="both",

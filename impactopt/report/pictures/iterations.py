@@ -49,7 +49,7 @@ def draw_iterations(figure: FigureBase, record: Record) -> None:
 
 
 def _middle_of(values: Array) -> tuple[float, float]:
-    """Limits of an axis that contain the last half of the values, and ten times their span."""
+    """Limits of an axis that contain the last half of the values, and others within five times their span."""
     last = values[len(values) // 2 :]
     low, high = float(last.min()), float(last.max())
     pad = max(5 * (high - low), 0.05 * abs(values[-1]), 1e-9)

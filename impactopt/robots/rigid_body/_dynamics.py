@@ -170,8 +170,8 @@ class Velocities:
 class Accelerations:
     """Link accelerations, in link frames, for one v and a: dw/dt, and the *point* acceleration of the origin.
 
-    A point acceleration depends on angular velocities only, except at the free-flyer, whose linear velocity
-    is given along turning axes.
+    Linear velocities of links are not needed for them, except that of the free-flyer, which is given along
+    turning axes.
     """
 
     def __init__(self, velocities: Velocities, a: Vector) -> None:

@@ -120,8 +120,8 @@ class StateEstimate:
         v[3:6] = measured.gyro
         pin.forwardKinematics(model, data, q, v)
         weights = loads / loads.sum()
-        # kinematics so far have the base at the origin, at rest: the base moves by what brings each sole's
-        # point back to its place, at rest
+        # so far the base is at the origin, with no linear velocity: move it so that each sole's point is in
+        # its place, at rest
         position, velocity = np.zeros(3), np.zeros(3)
         for (i, standing), point, weight in zip(self._placements.items(), points, weights, strict=True):
             now = pin.updateFramePlacement(model, data, i)

@@ -66,7 +66,7 @@ class Recovery:
         self.model, self.start, self.pace = robot.model, settings.recovery_start, settings.recovery_pace
         last = np.asarray(reference.q[-1])
         shift = np.zeros(robot.nv)
-        if not scene.hands:  # a shift would tear off hands that hold on
+        if not scene.hands:  # a shift would tear off supporting hands
             standing = np.asarray(reference.q[stance_begins(reference, stance_at(reference, np.inf))])
             q = _shifted_posture(robot, last, standing, scene, settings.recovery_margin)
             shift = np.array(pin.difference(self.model, last, q))

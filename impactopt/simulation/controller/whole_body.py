@@ -97,9 +97,9 @@ _AXES = pin.LOCAL_WORLD_ALIGNED
 
 
 class ConstrainedDynamics:
-    """Dynamics of a robot with its soles and gripping hands fixed, affine in the torques tau (n,).
+    """Dynamics of a robot with its soles and supporting hands fixed, affine in the torques tau (n,).
 
-    frames = soles, then gripping hands; h = number of striking points.
+    frames = soles, then supporting hands; h = number of striking points.
 
     A (nv, n), a0 (nv,) : accelerations A tau + a0
     B (6 frames, n), b0 : wrenches of the ground on the frames at their origins, world axes
@@ -242,7 +242,7 @@ class WrenchCones:
         """C (m, n + 1) and c (m,) with C x >= c; x: n torques over their limits, and a slack over the weight.
 
         B (6 frames, n), b0 : wrenches B x + b0 in world axes.  placements : of the frames.  The soles come
-        first; gripping hands, which come after them, have no cone.
+        first; supporting hands, which come after them, have no cone.
         """
         rotation, local = self._rotation, self._local
         for k, placement in enumerate(placements[: self._soles]):
@@ -274,7 +274,8 @@ MOMENT_ARM = 0.1  # [m] that makes the moments of a sole comparable with its for
 RECOVERY_TORQUE_WEIGHT = 1e-3  # of torques over their limits; the recovery has no feed-forward to follow
 SWING_FOOT_BANDWIDTH = 40.0  # [rad/s]
 CLEARANCE_SCALE = 10.0  # [m/s^2] over which clearance constraints are of order one
-# Weights of the slacks. The linear one is an exact penalty: cones are left only where they cannot be kept.
+# Weights of the slacks: the linear one, large enough to leave cones only where they cannot be kept, and that
+# of the squares.
 SLACK_WEIGHT, SLACK_SQUARE_WEIGHT = 1e3, 1e3
 MAX_SLACK = 1e3  # no limit in practice
 
@@ -488,9 +489,8 @@ class WholeBodyController:
             strict=True,
         ):
             error, acceleration = goal[0] - point, goal[2]
-            if (
-                self.has_soft_grip
-            ):  # no torque controls the tool's swing in the grip: take it out of the errors
+            if self.has_soft_grip:
+                # no torque controls the tool's swing in the grip: take it out of the errors
                 swing, J = J * (1.0 - self.actuated), J * self.actuated
                 error, acceleration = error - swing @ q_error, acceleration - swing @ aim.a
             if draws_back:  # the tool swings on in its grip, and would touch again

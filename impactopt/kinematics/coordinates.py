@@ -10,7 +10,7 @@ with V and A the twist and the acceleration that the sole would have if the leg'
 sides are written in the base's own frame, where J_leg depends on the joints between base and sole only.
 
 The dependent joints of a chain are its last six. Those before them are coordinates: the first joint of a leg
-of seven, or a waist that leads to both legs. A hand that holds on is treated as a sole. Of a free-floating
+of seven, or a waist that leads to both legs. A supporting hand is treated as a sole. Of a free-floating
 robot the coordinates are the base's pose and all joints.
 """
 

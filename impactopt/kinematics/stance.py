@@ -35,11 +35,11 @@ class Stance(ABC):
         return tuple(sole.frame for sole in self.soles(robot))
 
     def held_hands(self, robot: Robot) -> tuple[Striker, ...]:
-        """Fixed hands; InputError for an unknown one."""
+        """Supporting hands; InputError for an unknown one."""
         return ()
 
     def hand_frames(self, robot: Robot) -> tuple[str, ...]:
-        """Frames of the fixed hands; InputError for an unknown one."""
+        """Frames of the supporting hands; InputError for an unknown one."""
         return tuple(hand.model_frame for hand in self.held_hands(robot))
 
     def constraint_frames(self, robot: Robot) -> tuple[str, ...]:

@@ -110,7 +110,7 @@ def check_stances(problem: Any) -> None:
             )
     _check_steps(stances)
     if problem.stance.hand_frames(robot):
-        raise InputError("stances: a hand that holds on goes with one stance: leave one of them out")
+        raise InputError("stances: a supporting hand goes with one stance: leave one of them out")
     if robot.sprung.any():
         raise InputError(f"stances: robot {robot.name!r} has soft grips, which go with one stance")
     object.__setattr__(problem, "stance", _stance(robot, of_impact[0].soles))

@@ -301,7 +301,7 @@ def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]
         elif shared:
             found.found.append(
                 f"hand {name!r} cannot be fixed: of the last {LEG} joints before it, {shared} also move a "
-                "fixed sole or another fixed hand; give a hand on an arm of its own"
+                "fixed sole or another supporting hand; give a hand on an arm of its own"
             )
         elif np.any(robot.sprung[list(arm)]):
             found.found.append(f"hand {name!r} cannot be fixed by a soft grip: give the hand, not its tool")

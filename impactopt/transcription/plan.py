@@ -215,7 +215,7 @@ class Trajectory:
     q (k, nq), v (k, nv), a (k, nv) : Pinocchio's configurations, velocities, accelerations.
     torque (k, n) : feed-forward [N m].
     ground (k, 6) : total ground wrench about the world's origin that the feed-forward assumes [N, N m].
-    sole_wrench (k, 6 a sole, 6 a hand that holds on) : its parts, in their own frames; (0, 0): unknown.
+    sole_wrench (k, 6 a sole, 6 a supporting hand) : its parts, in their own frames; (0, 0): unknown.
     contact_start, contact_end, end : [s] planned begin and end of contact, and end of the motion.
     stance (k,) : number of the stance phase; (0,): there is one stance.
     """
@@ -300,7 +300,7 @@ class PlannedCollision:
         ``broken`` of a board).
     torque (m + 1, n) : servo and feed-forward [N m].
     ground (m, 6) : ground wrench about the world's origin [N, N m].
-    sole_wrench (m, 6 a sole, 6 a hand that holds on) : in their own frames [N, N m].
+    sole_wrench (m, 6 a sole, 6 a supporting hand) : in their own frames [N, N m].
     velocity, acceleration (m + 1, n) : of the joints; (0, 0): unknown. The first is the limit from the right:
         the force of a damped contact jumps at contact.
     """

@@ -163,7 +163,7 @@ def test_what_cannot_hold_on_is_refused(problem: ImpactProblem) -> None:
         ({"stance": BothSoles()}, "none does"),
         ({"striker": "left_hand"}, "cannot carry the striker"),
         ({"collision": "sdc"}, 'needs collision="full"'),
-        ({"stance": BothSoles(hands=("left_toe",))}, "also move a fixed sole or another fixed hand"),
+        ({"stance": BothSoles(hands=("left_toe",))}, "also move a fixed sole or another supporting hand"),
         ({"stance": BothSoles(hands=("left_hnd",))}, "left_hand"),
         ({"stance": BothSoles(hands=("left_hand",), base_mass=1e5, base_inertia=1e5)}, "exactly"),
     ):

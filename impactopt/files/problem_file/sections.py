@@ -393,7 +393,9 @@ class File(Section):
         stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
         if soles == "none":
             if hands:
-                raise InputError("[stance]: a robot that floats freely has no fixed hands: leave hands out")
+                raise InputError(
+                    "[stance]: a robot that floats freely has no supporting hands: leave hands out"
+                )
             stance = Free()
         if not robot.floating:
             if self.stance:

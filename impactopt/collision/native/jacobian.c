@@ -10,8 +10,8 @@ typedef struct {
 #define WORK_TYPE JacobianWork
 
 /* Tangents of the scalar outputs, for the k-th vector of directions. */
-static void scalars_tangent(const Outcome *c, const Data *d, int k, const StateTangent *dy, const RecordTangent *record)
-                            {
+static void scalars_tangent(const Outcome *c, const Data *d, int k, const StateTangent *dy,
+                            const RecordTangent *record) {
 #define PUT_NUMBER(name, x) write_entries(x, 1, 0, record->to[OUT_##name] + k * LANES)
 #ifdef OUT_impulse
   PUT_NUMBER(impulse, &dy->impulse);

@@ -83,8 +83,8 @@ static const double *or_zeros(const double *given, double *zeros, int n) {
 
 #if FREEZES
 /* Configuration and velocity at state y, from those at the begin of the segment. */
-static void advance_posture(const Frozen *F, const double *q, const double *v, const State *y, double *q_then, double
-                            *v_then) {
+static void advance_posture(const Frozen *F, const double *q, const double *v, const State *y, double *q_then,
+                            double *v_then) {
   double displacement[NV], change[NV], from[NQ];
   memcpy(from, q, sizeof from);
   velocity_change(F, y->torque2, y->impulse2, SLIDING2(y), y->time * y->time / 2, displacement);

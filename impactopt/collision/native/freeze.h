@@ -158,7 +158,7 @@ static void times_root_transposed(const Frozen *F, const double *x, double *out)
   FOR(i, NV) out[i] = ((double *)s)[COLUMN(i)];
 }
 
-static void plastic_velocity(const double *v, double target_mobility, Frozen *F) {
+static void plastic_velocity(const double *v, double target_inverse_mass, Frozen *F) {
   memcpy(F->drift_velocity, v, NV * sizeof(double));
 #if BIAS || JDOT
   /* The change of velocity by a plastic touch: P j' is in Q for the joints. The other velocities come first in v, and
@@ -169,7 +169,7 @@ static void plastic_velocity(const double *v, double target_mobility, Frozen *F)
   vec held_y[VC];
   pad(held_y, VC, y, C, 0.0);
   const double *of_hand = (const double *)F->Q[N];
-  const double impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / (of_hand[N] + target_mobility);
+  const double impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / (of_hand[N] + target_inverse_mass);
   FOR(r, NV - N) inner[r] = ((double *)F->root[r])[N] - dot(F->held[r], held_y, VC);
   FOR(i, NV - N) FOR(r, i + 1) F->drift_velocity[i] -= ((double *)F->root[r])[COLUMN(i)] * inner[r] * impulse;
   FOR(j, N) F->drift_velocity[NV - N + j] -= of_hand[j] * impulse;
@@ -266,20 +266,20 @@ static void nan_if_ill_conditioned(Frozen *F) {
   FOR(j, N + 1) FOR(i, V) F->Q[j][i] = (vec){0} + NAN;
 }
 
-static void freeze(const double *q, const double *v, const double *normal, double target_mobility, double target_speed,
-                   Frozen *F) {
+static void freeze(const double *q, const double *v, const double *normal, double target_inverse_mass,
+                   double target_speed, Frozen *F) {
   evaluate_tree(q, v, normal, F);
   F->approach_speed = F->hand_speed - target_speed;
   factor_constraints(F);
   inverse_inertia(F);
   inertia_at_point(F);
   nan_if_ill_conditioned(F);
-  plastic_velocity(v, target_mobility, F);
+  plastic_velocity(v, target_inverse_mass, F);
   drifts(q, normal, F);
   wrenches(F);
 }
 
-/* Wrenches on all constrained frames for a torque, a force at the hand and its friction (3); `weight` is that of L_0. */
+/* Wrenches on all constrained frames for a torque, a force at the hand and its friction (3); weight: of L_0. */
 static void wrench_of(const Frozen *F, const double *torque, double force, const double *sliding, double weight,
                       vec *out) {
   FOR(i, VC) out[i] = weight * F->L_0[i] - force * F->wrench[N][i];

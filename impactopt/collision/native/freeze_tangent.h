@@ -8,7 +8,7 @@ typedef struct {
   vec U[NV][V], P[C1][V];
   double tree_parts[TREE_PARTS], approach_parts[APPROACH_PARTS];
   /* of the velocity after a plastic touch, and of the drifts there */
-  double impulse, yielding, inner[NV], change[NV], bias[NV], L_0[C1], rest[NV];
+  double impulse, mobility, inner[NV], change[NV], bias[NV], L_0[C1], rest[NV];
 #if BIAS || JDOT
   double drift_parts[DRIFT_PARTS];
 #endif
@@ -53,11 +53,11 @@ static void tree_shared(const Frozen *F, FreezeTangent *w) {
   }
 }
 
-static void drifts_shared(const double *q, const double *normal, double target_mobility, const Frozen *F,
+static void drifts_shared(const double *q, const double *normal, double target_inverse_mass, const Frozen *F,
                           FreezeTangent *w) {
 #if BIAS || JDOT
-  w->yielding = ((double *)F->Q[N])[N] + target_mobility;
-  w->impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / w->yielding;
+  w->mobility = ((double *)F->Q[N])[N] + target_inverse_mass;
+  w->impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / w->mobility;
   FOR(r, NV) w->inner[r] = ((const double *)w->U[r])[N];
   times_root_transposed(F, w->inner, w->change);
   double at_hand, at_held[C1];
@@ -153,7 +153,7 @@ static void inverse_inertia_tangent(int k, const Frozen *F, FreezeTangent *w) {
 /* Tangent of the velocity that the drifts are evaluated at. */
 static void plastic_velocity_tangent(int k, const Frozen *F, const FreezeTangent *w, vec *velocity) {
   const FrozenTangent *t = &w->frozen;
-  vec more = either(F->approach_speed < 0.0, (vec){0}, t->hand_speed[k] / w->yielding);
+  vec more = either(F->approach_speed < 0.0, (vec){0}, t->hand_speed[k] / w->mobility);
   memcpy(velocity, w->by_v, sizeof w->by_v);
   if (k < VECTORS_OF_Q) {
     vec hand[NV];
@@ -168,7 +168,7 @@ static void plastic_velocity_tangent(int k, const Frozen *F, const FreezeTangent
       const double by = ((const double *)F->root[r])[c] * w->impulse;
       velocity[VELOCITY(c)] -= by * hand[r] + w->inner[r] * w->impulse * w->root[i];
     }
-    more -= t->Q[k][N][N] * (w->impulse / w->yielding);
+    more -= t->Q[k][N][N] * (w->impulse / w->mobility);
   }
   FOR(i, NV) velocity[i] -= w->change[i] * more;
 }
@@ -261,7 +261,7 @@ static void reactions_tangent(int k, const Frozen *F, FreezeTangent *w) {
 }
 
 /* Tangents of the frozen model for the requested vectors. */
-static void freeze_tangent(const double *q, const double *v, const double *normal, double target_mobility,
+static void freeze_tangent(const double *q, const double *v, const double *normal, double target_inverse_mass,
                            const Frozen *F, const int *wanted, FreezeTangent *w) {
   const double *in[] = {q, v, normal};
   double *tree_out[] = {w->tree_parts}, *approach_out[] = {w->approach_parts};
@@ -271,7 +271,7 @@ static void freeze_tangent(const double *q, const double *v, const double *norma
   memset(w->frozen.hand_speed, 0, sizeof w->frozen.hand_speed);
   memset(w->frozen.wrench_begin, 0, sizeof w->frozen.wrench_begin);
   tree_shared(F, w);
-  drifts_shared(q, normal, target_mobility, F, w);
+  drifts_shared(q, normal, target_inverse_mass, F, w);
   reactions_shared(F, w);
   FOR(k, VECTORS_OF_V) {
     if (!wanted[k]) continue;

@@ -80,7 +80,7 @@ static void evaluate(const double **arg, double **res, Work *w) {
   double by_q[NV], by_v[NV];
   const double *q = or_zeros(arg[ARG_q], w->q, NQ), *v = or_zeros(arg[ARG_v], w->v, NV);
   const double *normal = or_zeros(arg[ARG_normal], w->normal, 3);
-  freeze_adjoint(q, v, normal, call(target_yield, d->target, 0, 0), &w->frozen, &all, &work, by_q, by_v);
+  freeze_adjoint(q, v, normal, call(target_inverse_mass, d->target, 0, 0), &w->frozen, &all, &work, by_q, by_v);
   FOR(i, N) by_v[NV - N + i] += ((const double *)all.joint_velocity)[i];
   /* a value that is NaN has gradients that are NaN */
   FOR(i, NV) {

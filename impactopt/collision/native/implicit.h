@@ -219,10 +219,10 @@ static double largest(const double *w, double end, double most, double *where) {
   }
   /* Newton's method from the best sample, also from an end: the maximum may lie between it and its neighbour */
   FOR(tries, 5) {
-    double slope = 0.0, bend = 0.0;
+    double slope = 0.0, curvature = 0.0;
     for (int k = STAGES; k >= 1; k--) slope = slope * best + k * c[k];
-    for (int k = STAGES; k >= 2; k--) bend = bend * best + k * (k - 1) * c[k];
-    if (bend < 0.0) best = fmin(fmax(best - slope / bend, 0.0), end);
+    for (int k = STAGES; k >= 2; k--) curvature = curvature * best + k * (k - 1) * c[k];
+    if (curvature < 0.0) best = fmin(fmax(best - slope / curvature, 0.0), end);
   }
   powers(best, p);
   high = value(w, p);

@@ -62,7 +62,7 @@ static void evaluate(const double **arg, double **res, JacobianWork *w) {
 
   const double *q = or_zeros(arg[ARG_q], own->q, NQ), *v = or_zeros(arg[ARG_v], own->v, NV);
   const double *normal = or_zeros(arg[ARG_normal], own->normal, 3);
-  freeze_tangent(q, v, normal, call(target_yield, d->target, 0, 0), &own->frozen, wanted,
+  freeze_tangent(q, v, normal, call(target_inverse_mass, d->target, 0, 0), &own->frozen, wanted,
                  &w->freeze);
   run_tangent(d, &w->freeze.frozen, &own->tape, HISTORIES ? record : 0, wanted, &w->run);
   FOR(k, ALL_VECTORS) if (wanted[k]) scalars_tangent(&c, d, k, &w->run.states[k], record);

@@ -180,7 +180,7 @@ static void collide(const double **arg, double **res, Work *w, Outcome *c) {
   Record recorded = {.out = res, .v = v, .columns = N_COLUMNS[0]};
   Record *record = HISTORIES ? &recorded : 0;
   load_data(arg, d);
-  freeze(q, v, normal, call(target_yield, d->target, 0, 0), call(target_before, d->target, 0, 0), F);
+  freeze(q, v, normal, call(target_inverse_mass, d->target, 0, 0), call(target_speed_before, d->target, 0, 0), F);
   freeze_reference(arg, 0.0, 0.0, w);
   d->frozen = F;
   d->hand_speed = F->hand_speed;

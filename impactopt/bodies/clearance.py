@@ -95,9 +95,9 @@ class Places:
 class Closest(NamedTuple):
     """Closest points of two bodies.
 
-    distance [m] : < 0 for penetration.  one, other (3,) [m] : points of both, in the world.  normal (3,) :
-        direction
-    from the one to the other.  pieces : of the first body, that may touch the nearest piece of the other.
+    distance [m] : < 0 for penetration.  one, other (3,) [m] : points of both, in the world.
+    normal (3,) : direction from the one to the other.
+    pieces : of the first body, that may touch the nearest piece of the other.
     """
 
     distance: float
@@ -170,7 +170,7 @@ class Bodies:
         return Placed(np.ascontiguousarray(joints), world, present)
 
     def _strikes_from_inside(self, joint: int) -> bool:
-        """True if a link's body extends beyond all its strikers by more than `BEHIND`.
+        """True if all strikers of a link lie deeper than `BEHIND` inside one of its pieces.
 
         Such a body, as a box of inertia about a point mass, meets a target's core however it strikes.
         """

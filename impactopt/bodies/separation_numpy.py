@@ -34,7 +34,7 @@ class _Side(NamedTuple):
 
     separation (m,).  slope (m, 3) : gradient by u.  point (m, 3) : support point of the first.
     spread_one (m, 3, 3) : covariance of the first.  tangents (m, 2, 3) : unit vectors at right angles to u.
-    bend (m, 2, 2) : minus the Hessian by u on the tangents.
+    neg_hessian (m, 2, 2) : minus the Hessian by u on the tangents.
     """
 
     separation: Array
@@ -42,7 +42,7 @@ class _Side(NamedTuple):
     point: Array
     spread_one: Array
     tangents: Array
-    bend: Array
+    neg_hessian: Array
 
 
 def _gathered(points: Array, hulls: Index) -> tuple[Array, NDArray[np.bool_]]:
@@ -92,10 +92,10 @@ class _Pairs:
         tangents = np.stack([x, np.cross(u, x)], axis=1)
         slope = point - b.mean
         along = np.einsum("mi,mi->m", u, slope)
-        bend = _SHARP * tangents @ (one + b.spread) @ tangents.transpose(0, 2, 1)
-        bend += along[:, None, None] * np.eye(2)
+        neg_hessian = _SHARP * tangents @ (one + b.spread) @ tangents.transpose(0, 2, 1)
+        neg_hessian += along[:, None, None] * np.eye(2)
         separation = np.einsum("mi,mi->m", u, self.translation) - a.height - b.height
-        return _Side(separation, slope, point, one, tangents, bend)
+        return _Side(separation, slope, point, one, tangents, neg_hessian)
 
     def separate(self, u: Array) -> tuple[Array, _Side]:
         """Local maxima of the separation near directions u (m, 3), and their directions.
@@ -108,7 +108,7 @@ class _Pairs:
             step2, gain = self._step(at)
             size = np.linalg.norm(step2, axis=1)
             # stationary but no maximum, as may be if bodies penetrate: leave the saddle where it curves up
-            curved, axes = np.linalg.eigh(at.bend)
+            curved, axes = np.linalg.eigh(at.neg_hessian)
             saddle = going & (size < 1e-9) & (curved[:, 0] < -1e-9)
             up = axes[saddle, :, 0]
             slope2 = np.einsum("mki,mi->mk", at.tangents[saddle], at.slope[saddle])
@@ -135,7 +135,7 @@ class _Pairs:
                     old[n[accepted]] = new[accepted]
                 waiting[n[accepted]] = False
                 part[n[~accepted]] *= 0.4
-            low = np.linalg.eigvalsh(at.bend)[:, 0]
+            low = np.linalg.eigvalsh(at.neg_hessian)[:, 0]
             going &= ~waiting & ((part * size >= 1e-7) | (low < -1e-9))
         return u, at
 
@@ -143,7 +143,7 @@ class _Pairs:
     def _step(at: _Side) -> tuple[Array, Array]:
         """Newton steps on the tangents (m, 2), and the first-order gain of each (m,)."""
         slope2 = np.einsum("mki,mi->mk", at.tangents, at.slope)
-        step2 = np.einsum("mkl,ml->mk", _inverse(at.bend), slope2)
+        step2 = np.einsum("mkl,ml->mk", _inverse(at.neg_hessian), slope2)
         return step2, np.einsum("mk,mk->m", step2, slope2)
 
 
@@ -153,10 +153,10 @@ def _mask(numbers: NDArray[np.intp], size: int) -> NDArray[np.bool_]:
     return out
 
 
-def _inverse(bend: Array) -> Array:
-    """Inverse of ``bend`` (m, 2, 2), shifted to be positive definite."""
-    least = np.linalg.eigvalsh(bend)[:, 0]
-    return np.linalg.inv(bend + np.maximum(_MIN_CURVATURE - least, 0.0)[:, None, None] * np.eye(2))
+def _inverse(neg_hessian: Array) -> Array:
+    """Inverse of ``neg_hessian`` (m, 2, 2), shifted to be positive definite."""
+    least = np.linalg.eigvalsh(neg_hessian)[:, 0]
+    return np.linalg.inv(neg_hessian + np.maximum(_MIN_CURVATURE - least, 0.0)[:, None, None] * np.eye(2))
 
 
 # ---------------------------------------------------------------- chains
@@ -208,7 +208,7 @@ def write(
     spread = np.einsum("mij,mkj->mki", at.spread_one, turning)
     moved = np.concatenate([np.broadcast_to(np.eye(3), (len(z), 3, 3)), arm - _SHARP * spread], axis=1)
     mixed = np.einsum("mki,mli->mkl", moved, at.tangents)
-    found = mixed @ _inverse(at.bend) @ mixed.transpose(0, 2, 1)
+    found = mixed @ _inverse(at.neg_hessian) @ mixed.transpose(0, 2, 1)
     own = np.einsum("mki,mli->mkl", turning, arm) - _SHARP * np.einsum("mki,mli->mkl", turning, spread)
     columns, rows = np.triu_indices(n + 3)  # lower triangle, column by column
     inner = columns >= 3

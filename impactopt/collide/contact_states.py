@@ -140,9 +140,8 @@ class Posture:
     """Posture q (nq,) that the joint angles of cases are relative to.
 
     polygon (k, 2) [m] : support polygon; without corners on a fixed base.
-    v (nv,), torque (n,) [N m], reference : of a saved result, its velocity, torque, and the reference of its
-    servo,
-        settings as of `coasting_reference`.
+    v (nv,), torque (n,) [N m], reference : velocity and torque of a saved result, and the reference of its
+        servo, settings as of `coasting_reference`.
     """
 
     q: Array
@@ -303,8 +302,7 @@ class ContactStates:
         velocity : as of [at_contact].
         """
         changes = np.stack([*joints.values()], axis=1) if joints else np.zeros((count, 0))
-        # P distinct postures, and the index (count,) of each case's; cases that differ in speed only share
-        # one
+        # P distinct postures, and the index (count,) of each case's, as cases that differ in speed share one
         same = not changes.size or bool((changes == changes[0]).all())
         kept, back = changes[:1], np.zeros(count, dtype=np.intp)
         if not same:

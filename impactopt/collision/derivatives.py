@@ -232,7 +232,7 @@ class _OnDemand(ca.Callback):
         self._runs: dict[tuple[bool, ...], Any] = {}
         step = _SECOND_DIFFERENCE_STEP[part.name]
         differences = {"enable_fd": True, "fd_method": "central", "fd_options": {"h": step}}
-        self.construct(f"{part.name}_late", differences)
+        self.construct(f"{part.name}_on_demand", differences)
 
     # ------------------------------------------------------------ interface of ca.Callback
     def get_n_in(self) -> int:

@@ -150,7 +150,7 @@ class _Run:
         self.maps = self._state_maps(Q, np.append(vector("d"), data["e"].item() if "e" in data else 0.0))
 
     def _state_maps(self, Q: Array, drift: Array) -> StateMaps:
-        """Linear maps of the state, from Q = [A, -s; -s', m] and drifts of joints and hand (n + 1)."""
+        """Linear maps of the state, from Q = [A, s; s', m] and drifts of joints and hand (n + 1)."""
         unit, parts = np.eye(self.model.n_states), self.parts
         speeds = Q @ np.vstack([unit[parts["torque"]], -unit[parts["impulse"]]])
         speeds = speeds + np.outer(drift, unit[parts["time"]][0])

@@ -52,9 +52,9 @@ class SDC(SymbolicModel):
         paper. The error falls with 1/freezes^2; four take some five times as long as none.
     accuracy : required relative accuracy of the impulse. `collide` estimates the error of freezing from a
         collision with at least twice as many freezes: `Collision.freeze_error`. If it is larger than this,
-        `Collision.caution` warns. The estimate makes a collision frozen at contact only some six times as
-        slow, one with four freezes 1.4 times, and one more function is compiled. None: no estimate. The
-        estimate does not include effects that the model omits.
+        `Collision.caution` warns. In compiled code the estimate makes a collision frozen at contact only some
+        six times as slow, one with four freezes twice, and one more function is compiled. None: no estimate.
+        The estimate does not include effects that the model omits.
 
     Raises
     ------

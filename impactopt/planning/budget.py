@@ -77,8 +77,8 @@ def stopping() -> Iterator[Stop]:
 class Budget:
     """Solver with its options, and the time limit [s] of all its calls together; None: no limit.
 
-    callback : called with each iteration's record; True stops the solver.  report : called with lines of
-    text.
+    callback : called with each iteration's record; True stops the solver.
+    report : called with lines of text.
     since : when the time began (`time.perf_counter`).  stop : flag that Ctrl-C sets.
 
     Raises

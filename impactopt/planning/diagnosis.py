@@ -29,8 +29,8 @@ def ipopt_retry(budget: Budget, program: NonlinearProgram, start: Array, old: So
     """Result of IPOPT from the same initial guess, if our solver has failed without a diagnosis and IPOPT's
     result is better; else the old result.
 
-    IPOPT scales constraints, and has another restoration phase, so it rarely fails on the same programs. A
-    limit that the caller has set is a diagnosis.
+    IPOPT has another restoration phase, so it rarely fails on the same programs. A limit that the caller has
+    set is a diagnosis.
     """
     undiagnosed = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
     if budget.solver == "ipopt" or not undiagnosed or budget.left == 0:

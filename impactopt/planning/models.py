@@ -61,7 +61,7 @@ def carried_start(
 
 
 def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactProblem:
-    """Problem with the number of touches that point masses need; itself if it gives the number.
+    """Problem with the number of touches that point masses need, if it leaves that open; else itself.
 
     Raises
     ------

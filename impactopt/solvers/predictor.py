@@ -375,7 +375,7 @@ class _QP:
     def _length(self, step: Vector, at: Vector, along: Vector) -> float:
         """Step length that minimizes the augmented Lagrangian along a step (n,), 1 at most.
 
-        at, along : the inequalities' linearized values, and their change by the step.
+        at, along : changes of the inequalities' linearized values, so far and by the step.
         """
         hessian, shift = self._of._hessian, _PROXIMAL + self._newton.shift
         linear = float((self._q + hessian @ self.d + shift * self.d) @ step)

@@ -1,7 +1,9 @@
 /* Jacobians of a collision's outputs by some of its inputs, by central differences of collisions with a tight
    tolerance:
-   (q, v[, feedforward], settings) -> for each output, by each of these inputs, its Jacobian; rows are the output's
-   entries, by columns; those of q are in v's basis, as `integrate` moves it.
+
+     (q, v[, feedforward], settings) -> for each output, by each of these inputs, its Jacobian
+
+   Rows are the output's entries, by columns. Jacobians by q are in v's basis, as `integrate` moves it.
 
    For inputs without tangents: settings, and any input of a model with several freezes. The error is DIFFERENCE^2 / 6
    times the third derivative, plus errors of rounding and of the steps over DIFFERENCE. At a kink of the output the

@@ -14,7 +14,7 @@ typedef struct {
   vec wrench[N + 1][VC]; /* columns of L_tau, L_f */
   vec L_0[VC];
   double R[C1][C1];     /* with the reciprocal of its diagonal */
-  double free_acceleration[C1];      /* R^-1 (acceleration of the constrained frames if they were free) */
+  double held_push[C1]; /* R^-1 times minus the acceleration of the constrained frames if they were free */
   double bias_root[NV];
   double drift_velocity[NV];
   double hand_speed, approach_speed; /* of the hand, and relative to the target, along the normal */
@@ -24,7 +24,7 @@ typedef struct {
   double point_root[3][NV], point_held[3][C1], m_point[3][3], point_velocity[3], e_point[3];
   vec Q_point[3][V], L_point[3][VC];
 #endif
-  int ill_conditioned;          /* a pivot has lost all its digits */
+  int ill_conditioned;  /* a relative pivot, or the hand's relative mobility, is below LEAST_PIVOT */
 } Frozen;
 
 /* x := R^-1 x and x := R^-T x; T is double, or vec for several right-hand sides */
@@ -158,7 +158,7 @@ static void times_root_transposed(const Frozen *F, const double *x, double *out)
   FOR(i, NV) out[i] = ((double *)s)[COLUMN(i)];
 }
 
-static void plastic_velocity(const double *v, double target_mobility, Frozen *F) {
+static void plastic_velocity(const double *v, double target_inverse_mass, Frozen *F) {
   memcpy(F->drift_velocity, v, NV * sizeof(double));
 #if BIAS || JDOT
   /* The change of velocity by a plastic touch: P j' is in Q for the joints. The other velocities come first in v, and
@@ -169,7 +169,7 @@ static void plastic_velocity(const double *v, double target_mobility, Frozen *F)
   vec held_y[VC];
   pad(held_y, VC, y, C, 0.0);
   const double *of_hand = (const double *)F->Q[N];
-  const double impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / (of_hand[N] + target_mobility);
+  const double impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / (of_hand[N] + target_inverse_mass);
   FOR(r, NV - N) inner[r] = ((double *)F->root[r])[N] - dot(F->held[r], held_y, VC);
   FOR(i, NV - N) FOR(r, i + 1) F->drift_velocity[i] -= ((double *)F->root[r])[COLUMN(i)] * inner[r] * impulse;
   FOR(j, N) F->drift_velocity[NV - N + j] -= of_hand[j] * impulse;
@@ -177,7 +177,7 @@ static void plastic_velocity(const double *v, double target_mobility, Frozen *F)
 }
 
 static void drifts(const double *q, const double *normal, Frozen *F) {
-  double free_acceleration[C1] = {0};
+  double held_push[C1] = {0};
   memset(F->bias_root, 0, sizeof F->bias_root);
   FOR(i, V) F->drift[i] = (vec){0};
 #if SLIDES
@@ -207,26 +207,26 @@ static void drifts(const double *q, const double *normal, Frozen *F) {
     FOR(i, VC) by_constraints[i] += b * F->held[r][i];
   }
   FOR(i, V) F->drift[i] = sum_of[i];
-  FOR(c, C) free_acceleration[c] = ((double *)by_constraints)[c];
+  FOR(c, C) held_push[c] = ((double *)by_constraints)[c];
 #endif
 #if JDOT
-  FOR(c, C) free_acceleration[c] -= of_held[c];
+  FOR(c, C) held_push[c] -= of_held[c];
 #endif
-  SOLVE(F, free_acceleration, double)
-  memcpy(F->free_acceleration, free_acceleration, sizeof free_acceleration);
-  FOR(c, C) FOR(i, V) F->drift[i] += free_acceleration[c] * F->Z[c][i];
+  SOLVE(F, held_push, double)
+  memcpy(F->held_push, held_push, sizeof held_push);
+  FOR(c, C) FOR(i, V) F->drift[i] += held_push[c] * F->Z[c][i];
   for (int i = N + 1; i < V * LANES; i++) ((double *)F->drift)[i] = 0.0;
   ((double *)F->drift)[N] += of_hand;
 #if SLIDES
   FOR(k, 3) {
     FOR(r, NV) F->e_point[k] -= F->bias_root[r] * F->point_root[k][r];
-    FOR(c, C) F->e_point[k] += F->free_acceleration[c] * F->point_held[k][c];
+    FOR(c, C) F->e_point[k] += F->held_push[c] * F->point_held[k][c];
   }
 #endif
 #endif
 #if WRENCHES
-  SOLVE_TRANSPOSED(F, free_acceleration, double)
-  pad(F->L_0, VC, free_acceleration, C, 0.0);
+  SOLVE_TRANSPOSED(F, held_push, double)
+  pad(F->L_0, VC, held_push, C, 0.0);
 #endif
 }
 
@@ -255,8 +255,8 @@ static void wrenches(Frozen *F) {
 #endif
 }
 
-/* no numbers where rounding would be most of them: see `check_frozen` in collision/checks.py */
-static void no_number_of_spoiled(Frozen *F) {
+/* NaN where rounding dominates; see `check_frozen` in collision/checks.py. */
+static void nan_if_ill_conditioned(Frozen *F) {
   double whole = 0.0;
   FOR(r, NV) whole += ((double *)F->root[r])[N] * ((double *)F->root[r])[N];
   const double left = ((double *)F->Q[N])[N];
@@ -266,22 +266,22 @@ static void no_number_of_spoiled(Frozen *F) {
   FOR(j, N + 1) FOR(i, V) F->Q[j][i] = (vec){0} + NAN;
 }
 
-static void freeze(const double *q, const double *v, const double *normal, double target_mobility, double target_speed,
-                   Frozen *F) {
+static void freeze(const double *q, const double *v, const double *normal, double target_inverse_mass,
+                   double target_speed, Frozen *F) {
   evaluate_tree(q, v, normal, F);
   F->approach_speed = F->hand_speed - target_speed;
   factor_constraints(F);
   inverse_inertia(F);
   inertia_at_point(F);
-  no_number_of_spoiled(F);
-  plastic_velocity(v, target_mobility, F);
+  nan_if_ill_conditioned(F);
+  plastic_velocity(v, target_inverse_mass, F);
   drifts(q, normal, F);
   wrenches(F);
 }
 
-/* wrench of all that is held for a torque, a force at the hand, its friction (3), and the drift's weight */
-static void wrench_of(const Frozen *F, const double *torque, double force, const double *sliding, double weight, vec
-                      *out) {
+/* Wrenches on all constrained frames for a torque, a force at the hand and its friction (3); weight: of L_0. */
+static void wrench_of(const Frozen *F, const double *torque, double force, const double *sliding, double weight,
+                      vec *out) {
   FOR(i, VC) out[i] = weight * F->L_0[i] - force * F->wrench[N][i];
 #if SLIDES
   FOR(k, 3) FOR(i, VC) out[i] -= sliding[k] * F->L_point[k][i];
@@ -289,8 +289,7 @@ static void wrench_of(const Frozen *F, const double *torque, double force, const
   FOR(j, N) FOR(i, VC) out[i] += torque[j] * F->wrench[j][i];
 }
 
-/* change of v (nv) from integrals of torque, force and friction over a time; or of position, from second
-   integrals */
+/* Change of v (nv) from time integrals of torque, force and friction; or of the position, from second integrals. */
 static void velocity_change(const Frozen *F, const vec *torque, double impulse, const double *sliding, double time,
                             double *out) {
   vec w[VC], x[VF] = {0};

@@ -1,5 +1,5 @@
 /* From derivatives by the frozen model to those by q and v; see freeze.h. With Y = W_c' B, P = G^-1 Y and
-   p = G^-1 (free acceleration of the constraints), G the Delassus matrix, Q = B' B - Y' P, and the drifts are
+   p = R^-T held_push, G = R R' the Delassus matrix, Q = B' B - Y' P, and the drifts are
    Y' p - B' (root of bias). */
 
 typedef struct {
@@ -17,8 +17,8 @@ static void to_columns(const double *x, vec *out) {
 
 #if BIAS || JDOT
 /* Adjoint of the drifts, and of the velocity that they are evaluated at. */
-static void drifts_adjoint(const double *q, const double *normal, double target_mobility, const Frozen *F, FrozenAdjoint
-                           *all, FreezeAdjoint *b) {
+static void drifts_adjoint(const double *q, const double *normal, double target_inverse_mass, const Frozen *F,
+                           FrozenAdjoint *all, FreezeAdjoint *b) {
   double bias[NV] = {0}, of_hand, of_held[C1], p[C1] = {0}, by_push[C1] = {0}, by_bias_root[NV], by_bias[NV] = {0};
   double by_hand = ((double *)all->drift)[N], by_held[C1], by_q[NQ], by_v[NV];
   const double *in[] = {q, F->drift_velocity, normal,
@@ -37,7 +37,7 @@ static void drifts_adjoint(const double *q, const double *normal, double target_
     &of_hand, of_held
 #endif
   };
-  FOR(c, C) p[c] = F->free_acceleration[c], by_push[c] = dot(F->Z[c], all->drift, V);
+  FOR(c, C) p[c] = F->held_push[c], by_push[c] = dot(F->Z[c], all->drift, V);
   SOLVE_TRANSPOSED(F, p, double)
   SOLVE_TRANSPOSED(F, by_push, double)
   FOR(c, C) {
@@ -71,12 +71,12 @@ static void drifts_adjoint(const double *q, const double *normal, double target_
   pad(held_y, VC, y, C, 0.0);
   FOR(r, NV) inner[r] = ((double *)F->root[r])[N] - dot(F->held[r], held_y, VC);
   times_root_transposed(F, inner, change);
-  const double yielding = ((double *)F->Q[N])[N] + target_mobility;
-  const double impulse = (F->approach_speed >= 0.0 ? F->approach_speed : 0.0) / yielding;
+  const double mobility = ((double *)F->Q[N])[N] + target_inverse_mass;
+  const double impulse = (F->approach_speed >= 0.0 ? F->approach_speed : 0.0) / mobility;
   double by_impulse = 0.0, by_inner[NV];
   FOR(i, NV) by_impulse -= change[i] * by_v[i], by_v[i] *= -impulse;
-  if (F->approach_speed >= 0.0) all->hand_speed += by_impulse / yielding;
-  ((double *)all->Q[N])[N] -= by_impulse * impulse / yielding;
+  if (F->approach_speed >= 0.0) all->hand_speed += by_impulse / mobility;
+  ((double *)all->Q[N])[N] -= by_impulse * impulse / mobility;
   to_columns(by_v, by_change);
   times_root(F, by_change, by_inner);
   FOR(r, NV) {
@@ -95,12 +95,12 @@ static void drifts_adjoint(const double *q, const double *normal, double target_
 #endif
 
 /* Sets by_q and by_v (nv), by_q in v's basis; overwrites `all`. */
-static void freeze_adjoint(const double *q, const double *v, const double *normal, double target_mobility, const Frozen
-                           *F, FrozenAdjoint *all, FreezeAdjoint *b, double *by_q, double *by_v) {
+static void freeze_adjoint(const double *q, const double *v, const double *normal, double target_inverse_mass,
+                           const Frozen *F, FrozenAdjoint *all, FreezeAdjoint *b, double *by_q, double *by_v) {
   memset(b, 0, sizeof *b);
 #if BIAS || JDOT
   for (int i = N + 1; i < V * LANES; i++) ((double *)all->drift)[i] = 0.0;
-  drifts_adjoint(q, normal, target_mobility, F, all, b);
+  drifts_adjoint(q, normal, target_inverse_mass, F, all, b);
 #endif
 
   /* Q, symmetric */

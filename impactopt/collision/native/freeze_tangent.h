@@ -1,6 +1,5 @@
 /* Tangents of the frozen model, one vector of directions after the other; see freeze.h and tangent.h. With B the roots
-   of
-   joints and hand, U = B - W_c P and E = dB - dW_c P,
+   of joints and hand, U = B - W_c P and E = dB - dW_c P,
 
        dQ = U' E + E' U,    dP = G^-1 (dW_c' U + W_c' E),    G the Delassus matrix, P = G^-1 W_c' B */
 
@@ -9,7 +8,7 @@ typedef struct {
   vec U[NV][V], P[C1][V];
   double tree_parts[TREE_PARTS], approach_parts[APPROACH_PARTS];
   /* of the velocity after a plastic touch, and of the drifts there */
-  double impulse, yielding, inner[NV], change[NV], bias[NV], L_0[C1], rest[NV];
+  double impulse, mobility, inner[NV], change[NV], bias[NV], L_0[C1], rest[NV];
 #if BIAS || JDOT
   double drift_parts[DRIFT_PARTS];
 #endif
@@ -54,11 +53,11 @@ static void tree_shared(const Frozen *F, FreezeTangent *w) {
   }
 }
 
-static void drifts_shared(const double *q, const double *normal, double target_mobility, const Frozen *F, FreezeTangent
-                          *w) {
+static void drifts_shared(const double *q, const double *normal, double target_inverse_mass, const Frozen *F,
+                          FreezeTangent *w) {
 #if BIAS || JDOT
-  w->yielding = ((double *)F->Q[N])[N] + target_mobility;
-  w->impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / w->yielding;
+  w->mobility = ((double *)F->Q[N])[N] + target_inverse_mass;
+  w->impulse = (F->approach_speed < 0.0 ? 0.0 : F->approach_speed) / w->mobility;
   FOR(r, NV) w->inner[r] = ((const double *)w->U[r])[N];
   times_root_transposed(F, w->inner, w->change);
   double at_hand, at_held[C1];
@@ -73,7 +72,7 @@ static void drifts_shared(const double *q, const double *normal, double target_m
   };
   drift(in, out, 0, 0, 0);
   drift_parts(in, to, 0, 0, 0);
-  memcpy(w->L_0, F->free_acceleration, sizeof w->L_0);
+  memcpy(w->L_0, F->held_push, sizeof w->L_0);
   SOLVE_TRANSPOSED(F, w->L_0, double)
   FOR(r, NV) {
     w->rest[r] = -F->bias_root[r];
@@ -154,7 +153,7 @@ static void inverse_inertia_tangent(int k, const Frozen *F, FreezeTangent *w) {
 /* Tangent of the velocity that the drifts are evaluated at. */
 static void plastic_velocity_tangent(int k, const Frozen *F, const FreezeTangent *w, vec *velocity) {
   const FrozenTangent *t = &w->frozen;
-  vec more = either(F->approach_speed < 0.0, (vec){0}, t->hand_speed[k] / w->yielding);
+  vec more = either(F->approach_speed < 0.0, (vec){0}, t->hand_speed[k] / w->mobility);
   memcpy(velocity, w->by_v, sizeof w->by_v);
   if (k < VECTORS_OF_Q) {
     vec hand[NV];
@@ -169,7 +168,7 @@ static void plastic_velocity_tangent(int k, const Frozen *F, const FreezeTangent
       const double by = ((const double *)F->root[r])[c] * w->impulse;
       velocity[VELOCITY(c)] -= by * hand[r] + w->inner[r] * w->impulse * w->root[i];
     }
-    more -= t->Q[k][N][N] * (w->impulse / w->yielding);
+    more -= t->Q[k][N][N] * (w->impulse / w->mobility);
   }
   FOR(i, NV) velocity[i] -= w->change[i] * more;
 }
@@ -177,8 +176,8 @@ static void plastic_velocity_tangent(int k, const Frozen *F, const FreezeTangent
 
 static void drifts_tangent(int k, const Frozen *F, FreezeTangent *w) {
   FrozenTangent *t = &w->frozen;
-  vec *sum = t->drift[k], *free_acceleration = w->L_0_by;
-  memset(free_acceleration, 0, sizeof w->L_0_by);
+  vec *sum = t->drift[k], *held_push = w->L_0_by;
+  memset(held_push, 0, sizeof w->L_0_by);
 #if BIAS || JDOT
   vec velocity[NV], of_bias[NV], of_hand, of_held[C1], root[NV];
   plastic_velocity_tangent(k, F, w, velocity);
@@ -206,24 +205,24 @@ static void drifts_tangent(int k, const Frozen *F, FreezeTangent *w) {
     FOR(i, HELD_NONZEROS) {
       const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
       root[r] -= w->L_0[c] * w->held[i];
-      free_acceleration[c] -= w->rest[r] * w->held[i];
+      held_push[c] -= w->rest[r] * w->held[i];
     }
     FOR(r, NV) FOR(j, N + 1) sum[j] += w->rest[r] * w->E[r][j];
   }
   FOR(i, HELD_NONZEROS) {
     const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
-    free_acceleration[c] += ((const double *)F->held[r])[c] * root[r];
+    held_push[c] += ((const double *)F->held[r])[c] * root[r];
   }
   FOR(r, NV) root[r] = -root[r];
   add_product((const vec(*)[V])w->U, NV, root, sum, sum);
 #if JDOT
   FOR(c, C) {
-    free_acceleration[c] -= of_held[c];
+    held_push[c] -= of_held[c];
     FOR(j, N + 1) sum[j] -= ((const double *)w->P[c])[j] * of_held[c];
   }
   sum[N] += of_hand;
 #endif
-  by_delassus(F, free_acceleration, 1);
+  by_delassus(F, held_push, 1);
 #endif
 }
 
@@ -262,8 +261,8 @@ static void reactions_tangent(int k, const Frozen *F, FreezeTangent *w) {
 }
 
 /* Tangents of the frozen model for the requested vectors. */
-static void freeze_tangent(const double *q, const double *v, const double *normal, double target_mobility, const Frozen
-                           *F, const int *wanted, FreezeTangent *w) {
+static void freeze_tangent(const double *q, const double *v, const double *normal, double target_inverse_mass,
+                           const Frozen *F, const int *wanted, FreezeTangent *w) {
   const double *in[] = {q, v, normal};
   double *tree_out[] = {w->tree_parts}, *approach_out[] = {w->approach_parts};
   tree_parts(in, tree_out, 0, 0, 0);
@@ -272,7 +271,7 @@ static void freeze_tangent(const double *q, const double *v, const double *norma
   memset(w->frozen.hand_speed, 0, sizeof w->frozen.hand_speed);
   memset(w->frozen.wrench_begin, 0, sizeof w->frozen.wrench_begin);
   tree_shared(F, w);
-  drifts_shared(q, normal, target_mobility, F, w);
+  drifts_shared(q, normal, target_inverse_mass, F, w);
   reactions_shared(F, w);
   FOR(k, VECTORS_OF_V) {
     if (!wanted[k]) continue;

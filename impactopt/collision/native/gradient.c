@@ -1,6 +1,5 @@
 /* Gradient of a scalar output of a collision: (q, v[, feedforward], settings) -> value, d/dq (nv), d/dv (nv), both in
-   v's
-   basis. */
+   v's basis. */
 
 /* Value of the output (returned), and its derivatives by the final state. */
 static double final_value(const Data *d, const Outcome *c, State *y_) {
@@ -27,8 +26,7 @@ static double final_value(const Data *d, const Outcome *c, State *y_) {
 
 #if FREEZES
 /* With several freezes by central differences, at a far smaller tolerance of the steps: the length of a segment, and
-   the
-   posture that it is frozen at, depend on the segment before. */
+   the posture that it is frozen at, depend on the segment before. */
 static double value_at(const double **arg, const double *q, const double *v, Work *w) {
   const double *in[N_IN];
   Outcome c;
@@ -76,13 +74,13 @@ static void evaluate(const double **arg, double **res, Work *w) {
   if (res[0]) *res[0] = value;
   if (!res[1] && !res[2]) return;
   memset(&all, 0, sizeof all);
-  run_adjoint(d, &w->tape, c.in_contact != 0.0, &y_, &all);
+  run_adjoint(d, &w->tape, &y_, &all);
 
   FreezeAdjoint work;
   double by_q[NV], by_v[NV];
   const double *q = or_zeros(arg[ARG_q], w->q, NQ), *v = or_zeros(arg[ARG_v], w->v, NV);
   const double *normal = or_zeros(arg[ARG_normal], w->normal, 3);
-  freeze_adjoint(q, v, normal, call(target_yield, d->target, 0, 0), &w->frozen, &all, &work, by_q, by_v);
+  freeze_adjoint(q, v, normal, call(target_inverse_mass, d->target, 0, 0), &w->frozen, &all, &work, by_q, by_v);
   FOR(i, N) by_v[NV - N + i] += ((const double *)all.joint_velocity)[i];
   /* a value that is NaN has gradients that are NaN */
   FOR(i, NV) {

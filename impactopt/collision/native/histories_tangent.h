@@ -54,8 +54,8 @@ INLINE void write_entries(const vec *x, int rows, long place, double *const *to)
 }
 #define PUT(name, rows, x) write_entries(x, rows, (long)(rows) * c->number, record->to[OUT_##name] + k * LANES)
 
-static void write_tangent(const Data *d, const FrozenTangent *t, int k, const Column *c, const StateTangent *x, const
-                          RecordTangent *record) {
+static void write_tangent(const Data *d, const FrozenTangent *t, int k, const Column *c, const StateTangent *x,
+                          const RecordTangent *record) {
 #ifdef OUT_time
   PUT(time, 1, &x->time);
 #endif

@@ -1,12 +1,10 @@
 /* Implicit steps that end on events; see collision/implicit.py for the method and its symbols.
 
    The joints' velocity and the hand's speed are v = Q (T, -p) + drift t. With g = gamma h and D = kd + g kp of the
-       joints
-   that are not saturated (plus the slope of their friction), a stage solves v = X (rho, -p), where
+   joints that are not saturated (plus the slope of their friction), a stage solves v = X (rho, -p), where
    X = Q (I + g D Q)^-1 and rho = r_T + g kp r_deviation. X is symmetric where gains are one number a joint. Force,
    penetration and the target are scalar equations beside that. Nonlinear parts of law and target (remainders beyond
-       their
-   slopes at the step's begin) act as inputs n of these equations, polynomials as the state is one; see
+   their slopes at the step's begin) act as inputs n of these equations, polynomials as the state is one; see
    implicit_remainders.h. */
 
 #define TERMS (STAGES + 1)
@@ -22,8 +20,7 @@
 #define LENGTHEN_BELOW_NONLINEAR 0.1
 #define AIMED_ERROR 0.2
 /* Relative change of the hand's speed in the first step under a nonlinear law; the second where the force begins
-   without
-   a slope, as x^1.5 */
+   without a slope, as x^1.5 */
 #define FIRST_SPEED_CHANGE 0.1
 #define FIRST_SPEED_CHANGE_FLAT 3e-4
 /* Shorter step where Newton's method has not converged */
@@ -43,8 +40,7 @@ typedef struct {
   double rates[NZ1];               /* dz/dt at the begin */
   double Z[NZ1][NZ1], G[NZ1], at[NZ1]; /* slopes of dz/dt by z and by force; of the velocity by z */
   double inverse[NZ1][NZ1], state_by_force[NZ1], mobility;
-  double bare_mobility;                   /* mobility [1/kg] of hand and target without servo and damping within a step
-      */
+  double bare_mobility;            /* inverse mass [1/kg] of hand and target, without servo and damping */
 } Contact;
 
 /* X by columns, `rows` by rows. With matrices of gains D is by columns too. */
@@ -80,8 +76,7 @@ typedef struct {
 } Event;
 
 /* Record of the steps for derivatives: the state at the begin of each, its length, the part of it that was taken, and
-   the
-   event that ended it. */
+   the event that ended it. */
 typedef struct {
   int made;
   State states[GRADIENT ? STEPS_AT_ALL + 1 : 1];
@@ -171,9 +166,8 @@ static double falling_root(const double *b) {
 }
 
 /* First place where a polynomial, given by its Bernstein coefficients, falls below zero; above 1: nowhere. It has at
-   most as
-   many roots as its coefficients have changes of sign (Lane and Riesenfeld 1981): parts are halved until that decides.
-       */
+   most as many roots as its coefficients have changes of sign (Lane and Riesenfeld 1981): parts are halved until that
+   decides. */
 #define HALVINGS 40
 static double first_below(const double *given) {
   double parts[HALVINGS + 1][TERMS], begins[HALVINGS + 1], lengths[HALVINGS + 1];
@@ -225,10 +219,10 @@ static double largest(const double *w, double end, double most, double *where) {
   }
   /* Newton's method from the best sample, also from an end: the maximum may lie between it and its neighbour */
   FOR(tries, 5) {
-    double slope = 0.0, bend = 0.0;
+    double slope = 0.0, curvature = 0.0;
     for (int k = STAGES; k >= 1; k--) slope = slope * best + k * c[k];
-    for (int k = STAGES; k >= 2; k--) bend = bend * best + k * (k - 1) * c[k];
-    if (bend < 0.0) best = fmin(fmax(best - slope / bend, 0.0), end);
+    for (int k = STAGES; k >= 2; k--) curvature = curvature * best + k * (k - 1) * c[k];
+    if (curvature < 0.0) best = fmin(fmax(best - slope / curvature, 0.0), end);
   }
   powers(best, p);
   high = value(w, p);

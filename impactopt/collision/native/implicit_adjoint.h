@@ -1,6 +1,5 @@
 /* Discrete adjoint of the implicit steps, for fixed lengths and phases. A name with _ is the derivative of the output
-   by
-   what has that name. With x_j = w_j + gamma w_(j+1) the series is
+   by what has that name. With x_j = w_j + gamma w_(j+1) the series is
 
        w_(j+1) = h J x_j,    and h c on top for the first
 
@@ -12,9 +11,8 @@
    scalars. An event that ends a step is a root of the series, and its place has derivatives too.
 
    The remainders of nonlinear laws and targets, n = R(o(n)), have the transposed of I - dR K; it gives derivatives by
-       the
-   observations at the nodes, as further seeds. The slopes at the step's begin count as constants: the series depends on
-   them only through its error. */
+   the observations at the nodes, as further seeds. The slopes at the step's begin count as constants: the series
+   depends on them only through its error. */
 
 /* Event function as a linear form of the state and n; `velocity` is of joints and hand. */
 typedef struct {
@@ -43,8 +41,8 @@ static double derivative_along_step(const Series *s, double h, const State *y_, 
   return x + y_->time * h;
 }
 
-static void event_form(const Data *d, const Series *s, const Contact *c, int kind, int number, double theta, EventForm
-                       *f) {
+static void event_form(const Data *d, const Series *s, const Contact *c, int kind, int number, double theta,
+                       EventForm *f) {
   double force = kind == EVENT_FORCE, rate = kind == EVENT_RATE;
   memset(f, 0, sizeof *f);
 #if SWITCHES
@@ -97,8 +95,8 @@ static double slope_of(const EventForm *f, const Series *s, const Inputs n, doub
 }
 
 /* From the derivative by an event function's value to those by the state at theta, and by the frozen model. */
-static void event_form_adjoint(const Data *d, const State *y, const Series *s, double h, const EventForm *f, double
-                               value_, double theta, Seed *seed, FrozenAdjoint *all) {
+static void event_form_adjoint(const Data *d, const State *y, const Series *s, double h, const EventForm *f,
+                               double value_, double theta, Seed *seed, FrozenAdjoint *all) {
   const Frozen *F = d->frozen;
   StageInput *to = &seed->by;
   vec torque[V];
@@ -248,7 +246,7 @@ static int remainders_adjoint(const Data *d, const State *y, const Resolvent *r,
 }
 #endif
 
-/* one step back: `y_` goes from the state after it to the one before it */
+/* Adjoint of one step: y_, by the state after it, becomes that by the state before it. */
 static void step_adjoint(const Data *d, const Tape *tape, int step, Resolvent *r, State *y_, FrozenAdjoint *all) {
   const State *y = &tape->states[step];
   const double h = tape->lengths[step], theta = tape->parts[step];
@@ -332,9 +330,8 @@ static void step_adjoint(const Data *d, const Tape *tape, int step, Resolvent *r
   FOR(i, NZ) y_->target[i] = a.target[i];
 }
 
-/* from the final state back to what is frozen */
-static void run_adjoint(const Data *d, const Tape *tape, int in_contact, State *y_, FrozenAdjoint *all) {
+/* From derivatives by the final state to derivatives by the frozen model. */
+static void run_adjoint(const Data *d, const Tape *tape, State *y_, FrozenAdjoint *all) {
   Resolvent r = {.h = 0.0};
-  (void)in_contact;
   for (int i = tape->made - 1; i >= 0; i--) step_adjoint(d, tape, i, &r, y_, all);
 }

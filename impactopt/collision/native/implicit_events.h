@@ -27,21 +27,20 @@ static void check_joint_events(const vec (*w)[V], int i, double offset, double l
 }
 
 /* Whether a joint's series may cross the level in this step, one joint per lane: by the size of its coefficients, and
-   where
-   these do not decide by its Bernstein hull. */
+   where these do not decide by its Bernstein hull. */
 INLINE bits may_cross(const vec (*w)[V], int i, vec offset, vec level) {
   vec reach = BOUND[1] * magnitude(w[1][i]);
   for (int j = 2; j < TERMS; j++) reach += BOUND[j] * magnitude(w[j][i]);
   const vec start = w[0][i] + offset, size = magnitude(start);
   const bits open = magnitude(size - level) <= reach;
   if (!any(open)) return open;
-  const bits instant_within = size <= level, sign = (bits)start & SIGN_BIT;
+  const bits within = size <= level, sign = (bits)start & SIGN_BIT;
   bits crosses = {0};
   for (int k = 1; k < TERMS; k++) {
     vec b = start;
     for (int j = 1; j < TERMS; j++) b += HULL[j][k] * w[j][i];
     const vec out = magnitude(b) - level, in = level - (vec)((bits)b ^ sign);
-    crosses |= choose(instant_within, out, in) > 0.0;
+    crosses |= choose(within, out, in) > 0.0;
   }
   return crosses & open;
 }
@@ -145,10 +144,9 @@ static void switching_of(const Data *d, const State *y, const Series *s, Switchi
 #endif
 }
 /* Error of the switching functions relative to the tolerance, which `error_of` may not see: the deflection of a board
-   that
-   vibrates slowly hardly changes the hand's speed, but decides at which vibration the board breaks. Errors are relative
-   to the parts that a switch is made of. A switch by position allows less, as one that is approached slowly is passed
-   much too late. */
+   that vibrates slowly hardly changes the hand's speed, but decides at which vibration the board breaks. Errors are
+   relative to the parts that a switch is made of. A switch by position allows less, as one that is approached slowly is
+   passed much too late. */
 INLINE double error_of_switches(const Resolvent *r, const Series *s, const Switching *x, double scale) {
   double error = 0.0;
 #if SWITCHES
@@ -168,8 +166,8 @@ INLINE double error_of_switches(const Resolvent *r, const Series *s, const Switc
   return error * (LEFT_OUT / TOLERANCE);
 }
 
-static void find_event(const Data *d, const Instant *now, const Series *s, const Switching *switching, double end, Event
-                       *e) {
+static void find_event(const Data *d, const Instant *now, const Series *s, const Switching *switching, double end,
+                       Event *e) {
   double b[TERMS];
   *e = (Event){.at = end};
   hull(s->rate, b);

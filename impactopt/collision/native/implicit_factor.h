@@ -222,8 +222,8 @@ INLINE void law_and_slopes(const Data *d, double x, double rate, int compressing
 #endif
 }
 
-static void linearize_contact(const Data *d, const State *y, const Instant *now, double g, double mobility, Contact *c)
-                              {
+static void linearize_contact(const Data *d, const State *y, const Instant *now, double g, double mobility,
+                              Contact *c) {
   double law[3];
   law_and_slopes(d, y->penetration, now->rate, now->compressing, law);
   c->force = law[0], c->k = law[1], c->d = law[2];

@@ -1,11 +1,9 @@
 /* Nonlinear laws and targets within a step; see collision/implicit.py.
 
    Force, target rates and target velocity have remainders n of second order beyond their slopes at the step's begin.
-   Each
-   is a polynomial that interpolates them at NODES places, and an input of the linear model. Observations at these
-   places,
-   o = (penetration, rate, target), are linear in n with a matrix K, which the series of a model at rest give. So
-   n = R(o(n)) are a few scalar equations for Newton's method, whose number does not depend on that of the joints. */
+   Each is a polynomial that interpolates them at NODES places, and an input of the linear model. Observations at these
+   places, o = (penetration, rate, target), are linear in n with a matrix K, which the series of a model at rest give.
+   So n = R(o(n)) are a few scalar equations for Newton's method, whose number does not depend on that of the joints. */
 #if NONLINEAR
 #define OBSERVED (2 + (TARGET_NONLINEAR ? NZ : 0))
 #define UNKNOWNS (NODES * INPUTS)
@@ -158,8 +156,8 @@ static void relinearize(const Data *d, const State *y, const Instant *now, const
 }
 
 /* Series of a step with nonlinear law or target; returns whether Newton's method has converged. */
-static int nonlinear_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, Remainders *b, Series
-                            *s) {
+static int nonlinear_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, Remainders *b,
+                            Series *s) {
   static const Inputs none;
   double base[OBSERVED][NODES], n[UNKNOWNS] = {0}, change[UNKNOWNS], largest_[INPUTS];
   int found = 0;
@@ -197,8 +195,8 @@ typedef struct {
 #endif
 
 /* Series of a step; returns whether it has converged. */
-static int step_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, Remainders *b, Series *s)
-                       {
+static int step_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, Remainders *b,
+                       Series *s) {
 #if NONLINEAR
   return nonlinear_series(d, y, now, r, b, s);
 #else

@@ -1,8 +1,8 @@
 /* Integration by implicit steps, to separation or to the end of the segment. */
 
 /* Instant within a step; of the state only the parts that columns of histories need. */
-INLINE void instant_within(const Data *d, const State *y, const Instant *now, const Series *s, const Contact *c, double
-                           part, State *then, Instant *at) {
+INLINE void instant_within(const Data *d, const State *y, const Instant *now, const Series *s, const Contact *c,
+                           double part, State *then, Instant *at) {
   double p[TERMS];
   powers(part, p);
   then->penetration = value(s->penetration, p);

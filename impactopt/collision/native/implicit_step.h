@@ -82,8 +82,8 @@ INLINE void make_terms(const Data *d, const Resolvent *r, StageInput *b, const I
   }
 }
 
-static void make_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, const Inputs n, Series
-                        *s) {
+static void make_series(const Data *d, const State *y, const Instant *now, const Resolvent *r, const Inputs n,
+                        Series *s) {
   const Contact *c = &r->contact;
   const double h = r->h;
   StageInput b;
@@ -108,8 +108,7 @@ static void make_series(const Data *d, const State *y, const Instant *now, const
 
 /* Error of a step relative to the tolerance: the size of the next coefficient of hand speed, impulse and joint demands.
    The coefficients of a speed that oscillates change sign, so one of them may be nearly zero by chance; hence the
-       larger
-   of the last two. */
+   larger of the last two. */
 INLINE double error_of(const Data *d, const Resolvent *r, const Series *s, double scale) {
   const double speed = fmax(fabs(s->rate[STAGES]), fabs(s->rate[STAGES - 1]));
   double error = speed / fmax(scale, fabs(s->rate[1]));

@@ -1,7 +1,6 @@
 /* Tangents of the implicit steps, for the k-th vector of directions: the same stages, with the change of J on their
    right-hand side. Lengths and phases are constants; an event that ends a step is a root of the series, and its place
-       has
-   a tangent too. A name that begins with d is the tangent of what has the rest for its name. */
+   has a tangent too. A name that begins with d is the tangent of what has the rest for its name. */
 
 /* Tangent of Series, without torques, deviations and demands, which follow from the speeds. */
 typedef vec Terms[TERMS];
@@ -108,8 +107,8 @@ INLINE void add_gains(const vec *gain, double factor, const vec *x, vec *out) {
 #define ADD_KP(factor, x, out) (KP_MATRIX ? add_gain : add_gains)((const vec *)l->d->kp, factor, x, out)
 
 /* out = torque + factor (kp deviation - D speeds), for the joints that are not saturated. */
-INLINE void with_servo(const Linear *l, const vec *torque, double factor, const vec *speeds, const vec *deviation, vec
-                       *out) {
+INLINE void with_servo(const Linear *l, const vec *torque, double factor, const vec *speeds, const vec *deviation,
+                       vec *out) {
 #if GAIN_MATRIX
   vec held[N1];
   memset(held, 0, sizeof held);
@@ -133,8 +132,8 @@ INLINE void with_servo(const Linear *l, const vec *torque, double factor, const 
 typedef vec InputsTangent[NONLINEAR ? TERMS : 1][INPUTS];
 
 /* Solution of a stage, with `model_change` on the right-hand side. */
-INLINE void solve_tangent(const Linear *l, int stage, int model_change, const StageInputTangent *b, const InputsTangent
-                          n, StageSolutionTangent *x) {
+INLINE void solve_tangent(const Linear *l, int stage, int model_change, const StageInputTangent *b,
+                          const InputsTangent n, StageSolutionTangent *x) {
   const Resolvent *r = l->resolvent;
   const Contact *c = &r->contact;
   const double *X = (const double *)r->X[N];
@@ -272,8 +271,8 @@ INLINE vec along(const Terms w, const double *p) {
 }
 
 /* Tangents of the demands at places, from those at the begin; all places move by `moved`. */
-static void demands_tangent(const Linear *l, int count, const StepPoint *const *places, vec moved, const SeriesTangent
-                            *t, const vec *begin, StateTangent *x) {
+static void demands_tangent(const Linear *l, int count, const StepPoint *const *places, vec moved,
+                            const SeriesTangent *t, const vec *begin, StateTangent *x) {
 #if GAIN_MATRIX
   FOR(a, count) {
     const StepPoint *at = places[a];

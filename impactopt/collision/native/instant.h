@@ -67,8 +67,9 @@ INLINE void add_columns(const vec (*M)[V], int columns, const double *x, vec *a)
   FOR(i, V) a[i] += b[i];
 }
 
-/* Joint velocities u relative to the servo's reference, and the hand's speed (returned), both as changes since contact,
-   from the integrals of torque, force and friction, and time. Linear: rates of the integrals give accelerations. */
+/* Joint velocities u relative to the servo's reference, and the hand's speed (returned), both as changes since the
+   freeze, from the integrals of torque, force and friction, and time. Linear: rates of the integrals give
+   accelerations. */
 INLINE double velocity(const Data *d, const vec *torque, double impulse, const double *sliding, double time, vec *u) {
   const Frozen *F = d->frozen;
   AFRESH(F);

@@ -1,6 +1,5 @@
 /* CasADi's interface of external functions. All memory is in the caller's work vector, so that calls from several
-   threads
-   are safe.
+   threads are safe.
 
    One library has one of these functions under NAME, with the same inputs in the same order: q, v[, feedforward] and
    the settings (NAMES_IN, SHAPES_IN).

@@ -10,8 +10,8 @@ typedef struct {
 #define WORK_TYPE JacobianWork
 
 /* Tangents of the scalar outputs, for the k-th vector of directions. */
-static void scalars_tangent(const Outcome *c, const Data *d, int k, const StateTangent *dy, const RecordTangent *record)
-                            {
+static void scalars_tangent(const Outcome *c, const Data *d, int k, const StateTangent *dy,
+                            const RecordTangent *record) {
 #define PUT_NUMBER(name, x) write_entries(x, 1, 0, record->to[OUT_##name] + k * LANES)
 #ifdef OUT_impulse
   PUT_NUMBER(impulse, &dy->impulse);
@@ -62,7 +62,7 @@ static void evaluate(const double **arg, double **res, JacobianWork *w) {
 
   const double *q = or_zeros(arg[ARG_q], own->q, NQ), *v = or_zeros(arg[ARG_v], own->v, NV);
   const double *normal = or_zeros(arg[ARG_normal], own->normal, 3);
-  freeze_tangent(q, v, normal, call(target_yield, d->target, 0, 0), &own->frozen, wanted,
+  freeze_tangent(q, v, normal, call(target_inverse_mass, d->target, 0, 0), &own->frozen, wanted,
                  &w->freeze);
   run_tangent(d, &w->freeze.frozen, &own->tape, HISTORIES ? record : 0, wanted, &w->run);
   FOR(k, ALL_VECTORS) if (wanted[k]) scalars_tangent(&c, d, k, &w->run.states[k], record);

@@ -79,5 +79,3 @@ INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
 #endif
   add_slope(y, &k1, h, y);
 }
-
-INLINE void repeat_at_rest(const Data *d, State *y, const Instant *now) {}

@@ -85,8 +85,7 @@ INLINE void add(State *y_, const State *more) {
   FOR(i, NZ) y_->target[i] += more->target[i];
 }
 
-static void step_adjoint(const Data *d, const State *y, int moves, State *y_, FrozenAdjoint *all) {
-  if (!moves) return;
+static void step_adjoint(const Data *d, const State *y, State *y_, FrozenAdjoint *all) {
   const double left = d->until - y->time, h = fmin(LENGTH, left);
   const double shares[] = {0.0, h / 2, h / 2, h}, weights[] = {h / 6, h / 3, h / 3, h / 6};
   Slope k[4], k_[4];

@@ -45,8 +45,8 @@ static int columns_of(const Linear *l, const Instant *now, double theta, int fir
 }
 
 /* Tangent of the state at the end of a step. */
-static void step_tangent(const Linear *l, int k, double theta, const Event *e, const StepPoint *end, const SeriesTangent
-                         *s, StateTangent *dy) {
+static void step_tangent(const Linear *l, int k, double theta, const Event *e, const StepPoint *end,
+                         const SeriesTangent *s, StateTangent *dy) {
   const double h = l->resolvent->h, impulse = change(l->series->impulse, end->slope);
   vec moved = either(e->kind || theta == 1.0, (vec){0}, -dy->time / h);
   if (e->kind && e->at > 0.0) moved = event_tangent(l, k, e, s, dy);
@@ -59,8 +59,8 @@ static void step_tangent(const Linear *l, int k, double theta, const Event *e, c
 }
 
 /* Tangents of the columns and of the state at separation, for the requested vectors of directions. */
-static void run_tangent(const Data *d, const FrozenTangent *t, const Tape *tape, const RecordTangent *record, const int
-                        *wanted, RunTangent *w) {
+static void run_tangent(const Data *d, const FrozenTangent *t, const Tape *tape, const RecordTangent *record,
+                        const int *wanted, RunTangent *w) {
   Resolvent r = {.h = 0.0};
   Instant now;
   Series s;

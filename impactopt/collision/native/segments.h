@@ -83,8 +83,8 @@ static const double *or_zeros(const double *given, double *zeros, int n) {
 
 #if FREEZES
 /* Configuration and velocity at state y, from those at the begin of the segment. */
-static void advance_posture(const Frozen *F, const double *q, const double *v, const State *y, double *q_then, double
-                            *v_then) {
+static void advance_posture(const Frozen *F, const double *q, const double *v, const State *y, double *q_then,
+                            double *v_then) {
   double displacement[NV], change[NV], from[NQ];
   memcpy(from, q, sizeof from);
   velocity_change(F, y->torque2, y->impulse2, SLIDING2(y), y->time * y->time / 2, displacement);
@@ -180,7 +180,7 @@ static void collide(const double **arg, double **res, Work *w, Outcome *c) {
   Record recorded = {.out = res, .v = v, .columns = N_COLUMNS[0]};
   Record *record = HISTORIES ? &recorded : 0;
   load_data(arg, d);
-  freeze(q, v, normal, call(target_yield, d->target, 0, 0), call(target_before, d->target, 0, 0), F);
+  freeze(q, v, normal, call(target_inverse_mass, d->target, 0, 0), call(target_speed_before, d->target, 0, 0), F);
   freeze_reference(arg, 0.0, 0.0, w);
   d->frozen = F;
   d->hand_speed = F->hand_speed;

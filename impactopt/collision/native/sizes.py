@@ -128,7 +128,7 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
         left_force (x, rate, law) : above zero while contact lasts in restitution
         contact_force (x, rate, law) -> force
         target_velocity (z, target), target_rates (z, force, target), target_energy, target_result (z, target)
-        target_yield, target_before (target) : the results of `target_start`
+        target_inverse_mass, target_speed_before (target) : the results of `target_start`
     """
     law_numbers, target_numbers = list(model.law.parameters), list(model.target.parameters)
     law, target = ca.SX.sym("law", len(law_numbers)), ca.SX.sym("target", len(target_numbers))
@@ -151,8 +151,8 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
         ca.Function("target_rates", [z, force, target], [column(thing.derivative(states, force, of_target))]),
         ca.Function("target_energy", [z, target], [_number(thing.energy(states, of_target))]),
         ca.Function("target_result", [z, target], [column(thing.result(states, of_target))]),
-        ca.Function("target_yield", [target], [_number(start[0])]),
-        ca.Function("target_before", [target], [_number(start[1])]),
+        ca.Function("target_inverse_mass", [target], [_number(start[0])]),
+        ca.Function("target_speed_before", [target], [_number(start[1])]),
     ]
     return functions + (contact_functions(model.law, model.target) if method == "implicit" else [])
 

@@ -6,10 +6,6 @@ typedef struct {
   State states[GRADIENT ? STEPS_AT_ALL + 1 : 1];
 } Tape;
 
-/* Steps in a block of the CasADi graph's loop. The graph evaluates a state at rest once more, but not between blocks;
-   `repeat_at_rest` does the same, so that both agree to rounding. */
-#define BLOCK 16
-
 /* Integrates y to separation, or to the end of the segment; returns the phase there. */
 static Instant run(const Data *d, State *y, int steps, const Record *record, Tape *tape) {
   Instant now;
@@ -23,7 +19,6 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
     advance(d, y, &now, fmin(LENGTH, d->until - y->time));
   }
   if (GRADIENT) tape->states[made] = *y, tape->made = made;
-  if (made % BLOCK) repeat_at_rest(d, y, &now);
   spread_nan(d, y, &now);
   if (record) {
     const int column = made < steps ? (made + EVERY - 1) / EVERY : record->columns - 1;

@@ -6,16 +6,14 @@ enum { BY_Q, BY_V, BY_FEEDFORWARD };
 #define KINDS (2 + FEEDFORWARD)
 #define SEEDS(kind) ((kind) == BY_FEEDFORWARD ? N : NV)
 #define FIRST_OF(kind) ((kind) * NV)
-/* Vectors with directions of q, of q or v, and all. They are taken one after the other, so that the data of a step
-   stay in
-   the nearest cache. Products take as many rows at once as registers hold. */
+/* Vectors with directions of q, of q or v, and all. They are taken one after the other, so that the data of a step stay
+   in the nearest cache. Products take as many rows at once as registers hold. */
 #define VECTORS_OF_Q VECTORS(NV)
 #define VECTORS_OF_V VECTORS(2 * NV)
 #define ALL_VECTORS VECTORS(2 * NV + FEEDFORWARD * N)
 #define ROWS_AT_ONCE (V % 2 ? LANES : 2 * LANES)
 /* Joints and hand, padded to whole vectors. The number of columns is odd: else all rows of a column would compete for
-   the
-   same lines of a cache. */
+   the same lines of a cache. */
 #define ROWS_OF_V (V * LANES)
 #define COLUMNS_OF_V ((N + 1) | 1)
 

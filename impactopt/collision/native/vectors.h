@@ -98,8 +98,7 @@ INLINE void transpose(vec *x) {
 /* Clears the lanes of vector V - 1 beyond the hand, where `root` has other velocities. */
 #define to_hand(x) ((vec)((bits)(x) & ((bits){LANE_NUMBERS} <= (long long)(N % LANES))))
 /* Hides a pointer's origin from the compiler. Where it knows that the data behind have not changed, it keeps hundreds
-   of
-   vectors for the next call: copies on the stack, which cost more than loading the data again. */
+   of vectors for the next call: copies on the stack, which cost more than loading the data again. */
 #define AFRESH(pointer) __asm__ volatile("" : "+r"(pointer))
 /* Copies n numbers into the first lanes, and `rest` into the others. */
 INLINE void pad(vec *to, int count, const double *from, int n, double rest) {

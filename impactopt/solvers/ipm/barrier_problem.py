@@ -319,11 +319,11 @@ class Filter:
 
 
 # The barrier is lowered as soon as the barrier problem's error is below kappa_epsilon mu, to
-# min(kappa_mu mu, mu^theta_mu) (eq. 7). The paper has 10, 0.2, 1.5. Ours lets mu fall more gently, from
+# min(kappa_mu mu, mu^theta_mu) (eq. 7). The paper has 0.2, 10, 1.5. Ours lets mu fall more gently, from
 # barrier problems that are solved more loosely (fewer iterations, with the proximal term below).
 _KAPPA_MU, _KAPPA_EPSILON, _THETA_MU = 0.2, 30.0, 1.3
-# With given multipliers the iterate is near a solution, so mu falls at once. Above this initial barrier the
-# neighbour is not as near, and the iterates follow the central path as usual.
+# With given multipliers the iterate is near a solution, so mu falls at once. It is not as near if the initial
+# barrier is at least this; then the iterates follow the central path as usual.
 _KAPPA_EPSILON_WARM, _MIN_BARRIER_OF_PATH = 1e4, 5e-3
 # The paper's values: elastic constraints have to show that no point meets them.
 _KAPPA_EPSILON_ELASTIC, _THETA_MU_ELASTIC = 10.0, 1.5
@@ -418,7 +418,7 @@ class BarrierProblem:
         self._unequal = np.flatnonzero(lower < upper)  # into c.remaining: those with a slack
         push = options.push if state is None else _PUSH_CONTINUED
         if warm and state is None:
-            # as far as a bound is whose multiplier is of order one: farther, constraints would be violated
+            # the slack of a bound whose multiplier is one: moving farther would violate constraints
             push = min(push, self.mu)
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
         kept = state is not None
@@ -494,7 +494,7 @@ class BarrierProblem:
     def error(self, mu: float, residual: Vector) -> float:
         """Scaled error of the barrier problem (eq. 5), with the multipliers of `update_multipliers`.
 
-        mu = 0 : of the program; in units of kkt_tolerance, so that one comparison checks all tolerances.
+        mu = 0 : of the program; its complementarity is in units of kkt_tolerance, with which all is compared.
         """
         x, s, c = self.x, self.s, self._condenser
         bounds, count = x.total() + s.total(), max(1, x.bounds + s.bounds)

@@ -108,7 +108,7 @@ class LineSearch:
 def _bent_step(
     problem: BarrierProblem, pairs: Filter, step: Step, start: SearchStart, longest: float, limit: float
 ) -> AcceptedStep | None:
-    """Step as long as the variables' bounds permit, in which every slack stops by itself at its own bound.
+    """Step as long as the variables' bounds permit, in which every slack stops by itself short of its bound.
 
     Of thousands of slacks one is always close to its bound and would stop all variables and slacks (TALOS's
     punch takes 60 iterations with bent steps, 75 without). The constraints whose slacks stopped are violated
@@ -185,7 +185,7 @@ def _is_acceptable(pairs: Filter, start: SearchStart, length: float, trial: Tria
 _HARD_VIOLATION, _HARD_FRACTION = 1e-2, 1e-2
 _RESTORED_VIOLATION = 1e-3  # ends a minimization of the violation: from there hard constraints are faster
 _MAX_CHANGES = 12  # of the aim
-_MIN_BARRIER = 1e-4  # after a change of the aim
+_MIN_CHANGED_BARRIER = 1e-4  # after a change of the aim
 # Iterations with elastic constraints that are met. Without this limit, three of two hundred nails ended at
 # the iteration limit.
 _MAX_MET_ITERATIONS = 20
@@ -240,8 +240,8 @@ class ElasticPhase:
     def change_aim(self, problem: BarrierProblem, *, met: bool) -> Status | None:
         """Leave elastic constraints that stall, or end.
 
-        met : whether the constraints are met, or nearly so. They become hard then; else the violation is
-            minimized alone; if it already was, the violation is least, which is the end.
+        met : whether the constraints are met, or nearly so. They become hard then, while the price can
+            rise; else the violation is minimized alone; if it already was, it is least, which is the end.
         """
         assert problem.elastic is not None
         self._changes += 1
@@ -255,7 +255,7 @@ class ElasticPhase:
             problem.sigma, self._initial_violation = 0.0, problem.point.max_violation
         else:
             return self._least_violation(problem)
-        problem.mu = max(problem.mu, _MIN_BARRIER)
+        problem.mu = max(problem.mu, _MIN_CHANGED_BARRIER)
         return None
 
     def leave_stall(self, problem: BarrierProblem, residual: Vector) -> str | Status:
@@ -387,7 +387,7 @@ class InteriorRun(Run[IPMOptions]):
         self._search.reset_filter()
 
     def _back_to_best(self) -> bool:
-        """Move to the best iterate, with new multipliers, as the old ones may have led to the failure.
+        """Move to the best iterate, without multipliers, as these may have led to the failure.
 
         False if the present point is the best.
         """

@@ -204,13 +204,13 @@ _PENALTY = 1e9  # weight of an equality that remains, relative to the curvature 
 _RANK_TOLERANCE = 1e-15  # relative: smaller singular values of the Schur complement count as zero
 # A step is refined while the residual falls by half, as stiff contacts give weights of ten decades, which
 # cost digits: with one refinement 1e-4 of the dual residual remained, and solves ended as merely acceptable.
-_MAX_REFINEMENTS, _REFINEMENT_FACTOR = 6, 0.5
+_MAX_SOLVES, _REFINEMENT_FACTOR = 6, 0.5  # the first solve and five refinements
 _FIXED_WEIGHT = 1e15  # on the diagonal of fixed variables
 # Shift of the Hessian's diagonal: Waechter and Biegler 2006, section 3.1, with its names.
 _SHIFT_FIRST, _SHIFT_MIN, _SHIFT_MAX = 1e-4, 1e-20, 1e20  # delta_w^0, delta_w^min, delta_w^max
 _KAPPA_PLUS, _KAPPA_PLUS_FIRST = 8.0, 100.0  # growth; and of the very first shift
 _DECREASE = 3.0  # 1 / kappa_w^-
-_SHIFT_NEGLIGIBLE = 1e-5  # no shift is tried before a smaller one
+_SHIFT_NEGLIGIBLE = 1e-5  # a first shift that would be smaller is left out
 _SHIFT_RELATIVE = 0.1  # to the Hessian's largest entry: the first shift of an iteration is at most that
 
 
@@ -357,7 +357,7 @@ class NewtonSystem:
         exact = np.concatenate([c.eliminated, equal]) if self._hard else c.eliminated
         g, left, worst = q + self._transposed_product(w * r), r, np.inf
         d, y, change = np.zeros(c.n), np.zeros(c.m), np.zeros(c.m)
-        for _ in range(_MAX_REFINEMENTS):
+        for _ in range(_MAX_SOLVES):
             more_d, more_y, more_change, g = self._solve_once(g, left, w)
             d, y, change = d + more_d, y + more_y, change + more_change
             # what rounding leaves of the equalities, and of the gradient of the Lagrangian
@@ -424,8 +424,7 @@ def acquire(
     values only, or in inequalities that couple no other variables.
 
     determined : variables that constraints determine.  equal (m,) : which constraints are equalities.
-    bounded,
-    moves (n,) : which variables have a finite bound, and which are not fixed.
+    bounded, moves (n,) : which variables have a finite bound, and which are not fixed.
     """
     mine = equal[jacobian.indices]
     starts = np.append(0, np.cumsum(mine))[jacobian.indptr]

@@ -61,8 +61,8 @@ def write(export: Export, directory: Path) -> None:
         )
     if p.second is not None or p.stance.held_hands(p.robot):
         raise InputError(
-            "mujoco: the scene has one striker, and no supporting hand; export to csv instead, or replay here "
-            "(impactopt validate)"
+            "mujoco: the scene has one striker, and no supporting hand; export to csv instead, or replay "
+            "here (impactopt validate)"
         )
     if p.friction is not None:
         raise InputError(

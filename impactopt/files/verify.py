@@ -288,7 +288,7 @@ def motion_of_record(
         for leg in legs_of_stance[stance[i]]:
             frame, at = model.getFrameId(leg.frame), columns[leg.frame]
             error = float(np.abs(pin.log6(leg.placement.actInv(data.oMf[frame])).vector).max())
-            yield f"{prefix}: held soles", error, where
+            yield f"{prefix}: fixed soles", error, where
             if wrench.size:
                 jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL)
                 tau -= jacobian.T @ wrench[i, at : at + 6]

@@ -83,7 +83,10 @@ def test_a_duration_that_would_have_to_be_longer_is_that_of_its_phase(program: T
     x = first_iterate(program)
     x[bound.variables] = 1.5 / 0.1  # durations of motions are in tenths of a second
     (cause,) = bound.causes(x)
-    assert cause.text.startswith("stance phase 1: 1.5") and "s for 0.9 s ([[stances]] number 1" in cause.text
+    assert (
+        cause.text.startswith("stance phase 1: 1.5")
+        and "s instead of 0.9 s ([[stances]] number 1" in cause.text
+    )
     assert cause.problem is not None and cause.problem.stances[0].phase is not None
     assert cause.problem.stances[0].phase.duration[1] == pytest.approx(1.5, rel=0.05)
     assert cause.problem.stances[1:] == program.problem.stances[1:]
@@ -323,9 +326,9 @@ def test_a_verdict_holds_the_soles_of_each_phase_to_their_places(
     found = list(motion_of_record(plan.problem, arrays))
     worst = max(found, key=lambda off: off[1])
     assert worst[1] < 2e-2, worst  # [1] of its size: what a program's tolerance leaves
-    assert max(off for name, off, _ in found if name.endswith("held soles")) < 1e-6
+    assert max(off for name, off, _ in found if name.endswith("fixed soles")) < 1e-6
     moved = {**arrays, "reference_stance": np.zeros_like(ways[0].stance)}
-    assert max(off for name, off, _ in motion_of_record(plan.problem, moved) if "held soles" in name) > 0.01
+    assert max(off for name, off, _ in motion_of_record(plan.problem, moved) if "fixed soles" in name) > 0.01
 
 
 def test_an_export_says_which_sole_stands(plan: Plan, ways: tuple[Trajectory, Trajectory]) -> None:

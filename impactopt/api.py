@@ -203,7 +203,7 @@ def _public(found: R) -> R:
     """Planner's result with the public `Solution`; warns if it is not solved."""
     if isinstance(found, solution.Solved) and not found.status.usable:
         warnings.warn(
-            f"not solved, so its numbers are those of no plan: {found.result.message}",
+            f"not solved; its numbers are not a plan: {found.result.message}",
             NotSolvedWarning,
             stacklevel=3,
         )

@@ -1,14 +1,18 @@
-"""Errors and warnings that users see, and checks that raise them."""
+"""Errors and warnings that users see, and checks that raise them.
+
+Shell completion imports this module; NumPy, which is slow to load, is imported by the checks alone.
+"""
 
 from __future__ import annotations
 
 import difflib
 import re
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
     "FARTHEST",
@@ -152,6 +156,8 @@ def check_array(
     ------
     InputError : not numbers, another shape, or NaN, infinity or too large a number, with its index.
     """
+    import numpy as np
+
     try:
         # NumPy would convert text to numbers, and drop the imaginary part of complex ones
         if np.asarray(value).dtype.kind in "USc":
@@ -178,6 +184,8 @@ def check_array(
 
 def raw_array(name: str, value: object) -> NDArray[Any]:
     """NumPy array of any type from a value; InputError if its rows differ in length."""
+    import numpy as np
+
     try:
         return np.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:
@@ -213,7 +221,7 @@ def shortened(text: str, most: int = 80) -> str:
 def check_direction(name: str, value: ArrayLike) -> NDArray[np.float64]:
     """Checked float64 copy of a unit vector (3,); InputError as of `check_array`, or for another length."""
     array = check_array(name, value, (3,))
-    length = float(np.linalg.norm(array))
+    length = float((array @ array) ** 0.5)
     if abs(length - 1.0) > 1e-6:
         raise InputError(f"{name}: not a unit vector (length {length:.6g}); divide it by its length")
     return array

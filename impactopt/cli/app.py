@@ -8,6 +8,7 @@ input; 70 a fault of ours; 130 Ctrl-C.
 from __future__ import annotations
 
 import enum
+import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -244,6 +245,9 @@ app.command(epilog=examples("impactopt problems --json"))(problems)
 app.command(epilog=examples("impactopt robots --json"))(robots)
 for _registered in app.registered_commands:
     _registered.cls = PlainCommand
+    # typer keeps the line breaks of a docstring beside those that fit the terminal
+    _paragraphs = inspect.cleandoc(str(_registered.callback.__doc__)).split("\n\n")
+    _registered.help = "\n\n".join(text.replace("\n", " ") for text in _paragraphs)
 
 
 def _show(record: Record, as_json: bool, ok: bool) -> None:

@@ -106,7 +106,7 @@ def collide(
         at_contact |= {"result": str(what.resolve())} if saved else {}
         at_contact |= {} if posture is None else {"posture": posture}
         with SolveConsole(console, quiet=quiet) as progress:
-            progress.say(f"{read.path} is read; colliding (compiles the first time)")
+            progress.say(f"{read.path} is read; computing the collision (compiles the first time)")
             at_contact |= {} if speed is None else {"speed_m_s": speed}
             found = collide_once(read, at_contact, accuracy=accuracy / 100)
         if as_json:

@@ -38,8 +38,8 @@ def export(
     to: Annotated[
         Target,
         typer.Option(
-            help="csv: tables; ros2: goals for FollowJointTrajectory; mcap: ROS 2 messages; mujoco: a scene "
-            "and the lines that play it; mjlab: a motion for policies to track."
+            help="csv: tables; ros2: action goals; mcap: ROS 2 messages; mujoco: a scene and the lines that "
+            "play it; mjlab: a motion for policies to track."
         ),
     ],
     out: Annotated[
@@ -59,7 +59,7 @@ def export(
         bool,
         typer.Option(
             "--gravity/--no-gravity",
-            help="Whether effort includes gravity compensation; not, if the controller does it.",
+            help="Include gravity compensation in effort; leave it out if the controller adds its own.",
         ),
     ] = True,
     smooth: Annotated[

@@ -64,17 +64,17 @@ def check(
         plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
         for name, value in (problem.describe() | plain).items():
             for text in value if name in ("inertias", "notes", "followers") else [_as_text(value)]:
-                typer.echo(printable(f"  {name:<10} {text}"))
+                typer.echo(printable(f"  {name:<11} {text}"))
         if lost := _lost_meshes(problem.robot):
-            typer.echo(printable(f"  {'meshes':<10} {lost}"))
+            typer.echo(printable(f"  {'meshes':<11} {lost}"))
         if strength := _strength(problem):
-            typer.echo(printable(f"  {'strength':<10} {strength}"))
+            typer.echo(printable(f"  {'strength':<11} {strength}"))
         for warning in warnings:
-            typer.echo(printable(f"  {'doubt':<10} {warning}"))
+            typer.echo(printable(f"  {'doubt':<11} {warning}"))
 
 
 def _strength(problem: ImpactProblem) -> str:
-    """Estimated impulse as a percentage of the hardest blow nearby, as a message; "" if it is not known."""
+    """Estimated impulse as a percentage of the hardest impact nearby, as a message; "" if it is not known."""
     from impactopt.problem.strength import best_share
 
     found = best_share(problem)
@@ -82,7 +82,7 @@ def _strength(problem: ImpactProblem) -> str:
         return ""
     share, best = found
     where = f"point_m = {best.point.round(2).tolist()}, normal = {best.normal.tolist()}"
-    return f"{100 * share:.0f} % of the hardest blow nearby, by a rough estimate; that one: {where}"
+    return f"{100 * share:.0f} % of the hardest impact nearby, by a rough estimate; that one: {where}"
 
 
 def _lost_meshes(robot: Robot) -> str:
@@ -128,7 +128,7 @@ def new(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="[NAME]",
+            metavar="NAME",
             help="Name of the problem to start from; or a .urdf, or the .xml of an MJCF.",
             autocompletion=complete_problem,
         ),

@@ -118,7 +118,7 @@ TimeLimit = Annotated[
 Starts = Annotated[
     int, typer.Option(min=1, help="Multistart: number of initial guesses; all but the first are random.")
 ]
-Workers = Annotated[int, typer.Option(min=1, help="Parallel processes, for starts, replays and a baseline.")]
+Workers = Annotated[int, typer.Option(min=1, help="Number of parallel processes.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the random starts.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]

@@ -1,4 +1,4 @@
-"""Command `impactopt strike`: the hardest blow by itself, without a motion."""
+"""Command `impactopt strike`: the hardest impact by itself, without a motion."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def strike(
 ) -> None:
     """Find the posture and velocity at contact that hit hardest, without a motion that leads to them.
 
-    It has several initial guesses, as local optima differ much. A failed result goes to DIR/failed if there
-    is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
+    It starts from several initial guesses, as local optima differ much. A failed result goes to DIR/failed if
+    there is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
         from impactopt.errors import printable

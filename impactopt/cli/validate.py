@@ -51,7 +51,7 @@ def validate(
     controller: Annotated[
         Controller,
         typer.Option(
-            help="servo: of the joints; wbc: whole-body controller, with the problem file's settings."
+            help="servo: PD control of the joints; wbc: whole-body controller, set up by the problem file."
         ),
     ] = Controller.servo,
     contact: Annotated[
@@ -73,9 +73,9 @@ def validate(
     stiffness: Annotated[float, typer.Option(help="Stiffness of the contact, as a factor.")] = 1.0,
     damping: Annotated[float, typer.Option(help="Damping of the contact, as a factor.")] = 1.0,
     distance: Annotated[
-        float, typer.Option(metavar="M", help="How much farther the target is; < 0: nearer.")
+        float, typer.Option(metavar="M", help="Offset of the target, away from the robot; < 0: nearer.")
     ] = 0.0,
-    missing: Annotated[bool, typer.Option("--missing", help="There is no target.")] = False,
+    missing: Annotated[bool, typer.Option("--missing", help="Replay without the target.")] = False,
     payload: Annotated[float, typer.Option(metavar="KG", help="Unplanned mass at the striking point.")] = 0.0,
     friction: Annotated[float, typer.Option(help="Friction coefficient between soles and floor.")] = 0.9,
     floor_time: Annotated[
@@ -92,9 +92,11 @@ def validate(
         float, typer.Option(metavar="S", help="Delay from reading joints to setting torques.")
     ] = 0.0,
     push: Annotated[float, typer.Option(metavar="N", help="Level push on the base.")] = 0.0,
-    push_start: Annotated[float, typer.Option(metavar="S", help="When it begins.")] = 0.0,
-    push_time: Annotated[float, typer.Option(metavar="S", help="How long it lasts.")] = 0.1,
-    push_way: Annotated[float, typer.Option(metavar="RAD", help="Its angle from x, to the left.")] = 0.0,
+    push_start: Annotated[float, typer.Option(metavar="S", help="Start of the push.")] = 0.0,
+    push_time: Annotated[float, typer.Option(metavar="S", help="Duration of the push.")] = 0.1,
+    push_way: Annotated[
+        float, typer.Option(metavar="RAD", help="Direction of the push: angle from x, to the left.")
+    ] = 0.0,
 ) -> None:
     """Replay a result on free soles, as planned or with perturbations: does the robot stand?
 

@@ -297,7 +297,7 @@ def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, st
         out["ZMP"] = "not requested"
     free = [sole.name for sole in robot.soles if sole not in held_by.soles(robot)] if robot.floating else []
     if free:
-        out["held soles"] = f"{', '.join(free)}: not held by the stance"
+        out["fixed soles"] = f"{', '.join(free)}: not fixed by the stance"
     if not wanted & {*HISTORIES}:
         out["histories"] = "not requested"
     if "peak_force" not in wanted:

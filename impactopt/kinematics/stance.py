@@ -86,7 +86,7 @@ class _OnSoles(Stance):
         for name, value in (("base_mass [kg]", self.base_mass), ("base_inertia [kg m2]", self.base_inertia)):
             if value is not None and not check_array(f"virtual base: {name}", value, ()) > 0:
                 raise InputError(
-                    f"virtual base: {name}: {value:g}; give a number > 0, or None for exactly held soles"
+                    f"virtual base: {name}: {value:g}; give a number > 0, or None for exactly fixed soles"
                 )
 
     def held_hands(self, robot: Robot) -> tuple[Striker, ...]:

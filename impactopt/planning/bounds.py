@@ -166,7 +166,7 @@ def _duration_cause(
     else:
         phase, key = {"swing": "swing", "follow": "follow-through"}[name], f"[{name}]"
         new = {name: replace(_motion_phase(p, name), duration=both)}
-    text = f"{phase}: {value:.3g} s for {bound:.3g} s ({key} duration_s)"
+    text = f"{phase}: {value:.3g} s instead of {bound:.3g} s ({key} duration_s)"
     return Cause(kind="time", text=text, problem=changed_or_none(p, **new))
 
 
@@ -185,7 +185,7 @@ def _clearances(t: Transcription) -> Iterator[Bound]:
             free = (KeepOut if term == KeepOut.name else SelfCollision)(enabled=False)
             yield Cause(
                 kind="the floor" if "ground" in pair.split(" and ")[1:] else term,
-                text=f"{pair}: {missing:.2g} mm nearer than they may be",
+                text=f"{pair}: {missing:.2g} mm nearer than allowed",
                 problem=changed_or_none(t.problem, terms=with_term(t.problem, free)),
             )
 
@@ -244,7 +244,7 @@ def _gear_loads(t: Transcription, term: GearLoad) -> Iterator[Bound]:
             value = _outward(float(most[k]) + _violation(t, x, select), float(most[k]))
             limits = {n: float(m) for n, m in zip(names, most, strict=True) if np.isfinite(m)}
             bounded = replace(term, limit=limits | {joint: value})
-            text = f"gear of {joint}: {value:.3g} for {most[k]:.3g} of its torque limit"
+            text = f"gear of {joint}: {value:.3g} instead of {most[k]:.3g} times its torque limit"
             at = changed_or_none(t.problem, terms=with_term(t.problem, bounded))
             yield Cause(kind="gears", text=f"{text} ([terms.gear_load] limit)", problem=at)
 
@@ -286,7 +286,7 @@ def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> It
             continue
         value = _outward(needed, old)
         unit = about_field[field.name].unit if field.name in about_field else ""
-        text = f"{term.name}: {value:.3g} for {old:.3g}{' ' + unit if unit else ''}"
+        text = f"{term.name}: {value:.3g} instead of {old:.3g}{' ' + unit if unit else ''}"
         new = changed_or_none(t.problem, terms=with_term(t.problem, replace(term, **{field.name: value})))
         yield Cause(kind=kind, text=f"{text} ({section}{field.name}{where})", problem=new)
 

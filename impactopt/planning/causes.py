@@ -182,7 +182,7 @@ class _CauseSearch:
             if self._run(t.program, first_iterate(t), _ITERATIONS_STIFFNESS) is not None:
                 yield Cause(
                     kind="a soft contact" if factor > 1 else "a stiff contact",
-                    text=f"stiffness of the contact: {value:.2g} N/m for {known:.2g} N/m "
+                    text=f"stiffness of the contact: {value:.2g} N/m instead of {known:.2g} N/m "
                     "([contact] stiffness_N_m)",
                     problem=changed(self.given, law=law),
                 )

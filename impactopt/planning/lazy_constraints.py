@@ -63,7 +63,7 @@ def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: floa
         ratio = np.nan_to_num(loads.gear / most)
         k = int(ratio.argmax())
         if ratio[k] > worst:
-            of_limit = f"{loads.gear[k]:.3g} times its torque limit, which may be {most[k]:.3g}"
+            of_limit = f"{loads.gear[k]:.3g} times its torque limit, at most {most[k]:.3g} allowed"
             worst, message = ratio[k], f"gear of {loads.joints[k]}: {of_limit}"
     return message
 
@@ -73,7 +73,7 @@ def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> 
     loads = [one for one in found if one is not None]
     if problem.gear_load.active:
         text = gears_beyond(problem, loads, more=REPLAY_GEAR_TOLERANCE)
-        return {"gear_caution": f"{text}, more than it may"} if text else {}
+        return {"gear_caution": text} if text else {}
     beyond = [text for one in loads if (text := one.beyond_peak())]
     return {"gear_caution": beyond[0]} if beyond else {}
 
@@ -98,7 +98,7 @@ def slides_beyond(term: Slide, plan: Plan) -> str:
     far = float(np.abs(across(problem.normal) @ offset).max())
     if far <= (1 + SLIDE_TOLERANCE) * term.most:
         return ""
-    most = f"which may be {1e3 * term.most:.0f} mm"
+    most = f"at most {1e3 * term.most:.0f} mm allowed"
     return f"the striking point slides {1e3 * far:.0f} mm across the target, {most}"
 
 

@@ -126,10 +126,14 @@ def touch_message(report: Mapping[str, Any]) -> str:
     if "point" not in report:
         return ""
     hull, point = (
-        f"{contact['impulse_Ns']:.2f} N s, {contact['first_touch_ms']:+.2f} ms early"
+        f"{contact['impulse_Ns']:.2f} N s, {_early(contact['first_touch_ms'])}"
         for contact in (report, report["point"])
     )
     return f"contact of the link's hull: {hull}; of the striking point: {point}"
+
+
+def _early(ms: float) -> str:
+    return f"{abs(ms):.2f} ms {'late' if ms < 0 else 'early'}"
 
 
 def verdict_table(verdict: Mapping[str, Any]) -> Table:
@@ -228,7 +232,7 @@ def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
     """Table of the results from several initial guesses; `starts` as in a summary."""
     table = Table(title="starts", title_justify="left")
     for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
-        table.add_column(name, justify="left" if name in ("start", "status") else "right")
+        table.add_column(_plain(name), justify="left" if name in ("start", "status") else "right")
     for start in starts:
         name, numbers = str(start["start"]), (start["impulse_Ns"], start["iterations"], start["seconds"])
         cells = (f"{number:.{digits}f}" for number, digits in zip(numbers, (2, 0, 1), strict=True))
@@ -307,7 +311,7 @@ def nail_driving_table(series: Mapping[str, Any]) -> Table:
         ("solved in [s]", "solve_seconds", 1.0, 1),
     )
     for name in ("blow", *(label for label, *_ in columns)):
-        table.add_column(name, justify="right")
+        table.add_column(_plain(name), justify="right")
     for k, blow in enumerate(series["blows"], start=1):
         table.add_row(str(k), *(f"{scale * blow[key]:.{n}f}" for _, key, scale, n in columns))
     return table

@@ -118,8 +118,8 @@ class DriveLoads:
         k = int(worst_first[0])
         others = f", and {len(beyond) - 1} more" if len(beyond) > 1 else ""
         return (
-            f"gear of {names[k]}: {self.gear[k]:.3g} times its torque limit, and {limit[k]:.3g} is its "
-            f"momentary peak{others}; bound it with [terms.gear_load]"
+            f"gear of {names[k]}: {self.gear[k]:.3g} times its torque limit, above its momentary peak of "
+            f"{limit[k]:.3g}{others}; bound it with [terms.gear_load]"
         )
 
 

@@ -318,10 +318,12 @@ class ExtraBlock:
     """Block of a term or an objective.
 
     key : all that shapes the expression beside robot, stance and striker.  build : makes the expression.
+    user : its name is a user's.
     """
 
     key: tuple[Any, ...]
     build: Callable[[], BlockExpression]
+    user: bool = False
 
 
 def own_blocks(
@@ -376,7 +378,7 @@ def extra_blocks(
 
 def _extra(block: BlockExpression | BlockRecipe, problem: ImpactProblem, elements: Elements) -> ExtraBlock:
     if isinstance(block, BlockExpression):
-        return ExtraBlock(key_of(block), lambda: block)
+        return ExtraBlock(key_of(block), lambda: block, user=True)
     if block.of_stages:
         stages = len(contact_mesh(problem, elements))
         return ExtraBlock((*block.key, stages), partial(block.build, stages))

@@ -61,6 +61,7 @@ from impactopt.transcription.structured import derivative_functions
 
 __all__ = ["Transcription", "block_functions", "statement_of"]
 
+USER_PREFIX = "user_"  # of users' blocks in C, which has functions of its own, such as floor
 SECOND_BLOCKS = ("second_contact", "second_approach")
 
 
@@ -93,7 +94,10 @@ def block_functions(
         for name, build in own_blocks(problem, coordinates, edges).items()
     }
     found |= extra_blocks(problem, coordinates, elements)
-    blocks = [(name, (*recipe, *block.key), block.build) for name, block in found.items()]
+    blocks = [
+        (f"{USER_PREFIX}{name}" if block.user else name, (*recipe, *block.key), block.build)
+        for name, block in found.items()
+    ]
     soles = [(sole.frame, len(sole.polygon)) for sole in problem.soles]
     blocks += [
         (name, (*_coordinates_recipe(c), *soles), build)
@@ -105,7 +109,8 @@ def block_functions(
         )
         for name, key, build in blocks
     ]
-    return cached_groups(groups, report=report)
+    functions = cached_groups(groups, report=report)
+    return {name.removeprefix(USER_PREFIX): function for name, function in functions.items()}
 
 
 def _functions(name: str, build: Callable[[], BlockExpression]) -> list[Any]:

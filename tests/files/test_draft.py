@@ -344,7 +344,7 @@ def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:
     assert strong is not None and weak is not None and problem.normal[0] != 1.0
     assert weak[0] < strong[0] and weak[1].normal[0] != 1.0
     done = CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")])
-    assert f"{100 * strong[0]:.0f} % of the hardest blow nearby" in done.output
+    assert f"{100 * strong[0]:.0f} % of the hardest impact nearby" in done.output
 
 
 @pytest.mark.parametrize("velocity", [0.3, 4.0])

@@ -33,7 +33,7 @@ def arm() -> ImpactProblem:
 
 
 def unsolved(problem: ImpactProblem) -> Solution:
-    with pytest.warns(NotSolvedWarning, match="not solved, so its numbers are those of no plan: Infeasible"):
+    with pytest.warns(NotSolvedWarning, match="not solved; its numbers are not a plan: Infeasible"):
         solution = solve(problem)
     assert solution.status is Status.INFEASIBLE
     return solution

@@ -83,7 +83,10 @@ def test_a_duration_that_would_have_to_be_longer_is_that_of_its_phase(program: T
     x = first_iterate(program)
     x[bound.variables] = 1.5 / 0.1  # durations of motions are in tenths of a second
     (cause,) = bound.causes(x)
-    assert cause.text.startswith("stance phase 1: 1.5") and "s for 0.9 s ([[stances]] number 1" in cause.text
+    assert (
+        cause.text.startswith("stance phase 1: 1.5")
+        and "s instead of 0.9 s ([[stances]] number 1" in cause.text
+    )
     assert cause.problem is not None and cause.problem.stances[0].phase is not None
     assert cause.problem.stances[0].phase.duration[1] == pytest.approx(1.5, rel=0.05)
     assert cause.problem.stances[1:] == program.problem.stances[1:]

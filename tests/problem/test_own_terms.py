@@ -27,7 +27,7 @@ from impactopt.transcription.initial_guess import first_iterate, strike_iterate
 from impactopt.transcription.layout import millimetres
 from impactopt.transcription.objective import Quantity
 from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 
@@ -133,6 +133,16 @@ def test_a_plan_obeys_a_term_of_ones_own(arm_transcription: Transcription) -> No
     (bound,) = (bound for bound in bounds_of(low) if bound.name == "ceiling")
     (cause,) = bound.causes(result.x)
     assert "(Ceiling.height; " in cause.text, "no section of a file has it"
+
+
+@pytest.mark.filterwarnings("error::impactopt.errors.NoCompilerWarning")
+def test_a_block_may_be_named_as_a_function_of_c(arm_transcription: Transcription) -> None:
+    class Floor(Ceiling):
+        def blocks(self, problem: Any, coordinates: Any) -> dict[str, Any]:
+            return {"floor": height_of(self.frame, coordinates)}
+
+    problem = replace(arm_transcription.problem, terms=(Floor(height=1.0),))
+    assert "floor_hess" in block_functions(problem, problem.coordinates)
 
 
 def test_an_objective_of_ones_own_is_kept_small(arm_transcription: Transcription) -> None:

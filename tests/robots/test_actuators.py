@@ -195,7 +195,9 @@ def test_loads_are_those_of_their_formulas() -> None:
     assert loads.beyond_peak() == ""
     weak = robot.with_actuators({"elbow": Actuator(momentary_torque=35.0)})
     again = DriveLoads.of(weak, gear=gear, torque=torque, velocity=velocity, jump=np.full(4, np.nan))
-    assert "gear of elbow: 1.17 times its torque limit, and 0.583 is its" in again.beyond_peak()
+    assert (
+        "gear of elbow: 1.17 times its torque limit, above its momentary peak of 0.583" in again.beyond_peak()
+    )
     assert again.summary()["velocity_jump_joint"] is None and again.summary()["motor_ratio"] is None
 
 

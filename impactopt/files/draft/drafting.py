@@ -550,7 +550,7 @@ def _reasons(locked: Mapping[str, str]) -> Iterator[str]:
     """Reasons for locked joints, each once with its count."""
     for reason in dict.fromkeys(locked.values()):
         count = sum(other == reason for other in locked.values())
-        yield f"{reason}" if count == 1 else f"{count} x {reason}"
+        yield f"{reason}" if count == 1 else f"{reason} ({count} joints)"
 
 
 def _frames(robot: Robot) -> Iterator[str]:

@@ -18,7 +18,7 @@ LAWS: Mapping[type[ContactLaw], str] = {
     HertzDamped: "stiffness * x**1.5 + damping * x**0.25 * rate",
 }
 PLAYER = '''\
-"""Plays a planned blow. Needs mujoco and numpy. Run: python play.py, or python play.py missing"""
+"""Plays a planned impact motion. Needs mujoco and numpy. Run: python play.py, or python play.py missing"""
 
 import sys
 from pathlib import Path
@@ -30,7 +30,7 @@ here, missing = Path(__file__).parent, "missing" in sys.argv[1:]
 model = mujoco.MjModel.from_xml_path(str(here / "scene.xml"))
 data, ref = mujoco.MjData(model), np.load(here / "reference.npz")
 mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
-of = "missed_" if missing and "missed_time" in ref else ""  # the same until the blow is missed
+of = "missed_" if missing and "missed_time" in ref else ""  # the same until the target is missed
 time, table = ref[of + "time"], np.hstack([ref[of + x] for x in ("position", "velocity", "effort")])
 joints, kp, kd, impulse = [model.joint(name) for name in ref["joints"]], ref["kp"], ref["kd"], 0.0
 place, dof, n = [j.qposadr[0] for j in joints], [j.dofadr[0] for j in joints], len(joints)

@@ -62,7 +62,7 @@ def draw_ellipsoid(figure: FigureBase, record: Record) -> None:
     _over_angle(panels[-1], inverse, normal, largest)
     panels[-1].plot(0.0, mass, "o", color=VERMILION, markersize=4, zorder=4)
     figure.legend(*panels[-1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    figure.suptitle(title(record, f"{mass:.1f} kg meet the target along the blow"))
+    figure.suptitle(title(record, f"effective mass {mass:.1f} kg along the normal"))
 
 
 def _over_angle(axes: Any, inverse: Array, normal: Array, largest: float) -> None:
@@ -76,7 +76,7 @@ def _over_angle(axes: Any, inverse: Array, normal: Array, largest: float) -> Non
         masses = _within(effective_masses(inverse, directions), largest)
         if np.isfinite(masses).sum() > 1:
             axes.plot(np.degrees(turn), masses, style, color=BLUE if style == "-" else GREEN, label=name)
-    axes.set(xlabel="angle to the blow [deg]", ylabel="effective mass [kg]", ylim=(0.0, 1.05 * largest))
+    axes.set(xlabel="angle to the normal [deg]", ylabel="effective mass [kg]", ylim=(0.0, 1.05 * largest))
     axes.set_xticks([-90, -45, 0, 45, 90])
 
 

@@ -44,7 +44,7 @@ def draw_iterations(figure: FigureBase, record: Record) -> None:
         values = np.maximum(a[f"history_{key}"], MIN_VALUE)
         bottom.semilogy(count, values, style, color=colour, label=label)
     seconds = float(a["history_seconds"][-1])
-    bottom.set(xlabel=f"iterations [-], {count[-1]} in {seconds:.1f} s", ylabel="violated, not optimal [-]")
+    bottom.set(xlabel=f"iterations [-], {count[-1]} in {seconds:.1f} s", ylabel="residuals [-]")
     figure.legend(loc="outside lower center", ncols=2)
 
 

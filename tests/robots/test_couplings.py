@@ -23,7 +23,8 @@ from support.small_robots import arm, parallelogram, slider
 from impactopt import SDC, FreeMass, RigidBody, Robot, SoftGrip, SpringDamper, Striker, Tool
 from impactopt.codegen.cache import model_hash
 from impactopt.errors import InputError
-from impactopt.robots.couplings import Coupling, coupled, couplings_of, mass_matrix, with_followers
+from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
+from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.simulation.mujoco_world import MujocoOptions, MujocoRobot, mujoco_module, robot_bodies, spec_of
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 

@@ -219,7 +219,7 @@ KINDS = {type(thing) for thing in ON_TOP.values()} | {Impulse, AngularMomentum}
 
 def test_all_objectives_and_extra_terms_are_tried_here() -> None:
     """The biped's test below has the angular momentum, and what is about soles and the striking link. The
-    small robots have no hand that could hold on: of `Grip` tests/planning/test_holding_on.py has its own.
+    small robots have no hand that could hold on: of `Grip` tests/planning/test_supporting_hand.py has its own.
     """
     assert {*OBJECTIVES, *TERMS} - {*map(type, DEFAULT_TERMS)} == KINDS | {Grip}
 

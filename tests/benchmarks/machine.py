@@ -77,7 +77,7 @@ def run(
     return Report(
         name="machine",
         numbers={"rows": rows},
-        tables=(columns_table("what gears may bear, and what a blow brings", COLUMNS, rows),),
+        tables=(columns_table("loads that gears may carry, and those of an impact", COLUMNS, rows),),
         figures={"machine": picture},
     )
 

@@ -121,7 +121,7 @@ def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> R
         {**r, "zmp_margin_mm": None if m is None else 1e3 * m} for r, m in zip(rows, margins, strict=True)
     ]
     tables = (
-        columns_table("planned, and replayed on held soles", HELD, shown),
+        columns_table("planned, and replayed on fixed soles", HELD, shown),
         columns_table("replayed on free soles", FREE, shown),
         columns_table(
             "with the target missing, on free soles", MISSED, [r for r in shown if "missed_standing" in r]

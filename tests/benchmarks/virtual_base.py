@@ -69,7 +69,7 @@ def run(say: Say, *, robots: Sequence[str] = ROBOTS, masses: Sequence[float] = M
         exact += exact_rows(robot)
     tables = tuple(
         columns_table(
-            f"{name}: relative errors against exactly held soles",
+            f"{name}: relative errors against exactly fixed soles",
             COLUMNS,
             [_shown(r) for r in rows if r["robot"] == name],
         )

@@ -1,7 +1,7 @@
 """Time of a plan over its truth: every model of the collision that a plan can have in it.
 
 Each problem is solved from one plain start with each model, and the plan is replayed in full dynamics, on
-held soles; whether it stands is said by MuJoCo, on free ones.
+fixed soles; whether it stands is said by MuJoCo, on free ones.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The benches of models: the hierarchy against full dynamics, virtual bases against held soles."""
+"""The benches of models: the hierarchy against full dynamics, virtual bases against fixed soles."""
 
 from __future__ import annotations
 

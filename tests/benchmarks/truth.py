@@ -1,6 +1,6 @@
-"""Is what is planned what happens? Punches, planned and then replayed with held soles and with free ones.
+"""Is what is planned what happens? Punches, planned and then replayed with fixed soles and with free ones.
 
-One row a problem: how the solver ended; from the replay with held soles (Pinocchio) the impulse's error, the
+One row a problem: how the solver ended; from the replay with fixed soles (Pinocchio) the impulse's error, the
 least ZMP margin, what each sole by itself keeps of the margins asked of it, and the largest torque demand
 over limit; from the replay with free soles (MuJoCo) the impulse's error, each sole's least margin and force,
 slip, lift in the collision, and whether the robot stands at the end. What fails stays in.
@@ -167,12 +167,12 @@ def _variant(name: str, changes: dict[str, Any], say: Say) -> Solution:
 def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "servo") -> dict[str, Any]:
     """What one problem gives; an error is its status, and ends what can be said of it.
 
-    clearance_mm, touches : of the plan and its replay on held soles; replay_... : on free ones.
+    clearance_mm, touches : of the plan and its replay on fixed soles; replay_... : on free ones.
     mesh_touches : pairs that are in each other by the exact meshes of the robot's URDF, looked at every
     millisecond of the plan, the missed blow and the replay (None: it has no meshes).
     cop_planned, cop_held, force_planned, force_held : least that a sole keeps of the margin of its centre of
     pressure and of its normal force, over what is asked of it, in the plan (its missed blow included) and in
-    its replay on held soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers,
+    its replay on fixed soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers,
     by sole and phase.
     missed_... : of the replay on free soles where the target is missing.
     idle_travel_rad ... first_touch_ms : `impactopt.transcription.motion_measures`.

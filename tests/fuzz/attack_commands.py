@@ -80,7 +80,7 @@ _WORDS = (
 
 
 def make_result(folder: Path) -> Path:
-    """A saved result to damage: the plan of a small problem, replayed on held soles."""
+    """A saved result to damage: the plan of a small problem, replayed on fixed soles."""
     from impactopt.files.output import record_of, save_record
     from impactopt.files.problem_file import read_problem_file
     from impactopt.planning.solve import solve

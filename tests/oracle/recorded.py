@@ -92,7 +92,7 @@ def _start(p: Program, v: Variables) -> float:
 
 
 def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, course: int) -> Iterator[Off]:
-    """The servo's reference: the splines', on held soles, with the torque that it needs, within limits.
+    """The servo's reference: the splines', on fixed soles, with the torque that it needs, within limits.
 
     course : number of that from contact to rest.
     """

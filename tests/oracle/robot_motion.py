@@ -1,4 +1,4 @@
-"""A robot on held soles as numbers: configuration, rates, forces, in Pinocchio alone."""
+"""A robot on fixed soles as numbers: configuration, rates, forces, in Pinocchio alone."""
 
 from __future__ import annotations
 
@@ -246,7 +246,7 @@ class RobotMotion:
             tau -= jac.T @ wrenches[6 * k : 6 * k + 6]
 
     def ground(self, wrenches: Array) -> Array:
-        """(6,) [N, N m] about the world's origin, of wrenches (6 a sole) on the held soles."""
+        """(6,) [N, N m] about the world's origin, of wrenches (6 a sole) on the fixed soles."""
         total = np.zeros(6)
         for k, (_, _, _, place) in enumerate(self.soles[: self.standing]):
             total += place.act(pin.Force(wrenches[6 * k : 6 * k + 6])).vector

@@ -36,7 +36,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 def jacobians(problem: ImpactProblem, q: Array) -> tuple[Array, Array, Array]:
-    """By Pinocchio: inertia (nv, nv), striking point along the normal (nv,), held soles (6 a sole, nv)."""
+    """By Pinocchio: inertia (nv, nv), striking point along the normal (nv,), fixed soles (6 a sole, nv)."""
     model = problem.robot.model
     data = model.createData()
     inertia = pin.crba(model, data, q)

@@ -45,7 +45,7 @@ def virtual_base_picture(rows: Sequence[Row]) -> Picture:
         axes.yaxis.set_major_locator(LogLocator(numticks=10))
         axes.minorticks_off()
         axes.set_ylim(LEAST / 2, 5.0)
-    panels[0].set_ylabel("relative error against exactly held soles")
+    panels[0].set_ylabel("relative error against exactly fixed soles")
     solid: dict[str, Any] = {"marker": "o", "markersize": 3.5}
     handles = [
         Line2D([], [], color=BLUE, label="ours, effective mass", **solid),

@@ -218,8 +218,8 @@ KINDS = {type(thing) for thing in ON_TOP.values()} | {Impulse, AngularMomentum}
 
 
 def test_all_objectives_and_extra_terms_are_tried_here() -> None:
-    """The biped's test below has the angular momentum, and what is about soles and the striking link. The
-    small robots have no hand that could hold on: of `Grip` tests/planning/test_supporting_hand.py has its own.
+    """The biped's test below has the angular momentum, and all about soles and the striking link. The small
+    robots have no supporting hand: `Grip` has tests in tests/planning/test_supporting_hand.py.
     """
     assert {*OBJECTIVES, *TERMS} - {*map(type, DEFAULT_TERMS)} == KINDS | {Grip}
 

@@ -2,7 +2,7 @@
 
 The paper's robot is HRP-2, whose description is not public, in OpenHRP3. Ours are a stand-in of HRP-2's class
 (see `impactopt.robots.presets.standin`) and TALOS, in postures found by optimization, and the reference is
-full dynamics on fixed soles: the paper's figures stand beside ours as the paper's, not as what ours should be.
+full dynamics on fixed soles: the paper's figures stand beside ours for comparison, not as a reference.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def test_a_time_far_too_short_for_its_contact_is_named() -> None:
         solution = solve(dataclasses.replace(load_problem("arm_planar"), contact_duration=(0.0, 5e-5)))
     assert solution.status is Status.INFEASIBLE
     assert solution.result.message.startswith("Infeasible: time. each phase of contact: ")
-    assert "for 5e-05 s ([collision] duration_s)" in solution.result.message
+    assert "instead of 5e-05 s ([collision] duration_s)" in solution.result.message
 
 
 def test_a_board_that_takes_more_than_one_contact_is_named() -> None:

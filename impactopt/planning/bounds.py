@@ -5,7 +5,7 @@ parameter values that a relaxed solution needs.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -36,7 +36,16 @@ from impactopt.solvers.relaxed import Relaxation
 from impactopt.transcription.layout import ConstraintOrigin
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["FEASIBLE", "TYPICAL_DURATION", "Bound", "Cause", "bounds_of", "changed_or_none"]
+__all__ = [
+    "FEASIBLE",
+    "TYPICAL_DURATION",
+    "Bound",
+    "Cause",
+    "bounds_of",
+    "changed_or_none",
+    "motion_phases",
+    "phase_changes",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -118,7 +127,7 @@ def _durations(t: Transcription) -> Iterator[Bound]:
         at = np.array(numbers, dtype=np.intp)
 
         def causes(x: Array, at: Index = at, kind: str = kind) -> Iterator[Cause]:
-            low, high = p.contact_duration if kind == "contact" else _motion_phase(p, kind).duration
+            low, high = p.contact_duration if kind == "contact" else motion_phases(p)[kind].duration
             times = x[at] * scale[kind]
             longer = times.max() > high
             value = float(times.max() if longer else times.min())
@@ -142,11 +151,21 @@ def _durations(t: Transcription) -> Iterator[Bound]:
         )
 
 
-def _motion_phase(p: ImpactProblem, kind: str) -> Phase:
-    """Duration and spline of "swing", "follow" or a stance phase, "stance0" and so on."""
-    phase = p.stances[int(kind[6:])].phase if kind.startswith("stance") else getattr(p, kind)
-    assert isinstance(phase, Phase)
-    return phase
+def motion_phases(p: ImpactProblem) -> dict[str, Phase]:
+    """Durations and splines by name: "swing", "follow", and "stance0" and so on of other stance phases."""
+    stances = {f"stance{k}": stance.phase for k, stance in enumerate(p.stances) if stance.phase is not None}
+    return {"swing": p.swing, "follow": p.follow, **stances}
+
+
+def phase_changes(p: ImpactProblem, phases: Mapping[str, Phase]) -> dict[str, object]:
+    """Fields of a problem that give it these phases, with names as in `motion_phases`."""
+    changes: dict[str, object] = {
+        name: phase for name, phase in phases.items() if name in ("swing", "follow")
+    }
+    stances = tuple(
+        replace(stance, phase=phases.get(f"stance{k}", stance.phase)) for k, stance in enumerate(p.stances)
+    )
+    return changes | ({"stances": stances} if stances != p.stances else {})
 
 
 def _duration_cause(
@@ -156,18 +175,17 @@ def _duration_cause(
     bound = high if longer else low
     value = _outward(value, bound)
     both = (value, value) if low == high else (low, value) if longer else (value, high)
-    new: dict[str, object]
+    changes: dict[str, object]
     if name == "contact":
-        phase, key, new = "each phase of contact", "[collision]", {"contact_duration": both}
-    elif name.startswith("stance"):
-        k, stances = int(name[6:]), list(p.stances)
-        stances[k] = replace(stances[k], phase=replace(_motion_phase(p, name), duration=both))
-        phase, key, new = f"stance phase {k + 1}", f"[[stances]] number {k + 1},", {"stances": tuple(stances)}
+        phase, key, changes = "each phase of contact", "[collision]", {"contact_duration": both}
     else:
-        phase, key = {"swing": "swing", "follow": "follow-through"}[name], f"[{name}]"
-        new = {name: replace(_motion_phase(p, name), duration=both)}
+        phase, key = {"swing": "swing", "follow": "follow-through"}.get(name, name), f"[{name}]"
+        changes = phase_changes(p, {name: replace(motion_phases(p)[name], duration=both)})
+    if name.startswith("stance"):
+        number = int(name.removeprefix("stance")) + 1
+        phase, key = f"stance phase {number}", f"[[stances]] number {number},"
     text = f"{phase}: {value:.3g} s instead of {bound:.3g} s ({key} duration_s)"
-    return Cause(kind="time", text=text, problem=changed_or_none(p, **new))
+    return Cause(kind="time", text=text, problem=changed_or_none(p, **changes))
 
 
 def _clearances(t: Transcription) -> Iterator[Bound]:

@@ -24,6 +24,8 @@ from impactopt.planning.bounds import (
     Cause,
     bounds_of,
     changed_or_none,
+    motion_phases,
+    phase_changes,
 )
 from impactopt.planning.budget import Budget
 from impactopt.planning.lazy_constraints import with_lazy_constraints
@@ -99,17 +101,15 @@ class _CauseSearch:
         zero_multipliers = np.zeros(t.program.m), np.zeros(t.layout.n)
         own = warm_start(self.t, t, result.x, *zero_multipliers)[0]
         shortest, longest = p.contact_duration
+        phases, fixed = motion_phases(p), (TYPICAL_DURATION, TYPICAL_DURATION)
         loose = changed(
             p,
-            swing=_loosened(p.swing),
-            follow=_loosened(p.follow),
+            **phase_changes(p, {name: _loosened(phase) for name, phase in phases.items()}),
             contact_duration=(shortest, max(_MAX_CONTACT_PHASE, longest)),
         )
         self.loose = program_for(self.t, loose)
-        fixed = (TYPICAL_DURATION, TYPICAL_DURATION)
-        typical = changed(
-            loose, swing=replace(loose.swing, duration=fixed), follow=replace(loose.follow, duration=fixed)
-        )
+        lasting = {name: replace(phase, duration=fixed) for name, phase in phases.items()}
+        typical = changed(loose, **phase_changes(loose, lasting))
         # initial guesses: the failed solve's last point, and the problem's own with typical durations
         self.guesses = own, first_iterate(program_for(self.t, typical))
         self.bounds = bounds_of(self.t)

@@ -369,7 +369,7 @@ def simulate_mujoco(
     check_choice("contact", contact, CONTACTS)
     if controller is not None and robot.floating and not scene.soles and not scene.hands:
         raise InputError(
-            f"robot {robot.name!r} floats freely, and the whole-body controller needs soles or gripping "
+            f"robot {robot.name!r} floats freely, and the whole-body controller needs soles or supporting "
             "hands: take the servo"
         )
     world = perturbation if perturbation is not None else Perturbation()

@@ -11,6 +11,7 @@ from support.derivative_checks import check_derivatives
 from support.small_plans import BODILESS, biped_problem, transcribed
 from support.small_robots import arm, biped
 
+from impactopt import NotSolvedWarning, solve
 from impactopt.errors import InputError
 from impactopt.files.export.motion import motion_at
 from impactopt.files.output import Record
@@ -90,6 +91,17 @@ def test_a_duration_that_would_have_to_be_longer_is_that_of_its_phase(program: T
     assert cause.problem is not None and cause.problem.stances[0].phase is not None
     assert cause.problem.stances[0].phase.duration[1] == pytest.approx(1.5, rel=0.05)
     assert cause.problem.stances[1:] == program.problem.stances[1:]
+
+
+def test_a_step_without_the_time_for_it_names_its_phase() -> None:
+    """The search has to lengthen stance phases, too: with 0.2 s the foot does not come 6 cm ahead."""
+    step = StancePhase(soles=("left",), phase=Phase(duration=0.2, intervals=6, grading=1.0))
+    landed = StancePhase(soles=("left", "right"), steps=AHEAD)
+    with pytest.warns(NotSolvedWarning, match="Infeasible: time. stance phase 2: "):
+        solution = solve(stepping(stances=(BOTH, step, landed), scenarios=()))
+    longer = solution.causes[0].problem
+    assert longer is not None and longer.stances[0] == BOTH and longer.stances[2] == landed
+    assert longer.stances[1].phase is not None and longer.stances[1].phase.duration[0] > 0.2
 
 
 def test_derivatives_are_those_of_differences(program: Transcription) -> None:

@@ -223,9 +223,10 @@ def _bolted(
 
 
 def _hardest(robot: Robot, arm: Arm, q: Array, targets: list[Hit]) -> tuple[list[Strong], Hit, bool, str]:
-    """Solved strikes of the first target that has some, the target, True if edgewise, and "".
+    """Solved strikes of the first target that has some, the target, True if edgewise, and a reason.
 
-    Without any an empty list, the last target, and why; "" if there was nothing to try.
+    Without any an empty list and the last target. The reason is that of the last unsolved strike, "" if there
+    was none.
     """
     why = ""
     # edgewise last: for an arm of few joints, which cannot turn the link's face to its direction of motion

@@ -50,7 +50,7 @@ def write(export: Export, directory: Path) -> None:
 
     Raises
     ------
-    InputError : MuJoCo is not installed; a law or a target without a formula here; two strikers, gripping
+    InputError : MuJoCo is not installed; a law or a target without a formula here; two strikers, supporting
         hands, friction, a moving board.
     """
     p = export.problem

@@ -1,13 +1,21 @@
-"""Result of a peer that solved a program by the functions of our IPOPT adapter."""
+"""Results of peers, evaluated by the program's own functions."""
 
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 
 from impactopt.solvers.ipopt import Functions
-from impactopt.solvers.program import SolverResult, Status, Vector, max_violation, stationarity
+from impactopt.solvers.program import (
+    NonlinearProgram,
+    SolverResult,
+    Status,
+    Vector,
+    max_violation,
+    stationarity,
+)
 
 
 def peer_result(
@@ -31,19 +39,34 @@ def peer_result(
     status = Status.TIME_LIMIT if functions.out_of_time else status
     if not status.usable and functions.best.x is not None:
         x = functions.best.x
-    program, seconds = functions.program, time.perf_counter() - since
-    g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
+    return evaluated_result(
+        functions.program,
+        x,
+        multipliers,
+        bound_multipliers,
+        status=status,
+        iterations=iterations,
+        seconds=time.perf_counter() - since,
+        seconds_functions=functions.seconds,
+        seconds_qp=seconds_qp,
+        message="out of time" if functions.out_of_time else message,
+    )
+
+
+def evaluated_result(
+    program: NonlinearProgram, x: Vector, multipliers: Vector, bound_multipliers: Vector, **measured: Any
+) -> SolverResult:
+    """Result at a point (n,) with multipliers (m,), (n,), whose objective and residuals are evaluated here.
+
+    measured : its other fields.
+    """
+    gradient, jacobian = program.gradient(x), program.jacobian(x)
     return SolverResult(
         x=x,
         multipliers=multipliers,
         bound_multipliers=bound_multipliers,
         objective=float(program.objective(x)),
-        status=status,
-        iterations=iterations,
-        seconds=seconds,
-        seconds_functions=functions.seconds,
-        seconds_qp=seconds_qp,
-        max_violation=max_violation(program, x, g),
+        max_violation=max_violation(program, x, program.constraints(x)),
         kkt=stationarity(gradient, jacobian, multipliers, bound_multipliers),
-        message="out of time" if functions.out_of_time else message,
+        **measured,
     )

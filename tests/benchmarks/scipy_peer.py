@@ -10,6 +10,7 @@ import numpy as np
 import scipy.optimize as so
 import scipy.sparse as sp
 
+from benchmarks.peer_result import evaluated_result
 from impactopt.solvers.program import (
     BestIterate,
     NonlinearProgram,
@@ -17,8 +18,6 @@ from impactopt.solvers.program import (
     Status,
     TimedProgram,
     Vector,
-    max_violation,
-    stationarity,
 )
 
 __all__ = ["solve_slsqp", "solve_trust_constr"]
@@ -151,22 +150,19 @@ def _solved(
     seconds = time.perf_counter() - began
     if not status.usable and watched.best.x is not None:
         x = watched.best.x
-    g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
     y, z = np.zeros(program.m), np.zeros(program.n)
     if status.usable:
-        y, z = least_multipliers(program, x, g, gradient, jacobian)
-    return SolverResult(
-        x=x,
-        multipliers=y,
-        bound_multipliers=z,
-        objective=float(program.objective(x)),
+        y, z = least_multipliers(program, x, program.constraints(x), program.gradient(x), program.jacobian(x))
+    return evaluated_result(
+        program,
+        x,
+        y,
+        z,
         status=status,
         iterations=iterations,
         seconds=seconds,
         seconds_functions=watched.timed.seconds,
         seconds_qp=np.nan,
-        max_violation=max_violation(program, x, g),
-        kkt=stationarity(gradient, jacobian, y, z),
         message=message,
     )
 

@@ -15,6 +15,7 @@ from support import small_robots
 from support.frozen_cases import two_masses
 from support.native_cases import (
     FRICTION,
+    HARDENING,
     LAW,
     TARGET,
     X,
@@ -32,7 +33,6 @@ from impactopt.collision.graph import collision_graph, gradient_graph
 from impactopt.collision.native import native_gradient
 from impactopt.contact import (
     Board,
-    CustomLaw,
     HuntCrossley,
     KelvinVoigt,
     Nail,
@@ -45,15 +45,6 @@ pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
     pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning"),
 ]
-
-HARDENING = CustomLaw(
-    compression=lambda x, rate, k, h, d: k * x + h * x**3 + d * rate,
-    restitution=lambda x, rate, k, h, d: k * x + h * x**3,
-    analytic=True,
-    k=1e4,
-    h=4e8,
-    d=200.0,
-)
 
 
 def assert_same(model: Any, values: list[Any], outputs: tuple[str, ...], every: int = 1) -> dict[str, Any]:

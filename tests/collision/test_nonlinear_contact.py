@@ -10,14 +10,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from support.frozen_by_scipy import FrozenCollision
-from support.native_cases import ROBOTS, X, robot_named, situation
+from support.native_cases import FRICTION, HARDENING, ROBOTS, X, robot_named, situation
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Effects, JointFriction
+from impactopt.collision import SDC, Effects
 from impactopt.collision.graph import collision_graph
 from impactopt.collision.implicit import NODES, STAGES, Contact, gamma, node_tables
 from impactopt.collision.stepped import law_is_linear
-from impactopt.contact import CustomLaw, FreeMass, HertzDamped, HuntCrossley, Nail, SpringDamper
+from impactopt.contact import FreeMass, HertzDamped, HuntCrossley, Nail, SpringDamper
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
@@ -37,23 +37,14 @@ GAINS = 0.5 * np.ones((4, 4)) + np.diag([20.0, 30.0, 20.0, 10.0])
 GAINS[0, 1] += 0.3  # not symmetric
 MASS, SPRING = FreeMass(mass=1.0), SpringDamper(stiffness=1e4, damping=300.0)
 HUNT = HuntCrossley(stiffness=1e6, dissipation=0.3)
-CUBIC = CustomLaw(
-    compression=lambda x, rate, k, h, d: k * x + h * x**3 + d * rate,
-    restitution=lambda x, rate, k, h, d: k * x + h * x**3,
-    analytic=True,
-    k=1e4,
-    h=4e8,
-    d=200.0,
-)
-FRICTION = JointFriction(viscous=2.0, coulomb=3.0, transition=0.05)
 MODELS: dict[str, dict[str, Any]] = {
     "Hunt-Crossley": {"law": HUNT},
     "Hertz": {"law": HertzDamped(stiffness=1e6, damping=200.0)},
     "Hertz without a damper": {"law": HertzDamped(stiffness=1e6, damping=0.0)},
-    "a law of one's own": {"law": CUBIC},
+    "a law of one's own": {"law": HARDENING},
     "matrices of gains": {"kp": 10 * GAINS, "kd": GAINS},
     "drag": {"target": Dragged(mass=1.0)},
-    "all of them": {"law": CUBIC, "target": Dragged(mass=1.0), "kp": 10 * GAINS, "kd": GAINS},
+    "all of them": {"law": HARDENING, "target": Dragged(mass=1.0), "kp": 10 * GAINS, "kd": GAINS},
     "joints that slide": {"law": HUNT, "effects": Effects(friction=True), "friction": FRICTION},
     "a nail": {
         "law": HUNT,

@@ -14,6 +14,7 @@ from impactopt.codegen.cache import cached
 from impactopt.collision import SDC, JointFriction
 from impactopt.collision.native import native_collision
 from impactopt.contact import (
+    CustomLaw,
     FreeMass,
     SpringDamper,
 )
@@ -25,6 +26,16 @@ X = np.array([1.0, 0.0, 0.0])
 
 
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=1.0)
+
+
+HARDENING = CustomLaw(
+    compression=lambda x, rate, k, h, d: k * x + h * x**3 + d * rate,
+    restitution=lambda x, rate, k, h, d: k * x + h * x**3,
+    analytic=True,
+    k=1e4,
+    h=4e8,
+    d=200.0,
+)
 
 
 FRICTION = JointFriction(viscous=2.0, coulomb=3.0, transition=0.05)

@@ -141,7 +141,7 @@ class BetweenNodes:
                 yield Guess(program=finer, start=start, barrier=barrier)
 
         why = f"the plan violates limits between nodes, or its contact is too coarse: solving with {name}"
-        return Additions(name=name, why=why, guesses=guesses())
+        return Additions(name=name, why=why, guesses=guesses(), without="")
 
     def _most_for(self, outcome: Outcome[Transcription]) -> int:
         """Largest number of rounds; more if the outcome penetrates."""

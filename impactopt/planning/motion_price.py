@@ -66,4 +66,4 @@ class MotionPrice:
             yield Guess.mapped(program_for(t, replace(t.problem, price_scale=scale)), t, outcome.result)
 
         why = f"the motion's style takes {100 * share:.1f} % of the objective: its prices are reduced"
-        return Additions(name="lower prices of motion", why=why, guesses=guesses())
+        return Additions(name="lower prices of motion", why=why, guesses=guesses(), without="")

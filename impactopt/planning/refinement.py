@@ -212,20 +212,20 @@ class Additions(Generic[Program]):
     name : for the list of attempts.  why : for the report.
     guesses : programs with the additions, each made when it is needed; they are solved in turn until one
         succeeds.
-    without : the solution before is not valid without the additions: this text is appended to the message of
-        the failed solve. "": if all guesses fail, the solution before stays.
+    without : why the solution before is not valid without the additions; it ends the message of the failure
+        if all guesses fail, or the oracle has no rounds left. "": it is valid, and stays.
     """
 
     name: str
     why: str
     guesses: Iterable[Guess[Program]]
-    without: str = ""
+    without: str
 
 
 class Oracle(Protocol[Program]):
     """Check of one aspect of a solution.
 
-    most : rounds of one refinement.
+    most : rounds of one refinement, at most; the solution of the last one is checked, too.
     """
 
     most: int
@@ -237,7 +237,7 @@ class Oracle(Protocol[Program]):
 def refine(
     outcome: Outcome[Program], oracles: Sequence[Oracle[Program]], solve: Solve[Program], budget: Budget
 ) -> Outcome[Program]:
-    """Outcome that all oracles accept, or the last solution before a program with additions failed.
+    """Outcome that all oracles accept; else the last solution, if that is valid, or a failure.
 
     Oracles are nested: a program with one's additions is solved and refined by those before it, and then
     checked again.
@@ -254,11 +254,16 @@ def refine(
     def refined(guess: Guess[Program]) -> Outcome[Program]:
         return refine(solve(guess), before, solve, budget)
 
-    for _ in range(oracle.most):
+    for left in range(oracle.most, -1, -1):
         lacks = oracle.missing(outcome) if outcome.usable else None
-        # without time left, a solution that is not valid without the additions still has to become a failure
-        if lacks is None or (budget.left == 0 and not lacks.without):
+        # without rounds or time left, a solution that is not valid without the additions becomes a failure
+        if lacks is None or (0 in (left, budget.left) and not lacks.without):
             break
+        if left == 0:
+            message = f"{oracle.most} rounds of {lacks.name} are not enough. {lacks.without}"
+            worst = max(outcome.result.max_violation, 2 * VIOLATED)
+            result = replace(outcome.result, status=Status.FAILED, max_violation=worst, message=message)
+            return replace(outcome, result=result)
         budget.say(lacks.why)
         new = _first_usable(lacks.guesses, refined, budget)
         if not new.usable:

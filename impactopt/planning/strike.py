@@ -248,4 +248,5 @@ class Freezes:
             finer = program_for(t, elements=contact_elements(t.problem, shares), shares=shares)
             yield Guess(program=finer, start=carried(finer, t, outcome.result).x)
 
-        return Additions(name="freezes", why="freezes come at other times", guesses=guesses())
+        why = "freezes come at other times"
+        return Additions(name="freezes", why=why, guesses=guesses(), without="")

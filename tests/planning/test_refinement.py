@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt.planning.budget import Budget
+from impactopt.planning.budget import Budget, rank_of
 from impactopt.planning.refinement import Additions, Guess, Outcome, refine
 from impactopt.solvers.program import SolverResult, Status
 
@@ -80,6 +80,17 @@ def test_a_failed_addition_is_an_answer_only_if_it_is_needed(without: str) -> No
     found = refined(Lacking(0, 1.0, [], fails=2, without=without))
     assert found.usable is not bool(without)
     assert found.result.message == f"Told. {without}".strip()
+
+
+@pytest.mark.parametrize("without", ["", "Without it there is a plan."])
+@pytest.mark.parametrize("value", [2.0, 3.0])
+def test_the_solution_of_the_last_round_is_checked_too(value: float, without: str) -> None:
+    oracle = Lacking(0, value, [], without=without)
+    oracle.most = 2
+    found = refined(oracle)
+    assert found.result.x[0] == 2.0
+    assert found.usable is (value == 2.0 or not without)
+    assert found.usable or (found.result.message.endswith(without) and rank_of(found.result)[0])
 
 
 def test_the_effort_of_all_guesses_and_rounds_is_counted() -> None:

@@ -49,26 +49,36 @@ class FreeParameter:
 
 
 def sample_law(kind: type[ContactLaw]) -> ContactLaw:
-    """Law with a stiffness of 1 and no damping; parameters with a default keep it."""
-    unset = [f.name for f, _ in abouts(kind) if f.name not in _defaulted(kind)]
-    return kind(**{name: float(name == "stiffness") for name in unset})
+    """Law with a stiffness of 1 and no damping; parameters with a default keep it.
+
+    Raises
+    ------
+    InputError : a parameter that is not fitted has no default.
+    """
+    fitted, defaulted = _fitted(kind), _defaulted(kind)
+    for field, _ in abouts(kind):
+        if field.name not in {*fitted, *defaulted}:
+            raise InputError(
+                f"laws: {kind.__name__} has no default of {field.name}, which may not be 0 and is not fitted: "
+                "give the law with parameters"
+            )
+    return kind(**{name: float(name == "stiffness") for name in fitted})
 
 
 def free_parameters(law: ContactLaw, impact: MeasuredImpact) -> tuple[FreeParameter, ...]:
     """Fitted parameters of a law, and last the mass.
 
-    Of the package's laws, parameters with a default, such as exponents, are fixed. Of a user's law all are
-    fitted, with their present values as scales.
+    Of a law with a ``stiffness``, parameters with a default, such as exponents, and others that may not be 0
+    are fixed. Of another law, and of a `CustomLaw`, all are fitted, with their present values as scales.
 
     Raises
     ------
-    InputError : a parameter of a user's law is 0, which gives no scale.
+    InputError : a present value is 0, which gives no scale.
     """
     mass = FreeParameter(MASS, "kg", impact.mass, True, -_MAX_LOG)
     if isinstance(law, CustomLaw) or "stiffness" not in law.parameters:
         return (*_of_custom_law(law), mass)
-    defaulted = _defaulted(type(law))
-    units = {f.name: about.unit for f, about in abouts(type(law)) if f.name not in defaulted}
+    units = _fitted(type(law))
     stiffness, out = _stiffness(law, impact, units), []
     for name, unit in units.items():
         if name == "stiffness":
@@ -85,6 +95,13 @@ def _of_custom_law(law: ContactLaw) -> list[FreeParameter]:
             raise InputError(f"{type(law).__name__}: {name} is 0; give parameters of about the expected size")
         out.append(FreeParameter(name, "", value, False))
     return out
+
+
+def _fitted(kind: type[ContactLaw]) -> dict[str, str]:
+    """Units of the fitted parameters, by name: the stiffness, and those that are 0 without damping."""
+    fixed = _defaulted(kind)
+    both = {f.name: about for f, about in abouts(kind) if f.name not in fixed}
+    return {name: about.unit for name, about in both.items() if name == "stiffness" or about.allows(0.0)}
 
 
 def _defaulted(kind: type[ContactLaw]) -> set[str]:

@@ -36,7 +36,7 @@ def identify(
     unknown speed and instant of touch. Intervals are those of the linearized fit with white noise, whose
     standard deviations follow from the residuals of force and motion. Samples on flat tops, where the
     sensor's range has cut off the force, are left out. The hand's drives do not act in the model, which holds
-    for short impacts. Exponents are fixed.
+    for short impacts. Exponents, and other parameters that may not be 0, are fixed.
 
     Parameters
     ----------

@@ -30,10 +30,12 @@ from impactopt import (
     read_log,
 )
 from impactopt.cli.app import app
-from impactopt.contact.laws import LAWS
+from impactopt.contact.fields import about
+from impactopt.contact.laws import LAWS, ContactLaw
 from impactopt.files.named_problems import problem_file
 from impactopt.files.problem_file import problem_data, problem_from_data, read_toml
 from impactopt.identification.fitting import TwoMassModel
+from impactopt.identification.free_parameters import sample_law
 
 MASS = 3.0
 
@@ -131,6 +133,29 @@ def test_a_law_of_ones_own() -> None:
     assert found.law.parameters["d"] == pytest.approx(150.0, rel=0.05)
     with pytest.raises(InputError, match="a file cannot have it"):
         found.toml()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Saturating(ContactLaw):
+    """A spring and a damper; the spring's force approaches a limit."""
+
+    stiffness: float = dataclasses.field(metadata=about("k", unit="N/m", above=0))
+    limit: float = dataclasses.field(metadata=about("of the spring's force", unit="N", above=0))
+    damping: float = dataclasses.field(metadata=about("d", unit="N s/m", least=0))
+
+    def branch(self, penetration: Any, rate: Any, compressing: bool, parameters: Any = None) -> Any:
+        p = self.parameters if parameters is None else parameters
+        spring = p["stiffness"] * penetration
+        return spring / (1 + spring / p["limit"]) + p["damping"] * rate
+
+
+def test_a_parameter_that_may_not_be_zero_is_fixed() -> None:
+    law = Saturating(stiffness=1.0, limit=1e6, damping=0.0)
+    found = identify(log_of(TrueBlow("Kelvin-Voigt", mass=MASS), seed=3), laws=[law]).best
+    assert found.law.parameters == pytest.approx({"stiffness": 1e5, "limit": 1e6, "damping": 150.0}, rel=0.05)
+    assert found.held == {"limit": 1e6}
+    with pytest.raises(InputError, match=r"no default of limit.*give the law with parameters"):
+        sample_law(Saturating)
 
 
 # ---------------------------------------------------------------- joint positions

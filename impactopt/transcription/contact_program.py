@@ -221,7 +221,9 @@ class ContactProgram(ABC):
         for term in terms:
             # the parts have the constraints of the other terms
             if type(term).add_constraints is not Term.add_constraints:
+                since = len(self.constraints.origins)
                 term.add_constraints(self)
+                self.constraints.measured(since, term.name, term.unit)
         self.objectives = quantities(self, objectives)
         self._objective = assemble(self.layout, self.objectives, self._prices())
         self._without_clearance = self.builder

@@ -15,9 +15,9 @@ several.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -79,6 +79,8 @@ class Affine:
     vals: Array
     const: Array
 
+    __array_ufunc__: ClassVar[None] = None  # arrays leave sums and products with them to this class
+
     @classmethod
     def constant(cls, values: ArrayLike) -> Affine:
         c = np.atleast_1d(np.asarray(values, dtype=float)).ravel()
@@ -96,10 +98,16 @@ class Affine:
         rows, cols = (np.asarray(i, dtype=np.intp) for i in (entries.row, entries.col))
         return cls(len(const), rows, cols, np.asarray(entries.data), np.asarray(const))
 
-    def __add__(self, other: Affine) -> Affine:
+    def __add__(self, other: Affine | ArrayLike) -> Affine:
+        if not isinstance(other, Affine):
+            other = Affine.constant(np.zeros(self.size) + np.asarray(other, dtype=float))
         return add([self, other])
 
+    __radd__ = __add__  # `sum` begins at 0
+
     def __mul__(self, factor: ArrayLike) -> Affine:
+        if isinstance(factor, Affine):
+            raise InputError("a product of affine expressions is not affine: `lift` an output of a block for it")
         k = np.asarray(factor, dtype=float) + np.zeros(self.size)
         return Affine(self.size, self.rows, self.cols, self.vals * k[self.rows], self.const * k)
 
@@ -108,8 +116,8 @@ class Affine:
     def __neg__(self) -> Affine:
         return self * -1.0
 
-    def __sub__(self, other: Affine) -> Affine:
-        return self + (-other)
+    def __sub__(self, other: Affine | ArrayLike) -> Affine:
+        return self + (-other if isinstance(other, Affine) else -np.asarray(other, dtype=float))
 
     def __getitem__(self, index: NDArray[np.intp] | slice) -> Affine:
         keep = np.atleast_1d(np.arange(self.size)[index])
@@ -324,6 +332,13 @@ class Constraints:
     def copy(self) -> Constraints:
         """Copy to which other constraints can be added."""
         return Constraints(*(list(getattr(self, f.name)) for f in fields(self)))
+
+    def measured(self, since: int, term: str, unit: str) -> None:
+        """Give a term's constraints from number ``since`` on, if they have no measure, one in their unit."""
+        measure = Measure(unit, 1.0, "beyond its bound")
+        for k, origin in enumerate(self.origins[since:], since):
+            if origin.term == term and origin.measure is None:
+                self.origins[k] = replace(origin, measure=measure)
 
     def bound(self, k: int, lower: ArrayLike, upper: ArrayLike) -> None:
         """Replace the bounds of the constraints of call number ``k`` of :meth:`add`, which dropped none."""

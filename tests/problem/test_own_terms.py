@@ -308,6 +308,8 @@ def test_mistakes_in_rows_are_told_where_they_are_made(arm_transcription: Transc
     assert program().constraint_name(program().m - 1) == "ceiling, a", (
         "a number is as good as an array of one"
     )
+    violation = program().describe_violation(program().m - 1, first_iterate(arm_transcription), 0.15)
+    assert violation == ("ceiling, a", "0.15 m beyond its bound"), "in the term's unit, without a measure"
     for attribute, value, words in (
         ("rows", [("ab", np.zeros(1, dtype=int))], "ceiling: outputs are 1, components 2"),
         ("rows", [("a", 0), ("b", 0)], "in two constraints, ceiling, a and ceiling, b: "),

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from impactopt.errors import InputError
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import NonlinearProgram, Status
@@ -317,6 +318,10 @@ def test_affine_algebra(seed: int) -> None:
     np.testing.assert_allclose(a[np.array([1, 0, 1])].evaluate(x), va[[1, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(select(a, np.array([], dtype=np.intp)).evaluate(x), [])
     np.testing.assert_allclose(stack([a, Affine.zeros(1), b]).evaluate(x), [*va, 0, *vb], atol=1e-12)
+    np.testing.assert_allclose(sum([a, b, 2.0]).evaluate(x), va + vb + 2.0, atol=1e-12)
+    np.testing.assert_allclose((m[0, :2] + a - 1.0).evaluate(x), m[0, :2] + va - 1.0, atol=1e-12)
+    with pytest.raises(InputError, match="not affine: `lift`"):
+        a * b
     with pytest.raises(ValueError, match="sizes 2 and 3"):
         a + Affine.zeros(3)
 

@@ -59,8 +59,8 @@ def sample_law(kind: type[ContactLaw]) -> ContactLaw:
     for field, _ in abouts(kind):
         if field.name not in {*fitted, *defaulted}:
             raise InputError(
-                f"laws: {kind.__name__} has no default of {field.name}, which may not be 0 and is not fitted: "
-                "give the law with parameters"
+                f"laws: {kind.__name__} has no default of {field.name}, which may not be 0 and is not "
+                "fitted: give the law with parameters"
             )
     return kind(**{name: float(name == "stiffness") for name in fitted})
 

@@ -107,7 +107,7 @@ class Affine:
 
     def __mul__(self, factor: ArrayLike) -> Affine:
         if isinstance(factor, Affine):
-            raise InputError("a product of affine expressions is not affine: `lift` an output of a block for it")
+            raise InputError("a product of affine expressions is not affine: `lift` the output of a block")
         k = np.asarray(factor, dtype=float) + np.zeros(self.size)
         return Affine(self.size, self.rows, self.cols, self.vals * k[self.rows], self.const * k)
 

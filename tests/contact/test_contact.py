@@ -364,6 +364,10 @@ def test_a_custom_law_is_its_class_written_out_and_its_numbers_are_inputs():
         ({"compression": lambda x, rate: x, "stiffness": 1.0}, r"function\(penetration, rate, stiffness\)"),
         ({"compression": lambda x, rate: max(x, 0.0)}, "cannot be called with CasADi expressions"),
         ({"compression": lambda x, rate: ca.vertcat(x, rate)}, "gives 2 expressions"),
+        (
+            {"compression": lambda x, rate: 2 * x, "restitution": lambda x, rate: x},
+            "0.1 mm deep",
+        ),
         ({"compression": lambda x, rate: x**1.5, "analytic": True}, "CustomLaw: analytic: .*analytic=False"),
         ({"compression": lambda x, rate, k: k * x, "k": np.inf}, "CustomLaw: k: inf"),
         ({"compression": lambda x, rate, k: k * x, "k": "soft"}, "CustomLaw: k: expected numbers"),
@@ -498,6 +502,22 @@ class Baked(ContactLaw):
 class Undecorated(ContactLaw):
     def branch(self, penetration, rate, compressing, parameters=None):
         return penetration
+
+
+@pytest.mark.parametrize(
+    "branch, message",
+    [
+        (lambda law, x, rate, back, p=None: max(x, 0.0), r"as branch\(penetration.*casadi\.fmax"),
+        (lambda law, x, rate, back: x, r"compression: cannot be called .* parameters\)"),
+        (lambda law, x, rate, back, p=None: x if back else 2 * x, "agree there"),
+    ],
+)
+def test_a_law_is_refused_when_it_is_made(branch, message):
+    law = dataclasses.make_dataclass(
+        "Own", [], bases=(ContactLaw,), namespace={"branch": branch}, frozen=True
+    )
+    with pytest.raises(InputError, match=f"Own: .*{message}"):
+        law()
 
 
 def test_a_law_that_does_not_take_its_numbers_as_inputs_is_refused():

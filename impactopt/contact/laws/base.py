@@ -20,13 +20,16 @@ from impactopt.errors import InputError
 
 __all__ = ["ContactLaw", "rough_at"]
 
+# [m] penetrations at which both branches are compared at rate zero, and relative difference allowed there
+_DEPTHS, _SAME = (1e-4, 1e-3, 1e-2), 1e-6
+
 
 class ContactLaw(Described, ABC):
     """A contact law with one smooth branch for compression (rate > 0) and one for restitution (rate <= 0).
 
     To write one, make a frozen dataclass whose fields are its parameters, and implement `branch`. The
     branches have to agree where the rate is zero; contact ends when the force of the restitution branch has
-    fallen to zero. Fields with `impactopt.contact.fields.about` as metadata are checked when a law is made.
+    fallen to zero. Both are checked when a law is made, and fields with `impactopt.contact.fields.about`.
 
     Attributes
     ----------
@@ -37,6 +40,32 @@ class ContactLaw(Described, ABC):
 
     def __post_init__(self) -> None:
         check_numbers(self)
+        self._check_branches("branch(penetration, rate, compressing, parameters)")
+
+    def _check_branches(self, call: str) -> None:
+        """InputError unless both branches take CasADi expressions and agree where the rate is zero.
+
+        call : how they are called, for the message.
+        """
+        name, phases = type(self).__name__, {True: "compression", False: "restitution"}
+        x, rate, symbols = ca.SX.sym("x"), ca.SX.sym("rate"), {p: ca.SX.sym(p) for p in self.parameters}
+        for compressing, phase in phases.items():
+            try:
+                size = ca.SX(self.branch(x, rate, compressing, symbols)).numel()
+            except Exception as error:
+                raise InputError(
+                    f"{name}: {phase}: cannot be called with CasADi expressions as {call}, with casadi.fmax "
+                    f"and casadi.if_else in the place of max and if: {error}"
+                ) from error
+            if size != 1:
+                raise InputError(f"{name}: {phase}: gives {size} expressions; one force is wanted")
+        for depth in _DEPTHS:
+            there, back = (float(self.branch(depth, 0.0, compressing)) for compressing in phases)
+            if abs(there - back) > _SAME * max(abs(there), abs(back)):
+                raise InputError(
+                    f"{name}: the force at rate zero, {1e3 * depth:g} mm deep, is {there:g} N in compression "
+                    f"and {back:g} N in restitution: write branches that agree there"
+                )
 
     @property
     def parameters(self) -> dict[str, float]:

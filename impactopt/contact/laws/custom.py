@@ -7,8 +7,6 @@ from dataclasses import FrozenInstanceError
 from functools import partial
 from typing import Any, ClassVar
 
-import casadi as ca
-
 from impactopt.contact.fields import Parameters, choose
 from impactopt.contact.laws.base import ContactLaw, rough_at
 from impactopt.errors import InputError, check_array
@@ -58,7 +56,8 @@ class CustomLaw(ContactLaw):
     Raises
     ------
     InputError : no function; numbers that are not finite; a function that does not take just these numbers,
-        or gives anything but one expression; "analytic" for one that has no curvature at zero.
+        or gives anything but one expression; functions that differ at rate zero; "analytic" for one that has
+        no curvature at zero.
     """
 
     # Each instance gets a class of its own with these functions, so that type(law)(**numbers) is the same law
@@ -98,17 +97,7 @@ class CustomLaw(ContactLaw):
         checked = {name: float(check_array(f"CustomLaw: {name}", x, ())) for name, x in numbers.items()}
         object.__setattr__(self, "_numbers", checked)
         object.__setattr__(self, "_rough", False)
-        x, rate, symbols = ca.SX.sym("x"), ca.SX.sym("rate"), {name: ca.SX.sym(name) for name in checked}
-        for name, compressing in (("compression", True), ("restitution", False)):
-            try:
-                size = ca.SX(self.branch(x, rate, compressing, symbols)).numel()
-            except Exception as error:
-                raise InputError(
-                    f"CustomLaw: {name}: cannot be called with CasADi expressions as "
-                    f"function({', '.join(['penetration', 'rate', *checked])}): {error}"
-                ) from error
-            if size != 1:
-                raise InputError(f"CustomLaw: {name}: gives {size} expressions; one force is wanted")
+        self._check_branches(f"function({', '.join(['penetration', 'rate', *checked])})")
         rough = rough_at([partial(function, **checked) for function in self._branches or ()])
         if self.analytic and rough == 0.0:
             raise InputError(

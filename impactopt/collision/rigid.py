@@ -32,6 +32,7 @@ class RigidImpact(CollisionModel):
     Attributes
     ----------
     coefficient_of_restitution : e, speed of separation over speed of approach: 0, plastic, to 1, elastic.
+    law : not used; as an argument of all models.
 
     Others, and errors, as of `CollisionModel`; also
 
@@ -40,6 +41,7 @@ class RigidImpact(CollisionModel):
     InputError : a coefficient outside [0, 1]; a target that is neither a free mass nor a wall.
     """
 
+    law: Any = None
     coefficient_of_restitution: float = 0.0
 
     def __post_init__(self) -> None:

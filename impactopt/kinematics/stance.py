@@ -128,7 +128,7 @@ class FixedBase(Stance):
     def soles(self, robot: Robot) -> tuple[Sole, ...]:
         if robot.floating:
             raise InputError(
-                f"robot {robot.name!r} has a free-flyer: stand it on BothSoles() or OneSole(name), "
+                f"robot {robot.name!r} has a free-flyer: give stance=BothSoles() or OneSole(name), "
                 "or build it with floating=False"
             )
         return ()
@@ -154,5 +154,5 @@ def usual_stance(robot: Robot) -> Stance:
 def _check_floating(robot: Robot) -> None:
     if not robot.floating:
         raise InputError(
-            f"robot {robot.name!r} has a fixed base: use FixedBase(), or build it with floating=True"
+            f"robot {robot.name!r} has a fixed base: give stance=FixedBase(), or build it with floating=True"
         )

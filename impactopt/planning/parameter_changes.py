@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import inspect
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
 
-__all__ = ["Parameter", "changed", "moved_problem", "parameter_of", "with_term"]
+__all__ = ["MOVABLE", "Parameter", "changed", "moved_problem", "parameter_of", "with_term"]
 
 # Cached properties of a problem that stay valid with the same robot, stance and start; and those that also
 # need the same terms, or other ones that do not switch the bodies of the world on or off.
@@ -82,6 +83,9 @@ def moved_problem(
     if not new:
         raise InputError("nothing is moved: give point, normal, mass, stiffness, damping or margin")
     return changed(problem, **new)
+
+
+MOVABLE = tuple(inspect.signature(moved_problem).parameters)[1:]
 
 
 def _with(thing: Any, name: str, value: float) -> Any:

@@ -15,12 +15,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_choice
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.clearance_constraints import Margins, same_bodies
 from impactopt.planning.lazy_constraints import LazyTerms
-from impactopt.planning.parameter_changes import Parameter, changed, moved_problem, parameter_of
+from impactopt.planning.parameter_changes import MOVABLE, Parameter, changed, moved_problem, parameter_of
 from impactopt.planning.refinement import Guess, Outcome
 from impactopt.planning.refinement import refine as refine_with
 from impactopt.planning.solution import Solution, program_on, solution_of
@@ -312,6 +312,8 @@ def moved_solution(
 
     changes : as of `impactopt.planning.parameter_changes.moved_problem`.
     """
+    for name in changes:
+        check_choice("moved: a plan has no parameter", name, MOVABLE)
     problem = moved_problem(solution.problem, **changes)
     family = parametric_program(solution)
     if not polish:

@@ -101,7 +101,7 @@ def test_a_blow_moves_its_base_and_total_momentum_stays(satellite: Robot) -> Non
 
 
 def test_bolted_robots_refuse_it() -> None:
-    with pytest.raises(InputError, match=r"has a fixed base: use FixedBase\(\)"):
+    with pytest.raises(InputError, match=r"has a fixed base: give stance=FixedBase\(\)"):
         effective_mass(planar_arm(), striker="hammer", normal=NORMAL, stance=Free())
     assert FixedBase() != Free()
 

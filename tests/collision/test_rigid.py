@@ -16,15 +16,12 @@ from impactopt.kinematics.stance import FixedBase, Stance
 from impactopt.robots.robot import Robot
 
 NORMAL = np.array([0.6, 0.0, 0.8])
-LAW = SpringDamper(stiffness=1e4, damping=0.0)
 
 
 def blow(robot: Robot, stance: Stance, **changes: Any) -> RigidImpact:
     usual = {"target": RigidWall(), "coefficient_of_restitution": 0.3}
     (striker,) = robot.strikers
-    return RigidImpact(
-        robot=robot, striker=striker, normal=NORMAL, law=LAW, stance=stance, **{**usual, **changes}
-    )
+    return RigidImpact(robot=robot, striker=striker, normal=NORMAL, stance=stance, **{**usual, **changes})
 
 
 def moving(robot: Robot, stance: Stance) -> tuple[np.ndarray, np.ndarray]:

@@ -177,7 +177,11 @@ class Solution(Solved):
 
     @property
     def trajectory(self) -> Trajectory:
-        """Sampled reference of the servo."""
+        """Sampled reference of the servo.
+
+        With ``k = np.flatnonzero(trajectory.phase == 0)[-1]``, ``q[k]``, ``v[k]`` and ``torque[k]`` are the
+        state at contact: arguments of `CollisionModel.collide`, as in ``impactopt collide RESULT``.
+        """
         return self.plan.reference
 
     @property
@@ -323,7 +327,7 @@ def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> di
     return {
         "impulse_Ns": hit.impulse,
         "target": collision.outcome,
-        "peak_force_N": float(collision.force.max()) if duration > 0 else None,
+        "peak_force_N": collision.peak_force if duration > 0 else None,
         "contact_ms": 1e3 * duration,
         "hand_speed_m_s": hit.hand_speed,
     }

@@ -316,6 +316,11 @@ class PlannedCollision:
     acceleration: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     forces: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
+    @property
+    def peak_force(self) -> float:
+        """Largest contact force [N]; infinite for an impact without duration."""
+        return float(self.force.max()) if self.time[-1] > 0 else np.inf
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedScenario:

@@ -57,7 +57,8 @@ def write(export: Export, directory: Path) -> None:
     if type(p.law) not in LAWS or type(p.target) not in (FreeMass, RigidWall, Nail, Board):
         raise InputError(
             f"mujoco: there is no formula for {type(p.law).__name__} on {type(p.target).__name__}; scenes "
-            "have the laws and targets of problem files: export to csv instead"
+            f"have the laws {', '.join(law.__name__ for law in LAWS)}, and the package's targets: export to "
+            "csv instead"
         )
     if p.second is not None or p.stance.held_hands(p.robot):
         raise InputError(

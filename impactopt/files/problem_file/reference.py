@@ -112,8 +112,8 @@ impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit ma
 (`--set problem.point.1=-0.2`), one of several sections its index or its name
 (`--set scenarios.missing.abort_after=0.03`).
 
-In Python `impactopt.load_problem("my.toml")` reads a file, and `impactopt.write_problem(problem)` writes one
-without defaults, unless the problem has functions or models made in Python.
+In Python `impactopt.load_problem("my.toml")` reads a file, and `impactopt.write_problem(problem)` gives the
+text of one without defaults, unless the problem has functions or models made in Python.
 
 ## Limits
 

@@ -102,8 +102,6 @@ def chain_between(model: Any, one: int, other: int) -> Chain:
     # common ancestor; 0, the world, is in all lists.
     up_one, up_other = list(model.supports[one]), list(model.supports[other])
     shared = max(j for j in up_one if j in up_other)  # lowest common ancestor
-    if other == 0:
-        shared = 0
     # The chain goes up from the other body to the common ancestor, and down to the one. `place` collects the
     # fixed placements until the next joint.
     place, placements, base = pin.SE3.Identity(), [], False

@@ -146,6 +146,7 @@ def jump_at_contact(
     pushes = normals  # generalized force of a unit normal force, with its friction
     if problem.friction is not None:
         pushes = np.array([problem.friction.way(problem.normal, J @ v) @ J for J in jacobians])
+    # rate of the penetration, whose depth is zero: only the law's damper has a force there
     approach = normals @ v - float(problem.target.speed_before())
     forces = np.array([float(law.branch(0.0, float(rate), True)) for rate in approach])
     # H da = J_c' dw - j' f, with J_c da = 0: dw by least squares, as a straight knee makes J_c H^-1 J_c'
@@ -158,6 +159,8 @@ def jump_at_contact(
     da = of_forces + of_wrenches @ dw
     base = da[: c.base].copy()
     if c.base:  # from the base's own frame to rates of its coordinates
+        # Velocities do not jump, so products of velocities cancel in the change: a rotation and a matrix are
+        # enough.
         base[:3] = pin.rpy.rpyToMatrix(y[3:6]) @ base[:3]
         base[3:] = np.linalg.solve(pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL), base[3:])
     independent = np.concatenate([base, da[c.base :][c.independent]])
@@ -259,6 +262,7 @@ class Collocated:
 
     def _place(self, s: CollocationPoint) -> Place:
         time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
+        # a scenario's name may have braces, and the text is a format for the time
         suffix = self.suffix.replace("{", "{{").replace("}", "}}")
         return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
 
@@ -274,6 +278,7 @@ class Collocated:
         common: dict[str, Any] = {"term": term, "place": place, "lower": -most, "upper": most}
         common["measure"] = percent("over its limit", of=most)
         if b.problem.of_drives:
+            # terms use these torques again, and an output of a block may be in one constraint only
             name = f"torque in collision, {place.name}"
             self.torques.append(b.lift(name, outputs, labels=b.robot.joint_names, **common)[0])
         else:
@@ -293,6 +298,7 @@ class Collocated:
 
     def _motion(self, i: int) -> list[Affine]:
         """Slots of `impactopt.problem.block.joint_motion` at a stage."""
+        # value and slope of u, which is ydot already: so the S of ydot = r/S is one
         rates = self._slots(self.u, i, self.contact.u0[0])
         return [self.contact.state.y, *self._travel(i), *rates, Affine.constant(1.0), self.legs[i]]
 
@@ -322,6 +328,7 @@ class Collocated:
         s, labels = self.stages[i], integrals.labels
         integral = integrals[i]
         for m, w in zip(s.members, s.quadrature, strict=True):
+            # d_i = d_start + h sum_j a_ij u_j, with the A whose inverse gives the slopes of u
             integral = integral - rate[m] * w
         if not s.new_phase:
             integral = integral - integrals[s.previous]
@@ -378,6 +385,8 @@ class Collision(ContactParameters, Collocated):
         self.phases = p.contact_phases
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in range(len(self.phases))]
         self.forceless = np.array([self.phases[s.phase].apart for s in stages])
+        # A touch ends where the law's `separation` is zero. That is a constraint of its last stage, so the
+        # force there is zero by its bounds, and the law is no constraint.
         self.forceless[[i for i, f in zip(self.end, self.phases, strict=True) if f.end == SEPARATION]] = True
         self._prefix = prefix = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
@@ -410,6 +419,7 @@ class Collision(ContactParameters, Collocated):
         self.xt = add("target travel", 1, labels=["target"])
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
+        # from the third phase on: before the second one the mean rate is the d of the first
         joined = len(self.phases) - 2
         self.joined = b.layout.add(f"{prefix}travel in compression", joined, b.ny, labels=c.labels)
         self.joined_x = b.layout.add(f"{prefix}target travel in compression", joined, 1)
@@ -452,6 +462,7 @@ class Collision(ContactParameters, Collocated):
         collision, force = [], []
         for i, s in enumerate(self.stages):
             state = self._slots(self.state, i, at_rest)
+            # the travel is an integral over the phase so far, and begins each one at zero; states go on
             travel = self._slots(self.xt, i, zero, each_phase=True)
             impulse_slope, x1 = self._slots(self.p, i, zero)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
@@ -530,6 +541,9 @@ class Collision(ContactParameters, Collocated):
         for i in range(len(self.stages)):
             legs = [leg for g in self._leg_groups() for leg in by_leg(g.index(i))]
             out += [determined(Turn.STAGE_LEGS, leg, k) for k, leg in enumerate(legs)]
+        # Given an element's beginning, stages of one element depend on each other (Radau's A is full), on
+        # those of later ones nothing: so elements are eliminated one after the other, as one small system
+        # each.
         integrals, states = zip(*self.integrated(), strict=True)
         groups = (*states, self.w, self.f, *self.states())
         step = 0
@@ -696,6 +710,8 @@ class Collision(ContactParameters, Collocated):
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)
         before = np.concatenate([[0.0], np.cumsum(times)])
+        # d and xt are integrals over s: by the duration of the guess, not the clipped one, so that d is the
+        # integral of u ds
         per_time = (1 / found.durations[phase])[:, None]  # d and xt are integrals over s
         d = found.moved[:, None] * per_time * rates
         self.u.write(x, found.speed[:, None] * rates)
@@ -706,6 +722,7 @@ class Collision(ContactParameters, Collocated):
         # the point mass is in place of each striker
         self.p.write(x, len(p.strikers) * found.impulse[:, None])
         for joined, each in ((self.joined, d[self.end]), (self.joined_x, self.xt.read(x)[self.end])):
+            # mean rate in the first k phases: their mean rates, weighted by their durations
             means = [(times[:k, None] / before[k] * each[:k]).sum(axis=0) for k in range(2, len(times))]
             joined.write(x, np.reshape(means, (joined.count, joined.size)))
         self.after.write(x, y + float(found.moved[self.end].sum()) * rates)
@@ -736,6 +753,7 @@ class Collision(ContactParameters, Collocated):
         durations = [float(g.read(x)[0, 0]) for g in self.T]
         time = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in self.stages]
         before = float(target.speed_before(self.target))
+        # the limit from the right at contact, where collocation has no point
         first = [float(b.problem.law.branch(0.0, float(v) - before, True, self.law)) for v in approaches]
         forces, wrench = np.vstack([first, self.f.read(x)]), self.w.read(x)
         start = self.number * len(self.stages)  # the blocks' instances are collision by collision

@@ -27,6 +27,8 @@ EVENT_PHASE_FRACTION, IMMEDIATE_PHASE_FRACTION = 0.1, 0.05
 TOUCH_PHASE_FRACTION = 0.01  # of each phase where striker and target separate and meet again
 # Where no least duration is given, it is the least of a fraction of a point mass's restitution, a time [s],
 # and a fraction of the longest duration.
+# Measured: with fractions of 0.05 to 0.6 arm_planar and punch have the same optimum (33 to 76 and 57
+# iterations).
 NATURAL_FRACTION, MAX_LEAST_DURATION, LONGEST_FRACTION = 0.15, 2e-3, 0.5
 SIMILAR_FACTOR = 3.0  # parameters within this factor share least durations
 

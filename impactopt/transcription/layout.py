@@ -360,6 +360,7 @@ class Constraints:
         n = len(components)
         lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
         hi = np.broadcast_to(np.asarray(upper, dtype=float), (n,))
+        # what a term leaves unlimited has infinite bounds
         keep = np.flatnonzero(np.isfinite(lo) | np.isfinite(hi))
         if not keep.size:
             return
@@ -384,6 +385,7 @@ class Constraints:
 GRAVITY = 9.81  # [m/s^2] for the robot's weight, which scales forces; its model may have another gravity
 LEVER = 0.1  # [m] scale of sole moments relative to forces
 # [m, rad] largest deviation of the base from its start: of a robot on soles, and of a free-floating one
+# Pitch stays below pi/2, where roll and yaw turn about one axis and their rates are not defined.
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])
 FREE_BOX = np.array([10.0, 10.0, 10.0, 3.0, 1.2, 3.0])
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")

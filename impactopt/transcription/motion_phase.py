@@ -115,6 +115,7 @@ def add_cone_constraints(
         if leg.name in fading and not w.cols.size:  # the wrench is identically zero
             continue
         facets = contact_wrench_cone(leg.sole.polygon, b.limits.cone.friction, margin=margin)
+        # facets are of order one at unit normal force, so over the weight they are of order one here
         facets = facets / b.limits.weight
         normal, sole = w[2:3] * (1 / b.limits.weight), leg.end
         b.constraints.add(
@@ -221,6 +222,8 @@ class MotionPhase:
         self.bend: Group | None = None
         self._drifting: tuple[int, ...] = ()  # control points whose base part is in `drift`
         if b.coordinates.drifts:
+            # At rest the first two points give position and speed, also of a base that drifts; from the third
+            # on its acceleration, which gravity causes, is free. At the end nothing of it is given.
             self._drifting = ((2,) if begins == REST else ()) + {
                 REST: (self._last - 1, self._last),
                 COASTING: (self._last,),

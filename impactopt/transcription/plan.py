@@ -127,6 +127,7 @@ def drifting_reference(
     """
     c, robot = problem.coordinates, problem.robot
     model, data = robot.model, robot.model.createData()
+    # a swing's end is given, not its start: there the striking point has to be at the target
     order = np.arange(len(time))[:: -1 if backward else 1]
     y, yd, ydd = (np.array(part) for part in sample(time)[:3])
     no_legs, weight = np.zeros(0), np.append(np.array(model.gravity.linear), np.zeros(3))
@@ -599,6 +600,7 @@ class Plan:
         """
         t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
         within = sampled(t0, t1, step)
+        # an impact without duration has t1 = t0
         during = self.closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
         if reference is not None:
             parts = [
@@ -632,6 +634,7 @@ class Plan:
         (y0,), (u0,), _, _ = self.independent(0, np.array([t0]), missed=missed)
         (y1,), (u1,), _, _ = self.independent(2, np.array([t1]), missed=missed)
         span, chord, at = t1 - t0, y1 - y0, s[:, None]
+        # the cubic with the values y0, y1 and the slopes span u0, span u1 in s
         bend = at * (1 - at) * ((1 - at) * (span * u0 - chord) - at * (span * u1 - chord))
         return np.asarray(y0 + at * chord + bend)
 
@@ -647,6 +650,7 @@ class Plan:
         displacement = np.concatenate(
             [[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)]
         )
+        # the speed of a target that stays is zero after contact, up to rounding
         last = 0.0 if self.problem.target.stays else float(hit.target_speed[-1])
         before = float(self.problem.target.speed_before()) * np.minimum(since, 0.0)
         within = np.interp(since, hit.time, displacement, left=0.0)
@@ -796,6 +800,7 @@ def motion_loads(robot: Robot, reference: Trajectory, hit: PlannedCollision) -> 
     """Loads of a reference before and after contact, and of the collision, at all known instants."""
     phase, base = reference.phase, robot.nv - robot.n
     rates, outside = reference.v[:, base:], phase != 1
+    # the reference's phase 1 coasts, so the jump by the impact is between the phases beside it
     jump = rates[phase == 2][0] - rates[phase == 0][-1]
     motion = reference.torque[outside], rates[outside], reference.a[outside, base:]
     return _loads(robot, motion, hit, jump)

@@ -132,6 +132,7 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
     stiffness, damping = ((gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd))
     slots: list[list[Any]] = [[point.y, point.y1, point.T, gains] for point in points]
     at = b.add_block("spring", slots, np.concatenate([b.y0[c.base :], stiffness, damping]))
+    # The block's torque is zero in the start posture, where the springs carry what the robot's weight needs.
     rest, m = start_torque(b)[passive], b.ny - c.base
     position = np.array([int(np.flatnonzero(own == k)[0]) for k in passive])  # in the block's outputs (m,)
     names = [robot.joint_names[k] for k in passive]

@@ -114,7 +114,9 @@ class StrikeTranscription(ContactProgram):
         dd, du, uu = (2 * p.smoothness * k for k in (12 / T**3, -6 / T**2, 4 / T))
         diagonal[y], diagonal[u] = dd, uu
         linear[y], linear[u] = -dd * self.y0, -du * self.y0
+        # the mixed derivative by d and u stands at (y, u) and, by the transpose, at (u, y)
         mixed = sp.csr_array((np.full(len(y), du), (y, u)), shape=(n, n))
+        # a swing has a node at the end and in the middle of each interval
         of_swing = (self.w, 2 * p.swing.intervals)  # priced as one of the swing's nodes
         diagonal += wrench_prices(
             self.builder, [of_swing, *[(hit.w, hit.w.count) for hit in self.hit.collisions]]

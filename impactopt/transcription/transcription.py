@@ -327,6 +327,8 @@ class Transcription(ContactProgram):
         b.equal("follow-through starts from the predicted state", "position", labels, first + 1, far)
         b.equal("follow-through starts from the predicted state", "rate", labels, first + 2, fast)
         if self.abort is not None:
+            # instances: expected collision, scenarios by number, abort motion; three outputs for each
+            # coordinate
             after = first + 3 * b.ny * len(hit.collisions)
             b.equal("abort motion starts where coasting ends", "position", labels, after + 1, far)
             b.equal("abort motion starts where coasting ends", "rate", labels, after + 2, fast)
@@ -387,6 +389,7 @@ class Transcription(ContactProgram):
         total = self.objective_sum(x)
         if not total:
             return np.inf, np.inf
+        # the program minimizes prices minus the sum
         return (self.program.objective(x) + total) / abs(total), self._style.evaluate(x) / abs(total)
 
     def body_states(self, x: Array) -> list[BodyState]:

@@ -430,7 +430,7 @@ class SegmentedCollision:
             # v_middle is the velocity to freeze the drifts at, so nothing is to be estimated (`GIVES_WAY`)
             data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], ca.DM([GIVES_WAY, 0.0]))
             data = relative_to(inputs, duration * (a + b) / 2, data)
-            # Coefficients are frozen in the middle, but the segment begins with the segment's own velocities, by J of q
+            # Coefficients are of the middle, but the segment begins at q and v: so its speeds are by J of q.
             data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
             if self.model.slides:
                 data["point_velocity"] = self.frozen.velocity_of_point(q, v, inputs["normal"])

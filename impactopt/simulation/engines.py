@@ -165,12 +165,14 @@ def _step_error(
         return np.nan
     for other in (own if step > own else 2 * step, step / 2):
         try:
+            # only to shortly after the impact, up to which impulses are compared
             compared = run(*given, **options, step=other, until=until)
         except InputError:
             continue  # twice the step may be too long for the servo
         impulses = [sum(touch[2] for touch in s.touches if touch[0] <= until) for s in (simulation, compared)]
         largest = max(impulses)
         return abs(impulses[0] - impulses[1]) / largest if largest > 0 else np.nan
+    # all steps tried diverge
     return np.inf
 
 

@@ -56,6 +56,8 @@ class Servo:
     def target(self, t: float) -> Array:
         """Reference angles, rates and feed-forward (3 n,) at a time [s]; at a jump, the values after it."""
         i = min(max(int(np.searchsorted(self.time, t, side="right")) - 1, 0), len(self.time) - 2)
+        # at a jump two times are equal; `searchsorted` from the right takes the later one, so no interval has
+        # length 0
         f = min((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 1.0)
         return np.asarray((1 - f) * self.reference[i] + f * self.reference[i + 1])
 
@@ -88,6 +90,7 @@ class GearWatch:
         """Records an instant: torque (n,) [N m] of the motors, acceleration (nv,) of the robot."""
         # the motor's share that accelerates its own rotor does not pass the gear
         load = torque - self._armature * acceleration[-len(self._armature) :]
+        # both signs apart, as the largest magnitude may be of either
         np.maximum(self._high, load, out=self._high)
         np.minimum(self._low, load, out=self._low)
 
@@ -171,6 +174,7 @@ class Motors:
         """Mean torque (n,) [N m] during a time [s], for a constant wanted torque (n,)."""
         if not self._slow:
             return wanted
+        # infinite of a motor without inductance: the factor of the difference is 1 / inf = 0
         decay = self._rate * time
         # the exponential in `after`, integrated and divided by the time
         return wanted - np.expm1(-decay) / decay * (torque - wanted)

@@ -80,6 +80,7 @@ class MujocoDynamics(ReferenceModel):
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
         # steps that resolve servo and friction; halved until they resolve the contact too
+        # explicit in the applied forces, so that a decay faster than 2 / step would grow
         step = min(self.step, 1 / fastest) if fastest > 0 else self.step
         first = None
         while first is None:

@@ -70,6 +70,7 @@ REPORT = (
 
 def travelled(time: Array, speed: Array, contact_start: float) -> Array:
     """Travel (k,) [m] since contact began, from speeds (k,) [m/s]; without contact (nan), since the start."""
+    # trapezoidal rule
     gone = np.concatenate([[0.0], np.cumsum(np.diff(time) * (speed[1:] + speed[:-1]) / 2)])
     return gone - np.interp(contact_start, time, gone) if np.isfinite(contact_start) else gone
 
@@ -363,6 +364,7 @@ class Simulation:
 
 def centre_of_pressure(wrench: Array) -> Array:
     """Centre of pressure (..., 2) [m] on the ground of wrenches (..., 6) about the origin; nan at no load."""
+    # moment about the origin over normal force: (-M_y, M_x) / F_z on the plane z = 0
     normal = np.where(wrench[..., 2] > 1e-6, wrench[..., 2], np.nan)
     return np.stack([-wrench[..., 4], wrench[..., 3]], axis=-1) / normal[..., None]
 
@@ -370,6 +372,7 @@ def centre_of_pressure(wrench: Array) -> Array:
 def distance_inside(polygon: Array, points: Array) -> Array:
     """Distance (k,) [m] of points (k, 2) from a counter-clockwise polygon's nearest edge, < 0 outside."""
     edge = np.roll(polygon, -1, axis=0) - polygon
+    # edges of a counter-clockwise polygon have the inside on their left
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return np.asarray((points @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1))
 
@@ -444,6 +447,7 @@ class Touches:
                 self.intervals.append([t + since, t + since, 0.0])
             self.intervals[-1][2] += force * step
         self.touched = self.touching or force > 0
+        # in the step after a touch, too: its start is the touch's end
         if self.touched:
             self.intervals[-1][1] = max(t, self.intervals[-1][0])
         self.touching = force > 0

@@ -470,7 +470,7 @@ class Collision(ContactParameters, Collocated):
         common = np.concatenate(
             [*self._gains(), b.robot.torque_limit, b.limits.units, friction_parameters(p)]
         )
-        collision_p = [np.concatenate([p.normal, [s.place, s.phase > 0], common]) for s in self.stages]
+        collision_p = [np.concatenate([p.normal, [s.place], common]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
             "collision": (collision, collision_p),
             "force": (force, self.force_parameters()),
@@ -529,7 +529,7 @@ class Collision(ContactParameters, Collocated):
             [*start, self._before(s.phase)[0], self.T[s.phase][0], self.coast_legs[i], self.coast_rates[i]]
             for i, s in enumerate(self.stages)
         ]
-        return {"coasting": (slots, [[s.place, float(s.phase > 0)] for s in self.stages])}
+        return {"coasting": (slots, [[s.place] for s in self.stages])}
 
     def determined(self) -> list[Determined]:
         """Variables in the order in which the constraints determine them.

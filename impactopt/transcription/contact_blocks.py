@@ -64,24 +64,24 @@ def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpres
     """Legs of the reference that coasts through the collision: residuals of soles in place and at rest.
 
     z = y0; u0 (ydot at contact); T1; T; legs; leg rates [rad/s]; frozen: leg accelerations [rad/s^2].
-    p = s (place in the phase); 1 after the first phase else 0.
+    p = s (place in the phase).
     out = pose error of the fixed soles [m, rad]; their twist [m/s, rad/s]. Frozen: in place of the twist,
         residuals of rates and accelerations.
     """
     y0, u0 = ca.SX.sym("y0", c.ny), ca.SX.sym("u0", c.ny)
     legs, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("rates", c.nl)
-    T1, T, s, after = (ca.SX.sym(name) for name in ("T1", "T", "s", "after"))
+    T1, T, s = (ca.SX.sym(name) for name in ("T1", "T", "s"))
     # the reference coasts: constant rates of y, whatever the robot does
-    y = y0 + u0 * (after * T1 + T * s)
+    y = y0 + u0 * (T1 + T * s)
     z = [y0, u0, T1, T, legs, rates]
     if frozen is None:
         out = {"closure": c.closure(y, legs), "twist": c.sole_twists(y, legs, u0, rates)}
-        return make_block(z, [s, after], out, lanes=4)
+        return make_block(z, [s], out, lanes=4)
     accelerations = ca.SX.sym("accelerations", c.nl)
     # no yddot: leg joints accelerate only as far as constant rates of y need it
     v, a = (leg_part(c, x) for x in c.motion(y, legs, u0, ca.SX.zeros(c.ny)))
     out = {"closure": c.closure(y, legs), "rate": rates - v, "acceleration": accelerations - a}
-    return make_block([*z, accelerations], [s, after], out, lanes=2)
+    return make_block([*z, accelerations], [s], out, lanes=2)
 
 
 def collision(
@@ -111,8 +111,8 @@ def collision(
         their accelerations at the freeze; rates r of the legs, r'; lag of the legs behind the reference,
         lag'; time [s] since the beginning of the segment; slope of the hand's speed; without bias, wrenches
         that carry the weight (nw,); logarithms of the gain factors.
-    p = normal (3,); s (place in the phase); 1 after the first phase else 0; Kp, Kd, torque limits (n, each);
-        weight [N]; lever [m]; with friction the parameters of `ContactFriction`.
+    p = normal (3,); s (place in the phase); Kp, Kd, torque limits (n, each); weight [N]; lever [m]; with
+        friction the parameters of `ContactFriction`.
     out = closure [m, rad]; base equations over weight and weight x lever; joint equations over torque limit;
         servo torque over limit; frozen: residuals of r', of lag' and of the slope of the hand's speed.
     """
@@ -121,11 +121,11 @@ def collision(
     legs, ff, w = ca.SX.sym("legs", nl), ca.SX.sym("ff", n), ca.SX.sym("w", nw)
     strikers = _strikers(striker, second)
     T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f", len(strikers))
-    normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
+    normal, s = ca.SX.sym("n", 3), ca.SX.sym("s")
     kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
     weight, lever, logs = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("logs", len(gain_groups))
     of_friction = ca.SX.sym("friction", 2 * friction)
-    t = after * T1 + T * s  # since contact
+    t = T1 + T * s  # since contact
     y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
     through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
     # at: state at which the rigid-body functions are evaluated
@@ -182,7 +182,7 @@ def collision(
     }
     z = [y0, u0, *(own if frozen is None else []), ff, d1, T1, d, T, u, u1, legs, f, w]
     z += [*(own if frozen is not None else []), logs]
-    p = [normal, s, after, kp, kd, limit, weight, lever, of_friction]
+    p = [normal, s, kp, kd, limit, weight, lever, of_friction]
     return make_block(z, p, out, through, lanes=4, stages=stages)
 
 

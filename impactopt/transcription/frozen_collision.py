@@ -378,7 +378,7 @@ class FrozenCollision(Collision):
             [*start, self._before(phase)[0], self.T[phase][0], *(group[k] for group in groups)]
             for k, (phase, _) in enumerate(self._instants())
         ]
-        return {"coasting": (slots, [[place, float(phase > 0)] for phase, place in self._instants()])}
+        return {"coasting": (slots, [[place] for _, place in self._instants()])}
 
     def _reference_groups(self) -> tuple[Group, ...]:
         """Variables of the reference's legs, in the order of the block ``coasting``."""

@@ -240,6 +240,7 @@ def _frozen_names(
     collision: SteppedModel, model: JointSpaceModel, outputs: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Attributes of FrozenDynamics that a collision with these outputs needs."""
+    # each freeze is at a configuration and velocity of the whole robot, which that output needs
     wanted = (*outputs, "velocity") if collision.n_freezes else outputs
     return tuple(dict.fromkeys((*model.frozen, *frozen_for(wanted, slides=model.slides))))
 

@@ -110,6 +110,8 @@ class Outputs:
         self._instants = [Instants(model, segment, soles, held, v) for segment in segments]
 
     def __getattr__(self, name: str) -> Any:
+        # called for attributes that this class does not have: histories are those of all segments, side by
+        # side
         if name not in HISTORIES:
             raise AttributeError(name)
         history = ca.horzcat(*[getattr(instants, name) for instants in self._instants])

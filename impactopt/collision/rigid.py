@@ -87,6 +87,7 @@ class RigidImpact(CollisionModel):
         # change of the target's state, and of its velocity [1/kg], by a unit impulse
         # both targets are linear in the force, so a unit force for a unit of time is a unit impulse
         gain = np.array(self.target.derivative(state, 1.0, numbers), dtype=float)
+        # the velocity is linear in the state, with `before` at zero
         of_target = float(self.target.velocity(gain, numbers)) - before
         e = self.coefficient_of_restitution
         # a hand that does not approach does not hit

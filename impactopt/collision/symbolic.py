@@ -261,6 +261,7 @@ class SymbolicModel(SteppedModel):
 
     def _check_parameters(self, parameters: tuple[str, ...]) -> None:
         for name in parameters:
+            # refuses an unknown name
             self.settings.override({name: self.settings.get(name, 0.0)})
 
     def _with_parameters(self, whole: Any, parameters: tuple[str, ...]) -> Any:

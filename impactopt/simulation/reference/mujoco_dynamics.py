@@ -236,6 +236,7 @@ def march(
 
 def _fastest(forces: Forces, depth: float, rate: float, compressing: bool, scales: Scales) -> float:
     """Fastest rate [1/s] of the contact's spring and damper between free hand and target."""
+    # differences a thousandth of the contact's own depth and speed
     depth_step, speed_step = 1e-3 * scales.time * scales.speed, 1e-3 * scales.speed
     stiffness, damping = forces.contact_slopes(depth, rate, compressing, depth_step, speed_step)
     return max(sqrt(max(stiffness, 0.0) * scales.inverse_mass), abs(damping) * scales.inverse_mass)

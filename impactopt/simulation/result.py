@@ -516,6 +516,7 @@ def _standing_intervals(
     """
     if not stance.size:
         return [(0, count)]
+    # zeros at both ends, so that a stance that begins or ends the motion has edges too
     on = np.pad(scene.standing[stance, sole].astype(int), 1)
     return list(zip(np.flatnonzero(np.diff(on) > 0), np.flatnonzero(np.diff(on) < 0), strict=True))
 
@@ -551,6 +552,7 @@ def check_not_diverged(rates: Array, t: float, step: float) -> None:
 
 def posture_error(model: Any, q: Array, planned: Array) -> float:
     """Largest error [rad] of a joint or of the base's orientation at q (nq,)."""
+    # in the tangent space, whose components 3 to 5 are the base's rotation vector
     error = np.abs(pin.difference(model, planned, q))
     if model.joints[1].nv == 6:
         return float(max(np.linalg.norm(error[3:6]), error[6:].max(initial=0.0)))

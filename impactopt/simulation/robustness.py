@@ -152,6 +152,7 @@ class Robustness:
     def interval(self) -> tuple[float, float]:
         """Wilson's 95 % interval of the rate at which the plan stands under such perturbations."""
         n, p = self.draws, self.rate
+        # Wilson's, as that of the normal approximation has no width if all draws stand
         centre = (p + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
         half = Z95 / (1 + Z95**2 / n) * np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n**2))
         return max(0.0, float(centre - half)), min(1.0, float(centre + half))

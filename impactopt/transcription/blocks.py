@@ -205,6 +205,7 @@ def spring(c: StanceCoordinates, gain_groups: JointGroups = ()) -> BlockExpressi
     # joints of the closed legs have no spring here: only coordinates y are independent
     rest, stiffness, damping = ca.SX.sym("rest", m), ca.SX.sym("k", m), ca.SX.sym("d", m)
     logs, place = ca.SX.sym("logs", len(gain_groups)), {int(j): k for k, j in enumerate(c.independent)}
+    # from joints of the robot to those of this block, which has none of the closed legs
     groups = tuple(tuple(place[j] for j in joints if j in place) for joints in gain_groups)
     scaled_stiffness, scaled_damping = with_gain_factors(stiffness, damping, logs, groups)
     torque = -scaled_stiffness * (y[c.base :] - rest) - scaled_damping * y1[c.base :] / T
@@ -397,5 +398,6 @@ def _extra(block: BlockExpression | BlockRecipe, problem: ImpactProblem, element
 def key_of(block: BlockExpression) -> tuple[Any, ...]:
     """Hash of a block's expression: the cache key of a user's block, whose source is not hashed."""
     stages = [stage.symbols for stage in block.through], [stage.expression for stage in block.through]
+    # a stage's symbols are free in `out`, so here they are inputs, and their expressions outputs
     graph = ca.Function("block", [block.z, block.p, *stages[0]], [block.out, *stages[1]])
     return hashlib.sha256(graph.serialize().encode()).hexdigest(), block.lanes

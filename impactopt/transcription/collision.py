@@ -391,6 +391,7 @@ class Collision(ContactParameters, Collocated):
         self._prefix = prefix = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
         self.mass = mass
+        # sets `shortest`, which the bounds of the durations below need
         self.update_parameters()
         self.torque_fraction = scenario.torque if scenario else limits.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else limits.cone.collision_margin

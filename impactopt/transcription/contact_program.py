@@ -269,6 +269,7 @@ class ContactProgram(ABC):
         whether that has updated everything that depends on the problem.
         """
         self.problem = problem
+        # without clearance constraints the program's builder is that one itself, which is to be updated once
         builders = [self._without_clearance]
         if self.builder is not self._without_clearance:
             builders.append(self.builder)

@@ -121,15 +121,18 @@ class Affine:
     def apply(self, matrix: ArrayLike) -> Affine:
         """The affine expressions ``matrix @ self``."""
         m = np.asarray(matrix, dtype=float)
+        # column j of m[:, rows] multiplies triplet j
         r, c = np.nonzero(m[:, self.rows])
         return Affine(m.shape[0], r, self.cols[c], m[r, self.rows[c]] * self.vals[c], m @ self.const)
 
     def evaluate(self, x: Array) -> Array:
+        # A place (row, column) may stand in several triplets, as sums are not merged: all of them count.
         return self.const + np.bincount(self.rows, self.vals * x[self.cols], self.size)
 
 
 def select(expression: Affine, keep: NDArray[np.intp]) -> Affine:
     """Expressions with numbers ``keep``, in this order; a number may be repeated."""
+    # O(len(keep) x triplets), which suffices for expressions of single nodes
     found = [np.flatnonzero(expression.rows == k) for k in keep]
     triplets = np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
     rows = np.repeat(np.arange(len(keep)), [len(each) for each in found])
@@ -243,6 +246,7 @@ class Layout:
 
     def bound(self, group: Group, lower: ArrayLike, upper: ArrayLike) -> None:
         """Replace a group's bounds; as of :meth:`add`."""
+        # the stores have one entry a group, in the same order
         k = list(self.groups).index(group.name)
         for store, bound in ((self._lower, lower), (self._upper, upper)):
             shape = group.count, group.size

@@ -212,6 +212,7 @@ class MotionPhase:
         self._last = len(self.breaks) + 1
         self._y0 = Affine.constant(b.y0)
         self.lead = _control_points(begins, {REST: 3, FREE: 0})
+        # at rest three equal control points are given at a start, and one variable stands for three at an end
         points = self._last + 1 - self.lead - _control_points(ends, {REST: 2, FREE: 0, COASTING: 1})
         nodes, limits = len(self.nodes), b.limits
         self.c = b.layout.add(f"{self.kind} control point", points, b.ny, **limits.of_y)

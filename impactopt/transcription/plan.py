@@ -683,6 +683,8 @@ class Plan:
                 q, v, _ = c.complete_motion(y, yd, ydd, c.solve_legs(y, c.start_legs))
                 pin.forwardKinematics(robot.model, data, q, v)
                 frame = robot.model.getFrameId(sole.frame)
+                # LOCAL: the corners are known in the sole's own axes, and the length of a velocity is the
+                # same in all
                 twist = pin.getFrameVelocity(robot.model, data, frame, pin.LOCAL)
                 corners = np.column_stack([sole.polygon, np.zeros(len(sole.polygon))])
                 speeds = twist.linear + np.cross(twist.angular, corners)

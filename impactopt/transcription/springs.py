@@ -93,6 +93,7 @@ def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) ->
     for one, other in pairwise(motion.breaks):
         samples = []
         for s in (one, (one + other) / 2, other):
+            # none at the start of a swing from rest, where the torque is known
             near = np.flatnonzero(np.isclose(motion.nodes, s))
             torque = torques[near[0]] if near.size else Affine.constant(start_torque(b))
             samples.append((torque, *motion.at(s)[:2]))

@@ -47,6 +47,7 @@ class StrikeTranscription(ContactProgram):
         self.y = add("posture at contact", 1, b.ny, **limits.of_y)
         self.legs = add("legs at contact", 1, b.nl, **limits.of_legs)
         self.w = add("sole wrench at contact", 1, b.nw, **limits.of_wrenches)
+        # the base has no rate limit of its own
         fastest = np.full(b.ny, np.inf)
         fastest[c.base :] = limits.rate_limit[c.independent]
         coasting = add_coasting(b, {"lower": -fastest, "upper": fastest})

@@ -157,6 +157,8 @@ class Transcription(ContactProgram):
         shares: Shares = (),
     ) -> None:
         b, self.nodes = Builder(problem, coordinates, functions), nodes
+        # The phase with the impact is in both: its swing ends the first sequence, its follow-through begins
+        # the second.
         before, after = range(problem.blow + 1), range(problem.blow, max(1, len(problem.stances)))
         self.before = PhaseSequence(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
         self.swing = cast(Swing, self.before.phases[problem.blow])

@@ -48,6 +48,7 @@ class Servo:
 
     def angles(self, q: Array) -> Array:
         """Joint angles (n,) of a configuration; those of continuous joints in [-pi, pi]."""
+        # as `Robot.joint_positions`, without its checks: it is called in every step
         out = q[self.place]
         for k in self.continuous:
             out[k] = np.arctan2(q[self.place[k] + 1], q[self.place[k]])

@@ -843,6 +843,7 @@ def gear_share(problem: ImpactProblem, torque: Array, acceleration: Array) -> Ar
 
 def _loads(robot: Robot, motion: tuple[Array, ...], hit: PlannedCollision, jump: Array) -> DriveLoads:
     """motion : torque, velocity, acceleration (k, n) of the joints.  jump (n,) : of velocities, at impact."""
+    # an impact without duration has no accelerations, and no torques of its own
     parts = [motion, (hit.torque, hit.velocity, hit.acceleration)][: 1 + bool(hit.acceleration.size)]
     torque, velocity, acceleration = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     gear = gear_torque(robot, torque, acceleration)

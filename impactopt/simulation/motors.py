@@ -36,7 +36,7 @@ class Servo:
         self.place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
         # q has the cosine and sine of a continuous joint's angle
         self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
-        angles = np.array([self.angles(q) for q in reference.q])
+        angles = robot.joint_positions(reference.q)
         angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
         rates, torques = np.array(reference.v[:, -robot.n :]), np.array(reference.torque)
         # springs do not follow the plan: they carry the tool at rest at first, and deflect from there

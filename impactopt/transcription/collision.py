@@ -317,6 +317,7 @@ class Collocated:
         velocity = [c.complete_motion(y, rates, 0 * rates, legs)[1][c.base :]]
         acceleration = [jump_at_contact(b.problem, c, law, y, rates, legs)[3]]
         for i in range(len(self.stages)):
+            # slots of `_motion`; the S among them is one
             y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
             _, v, a = c.complete_motion(y0 + T1 * d1 + T * d, u, slope / T, legs_there)
             velocity.append(v[c.base :])
@@ -433,6 +434,7 @@ class Collision(ContactParameters, Collocated):
         There is none while a nail is driven, if the collision ``holds``.
         """
         p = self._b.problem
+        # phases between the first and the last are those in which the nail is driven
         if self.holds:
             driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
             return np.where(driven, -np.inf, 0.0)[:, None]
@@ -580,6 +582,7 @@ class Collision(ContactParameters, Collocated):
             names = [label for one, _ in self._integrals() for label in one.labels] * self.joined.count
             outputs = at["join"][0] + np.arange(len(names))
             self._b.equal("travel in compression", where, names, outputs, along(names, "off"))
+        # end that is no event of the target -> component, output of the block ``force``, measure
         ends = {
             TURN: ("approach speed", "rate", Measure("m/s", 1.0, "left")),
             SEPARATION: ("force", "separation", Measure("N", FORCE_SCALE, "left")),
@@ -591,6 +594,7 @@ class Collision(ContactParameters, Collocated):
             for prefix in self._prefixes if phase.end in ends else self._prefixes[:1]:
                 outputs = start + last * size + part[prefix + name]
                 self._b.equal(phase.end, where, [prefix + component], outputs, measure)
+            # a gap ends where the two meet; zero penetration alone would also hold where they part
             if phase.end == TOUCH:
                 self._bound_rate(last, start + last * size, receding=False)
 

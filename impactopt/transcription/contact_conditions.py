@@ -228,6 +228,7 @@ def _add_clearance(
     soft = any(tool.name == striker and tool.grip is not None for tool in p.robot.tools)
     behind = (SOFT_GRIP_RATE if soft else CLEARANCE_RATE) * float(np.mean(p.follow.duration))
     name = f"target left by {striker}" if number else "target left"
+    # each constraint below needs this output, and an output may be in one constraint only
     there = b.lift(name, np.array([first]), place=place(0.0), measure=TOO_NEAR)[0]
     spots = [(first + i, place(s), s * behind) for i, s in enumerate(after) if i]
     left = len(b.constraints.lower)

@@ -399,6 +399,7 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
         values.append(found.y)
         if found.status != 1:  # no event until the end of the time
             break
+        # the state goes on; only the event that is looked for changes
         start = found.y[:, -1]
         if k % 2 == 0 and (k == 2 * touches - 2 or target.guard(start[3:], 0.0, found.t[-1], 0) >= 0):
             break
@@ -427,6 +428,7 @@ def _phases(found: _History, target: Target) -> Array | None:
         # an event after the turn is not the one that splits compression
         if first is None or first >= deepest:
             return None
+        # phases: up to the event, from there to the turn, restitution
         ends.insert(1, time[first])
     return np.array(ends) if min(np.diff(ends)) > 0 else None
 

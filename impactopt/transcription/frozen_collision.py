@@ -294,6 +294,7 @@ class FrozenCollision(Collision):
         at = self._frozen[k]
         s = self._element_at(at.phase, at.place)
         T1, d1, _ = self._before(at.phase)
+        # integral over the phase up to the element, to which that over the element's part is added
         d = Affine.zeros(self._b.ny) if s.new_phase else self.d[s.previous]
         places, begin = [self.stages[m].place for m in s.members], self._ends(s)[0]
         # Integral of the polynomial through the element's rates, from its beginning to the freeze: Gauss's
@@ -417,6 +418,7 @@ class FrozenCollision(Collision):
         return out
 
     def determined(self) -> list[Determined]:
+        # equal to an affine expression of the collocated legs, as lifted variables are to outputs
         out = [determined(Turn.LIFTED, group.index(0)) for group in self.frozen_legs if group.size]
         out += super().determined()
         for k in range(self.coast_legs.count):

@@ -222,6 +222,7 @@ def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Ar
             continue
         if name.split()[0] in nodes and known.count != group.count:
             before, now = nodes[name.split()[0]]
+            # the old nodes are among the new ones; multipliers of added nodes are zero
             pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]
             group.write(new, np.column_stack([np.interp(now, before, column) for column in known.read(x).T]))
         elif known.count == len(old.hit.stages) and known.count != group.count:
@@ -377,6 +378,7 @@ def _least_accelerations(
             bounds = limits.y_lower[k] - 1e-9, limits.y_upper[k] + 1e-9
             found = lsq_linear(accelerations[:, free], -accelerations @ points, bounds)
             points[free] = found.x
+            # control points of the rate, which bound it
             largest = float(np.abs(factors * np.diff(points)).max()) / duration
             if largest < slowest:
                 slowest, control[:, k] = largest, points

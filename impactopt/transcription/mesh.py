@@ -73,6 +73,7 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     if plan.abort is not None:  # the abort motion has the follow-through's nodes
         for piece in plan.pieces(missed=True)[len(plan.before) + 1 :]:
             middles = _middles_violated(plan, plan.missed_reference, piece)
+            # one mesh for both motions to rest, so nodes that either needs
             found[piece.phase, piece.number] |= set(middles)
     stands = [
         {*known.of_stand(k), *(found[0 if k < blow else 2, k] if k != blow else ())}
@@ -92,6 +93,7 @@ def _middles_violated(plan: Plan, reference: Trajectory, piece: Piece) -> list[f
     if reference.stance.size:
         own &= reference.stance == piece.number
     nodes, duration = piece.nodes, piece.spline.duration
+    # without the instants of rest after the motion, which the reference goes on with
     at = np.flatnonzero(own & (reference.time <= piece.start + duration))
     torque = reference.torque[at]
     limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)

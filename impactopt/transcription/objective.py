@@ -143,6 +143,7 @@ def _priced(
         # the jerk of a cubic spline is constant in an interval: y''' = step / (end - s)
         for s, end in pairwise(motion.breaks) if prices.jerk else ():
             step = motion.at(float(end))[2] - motion.at(float(s))[2]
+            # integral of (y'''/T^3)^2 dt over the interval, dt = T ds: step^2 / (T^5 (end - s))
             residuals.append(step * np.sqrt(2 * prices.jerk / (T**5 * (end - s))))
     m = sp.csr_array((0, n))
     constants = np.zeros(0)

@@ -257,6 +257,7 @@ class PhaseSequence:
             if sole in b.coordinates.soles:
                 continue
             lifted, lands = (j in self.numbers and sole.name in self._soles(j) for j in (k - 1, k + 1))
+            # inf if the sole was not on the ground before, or does not come down after: no ramp there
             since = np.where(lifted, phase.nodes * T, np.inf)  # [s] lift-off
             until = np.where(lands, (1 - phase.nodes) * T, np.inf)  # [s] touch-down
             ramp = np.minimum(np.minimum(since, until) / RAMP_TIME, 1.0)

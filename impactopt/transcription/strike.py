@@ -110,6 +110,7 @@ class StrikeTranscription(ContactProgram):
         """
         p, n = self.problem, self.layout.n
         T, linear, diagonal = float(np.mean(p.swing.duration)), np.zeros(n), np.zeros(n)
+        # in solver units, as coordinates and rates have a scale of one
         y, u = self.y.index(0), self.u0.index(0)
         # second derivatives by d, by d and u, and by u, with d = y - y0
         dd, du, uu = (2 * p.smoothness * k for k in (12 / T**3, -6 / T**2, 4 / T))

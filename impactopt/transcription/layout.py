@@ -387,7 +387,9 @@ class Constraints:
 
 
 GRAVITY = 9.81  # [m/s^2] for the robot's weight, which scales forces; its model may have another gravity
-LEVER = 0.1  # [m] scale of sole moments relative to forces
+# [m] scale of sole moments relative to forces; with 0.01 to 1 m punch has the same optimum, in 40 to 57
+# iterations
+LEVER = 0.1
 # [m, rad] largest deviation of the base from its start: of a robot on soles, and of a free-floating one
 # Pitch stays below pi/2, where roll and yaw turn about one axis and their rates are not defined.
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])

@@ -540,8 +540,8 @@ class WholeBodyController:
         if recovers:  # the reference of the centre of mass is no longer that of the joints
             error[:3] = mass * aim.com[1] - data.hg.linear
         wanted = np.zeros(6)
-        # (c' + c''/omega) = -gain (c + c'/omega) for the errors: c'' = -omega gain c - (omega + gain) c'.
-        # Gravity is no wrench of the soles, which have to give the rest.
+        # (c' + c''/omega) = -gain (c + c'/omega) for the errors: c'' = -omega gain c - (omega + gain) c'. The
+        # soles' wrenches over the mass are c'' - g.
         wanted[:3] = (
             aim.com[2]
             + self.kp * omega * gain * (aim.com[0] - com)

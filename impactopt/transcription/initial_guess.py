@@ -56,7 +56,8 @@ def strike_rates(
     # central differences: their error, h^2, and rounding, 1e-16 / h, are both below 1e-9
     h = 1e-6
     jac = np.stack([(point(y + h * e) - point(y - h * e)) / (2 * h) for e in np.eye(c.ny)], axis=1)
-    # least |rates / weight|, by the substitution rates = weight * r
+    # least |rates / weight|, by the substitution rates = weight * r. Measured: with `base` of 0.05 to
+    # 1 punch has the same optimum.
     weight = np.ones(c.ny)
     weight[: c.base] = base
     return np.asarray(weight * np.linalg.lstsq(jac * weight, np.tile(velocity, len(frames)), rcond=None)[0])
@@ -105,7 +106,8 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     zero, (swing_T, follow_T) = np.zeros(len(t.y0)), _durations(t)
     start, end = _ends(t.problem, t.coordinates, t.problem.blow)
     swing = quintic(start, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
-    # half of the rates is left after contact, as after an inelastic impact of two equal masses
+    # Half of the rates is left after contact, as after an inelastic impact of two equal masses. Measured:
+    # with 0.2 to 0.9 arm_planar and punch have the same optimum.
     back = quintic(hit.y, 0.5 * hit.rates, end, zero, follow_T, t.follow.breaks)
     curve = CubicSpline.fit(swing, t.swing.breaks, zero, hit.rates, swing_T)
     after = CubicSpline.fit(back, t.follow.breaks, 0.5 * hit.rates, zero, follow_T)

@@ -143,6 +143,7 @@ class Batch:
         names = ("q", *self.model.settings)
         own = {name: given[name] for name in names}
         count = len(given["q"])
+        # one row a case, of all that stability depends on
         flat = [x.reshape(len(x), -1) for x in own.values()]
         whole = np.concatenate([np.broadcast_to(x, (count, x.shape[1])) for x in flat], axis=1)
         _, first, back = np.unique(whole, axis=0, return_index=True, return_inverse=True)
@@ -184,6 +185,7 @@ def _in_threads(loop: Any, work: int, inputs: list[Array], found: list[Array], t
     slices = _slices(count, threads)
 
     def run() -> None:
+        # each thread needs its own work array; results are written to rows of its slice only
         memory = np.empty(work + _ALIGNED)
         work_array = pointers(memory.ctypes.data)
         # the threads share the iterator: each takes the next slice, under the interpreter's lock

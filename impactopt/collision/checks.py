@@ -192,6 +192,7 @@ def check_steps(collision: SteppedModel, result: Collision, error: float) -> Non
             f"{length:g}: give a shorter step, or a v that approaches faster"
         )
     if too_large(method, np.array(error)):
+        # the estimate is not exact, so the step that is advised is a fifth shorter than by its order
         shorter = 0.8 * length * (ACCURACY[method] / error) ** (1 / _ORDERS[method])
         raise InputError(
             f"step [s]: {length:g} is too long to follow this contact within {ACCURACY[method]:g} of its "
@@ -200,6 +201,8 @@ def check_steps(collision: SteppedModel, result: Collision, error: float) -> Non
 
 
 # The classical Runge-Kutta method is stable for all decaying modes with |eigenvalue| h up to this
+# The region's boundary is at 2.785 on the negative real axis, at 2.828 on the imaginary one, and nearest to
+# zero at 2.615, at 122 degrees.
 _STABILITY_LIMIT = 2.6
 _BALANCING_SWEEPS = 4  # of a matrix, before its norm is taken
 
@@ -208,8 +211,11 @@ def _fastest_states(model: JointSpaceModel, data: dict[str, Any]) -> Iterator[tu
     """States with the fastest modes, and the data there."""
     there = dict(data)
     for name in {"feedforward", "joint_velocity"} & {*model.data}:
+        # no saturation, which would switch the servo's modes off, and joints at rest, in the band of steep
+        # friction
         there[name] = np.zeros(model.n)
     y = model.start()
+    # a law such as k x^1.5 has no stiffness at zero penetration
     y[model.layout["penetration"]] = 1e-3
     for there["hand_speed"] in (1.0, -1.0):  # compression, restitution
         for y[model.layout["target"]] in (0.0, 1e-3):  # a target that sticks does not show its modes
@@ -237,6 +243,7 @@ def _unstable_cases(model: JointSpaceModel, slope: Any, data: dict[str, Array], 
     for y, there in _fastest_states(model, data):
         slopes = np.array(many(y, *[side_by_side(name, there[name]) for name in model.data]))
         slopes = slopes.reshape(size, count, size).swapaxes(0, 1)
+        # negated, so that NaN counts as close
         close = np.flatnonzero(~(_eigenvalue_bound(slopes) < limit))
         finite = np.isfinite(slopes[close]).all(axis=(1, 2))
         found[close[~finite]] = True
@@ -253,6 +260,8 @@ def _eigenvalue_bound(matrices: Array) -> Array:
         scaled = a * scale[:, :, None] / scale[:, None, :]
         rows, columns = scaled.sum(axis=2), scaled.sum(axis=1)
         both = (rows > 0) & (columns > 0)
+        # A diagonal similarity keeps the eigenvalues. The states have other units, so that without it the
+        # norm is much larger than they are.
         scale *= np.sqrt(np.where(both, columns, 1.0) / np.where(both, rows, 1.0))
     scaled = a * scale[:, :, None] / scale[:, None, :]
     bound: Array = np.minimum(scaled.sum(axis=2).max(axis=1), scaled.sum(axis=1).max(axis=1))
@@ -280,6 +289,7 @@ class Stability:
     def frozen(self, q: Array, values: dict[str, Array]) -> dict[str, Array]:
         """Frozen quantities at q (nq), by name; InputError if rounding dominates them."""
         function = self._freeze
+        # A, s and m do not depend on the velocity, nor on `target_start`
         at_rest = np.zeros(self._collision.robot.nv)
         found = function.call([ca.DM(x) for x in (q, at_rest, values["normal"], np.zeros(2))])
         frozen = {name: np.array(x) for name, x in zip(function.name_out(), found, strict=True)}
@@ -291,6 +301,7 @@ class Stability:
         data: dict[str, Any] = frozen | values
         drifts = {name for name in self._model.data if name not in data}
         data |= {name: np.zeros(self._model.data[name]) for name in drifts}
+        # a system that does not move has a step as long as any
         rates = [1e-12]
         for y, there in _fastest_states(self._model, data):
             matrix = np.array(self._slope(y, *[there[name] for name in self._model.data]))

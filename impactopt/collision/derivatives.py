@@ -107,6 +107,7 @@ def differentiable(
         return function, function.sizes
 
     value, jacobian = with_jacobian(model, whole, parameters, by, on_demand)
+    # no penalty, as the Jacobian is all there is: directional derivatives are switched off below
     own = {"custom_jacobian": jacobian, "jac_penalty": 0, "never_inline": True}
     own |= {"enable_forward": False, "enable_reverse": False}
     moving = value.name_in() if by is None else by
@@ -142,6 +143,7 @@ def with_jacobian(
     blocks: dict[tuple[str, str], Any] = {}
     for part in _parts(model, outputs, moving):
         function, sizes = derivatives(part)
+        # divided by their sizes, which `_OnDemand` multiplies by again
         found = function.call([ca.rdivide(values[name], ca.DM(size)) for name, size in sizes.items()])
         named = dict(zip(function.name_out(), found, strict=True))
         pairs = [pair for pair in product(part.outputs, part.by) if pair[1] in moving]
@@ -262,6 +264,7 @@ class _OnDemand(ca.Callback):
             self._function = self._compile()  # type: ignore[no-untyped-call]
         for given, size, buffer in zip(arg, self._flat_sizes, self._buffers, strict=True):
             if given is None:
+                # CasADi passes no pointer for an argument that is zero
                 buffer[:] = 0.0
             else:
                 np.multiply(np.frombuffer(given), size, out=buffer)
@@ -318,6 +321,7 @@ def _configuration(model: SteppedModel) -> tuple[Any, Any]:
     unit = given / lengths
     basis = ca.Function("basis", [rb.q], [rb.tangent_map()])
     to_tangent = ca.mtimes(ca.diag(ca.DM(square)), basis(unit).T)
+    # T is constant along a ray of q, so its derivative there is over the length; along the ray it is zero
     to_tangent = ca.mtimes(to_tangent, ca.diag(1 / lengths))
     return ca.Function("unit", [given], [unit]), ca.Function("to_tangent", [given], [to_tangent])
 

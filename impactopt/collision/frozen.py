@@ -90,6 +90,7 @@ class FrozenDynamics:
         if not (self.bias or self.jdot):
             return self.v
         w, z = self._roots, self._held
+        # P j' = W' (W_j - W_c R^-T Z_j), with W = D^-1/2 L^-T of the comment below
         inner = w["hand"] - ca.mtimes(w["held"], ca.mtimes(self._cholesky.T, z["hand"]))
         closing = self.hand_speed - self.target_start[1]
         impulse = ca.fmax(closing, 0.0) / (self.m + self.target_start[0])
@@ -170,6 +171,7 @@ class FrozenDynamics:
         """
         held = self._roots["held"]
         diagonal = ca.sum1(held**2).T + ca.diag(self._gamma)
+        # 1 / (R^-1)_ii^2 = R_ii^2: what is left of diagonal i after the constraints before it are eliminated
         return 1 / (ca.diag(self._cholesky) ** 2 * diagonal)
 
     @cached_property
@@ -216,6 +218,8 @@ class FrozenDynamics:
     @cached_property
     def L_tau(self) -> Any:
         """Wrenches of the world on the constrained frames per joint torque (c, n) [N/(N m), -]."""
+        # w = -G^-1 (J_c H^-1 (S' tau - j' f - bias) + dJ_c/dt v), where G^-1 = R^-T R^-1 is of the Delassus
+        # matrix: so is the sign of each of the four parts below.
         return -ca.mtimes(self._cholesky.T, self._held["joints"])
 
     @cached_property
@@ -349,6 +353,8 @@ class _TreeQuantities:
         # the bias on the base, expressed as a wrench at a sole by its Jacobian, then about the world's origin
         J, p, bias = self.rb.jacobian(self.soles[0]), self.rb.frame(self.soles[0])[1], self.bias_force
         R = J[:3, :3]
+        # Columns of the base in J: R = J[:3, :3] turns its own axes to the world's. J' (force, moment) = bias
+        # of the base has force in its first three equations, and moment and force in the next.
         force = ca.mtimes(R, bias[:3])
         moment = ca.mtimes(R, bias[3:6] - ca.mtimes(J[:3, 3:6].T, force))
         return ca.vertcat(force, moment + ca.cross(p, force))
@@ -357,6 +363,7 @@ class _TreeQuantities:
         torque, force, time = ca.SX.sym("torque", self.robot.n), ca.SX.sym("force"), ca.SX.sym("time")
         friction = ca.SX.sym("friction", 3)
         wrench = ca.SX.sym("wrench", 6 * len(self.held))
+        # the base has no actuator; the contact force is -f n on the hand
         push = ca.vertcat(ca.SX.zeros(self.base, 1), torque) - self.hand_row.T * force
         push += ca.mtimes(self.held_jacobian.T, wrench) - ca.mtimes(self.point_jacobian.T, friction)
         if bias:

@@ -76,6 +76,7 @@ def target_start(target: Target, numbers: dict[str, Any]) -> Any:
     states = [z[i] for i in range(target.n_states)]
     rates = ca.vertcat(ca.SX(0, 1), *target.derivative(states, f, symbols))
     acceleration = ca.mtimes(ca.jacobian(ca.SX(target.velocity(states, symbols)), z), rates)
+    # d(dv/dt)/df = (dv/dz) d(dz/dt)/df, by the chain rule
     slope = ca.densify(ca.jacobian(acceleration, f))
     start = ca.vertcat(slope, ca.densify(ca.SX(target.velocity(states, symbols))))
     function = ca.Function("target_start", [z, f, *symbols.values()], [start])
@@ -84,6 +85,7 @@ def target_start(target: Target, numbers: dict[str, Any]) -> Any:
 
 def columns_of(collision: SteppedModel, fraction: float, every: int) -> int:
     """Number of instants of the histories in a fraction of the horizon, with implicit steps."""
+    # without the 1e-9, rounding of a whole quotient would add a column
     return ceil(fraction * collision.horizon / (every * collision.step_length) - 1e-9) + 1
 
 
@@ -238,6 +240,7 @@ def _frozen_names(
     collision: SteppedModel, model: JointSpaceModel, outputs: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Attributes of FrozenDynamics that a collision with these outputs needs."""
+    # each freeze is at a configuration and velocity of the whole robot, which that output needs
     wanted = (*outputs, "velocity") if collision.n_freezes else outputs
     return tuple(dict.fromkeys((*model.frozen, *frozen_for(wanted, slides=model.slides))))
 

@@ -142,6 +142,7 @@ def polynomials(count: int = STAGES) -> Array:
     for j in range(1, count):
         L[j + 1] = (2 * j * L[j] - np.append(0.0, L[j, :-1]) - (j - 1) * L[j - 1]) / (j + 1)
     powers = np.arange(count + 1)
+    # p_j(theta) = (-g)^j L_j(theta / g): rows have the factor (-g)^j, columns the powers of 1 / g
     found: Array = L * (-g) ** powers[:, None] / g**powers
     return found
 
@@ -174,10 +175,12 @@ def tables() -> dict[str, Array | float]:
 
 def node_tables() -> tuple[Array, Array]:
     """AT_NODES and FROM_NODES of `tables`; Lobatto nodes, as they include the end of the step."""
+    # the eight Lobatto nodes of [0, 1]: its ends and the roots of the derivative of P_7
     inner = np.polynomial.legendre.legroots(np.polynomial.legendre.Legendre.basis(NODES).deriv().coef)
     nodes = np.array([0.0, *((np.sort(inner) + 1.0) / 2.0), 1.0])
     values = np.vander(nodes, STAGES + 1, increasing=True) @ polynomials().T
     back = np.zeros((STAGES + 1, NODES))
+    # p_8 is left out: eight values, the start's among them, determine a polynomial of degree seven
     back[:STAGES] = np.linalg.inv(values[:, :STAGES])[:, 1:]
     back[0] = 0.0
     return values[1:], back

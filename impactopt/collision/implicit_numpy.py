@@ -131,6 +131,7 @@ class _Run:
         Q = np.zeros((n + 1, n + 1))
         if n:
             A = np.zeros((n, n))
+            # by columns of the lower triangle is by rows of the upper one
             A[np.triu_indices(n)] = data["A"].ravel()  # its lower triangle by columns
             Q[:n, :n] = A + np.triu(A, 1).T
             Q[:n, n] = Q[n, :n] = data["s"].ravel()
@@ -152,6 +153,7 @@ class _Run:
     def _state_maps(self, Q: Array, drift: Array) -> StateMaps:
         """Linear maps of the state, from Q = [A, s; s', m] and drifts of joints and hand (n + 1)."""
         unit, parts = np.eye(self.model.n_states), self.parts
+        # [u; w] = Q [integral of torque; -impulse] + drift x time: the state's parts are such integrals
         speeds = Q @ np.vstack([unit[parts["torque"]], -unit[parts["impulse"]]])
         speeds = speeds + np.outer(drift, unit[parts["time"]][0])
         demand = -self.kd @ speeds[:-1]
@@ -396,6 +398,7 @@ class _Run:
                 kept.append(self.state_at(y, s, part))
             y = self.move(y, s, theta)
             if theta == end and end < 1.0:
+                # exactly, as the loop ends at this time, and rounding would add a step
                 y[self.parts["time"]] = self.until
             lengthen_below = _LENGTHEN_BELOW_NONLINEAR if self.is_nonlinear else _LENGTHEN_BELOW
             if at is None and error < lengthen_below and left > 2.0 * h:

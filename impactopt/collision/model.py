@@ -175,6 +175,7 @@ class JointSpaceModel:
         """
         if not self.n:
             return ca.mtimes(ca.DM(0, 1), self.part(y, "impulse"))
+        # not an integral of its own: A, s and d are constant, so integrals of torque, force and time give it
         u = self._product(data["A"], self.part(y, "torque")) - ca.mtimes(data["s"], self.part(y, "impulse"))
         if self.slides:
             u -= ca.mtimes(data["s_point"], self.part(y, "sliding"))
@@ -400,6 +401,7 @@ class SegmentedCollision:
         if not self.freezes:
             return [self._segment(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0, record=True)]
         data |= {"velocity_before": ca.MX.zeros(self.model.n), "until": ca.MX(self.horizon)}
+        # contact's duration by the freeze at contact, then by one in its middle: see above
         predicted = self._time(self._loop(data, ca.MX(self.model.start()), 1.0)[0])
         (trial,) = self._segments(inputs, data, predicted, [0.0, 1.0], record=False)
         return self._segments(inputs, data, self._time(trial.final), cuts(self.freezes), record=True)
@@ -416,14 +418,19 @@ class SegmentedCollision:
         for a, b in pairwise(ends):
             last = b == ends[-1]
             # predict the middle of this segment with the freeze before it
+            # `reached` counts its time since the segment before began, as its data do
             ahead = data | {"until": self._time(reached) + duration * (b - a) / 2}
+            # A fraction of the horizon, as the number of Runge-Kutta steps has to be constant; `until` ends
+            # it earlier.
             middle = self._loop(ahead, reached, (b - a) / 2)[0]
             q_middle, v_middle = self._moved(data, frozen_at, q, v, middle)
             if segments:
                 q, v = segments[-1].q_after(), segments[-1].v_after()
             frozen_at = q_middle
+            # v_middle is the velocity to freeze the drifts at, so nothing is to be estimated (`GIVES_WAY`)
             data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], ca.DM([GIVES_WAY, 0.0]))
             data = relative_to(inputs, duration * (a + b) / 2, data)
+            # Coefficients are of the middle, but the segment begins at q and v: so its speeds are by J of q.
             data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
             if self.model.slides:
                 data["point_velocity"] = self.frozen.velocity_of_point(q, v, inputs["normal"])
@@ -438,6 +445,7 @@ class SegmentedCollision:
             segments.append(self._segment(data, frozen_at, q, v, *begin, record=record))
             reached = segments[-1].final
             start = self._next_start(reached)
+            # once separated, always: bodies that meet again are not in this model
             contact *= self.model.phase(reached, data)[1]
         return segments
 
@@ -484,6 +492,8 @@ class SegmentedCollision:
     def _moved(self, data: dict[str, Any], frozen_at: Any, q: Any, v: Any, y: Any) -> tuple[Any, Any]:
         """Configuration and velocity at state y, from those at the start of the segment."""
         time = self._time(y)
+        # The integral of v_0 + change(t). Changes are linear in the integrals of the state, so their integral
+        # has the second integrals in their place.
         displacement = v * time + self._change(data, frozen_at, y, second=True)
         return self.frozen.integrate(q, displacement), v + self._change(data, frozen_at, y)
 

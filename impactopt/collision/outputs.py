@@ -110,6 +110,8 @@ class Outputs:
         self._instants = [Instants(model, segment, soles, held, v) for segment in segments]
 
     def __getattr__(self, name: str) -> Any:
+        # called for attributes that this class does not have: histories are those of all segments, side by
+        # side
         if name not in HISTORIES:
             raise AttributeError(name)
         history = ca.horzcat(*[getattr(instants, name) for instants in self._instants])
@@ -129,6 +131,7 @@ class Outputs:
     @cached_property
     def step_error(self) -> Any:
         left_out = self._model.part(self._last.final, "left_out")
+        # without an impulse there is no error either: 0 / 1e-300
         return left_out / ca.fmax(self.impulse, 1e-300)
 
     @cached_property
@@ -189,6 +192,7 @@ class Instants:
         model = self._model
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
         numbers = {name: ca.SX.sym(name) for name in model.law.parameters}
+        # in SX and mapped, as laws are written for one instant
         law = ca.Function("force", [x, rate, *numbers.values()], [model.law.force(x, rate, numbers)])
         rates = model.rate(self._states, self._data)
         columns = self._states.size2()
@@ -266,6 +270,7 @@ class Instants:
         total = ca.repmat(self._data["unmodelled_wrench"], 1, self._states.size2())
         for i in range(self._n_soles):
             wrench = self.sole_wrench[6 * i : 6 * i + 6, :]
+            # moment about the world's origin: m + p x f
             arm = ca.skew(self._data["sole_positions"][:, i])
             total = total + ca.vertcat(wrench[:3, :], wrench[3:, :] + ca.mtimes(arm, wrench[:3, :]))
         return total

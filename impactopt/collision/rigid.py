@@ -87,9 +87,12 @@ class RigidImpact(CollisionModel):
         hand, change = self._by_unit_impulse(q)
         speed, inverse_mass = float(hand @ v), float(hand @ change)
         # change of the target's state, and of its velocity [1/kg], by a unit impulse
+        # both targets are linear in the force, so a unit force for a unit of time is a unit impulse
         gain = np.array(self.target.derivative(state, 1.0, numbers), dtype=float)
+        # the velocity is linear in the state, with `before` at zero
         of_target = float(self.target.velocity(gain, numbers)) - before
         e = self.coefficient_of_restitution
+        # a hand that does not approach does not hit
         impulse = max((1 + e) * (speed - before) / (inverse_mass + of_target), 0.0)
         after, state = v - change * impulse, gain * impulse
         values = self.target.result(state, numbers)

@@ -62,6 +62,7 @@ def rk4_step(model: JointSpaceModel, length: float) -> Any:
     """ca.Function (y, *data) -> state `length` [s] later; after separation y itself."""
     y, data, u = ca.SX.sym("y", model.n_states), model.small_symbols(), ca.SX.sym("u", model.n)
     rate = ca.Function("rate", [y, *data.values(), u], [rate_of_change(model, y, u, data)])
+    # A step of length zero leaves the state as it is: so the number of steps can be constant.
     time = model.longest(y, data, length) * model.running(y, data)
     step_length = ca.Function("step_length", [y, *data.values()], [time])
     Y, D = ca.MX.sym("y", model.n_states), model.symbols(ca.MX)
@@ -78,6 +79,7 @@ def rk4_step(model: JointSpaceModel, length: float) -> Any:
     y_next = Y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     if model.peak:
         peak = model.layout["peak"]
+        # the force at the step's start is the slope of the impulse there
         largest = ca.fmax(Y[peak], ca.if_else(h > 0, model.part(k1, "impulse"), 0.0))
         y_next = ca.vertcat(y_next[: peak.start], largest, y_next[peak.stop :])
     if model.error:
@@ -103,6 +105,7 @@ def rate_of_change(model: JointSpaceModel, y: Any, u: Any, data: dict[str, Any])
         "penetration": rate,
         "impulse": force,
         "target": ca.vertcat(*target),
+        # `rk4_step` updates these two, which are no integrals
         "peak": 0.0,
         "left_out": 0.0,
         "torque": tau,

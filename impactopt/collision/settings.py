@@ -184,6 +184,7 @@ class Settings(Mapping[str, Array]):
             array = np.minimum(array, NO_LIMIT)
         if name in ("kp", "kd") and array.ndim == 2:
             # a servo must not add energy
+            # x' K x depends on the symmetric part alone
             least = float(np.linalg.eigvalsh((array + array.T) / 2).min())
             if least < -1e-9 * np.abs(array).max():
                 raise InputError(f"{name}: not positive semidefinite, it has the eigenvalue {least:.3g}")

@@ -28,6 +28,7 @@ def law_is_linear(law: ContactLaw) -> bool:
     parameters, branches = _law_parts(law)
     slopes = ca.horzcat(*[ca.jacobian(f, x) for f, x in branches])
     found = [_sampled(parameters, law.parameters, slopes, branches[0][1], k) for k in range(_PARAMETER_SETS)]
+    # Exactly equal: the slopes of a linear law are expressions without penetration and rate.
     return all((values == values[0]).all() for values in found)
 
 
@@ -52,7 +53,9 @@ def _sampled(parameters: Any, values: dict[str, float], f: Any, x: Any, seed: in
     """
     rng, function = np.random.default_rng(seed), ca.Function("f", [parameters, x], [ca.densify(ca.vec(f))])
     own = np.array(list(values.values()))
+    # other parameters, as one that happens to be 0 or 1 may hide a nonlinear term
     given = own * rng.uniform(0.5, 2.0, own.size) + rng.uniform(0.1, 0.5, own.size) if seed else own
+    # from micrometres to tens of kilonewtons, so that thresholds of either are crossed
     sizes = np.repeat(np.logspace(-6, 4, 11), 12)
     points = sizes * rng.uniform(-1.0, 1.0, (x.size1(), sizes.size))
     return np.array(function(given, points)).T  # all points in one call

@@ -261,6 +261,7 @@ class SymbolicModel(SteppedModel):
 
     def _check_parameters(self, parameters: tuple[str, ...]) -> None:
         for name in parameters:
+            # refuses an unknown name
             self.settings.override({name: self.settings.get(name, 0.0)})
 
     def _with_parameters(self, whole: Any, parameters: tuple[str, ...]) -> Any:
@@ -360,6 +361,7 @@ class SymbolicModel(SteppedModel):
             force = values["target_breaking_force"]
             error += float(left_out_by_breaking(self, result.impulse, outputs["target_result"][:, 0], force))
         # If the contact is broken off early, the error is relative to the impulse of a plastic impact.
+        # plastic impulse v_c / (m + 1 / m_t), after which hand and target have one speed
         parameters = {name: values[f"target_{name}"] for name in self.target.parameters}
         inverse_mass = float(frozen["m"].item()) + float(target_start(self.target, parameters)[0])
         plastic = float(result.hand_speed[0] - result.target_speed[0]) / max(inverse_mass, 1e-300)

@@ -51,6 +51,7 @@ __all__ = [
     "check_names",
     "check_prices",
     "check_stance",
+    "check_strikers",
     "check_touches",
     "check_world",
 ]
@@ -133,9 +134,7 @@ def check_stance(problem: Any) -> None:
 
 
 def check_hands(problem: Any) -> None:
-    """InputError for a supporting hand without a known grip, in a model without it, or on the striking
-    arm.
-    """
+    """InputError for a supporting hand without a known grip, or in a model without it."""
     p, robot, grip = problem, problem.robot, problem.extra(Grip)
     hands = p.stance.held_hands(robot)
     if not hands:
@@ -152,14 +151,25 @@ def check_hands(problem: Any) -> None:
         )
     if p.collision != "full":
         raise InputError(f'a plan whose hand holds on needs collision="full", not {p.collision!r}')
-    for hand in hands:
-        arm = set(robot.limb(hand.model_frame)[-LEG:])
+
+
+def check_strikers(problem: Any) -> None:
+    """InputError for a striker on the limb of a sole that stands or of a hand that holds on.
+
+    A plan computes the striking point from the coordinates that these joints follow from, without them.
+    """
+    p, robot = problem, problem.robot
+    ends = [(f"sole {sole.name!r} stands", sole.frame, "stand on") for sole in p.stance.soles(robot)]
+    hands = p.stance.held_hands(robot)
+    ends += [(f"hand {hand.name!r} holds on", hand.model_frame, "hold on with") for hand in hands]
+    for end, frame, verb in ends:
+        limb = set(robot.limb(frame)[-LEG:])
         for name in p.strikers:
-            if not (both := arm & set(robot.limb(robot.striker(name).model_frame))):
+            if not (both := limb & set(robot.limb(robot.striker(name).model_frame))):
                 continue
             raise InputError(
-                f"the hand {hand.name!r} holds on, so it cannot carry the striker {name!r} (both move "
-                f"by {', '.join(robot.joint_names[j] for j in sorted(both))}): hold on with another one"
+                f"the {end}, so it cannot carry the striker {name!r} (both move "
+                f"by {', '.join(robot.joint_names[j] for j in sorted(both))}): {verb} another one"
             )
 
 

@@ -51,6 +51,7 @@ from impactopt.problem.checks import (
     check_names,
     check_prices,
     check_stance,
+    check_strikers,
     check_touches,
     check_world,
 )
@@ -220,6 +221,7 @@ class ImpactProblem:
         sound = striker and stance and terms and mistakes.attempt(partial(check_second, self))
         if sound:
             mistakes.attempt(partial(check_hands, self))
+        sound = sound and mistakes.attempt(partial(check_strikers, self))
         if sound and aim and mistakes.attempt(lambda: self.contact_posture):
             mistakes.attempt(partial(check_moves, self))
         mistakes.raise_if_any("the problem")

@@ -96,6 +96,7 @@ class _PostureSearch:
         self.polygon = support_polygon(robot, StanceCoordinates(robot, soles, q0)) if soles else np.zeros(0)
         joints = robot.joint_positions(q0)
         free = np.full(robot.nv - robot.n, np.inf)
+        # a start outside of its range may stay there, but go no farther out
         self.low = np.concatenate([-free, np.minimum(robot.lower + _RANGE_MARGIN - joints, 0.0)])
         self.high = np.concatenate([free, np.maximum(robot.upper - _RANGE_MARGIN - joints, 0.0)])
         # the base follows from the legs; a small weight makes the Hessian regular
@@ -109,7 +110,9 @@ class _PostureSearch:
         """Displacements of the fixed frames, and logarithmic error of the effective mass; 0 if feasible."""
         q = pin.integrate(self.model, self.q0, d)
         pin.framesForwardKinematics(self.model, self.data, q)
+        # zero where a frame is in place, and smooth near it
         displacements = [pin.log6(at.actInv(self.data.oMf[i])).vector for i, at in self.fixed]
+        # the logarithm, as masses differ by factors, and its slope is of order one at any mass
         return np.concatenate([*displacements, [np.log(float(self._effective_mass(q)) / self.mass)]])
 
     def balance(self, d: Array) -> Array:
@@ -169,6 +172,7 @@ def errors_against(
     The last two are evaluated at the result's instants while both are in contact, at equal times since
     contact, with linear interpolation of the reference; ZMPs only while both normal forces exceed 50 N.
     """
+    # both histories begin at contact, so these are the first k instants
     time = result.time[result.time <= reference.time[-1]]
     k = time.size
 

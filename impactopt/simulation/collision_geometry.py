@@ -151,6 +151,7 @@ class Solids:
             else:
                 distance = np.linalg.norm(centre[:, one] - centre[:, other], axis=1)
                 gap = distance - radius[one] - radius[other]
+            # where the target goes depends on the simulated contact, which the reference does not have
             moving = other != FLOOR and (self.solids[one].moves or self.solids[other].moves)
             if moving or gap.min() < NEAR:
                 out.append((one, other))
@@ -195,6 +196,7 @@ class UnintendedContacts:
         self._number[0] = 0
         for k in range(world.ngeom):
             kind, _, number = world.geom(k).name.partition(" ")
+            # geoms are numbered by MuJoCo; names keep the scene's numbers, of which only some have a geom
             if kind == "solid":
                 self._number[k] = 1 + int(number)
         self._mocap = int(world.body("target").mocapid[0])
@@ -214,7 +216,9 @@ class UnintendedContacts:
         if not both.any():
             return
         for k in np.flatnonzero(both & (contacts.dist < 0)):
+            # a pair has one entry, whichever of its geoms MuJoCo names first
             one, other = (int(n) for n in sorted(numbers[k], reverse=True))
+            # -1: MuJoCo has left the contact out; else its first constraint is the normal one
             address = contacts.efc_address[k]
             force = float(data.efc_force[address]) if address >= 0 else 0.0
             contact = self._contacts.setdefault((one, other), [t, t, 0.0, 0.0])

@@ -107,6 +107,7 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
 
 def _sampled(time: Array, q: Array, travel: Array) -> NDArray[np.intp]:
     """Indices of the first and last instant, and of those at which bodies have moved since the one before."""
+    # the first recorded instant in each millisecond, as in contact all steps are recorded
     _, every = np.unique(np.floor(time / SAMPLING), return_index=True)
     coordinates = np.column_stack([q, travel])
     chosen = [0]
@@ -130,6 +131,7 @@ def with_step_error(run: Callable[..., Simulation], *given: Any, **options: Any)
     simulation diverges, the step is halved, at most three times; a given step longer than the default is
     kept.
     """
+    # the default of the engine's signature
     own = float((run.__kwdefaults__ or {})["step"])
     step = float(options.pop("step", own))
     for left in range(HALVINGS, -1, -1):
@@ -165,12 +167,14 @@ def _step_error(
         return np.nan
     for other in (own if step > own else 2 * step, step / 2):
         try:
+            # only to shortly after the impact, up to which impulses are compared
             compared = run(*given, **options, step=other, until=until)
         except InputError:
             continue  # twice the step may be too long for the servo
         impulses = [sum(touch[2] for touch in s.touches if touch[0] <= until) for s in (simulation, compared)]
         largest = max(impulses)
         return abs(impulses[0] - impulses[1]) / largest if largest > 0 else np.nan
+    # all steps tried diverge
     return np.inf
 
 

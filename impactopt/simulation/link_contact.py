@@ -59,6 +59,8 @@ class LinkContact:
         """
         distance, point = MAX_DISTANCE, None
         for link, body in self._pairs[striker]:
+            # the distance up to a limit, negative in penetration; `_ends` gets the nearest points, first that
+            # of the link
             of_pair = self._mujoco.mj_geomDistance(self._world, data, link, body, MAX_DISTANCE, self._ends)
             if of_pair < distance:
                 distance, point = of_pair, self._ends[:3].copy()

@@ -36,7 +36,7 @@ class Servo:
         self.place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
         # q has the cosine and sine of a continuous joint's angle
         self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
-        angles = np.array([self.angles(q) for q in reference.q])
+        angles = robot.joint_positions(reference.q)
         angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
         rates, torques = np.array(reference.v[:, -robot.n :]), np.array(reference.torque)
         # springs do not follow the plan: they carry the tool at rest at first, and deflect from there
@@ -48,6 +48,7 @@ class Servo:
 
     def angles(self, q: Array) -> Array:
         """Joint angles (n,) of a configuration; those of continuous joints in [-pi, pi]."""
+        # as `Robot.joint_positions`, without its checks: it is called in every step
         out = q[self.place]
         for k in self.continuous:
             out[k] = np.arctan2(q[self.place[k] + 1], q[self.place[k]])
@@ -56,6 +57,8 @@ class Servo:
     def target(self, t: float) -> Array:
         """Reference angles, rates and feed-forward (3 n,) at a time [s]; at a jump, the values after it."""
         i = min(max(int(np.searchsorted(self.time, t, side="right")) - 1, 0), len(self.time) - 2)
+        # at a jump two times are equal; `searchsorted` from the right takes the later one, so no interval has
+        # length 0
         f = min((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 1.0)
         return np.asarray((1 - f) * self.reference[i] + f * self.reference[i + 1])
 
@@ -88,6 +91,7 @@ class GearWatch:
         """Records an instant: torque (n,) [N m] of the motors, acceleration (nv,) of the robot."""
         # the motor's share that accelerates its own rotor does not pass the gear
         load = torque - self._armature * acceleration[-len(self._armature) :]
+        # both signs apart, as the largest magnitude may be of either
         np.maximum(self._high, load, out=self._high)
         np.minimum(self._low, load, out=self._low)
 
@@ -171,6 +175,7 @@ class Motors:
         """Mean torque (n,) [N m] during a time [s], for a constant wanted torque (n,)."""
         if not self._slow:
             return wanted
+        # infinite of a motor without inductance: the factor of the difference is 1 / inf = 0
         decay = self._rate * time
         # the exponential in `after`, integrated and divided by the time
         return wanted - np.expm1(-decay) / decay * (torque - wanted)

@@ -85,6 +85,8 @@ class _Replay(MujocoRobot):
         self.links = LinkContact(self.mujoco, self.world, link_pairs) if link_pairs else None
         self.depths = np.full(len(scene.strikers), -np.inf)  # [m] of striking points in the target
         if self.links is not None:
+            # MuJoCo else takes a site that is compiled at its body's origin to be there, whatever its
+            # position
             self.world.site_sameframe[self.sites] = 0  # striking points move on their links
         self.grips = Welds(self.world, scene.hands)
         self.unintended = UnintendedContacts(self.world, solids)
@@ -193,8 +195,10 @@ class _Replay(MujocoRobot):
         self.response = None
         if contact.near(depths, speeds, self.target, step):
             self.response = np.zeros_like(self.normal_jacobian)
+            # M is the free robot's: MuJoCo's contacts hold the soles, and their effect is in `accelerations`.
             self.mujoco.mj_solveM(self.world, d, self.response, self.force_map)
             inverse_mass = self.normal_jacobian @ self.response.T
+            # speeds' change minus that by the contact forces of the last step, -M^-1 f
             accelerations = zero if self.last_step is None else (speeds - self.last_step[0]) / step
             accelerations = accelerations + (
                 zero if self.last_step is None else inverse_mass @ self.last_step[1]
@@ -418,6 +422,8 @@ def simulate_mujoco(
             if motors.lines:
                 cuts.update(t, saturated_demand, cut, step)
             drive = cut if drive is None else drive
+            # The step has the mean torque, by which its impulse is exact; the motor's own state goes on from
+            # its end.
             torque, drive = motors.mean(drive, cut, step), motors.after(drive, cut, step)
             if has_passive:  # springs act at every step: no computer samples them
                 torque = np.where(passive, servo.springs(data.qpos[replay.qpos_index], rates), torque)

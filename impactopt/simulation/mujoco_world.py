@@ -136,6 +136,7 @@ def spec_of(robot: Robot, solver: MujocoOptions) -> Any:
     mujoco = mujoco_module()
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
+    # inertias are taken as they are: balancing would change those that are not physical, without a word
     spec.compiler.balanceinertia = False
     spec.option.timestep = solver.step
     spec.option.iterations, spec.option.tolerance = solver.iterations, solver.tolerance
@@ -225,6 +226,7 @@ def _robot_bodies(
         hand.add_site(name=site_name(k), pos=frame.placement.translation)
     if perturbation.payload > 0:
         load = hand.add_body(name="payload", pos=frame.placement.translation)
+        # a radius of gyration of 1 cm, as a body needs an inertia
         _inertial(load, perturbation.payload, np.zeros(3), 1e-4 * perturbation.payload * np.eye(3))
     return bodies
 
@@ -243,6 +245,7 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
             continue
         joints, placement, placements = chain[chain.index(parent) + 1 :], pin.SE3.Identity(), list[Any]()
         for i in joints:
+            # placements of all joints of the chain in the body's parent, at zero angles
             placement = placement * model.jointPlacements[i]
             placements.append(placement)
         body = bodies[parent].add_body(
@@ -319,6 +322,7 @@ def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[s
 def _surface(geom: Any, perturbation: Perturbation, *, sole: bool) -> None:
     """Sets the contact parameters of the floor, or of a corner of a sole."""
     geom.contype, geom.conaffinity = int(sole), int(not sole)  # soles touch the floor, not each other
+    # of two geoms MuJoCo takes the larger friction, so floor and soles have the same
     geom.friction = [perturbation.friction, 1e-3, 1e-4]
     geom.condim = 3
     geom.solref = [perturbation.floor_time, 1.0]

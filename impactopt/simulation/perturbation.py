@@ -95,6 +95,7 @@ class Perturbation:
         of_law, of_target = scaled_numbers(
             "perturbation", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
         )
+        # away from the robot, as the normal is the way in which the target is pushed
         displacement = self.distance * planned.normal
         solids = planned.solids.moved(displacement) if self.distance else planned.solids
         solids = solids.without_target() if self.missing else solids

@@ -151,6 +151,8 @@ class _World:
             if contact.near(depths, speeds, s.target, step):
                 units = np.eye(len(speeds))
                 a = body.accelerate(torque, 0.0 * speeds)
+                # Accelerations are affine in the contact forces: differences with unit forces give the
+                # response, and with it J P J', whatever is fixed, without inverting H.
                 response = np.column_stack([a - body.accelerate(torque, unit) for unit in units])
                 inverse_mass = body.normal_jacobian @ response
                 push = contact.pushed(
@@ -197,6 +199,8 @@ class _World:
         if push is not None and np.any(push.first_half != first.forces):
             a = self.body.accelerate(first.torque, push.first_half)
         half = _State(
+            # explicit midpoint rule: half a step by the rates at the start, then a whole one by the rates in
+            # its middle
             q=pin.integrate(self.model, s.q, h / 2 * s.v),
             v=s.v + h / 2 * a,
             travel=s.travel,
@@ -204,6 +208,8 @@ class _World:
             impulses=s.impulses,
             drive=self.motors.after(s.drive, first.cut, h / 2),
         )
+        # mean forces of the whole step, so that momentum is exchanged exactly as the target's integration has
+        # it
         middle = self.rates(t + h / 2, half, forces=0.0 * first.forces if push is None else push.forces)
         if push is None:
             target, travel = self.contact.untouched_step(s.target, s.travel, h)
@@ -223,6 +229,7 @@ class _World:
         # travel that makes them agree.
         self.body.update(after.q, after.v)
         travels = self.depths(replace(after, travel=0.0)) - push.depths
+        # a point beside the target's surface has no depth
         known = travels[np.isfinite(travels)]
         return replace(after, travel=float(known.mean())) if known.size else after
 

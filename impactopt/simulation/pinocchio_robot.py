@@ -131,6 +131,7 @@ class DenseBody(Body):
         super().__init__(*args)
         size = self.nv + 6 * len(self.frames)
         self._matrix, self._right = np.zeros((size, size)), np.zeros(size)
+        # constant; the other blocks are written at every update
         self._matrix[self.nv :, self.nv :] = np.diag(self.compliance)
         self._zero = np.zeros(self.nv)
 

@@ -70,6 +70,7 @@ REPORT = (
 
 def travelled(time: Array, speed: Array, contact_start: float) -> Array:
     """Travel (k,) [m] since contact began, from speeds (k,) [m/s]; without contact (nan), since the start."""
+    # trapezoidal rule
     gone = np.concatenate([[0.0], np.cumsum(np.diff(time) * (speed[1:] + speed[:-1]) / 2)])
     return gone - np.interp(contact_start, time, gone) if np.isfinite(contact_start) else gone
 
@@ -363,6 +364,7 @@ class Simulation:
 
 def centre_of_pressure(wrench: Array) -> Array:
     """Centre of pressure (..., 2) [m] on the ground of wrenches (..., 6) about the origin; nan at no load."""
+    # moment about the origin over normal force: (-M_y, M_x) / F_z on the plane z = 0
     normal = np.where(wrench[..., 2] > 1e-6, wrench[..., 2], np.nan)
     return np.stack([-wrench[..., 4], wrench[..., 3]], axis=-1) / normal[..., None]
 
@@ -370,6 +372,8 @@ def centre_of_pressure(wrench: Array) -> Array:
 def distance_inside(polygon: Array, points: Array) -> Array:
     """Distance (k,) [m] of points (k, 2) from a counter-clockwise polygon's nearest edge, < 0 outside."""
     edge = np.roll(polygon, -1, axis=0) - polygon
+    # As `kinematics.support.margin`, which engines do not import: they share no code with the planner. Edges
+    # of a counter-clockwise polygon have the inside on their left.
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return np.asarray((points @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1))
 
@@ -444,6 +448,7 @@ class Touches:
                 self.intervals.append([t + since, t + since, 0.0])
             self.intervals[-1][2] += force * step
         self.touched = self.touching or force > 0
+        # in the step after a touch, too: its start is the touch's end
         if self.touched:
             self.intervals[-1][1] = max(t, self.intervals[-1][0])
         self.touching = force > 0
@@ -512,6 +517,7 @@ def _standing_intervals(
     """
     if not stance.size:
         return [(0, count)]
+    # zeros at both ends, so that a stance that begins or ends the motion has edges too
     on = np.pad(scene.standing[stance, sole].astype(int), 1)
     return list(zip(np.flatnonzero(np.diff(on) > 0), np.flatnonzero(np.diff(on) < 0), strict=True))
 
@@ -547,6 +553,7 @@ def check_not_diverged(rates: Array, t: float, step: float) -> None:
 
 def posture_error(model: Any, q: Array, planned: Array) -> float:
     """Largest error [rad] of a joint or of the base's orientation at q (nq,)."""
+    # in the tangent space, whose components 3 to 5 are the base's rotation vector
     error = np.abs(pin.difference(model, planned, q))
     if model.joints[1].nv == 6:
         return float(max(np.linalg.norm(error[3:6]), error[6:].max(initial=0.0)))

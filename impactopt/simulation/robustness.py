@@ -94,6 +94,7 @@ def draw_perturbations(n: int, seed: int = 0, ranges: PerturbationRanges | None 
         raise InputError(f"ranges: {shortened(repr(ranges))}; give PerturbationRanges")
     chosen = ranges if ranges is not None else PerturbationRanges()
     bounds = chosen.bounds()
+    # row by row, so that the first draws are the same for any n
     unit = np.random.default_rng(seed).random((n, len(bounds)))
     columns, planned = {}, Perturbation(period=chosen.period)
     for (name, (low, high)), u in zip(bounds.items(), unit.T, strict=True):
@@ -151,6 +152,7 @@ class Robustness:
     def interval(self) -> tuple[float, float]:
         """Wilson's 95 % interval of the rate at which the plan stands under such perturbations."""
         n, p = self.draws, self.rate
+        # Wilson's, as that of the normal approximation has no width if all draws stand
         centre = (p + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
         half = Z95 / (1 + Z95**2 / n) * np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n**2))
         return max(0.0, float(centre - half)), min(1.0, float(centre + half))
@@ -213,6 +215,7 @@ class Robustness:
         for name, value in self.table().items():
             low, high = self.drawn_from.bounds()[name]
             x, ends = (np.log(a) if name in LOGARITHMIC else a for a in (value, np.array([low, high])))
+            # an empty range has all draws in its first third
             width = max(float(ends[1] - ends[0]), np.finfo(float).tiny)
             third = np.clip(np.floor(3 * (x - ends[0]) / width), 0, 2)
             groups = [self.standing[third == k] for k in range(3)]
@@ -243,6 +246,7 @@ def replay(shared: Shared, perturbation: Perturbation) -> Outcome:
     given = (shared.robot, shared.reference, shared.scene)
     controller = shared.controller
     if controller is not None:  # every draw has its own sensor errors, in whichever process it is replayed
+        # `hash` of a text differs between processes
         draw = zlib.crc32(repr(perturbation).encode())
         controller = replace(controller, seed=(controller.seed + draw) % MAX_SEED)
     try:

@@ -161,6 +161,7 @@ class TargetContact:
             method="RK45",  # Newton's method, of implicit ones, does not converge across a target's switches
             rtol=RELATIVE_TOLERANCE,
             atol=ABSOLUTE_TOLERANCE,
+            # a touch that begins within the step would else be stepped over, as there is no force before it
             max_step=0.5 * step,
         )
         if not found.success or found.t.size > MAX_POINTS or not np.isfinite(found.y).all():
@@ -178,6 +179,7 @@ class TargetContact:
             state=np.array(end[2 * h + 1 :]),
             travel=travel + float(end[2 * h]),
             depths=np.where(np.isfinite(depths), end[:h], -np.inf),
+            # the last instant of the integration without a force
             since=float(found.t[max(int(np.argmax(total > 0)) - 1, 0)]),
             times=found.t,
             touching=total > 0,
@@ -236,6 +238,7 @@ def smooth_steps(begin: Callable[[float, State], Move[State]], state: State, len
         after, smooth = move(high)
         if smooth:
             return after
+        # `move` tells no more than whether a switch is passed, so the step's length is bisected
         for _ in range(BISECTIONS):  # `low` is before the switch, `high` beyond it
             middle = (low + high) / 2
             low, high = (middle, high) if move(middle)[1] else (low, middle)

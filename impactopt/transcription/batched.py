@@ -44,6 +44,8 @@ class BatchedFunction:
         for first, last in _parts(calls, calls if columns == 1 else MAX_MAPPED_CALLS):
             buffer, run = _mapped(function, last - first).buffer()
             self._parts.append((slice(first * columns, last * columns), buffer, run))
+        # CasADi keeps bare pointers, so these arrays are written in place from now on and never replaced; the
+        # slices are contiguous, as they are of whole instances.
         for part, buffer, _ in self._parts:
             for i, a in enumerate(self.inputs):
                 if a.size:
@@ -84,6 +86,7 @@ class BatchedFunction:
     def pattern(self) -> tuple[Index, Index]:
         """Row and column indices of an instance's nonzeros, in CasADi's (column-major) order."""
         rows, columns = pattern(self._function.sparsity_out(0))
+        # In lanes the instances' patterns stand side by side, the first one's nonzeros first.
         return rows[: self.output.shape[1]], columns[: self.output.shape[1]]
 
 

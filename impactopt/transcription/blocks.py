@@ -112,15 +112,18 @@ def node(c: StanceCoordinates) -> BlockExpression:
     weight, lever, start = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("start", len(c.legs))
     u, udot = ca.SX.sym("u", ny), ca.SX.sym("udot", ny)
     v, a, stages = motion_in_stages(c, y, legs, u, udot)
+    # `rb` has symbols of its own: a call of a Function puts this node's q, v, a in their place.
     rnea = ca.Function("rnea", [c.rb.q, c.rb.v, c.rb.a], [c.rb.rnea(c.rb.v, c.rb.a)])
     tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(y, legs, w)
     out = {
         "closure": c.closure(y, legs),
+        # no actuator drives the base, so the first 6 equations have to be zero; the others give the torques
         "base": tau[: c.base, :] / base_scale(c, weight, lever),
         "torque": tau[c.base :] / limit,
         "leg_rate": leg_part(c, v) / rate_limit,
         "extension": c.leg_determinants(legs) / start,
     }
+    # u and udot are a stage: y', y'' and T enter through them only, which keeps the Hessian by them short
     through = [(u, y1 / T), (udot, y2 / T**2)]
     p = [limit, rate_limit, weight, lever, start]
     return make_block([y, y1, y2, legs, w, T], p, out, through, stages=stages)
@@ -160,6 +163,8 @@ def link() -> BlockExpression:
         rates d1, d2 in these two phases; ydot at contact; ydot after it.
     out = residuals of the rate at contact, and of position and rate after it.
     """
+    # One coordinate an instance: its Hessian is 12 x 12 at most, where that of all ny together would be
+    # mostly zeros.
     names = ("yf", "yf1", "Tf", "y", "y1", "Ts", "T1", "T2", "d1", "d2", "u0", "u")
     yf, yf1, Tf, y, y1, Ts, T1, T2, d1, d2, u0, u = z = [ca.SX.sym(s) for s in names]
     out = {"contact": y1 / Ts - u0, "position": yf - y - T1 * d1 - T2 * d2, "rate": yf1 / Tf - u}
@@ -181,6 +186,7 @@ def corner_heights(c: StanceCoordinates, frame: str, corners: int) -> BlockExpre
     y, zero, p = ca.SX.sym("y", c.ny), ca.SX.zeros(c.ny), ca.SX.sym("corners", 2 * corners)
     q, _, _ = c.upper_motion(y, zero, zero)
     rotation, point = c.rb_frame(frame, q)
+    # rotation[2, :2]: heights of the frame's x and y axes; a corner is x, y in the sole's plane
     heights = ca.mtimes(ca.reshape(p, 2, corners).T, rotation[2, :2].T) + point[2]
     return make_block([y], [p], {"height": heights, "place": point[:2]})
 
@@ -196,8 +202,10 @@ def spring(c: StanceCoordinates, gain_groups: JointGroups = ()) -> BlockExpressi
     """
     m = c.ny - c.base
     y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
+    # joints of the closed legs have no spring here: only coordinates y are independent
     rest, stiffness, damping = ca.SX.sym("rest", m), ca.SX.sym("k", m), ca.SX.sym("d", m)
     logs, place = ca.SX.sym("logs", len(gain_groups)), {int(j): k for k, j in enumerate(c.independent)}
+    # from joints of the robot to those of this block, which has none of the closed legs
     groups = tuple(tuple(place[j] for j in joints if j in place) for joints in gain_groups)
     scaled_stiffness, scaled_damping = with_gain_factors(stiffness, damping, logs, groups)
     torque = -scaled_stiffness * (y[c.base :] - rest) - scaled_damping * y1[c.base :] / T
@@ -218,6 +226,7 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
     com, h = ca.SX.sym("com", 3), ca.SX.sym("h", 6)
     stages.append(Stage(ca.vertcat(com, h), ca.vertcat(*momentum(c.configuration(y, legs), v))))
     mass = sum(i.mass for i in c.model.inertias)
+    # Pinocchio's order: h = linear (3), angular (3). Gravity's z is negative in the root below.
     velocity = h[:3] / mass
     capture = com[:2] + velocity[:2] * ca.sqrt(-com[2] / float(c.model.gravity.linear[2]))
     polygon = ca.SX.sym("polygon", 3 * edges)
@@ -277,6 +286,7 @@ def builders(
     if frozen is not None:
         lasting["moved"] = lambda: moved(c, striker)
     if frozen is not None and frozen.jdot and not freezes:
+        # one freeze, at the velocity v_meet, which an impact without rebound determines (`FrozenCollision`)
         lasting["impact"] = lambda: impact(c, striker)
     if target.guards:
         lasting["join"] = join
@@ -388,5 +398,6 @@ def _extra(block: BlockExpression | BlockRecipe, problem: ImpactProblem, element
 def key_of(block: BlockExpression) -> tuple[Any, ...]:
     """Hash of a block's expression: the cache key of a user's block, whose source is not hashed."""
     stages = [stage.symbols for stage in block.through], [stage.expression for stage in block.through]
+    # a stage's symbols are free in `out`, so here they are inputs, and their expressions outputs
     graph = ca.Function("block", [block.z, block.p, *stages[0]], [block.out, *stages[1]])
     return hashlib.sha256(graph.serialize().encode()).hexdigest(), block.lanes

@@ -55,11 +55,13 @@ class Builder:
         coordinates : of that stance phase.  node : name of its block ``node``.
         """
         other = copy.copy(self)
+        # a shallow copy: variables, blocks and constraints are the same lists, to which both builders add
         other.coordinates, other.limits = coordinates, Limits(self.problem, coordinates)
         other.ny, other.nl, other.nw = coordinates.ny, coordinates.nl, 6 * len(coordinates.legs)
         other.y0, other.legs0 = coordinates.start, coordinates.start_legs
         other.functions = dict(self.functions)
         for of in ("", "_jac", "_hess"):
+            # so `add_nodes` does not have to know the stance
             other.functions[f"node{of}"] = self.functions[f"{node}{of}"]
         return other
 
@@ -129,6 +131,7 @@ class Builder:
             upper=0,
             measure=measure,
         )
+        # in the order of their making, as an output may depend on variables lifted before (`with_lifted`)
         self.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
         return group
 

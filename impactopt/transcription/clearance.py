@@ -68,6 +68,8 @@ class Chain:
 
         rotation : axes, as columns, of the world's body that the chain begins at.
         """
+        # Sums, as the base's position is turned into the other body's axes: R' p has three terms a component.
+        # Links of one robot do not need it: the base moves both.
         index = _coordinate_indices(c)
         slots = [3 + k for k in range(len(self.columns))]
         coordinates, factors = [index[k] for k in self.columns], list(self.ratios)
@@ -96,14 +98,16 @@ def _coordinate_indices(c: StanceCoordinates) -> list[int]:
 
 def chain_between(model: Any, one: int, other: int) -> Chain:
     """Chain from the frame of joint ``other`` to that of ``one``; 0: the world."""
+    # Pinocchio numbers joints from the root outwards, so the largest number that both have is the nearest
+    # common ancestor; 0, the world, is in all lists.
     up_one, up_other = list(model.supports[one]), list(model.supports[other])
     shared = max(j for j in up_one if j in up_other)  # lowest common ancestor
-    if other == 0:
-        shared = 0
     # The chain goes up from the other body to the common ancestor, and down to the one. `place` collects the
     # fixed placements until the next joint.
     place, placements, base = pin.SE3.Identity(), [], False
     joints: list[tuple[int, float, float]] = []  # column, ratio, 1 if it is revolute
+    # Upwards each joint is passed from its child side: its axis placement, minus its coordinate (the ratio
+    # -1), and the inverse of what comes before the joint downwards.
     for j in reversed([j for j in up_other if j > shared]):
         joint = axis_of(model, j)
         axis, revolute = _axis_to_z(joint)
@@ -113,6 +117,8 @@ def chain_between(model: Any, one: int, other: int) -> Chain:
     for j in [j for j in up_one if j > shared]:
         if model.joints[j].nv == 6:  # floating base: position, and yaw, pitch, roll in turn
             base, place = True, place * model.jointPlacements[j]
+            # R = Rz(yaw) Ry(pitch) Rx(roll), so the chain turns by yaw first; columns are of y = (p, roll,
+            # pitch, yaw)
             for column, direction in ((5, [0, 0, 1]), (4, [0, 1, 0]), (3, [1, 0, 0])):
                 axis = _turned(np.array(direction, dtype=float))
                 placements.append(place * axis)
@@ -148,6 +154,7 @@ def _axis_to_z(joint: Axis) -> tuple[Any, float]:
 def _turned(direction: Array) -> Any:
     """Placement at the origin whose z axis has this direction."""
     up = np.array([0.0, 0.0, 1.0])
+    # opposite vectors do not determine the axis of their rotation: half a turn about x
     if np.abs(direction + up).max() < 1e-8:
         return pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     return pin.SE3(pin.Quaternion.FromTwoVectors(up, direction).matrix(), np.zeros(3))
@@ -212,6 +219,7 @@ class SeparationBlock(Block):
         )
 
     def take_parameters(self, parameters: Array) -> None:
+        # in place, as the functions' inputs are this array
         self.of.numbers[...] = parameters
         self.of.forget()
 
@@ -266,6 +274,8 @@ def add_clearance_constraints(
     bodies, shapes = b.problem.bodies, b.problem.bodies.shapes
     spot_of = {place.name: k for k, (place, _) in enumerate(spots)}
     width = b.ny + b.nl
+    # All nodes' (y, legs) as one sparse matrix, of which a product with a selection takes the z of all
+    # constraints at once.
     everywhere = stack([part for _, slots in spots for part in slots])
     coordinates, constants = everywhere.matrix(b.layout.n), everywhere.const
     known: dict[tuple[int, int], _BodyPair] = {}
@@ -303,6 +313,7 @@ def add_clearance_constraints(
         counts = [len(slots) for slots, _, _ in group.patterns]
         slots, columns, factors = (np.concatenate([p[k] for p in group.patterns]) for k in range(3))
         instance = np.repeat(np.arange(count), counts)
+        # rows of `coordinates`: (y, legs) of one node after the other, `width` each
         at = np.repeat(group.spots, counts) * width + columns
         chosen = sp.csr_array((factors, (instance * size + slots, at)), shape=(count * size, len(constants)))
         of = Separations(
@@ -327,6 +338,8 @@ def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_
     own = sp.coo_array(matrix)
     rows, columns, values = [own.coords[0]], [own.coords[1]], [own.data]
     for _, slots in spots:
+        # a dense square of each node's variables: any pair of bodies may get a constraint there in a later
+        # round
         touched = np.unique(stack(slots).cols)
         rows.append(np.repeat(touched, len(touched)))
         columns.append(np.tile(touched, len(touched)))
@@ -343,6 +356,8 @@ def move_bodies(
     """Update the blocks of these constraints to a problem that has moved, but not rotated, bodies."""
     of_name = {block.name: block for block in blocks}
     parameters = {name: block.parameters.copy() for name, block in of_name.items()}
+    # Constraints are in the order of `add_clearance_constraints`, so counting them by block finds the
+    # instance.
     instance = dict.fromkeys(of_name, 0)
     for key, direction in constraints.items():
         chain = _chain(problem.robot, key.joint, max(key.other, 0))

@@ -146,6 +146,7 @@ def jump_at_contact(
     pushes = normals  # generalized force of a unit normal force, with its friction
     if problem.friction is not None:
         pushes = np.array([problem.friction.way(problem.normal, J @ v) @ J for J in jacobians])
+    # rate of the penetration, whose depth is zero: only the law's damper has a force there
     approach = normals @ v - float(problem.target.speed_before())
     forces = np.array([float(law.branch(0.0, float(rate), True)) for rate in approach])
     # H da = J_c' dw - j' f, with J_c da = 0: dw by least squares, as a straight knee makes J_c H^-1 J_c'
@@ -158,6 +159,8 @@ def jump_at_contact(
     da = of_forces + of_wrenches @ dw
     base = da[: c.base].copy()
     if c.base:  # from the base's own frame to rates of its coordinates
+        # Velocities do not jump, so products of velocities cancel in the change: a rotation and a matrix are
+        # enough.
         base[:3] = pin.rpy.rpyToMatrix(y[3:6]) @ base[:3]
         base[3:] = np.linalg.solve(pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL), base[3:])
     independent = np.concatenate([base, da[c.base :][c.independent]])
@@ -259,6 +262,7 @@ class Collocated:
 
     def _place(self, s: CollocationPoint) -> Place:
         time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
+        # a scenario's name may have braces, and the text is a format for the time
         suffix = self.suffix.replace("{", "{{").replace("}", "}}")
         return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
 
@@ -274,6 +278,7 @@ class Collocated:
         common: dict[str, Any] = {"term": term, "place": place, "lower": -most, "upper": most}
         common["measure"] = percent("over its limit", of=most)
         if b.problem.of_drives:
+            # terms use these torques again, and an output of a block may be in one constraint only
             name = f"torque in collision, {place.name}"
             self.torques.append(b.lift(name, outputs, labels=b.robot.joint_names, **common)[0])
         else:
@@ -293,6 +298,7 @@ class Collocated:
 
     def _motion(self, i: int) -> list[Affine]:
         """Slots of `impactopt.problem.block.joint_motion` at a stage."""
+        # value and slope of u, which is ydot already: so the S of ydot = r/S is one
         rates = self._slots(self.u, i, self.contact.u0[0])
         return [self.contact.state.y, *self._travel(i), *rates, Affine.constant(1.0), self.legs[i]]
 
@@ -311,6 +317,7 @@ class Collocated:
         velocity = [c.complete_motion(y, rates, 0 * rates, legs)[1][c.base :]]
         acceleration = [jump_at_contact(b.problem, c, law, y, rates, legs)[3]]
         for i in range(len(self.stages)):
+            # slots of `_motion`; the S among them is one
             y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
             _, v, a = c.complete_motion(y0 + T1 * d1 + T * d, u, slope / T, legs_there)
             velocity.append(v[c.base :])
@@ -322,6 +329,7 @@ class Collocated:
         s, labels = self.stages[i], integrals.labels
         integral = integrals[i]
         for m, w in zip(s.members, s.quadrature, strict=True):
+            # d_i = d_start + h sum_j a_ij u_j, with the A whose inverse gives the slopes of u
             integral = integral - rate[m] * w
         if not s.new_phase:
             integral = integral - integrals[s.previous]
@@ -378,10 +386,13 @@ class Collision(ContactParameters, Collocated):
         self.phases = p.contact_phases
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in range(len(self.phases))]
         self.forceless = np.array([self.phases[s.phase].apart for s in stages])
+        # A touch ends where the law's `separation` is zero. That is a constraint of its last stage, so the
+        # force there is zero by its bounds, and the law is no constraint.
         self.forceless[[i for i, f in zip(self.end, self.phases, strict=True) if f.end == SEPARATION]] = True
         self._prefix = prefix = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
         self.mass = mass
+        # sets `shortest`, which the bounds of the durations below need
         self.update_parameters()
         self.torque_fraction = scenario.torque if scenario else limits.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else limits.cone.collision_margin
@@ -410,6 +421,7 @@ class Collision(ContactParameters, Collocated):
         self.xt = add("target travel", 1, labels=["target"])
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
+        # from the third phase on: before the second one the mean rate is the d of the first
         joined = len(self.phases) - 2
         self.joined = b.layout.add(f"{prefix}travel in compression", joined, b.ny, labels=c.labels)
         self.joined_x = b.layout.add(f"{prefix}target travel in compression", joined, 1)
@@ -422,6 +434,7 @@ class Collision(ContactParameters, Collocated):
         There is none while a nail is driven, if the collision ``holds``.
         """
         p = self._b.problem
+        # phases between the first and the last are those in which the nail is driven
         if self.holds:
             driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
             return np.where(driven, -np.inf, 0.0)[:, None]
@@ -452,6 +465,7 @@ class Collision(ContactParameters, Collocated):
         collision, force = [], []
         for i, s in enumerate(self.stages):
             state = self._slots(self.state, i, at_rest)
+            # the travel is an integral over the phase so far, and begins each one at zero; states go on
             travel = self._slots(self.xt, i, zero, each_phase=True)
             impulse_slope, x1 = self._slots(self.p, i, zero)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
@@ -459,7 +473,7 @@ class Collision(ContactParameters, Collocated):
         common = np.concatenate(
             [*self._gains(), b.robot.torque_limit, b.limits.units, friction_parameters(p)]
         )
-        collision_p = [np.concatenate([p.normal, [s.place, s.phase > 0], common]) for s in self.stages]
+        collision_p = [np.concatenate([p.normal, [s.place], common]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
             "collision": (collision, collision_p),
             "force": (force, self.force_parameters()),
@@ -518,7 +532,7 @@ class Collision(ContactParameters, Collocated):
             [*start, self._before(s.phase)[0], self.T[s.phase][0], self.coast_legs[i], self.coast_rates[i]]
             for i, s in enumerate(self.stages)
         ]
-        return {"coasting": (slots, [[s.place, float(s.phase > 0)] for s in self.stages])}
+        return {"coasting": (slots, [[s.place] for s in self.stages])}
 
     def determined(self) -> list[Determined]:
         """Variables in the order in which the constraints determine them.
@@ -530,6 +544,9 @@ class Collision(ContactParameters, Collocated):
         for i in range(len(self.stages)):
             legs = [leg for g in self._leg_groups() for leg in by_leg(g.index(i))]
             out += [determined(Turn.STAGE_LEGS, leg, k) for k, leg in enumerate(legs)]
+        # Given an element's beginning, stages of one element depend on each other (Radau's A is full), on
+        # those of later ones nothing: so elements are eliminated one after the other, as one small system
+        # each.
         integrals, states = zip(*self.integrated(), strict=True)
         groups = (*states, self.w, self.f, *self.states())
         step = 0
@@ -565,6 +582,7 @@ class Collision(ContactParameters, Collocated):
             names = [label for one, _ in self._integrals() for label in one.labels] * self.joined.count
             outputs = at["join"][0] + np.arange(len(names))
             self._b.equal("travel in compression", where, names, outputs, along(names, "off"))
+        # end that is no event of the target -> component, output of the block ``force``, measure
         ends = {
             TURN: ("approach speed", "rate", Measure("m/s", 1.0, "left")),
             SEPARATION: ("force", "separation", Measure("N", FORCE_SCALE, "left")),
@@ -576,6 +594,7 @@ class Collision(ContactParameters, Collocated):
             for prefix in self._prefixes if phase.end in ends else self._prefixes[:1]:
                 outputs = start + last * size + part[prefix + name]
                 self._b.equal(phase.end, where, [prefix + component], outputs, measure)
+            # a gap ends where the two meet; zero penetration alone would also hold where they part
             if phase.end == TOUCH:
                 self._bound_rate(last, start + last * size, receding=False)
 
@@ -696,6 +715,8 @@ class Collision(ContactParameters, Collocated):
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)
         before = np.concatenate([[0.0], np.cumsum(times)])
+        # d and xt are integrals over s: by the duration of the guess, not the clipped one, so that d is the
+        # integral of u ds
         per_time = (1 / found.durations[phase])[:, None]  # d and xt are integrals over s
         d = found.moved[:, None] * per_time * rates
         self.u.write(x, found.speed[:, None] * rates)
@@ -706,6 +727,7 @@ class Collision(ContactParameters, Collocated):
         # the point mass is in place of each striker
         self.p.write(x, len(p.strikers) * found.impulse[:, None])
         for joined, each in ((self.joined, d[self.end]), (self.joined_x, self.xt.read(x)[self.end])):
+            # mean rate in the first k phases: their mean rates, weighted by their durations
             means = [(times[:k, None] / before[k] * each[:k]).sum(axis=0) for k in range(2, len(times))]
             joined.write(x, np.reshape(means, (joined.count, joined.size)))
         self.after.write(x, y + float(found.moved[self.end].sum()) * rates)
@@ -736,6 +758,7 @@ class Collision(ContactParameters, Collocated):
         durations = [float(g.read(x)[0, 0]) for g in self.T]
         time = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in self.stages]
         before = float(target.speed_before(self.target))
+        # the limit from the right at contact, where collocation has no point
         first = [float(b.problem.law.branch(0.0, float(v) - before, True, self.law)) for v in approaches]
         forces, wrench = np.vstack([first, self.f.read(x)]), self.w.read(x)
         start = self.number * len(self.stages)  # the blocks' instances are collision by collision

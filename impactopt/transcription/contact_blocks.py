@@ -64,22 +64,24 @@ def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpres
     """Legs of the reference that coasts through the collision: residuals of soles in place and at rest.
 
     z = y0; u0 (ydot at contact); T1; T; legs; leg rates [rad/s]; frozen: leg accelerations [rad/s^2].
-    p = s (place in the phase); 1 after the first phase else 0.
+    p = s (place in the phase).
     out = pose error of the fixed soles [m, rad]; their twist [m/s, rad/s]. Frozen: in place of the twist,
         residuals of rates and accelerations.
     """
     y0, u0 = ca.SX.sym("y0", c.ny), ca.SX.sym("u0", c.ny)
     legs, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("rates", c.nl)
-    T1, T, s, after = (ca.SX.sym(name) for name in ("T1", "T", "s", "after"))
-    y = y0 + u0 * (after * T1 + T * s)
+    T1, T, s = (ca.SX.sym(name) for name in ("T1", "T", "s"))
+    # the reference coasts: constant rates of y, whatever the robot does
+    y = y0 + u0 * (T1 + T * s)
     z = [y0, u0, T1, T, legs, rates]
     if frozen is None:
         out = {"closure": c.closure(y, legs), "twist": c.sole_twists(y, legs, u0, rates)}
-        return make_block(z, [s, after], out, lanes=4)
+        return make_block(z, [s], out, lanes=4)
     accelerations = ca.SX.sym("accelerations", c.nl)
+    # no yddot: leg joints accelerate only as far as constant rates of y need it
     v, a = (leg_part(c, x) for x in c.motion(y, legs, u0, ca.SX.zeros(c.ny)))
     out = {"closure": c.closure(y, legs), "rate": rates - v, "acceleration": accelerations - a}
-    return make_block([*z, accelerations], [s, after], out, lanes=2)
+    return make_block([*z, accelerations], [s], out, lanes=2)
 
 
 def collision(
@@ -109,8 +111,8 @@ def collision(
         their accelerations at the freeze; rates r of the legs, r'; lag of the legs behind the reference,
         lag'; time [s] since the beginning of the segment; slope of the hand's speed; without bias, wrenches
         that carry the weight (nw,); logarithms of the gain factors.
-    p = normal (3,); s (place in the phase); 1 after the first phase else 0; Kp, Kd, torque limits (n, each);
-        weight [N]; lever [m]; with friction the parameters of `ContactFriction`.
+    p = normal (3,); s (place in the phase); Kp, Kd, torque limits (n, each); weight [N]; lever [m]; with
+        friction the parameters of `ContactFriction`.
     out = closure [m, rad]; base equations over weight and weight x lever; joint equations over torque limit;
         servo torque over limit; frozen: residuals of r', of lag' and of the slope of the hand's speed.
     """
@@ -119,11 +121,11 @@ def collision(
     legs, ff, w = ca.SX.sym("legs", nl), ca.SX.sym("ff", n), ca.SX.sym("w", nw)
     strikers = _strikers(striker, second)
     T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f", len(strikers))
-    normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
+    normal, s = ca.SX.sym("n", 3), ca.SX.sym("s")
     kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
     weight, lever, logs = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("logs", len(gain_groups))
     of_friction = ca.SX.sym("friction", 2 * friction)
-    t = after * T1 + T * s  # since contact
+    t = T1 + T * s  # since contact
     y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
     through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
     # at: state at which the rigid-body functions are evaluated
@@ -148,18 +150,23 @@ def collision(
         J = _striker_jacobian(c, name, q)
         way = pushed_way(normal, ca.mtimes(J, v), *ca.vertsplit(of_friction)) if friction else normal
         tau += ca.mtimes(J.T, way) * f[k]
+    # Without bias H a has no weight, so the part of w that carries it must not stand in the balance either.
     tau -= c.sole_wrench_map(at[0], at[2], w - carried)
     # Reference minus robot: angles and rates of the constrained legs' joints, ...
     if frozen is None:
         lag, rate_lag = ref_legs - legs, ref_rates - leg_part(c, v)
     else:
         rate_lag = ref_rates0 + ref_accelerations * since - r
+        # v enters this acceleration as dJ/dt v alone: without it, equation (15) in place of (14)
         hand_acceleration = striker_kinematics(c, striker)(q, v if frozen.jdot else 0 * v, a)[2]
+        # a prime is d/ds, and t = T s in the phase: r' = T dr/dt
         slopes = {"legs": r1 - T * leg_part(c, a), "lag": lag1 - T * rate_lag}
         slopes["hand"] = hand_slope - T * ca.dot(normal, hand_acceleration)
     # ... and of all others. The reference of a sprung joint is its angle at rest, which does not coast.
     coasts = np.ones(ny)
     coasts[c.base :] -= c.robot.sprung[c.independent]
+    # `configuration` puts parts of y and of the legs in the robot's order of joints; the base's part is cut
+    # off.
     angle_error = c.configuration(y0 + coasts * u0 * t - y, lag)[c.base :]
     rate_error = c.configuration(u0 - u, rate_lag)[c.base :]
     stiffness, damping = with_gain_factors(kp, kd, logs, gain_groups)
@@ -168,13 +175,14 @@ def collision(
     out = {
         "closure": c.closure(y, legs),
         "base": tau[: c.base, :] / base_scale(c, weight, lever),
+        # what the motion needs, less what the servo gives: the limit (12) itself is a bound of "torque"
         "joints": tau[c.base :] / limit - servo,
         "torque": servo,
         **slopes,
     }
     z = [y0, u0, *(own if frozen is None else []), ff, d1, T1, d, T, u, u1, legs, f, w]
     z += [*(own if frozen is not None else []), logs]
-    p = [normal, s, after, kp, kd, limit, weight, lever, of_friction]
+    p = [normal, s, kp, kd, limit, weight, lever, of_friction]
     return make_block(z, p, out, through, lanes=4, stages=stages)
 
 
@@ -239,6 +247,7 @@ def force(
     of_target = ca.SX.sym("target", len(target.parameters))
     y, surface = ca.SX.sym("y", ny), ca.SX.sym("surface")
     if frozen is None:
+        # right as long as no leg of the stance moves the striker
         q, vel, _ = c.upper_motion(y, u, ca.SX.zeros(ny))
         hands = []  # position and speed along the normal
         for name, at in zip(strikers, (point, other), strict=False):
@@ -248,6 +257,7 @@ def force(
         hands = [(y, u)]
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     parameters = {name: of_target[i] for i, name in enumerate(target.parameters)}
+    # a target without events has one smooth mode, in all phases
     modes = [target.smooth(state, total, k, parameters) for k in phases or (0,)]
     speed, derivative = ca.SX(modes[0][0]), ca.vertcat(ca.SX(0, 1), *modes[0][1])
     event = invariant = reserve = ca.SX(0, 1)
@@ -269,6 +279,8 @@ def force(
     for k, (position, velocity) in enumerate(hands):
         penetration, rate = position - surface, velocity - speed
         compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
+        # The branch is a parameter, not a switch: the program stays smooth, and events are at the ends of
+        # phases.
         residual = (f[k] - ((1 - restituting) * compress + restituting * restitute)) / FORCE_SCALE
         separation = ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE
         of_hands.append((residual, rate, penetration / DEPTH_SCALE, separation))
@@ -319,6 +331,7 @@ def carried(c: StanceCoordinates) -> BlockExpression:
     y, u, legs = ca.SX.sym("y", c.ny), ca.SX.sym("u", c.ny), ca.SX.sym("legs", c.nl)
     w, weight, lever = ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("weight"), ca.SX.sym("lever")
     v = c.velocity(y, legs, u)
+    # bias alone: gravity, Coriolis and centrifugal forces, as a = 0
     force = _inverse_dynamics(c, c.configuration(y, legs), v, ca.SX.zeros(c.rb.nv))
     force -= c.sole_wrench_map(y, legs, w)
     out = {"base": force[: c.base, :] / base_scale(c, weight, lever)}
@@ -392,6 +405,7 @@ def first_instant(
     q = c.configuration(y, legs)
     J = _striker_jacobian(c, striker, q)
     da = c.velocity(y, legs, change)
+    # acceleration just before contact, where the swing ends with yddot = 0
     v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
     j = push = ca.mtimes(J.T, normal)  # (nv, 1)
     of_friction = ca.SX.sym("friction", 2 * friction)

@@ -52,6 +52,8 @@ def add_balance(
             slots = [state.y, state.y1, state.legs, state.T]
             states.append((slots, s.capture_margin, f"contact, if {s.name}"))
     inward, offset = inward_edges(support_polygon(b.robot, b.coordinates))
+    # Distance from an edge: inward . point - offset, of edges moved inwards by the margin. A state without a
+    # margin has an instance too, for its speed and momentum.
     parameters = [np.column_stack([inward, offset + (margin or 0.0)]).ravel() for _, margin, _ in states]
     at = b.add_block("balance", [slots for slots, _, _ in states], np.array(parameters))
     edges = len(inward)
@@ -138,6 +140,7 @@ def _add_conditions(b: Builder, state: ContactState, block: str, number: int) ->
             upper=point,
             measure=millimetres("away"),
         )
+        # number of the call of `add` above
         hit_point = len(b.constraints.lower) - 1
 
         def update_point(b: Builder) -> None:
@@ -199,6 +202,7 @@ def _add_clearance(
     b: Builder, swing: MotionPhase, follow: MotionPhase, block: str, number: int, travel: Affine | None
 ) -> None:
     """Add the clearance of one striker.  travel [m] : of the target in the follow-through."""
+    # not the swing's last node, at which the striking point is at the target by "hit point"
     p, before, after, start = b.problem, swing.nodes[:-1], follow.nodes, len(b.constraints.lower)
     striker, point = b.problem.contacts[number]
     motions = [swing.at(s)[0] for s in before]
@@ -210,6 +214,8 @@ def _add_clearance(
     surface, speed = Affine.constant(float(p.normal @ point)), float(p.target.speed_before())
     distances = [CLEARANCE_RATE * (1 - s) * duration for s in before]
     for i, (s, distance) in enumerate(zip(before, distances, strict=True)):
+        # Linear in T. The speed is a coefficient, which no update changes: with another one the program is
+        # built anew (`StructuredProgram.same_parameters`).
         plane = surface - swing.T[0] * (speed * (1 - s))
         spot = first + i, swing.place_at(s), distance
         _add_plane_distance(b, "no touch before contact", number, spot, plane)
@@ -222,6 +228,7 @@ def _add_clearance(
     soft = any(tool.name == striker and tool.grip is not None for tool in p.robot.tools)
     behind = (SOFT_GRIP_RATE if soft else CLEARANCE_RATE) * float(np.mean(p.follow.duration))
     name = f"target left by {striker}" if number else "target left"
+    # each constraint below needs this output, and an output may be in one constraint only
     there = b.lift(name, np.array([first]), place=place(0.0), measure=TOO_NEAR)[0]
     spots = [(first + i, place(s), s * behind) for i, s in enumerate(after) if i]
     left = len(b.constraints.lower)
@@ -270,4 +277,5 @@ def _most_clearance(b: Builder, number: int) -> float:
     """Clearance [m] of a striking point far from contact: at most its distance in the start posture."""
     p, (striker, point) = b.problem, b.problem.contacts[number]
     at = striking_point(p.robot, striker, p.start_posture)
+    # a robot that starts at the target need not go back to have more clearance than it began with
     return min(CLEARANCE, max(float(p.normal @ (point - at)), 0.0))

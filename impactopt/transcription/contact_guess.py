@@ -86,6 +86,7 @@ def effective_mass(
     # docs/notation.md. Least squares, because J_c H^-1 J_c' is singular at a straight knee.
     soles, coupling = delassus[:m, :m], delassus[:m, m:]
     inverse_mass = delassus[m:, m:] - delassus[m:, :m] @ np.linalg.lstsq(soles, coupling, rcond=1e-12)[0]
+    # Impulses at the strikers that change all their speeds by one; with one striker 1 / (J P J').
     mass = float(np.linalg.solve(inverse_mass, np.ones(len(J_hand))).mean())
     return mass, speed if abs(speed) > MIN_STRIKER_SPEED else MIN_STRIKER_SPEED
 
@@ -256,6 +257,7 @@ def guessed_contact(
     def in_phase(quantity: Array) -> Array:
         return np.interp(times, time, quantity) - np.interp(ends[phase], time, quantity)
 
+    # rows as of `_History`
     x, v, travel, force = values[0], values[1], values[2], values[-1]
     states = [np.interp(times, time, state) for state in values[3:-1]]
     # Not for a mass that comes towards the robot: under such a push it would pass through the hand.
@@ -267,6 +269,7 @@ def guessed_contact(
         speed=np.interp(times, time, v) / v[0],
         moved=in_phase(x) / v[0],
         force=np.interp(times, time, force),
+        # momentum that the mass has lost, which no quadrature of the force has to approximate
         impulse=mass * (v[0] - np.interp(times, time, v)),
         state=np.reshape(states, (target.n_states, len(times))).T,
         travel=in_phase(travel),
@@ -374,6 +377,8 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
 
     def separation(_: float, y: Array) -> float:
         rate = float(y[1] - surface_speed(y))
+        # The law's `separation` is its restitution; while bodies approach, at first touch too, it says
+        # nothing.
         return 1.0 if rate > 0 else float(law.separation(float(y[0] - y[2]), rate, of_law))
 
     def touch(_: float, y: Array) -> float:
@@ -383,6 +388,8 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
     touch.terminal, touch.direction = True, 1.0  # type: ignore[attr-defined]
     start = np.array([0.0, speed, 0.0, *np.zeros(target.n_states)])
     # An explicit method, because the switches of a nail make implicit ones stall.
+    # Steps are bounded, as results are interpolated linearly and the deepest point is the deepest of the
+    # steps.
     options = {"method": "RK23", "rtol": 1e-4, "atol": 1e-8, "max_step": MAX_CONTACT_TIME / 400}
     times, values, switched = list[Array](), list[Array](), list[float]()
     for k in range(2 * touches - 1):  # touches (even k) and gaps between them (odd k)
@@ -392,6 +399,7 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
         values.append(found.y)
         if found.status != 1:  # no event until the end of the time
             break
+        # the state goes on; only the event that is looked for changes
         start = found.y[:, -1]
         if k % 2 == 0 and (k == 2 * touches - 2 or target.guard(start[3:], 0.0, found.t[-1], 0) >= 0):
             break
@@ -417,8 +425,10 @@ def _phases(found: _History, target: Target) -> Array | None:
         ends = [0.0, max(time[moves[0] - 1], MIN_PRESS_TIME), time[moves[-1]], time[-1]]
     elif target.guards:
         first = _first_event(found, target)
+        # an event after the turn is not the one that splits compression
         if first is None or first >= deepest:
             return None
+        # phases: up to the event, from there to the turn, restitution
         ends.insert(1, time[first])
     return np.array(ends) if min(np.diff(ends)) > 0 else None
 

@@ -226,6 +226,7 @@ class ContactProgram(ABC):
                 self.constraints.measured(since, term.name, term.unit)
         self.objectives = quantities(self, objectives)
         self._objective = assemble(self.layout, self.objectives, self._prices())
+        # each round's set of clearance constraints is added to a copy of this builder
         self._without_clearance = self.builder
 
     @cached_property
@@ -250,6 +251,7 @@ class ContactProgram(ABC):
     def with_clearance(self: Program, constraints: Mapping[ClearanceKey, SeparatingDirection]) -> Program:
         """The same program with exactly these clearance constraints."""
         other = copy.copy(self)
+        # the copy has the cached program of the old constraints
         other.__dict__.pop("program", None)
         other.builder = self._without_clearance.copy()
         order = add_clearance_constraints(other.builder, self.body_spots(), constraints)
@@ -269,6 +271,7 @@ class ContactProgram(ABC):
         whether that has updated everything that depends on the problem.
         """
         self.problem = problem
+        # without clearance constraints the program's builder is that one itself, which is to be updated once
         builders = [self._without_clearance]
         if self.builder is not self._without_clearance:
             builders.append(self.builder)
@@ -278,6 +281,7 @@ class ContactProgram(ABC):
         for b in builders:
             for update in b.followers:
                 update(b)
+        # `with_clearance` appends its blocks after all others
         own = len(self._without_clearance.blocks)
         move_bodies(problem, self.blocks[own:], self.clearance_constraints)
         self.program.update_parameters(self.layout, self.blocks, self.constraints)

@@ -72,6 +72,7 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
         return ContactError(pct=np.inf, coarse=np.inf, of_elements=unknown, missed=False)
     coarse, of_elements, errors = [], [], []
     finer, outputs = list[PlannedCollision](), contact.program.outputs(by_phases)
+    # `decode` needs the outputs of the finer program, but contact begins at the plan's own speed.
     approach = approaches(t.program.outputs(x))
     for new, old in zip(contact.hit.lasting, t.hit.lasting, strict=True):
         finer.append(new.decode(by_phases, outputs, approach))
@@ -103,6 +104,7 @@ def refined_elements(
     strained = error is not None and any(map(any, error.strained))
     if error is None or (abs(error.coarse) <= tolerance and not error.missed and not strained):
         return None
+    # Errors of elements add up, so each gets an equal part of the tolerance.
     most = tolerance / sum(map(len, elements))  # of an element
     out = []
     none = [(False,) * len(lengths) for lengths in elements]
@@ -131,6 +133,7 @@ class _FinerContact:
 
     def __init__(self, t: ContactProgram, x: Array) -> None:
         self._planned, b = t.hit, Builder(t.problem, t.coordinates, t.functions)
+        # the state at contact is no variable here: expressions without terms in x
         given = ContactState(*(Affine.constant(e.evaluate(x)) for e in t.hit.contact.state))
         self._builder = b
         self.hit = ContactSet(
@@ -172,9 +175,13 @@ class _FinerContact:
             fixed.append(new_group.index(0))
         for new, old in zip(self.hit.lasting, self._planned.lasting, strict=True):
             map_contact(new, old, z, x)
+            # positions after contact follow from the solution, and a force that is zero by its bounds is not
+            # determined
             fixed += [new.after.index(0)] if new.after.count else []
             fixed += [new.f.index(int(i)) for i in np.flatnonzero(new.forceless[:-1])]
         ends = {phase.end for phase in self._builder.problem.contact_phases}
+        # Inequalities do not matter here: the contact runs as it does, and `contact_error` looks at the
+        # result.
         equal = program.g_lower == program.g_upper
         events = np.array([o.term in ends for o in program.origins])
 
@@ -214,6 +221,7 @@ class _FinerContact:
                     return
                 jacobian = program.jacobian(z)[constraints][:, free]
                 try:
+                    # `system` gives as many constraints as free variables
                     z[free] -= splu(sp.csc_matrix(jacobian)).solve(residual)
                 except RuntimeError as error:
                     raise ArithmeticError("no contact: the matrix is singular") from error
@@ -233,11 +241,16 @@ class _FinerContact:
             mine = slice(k * n, (k + 1) * n)
             force = collision.f.read(z)[:, 0]
             other = [
+                # `compressing` is what restitutes: the force on the other branch
                 float(law.branch(a, b, bool(back), collision.law))
                 for a, b, back in zip(depth[mine], rate[mine], restituting[mine], strict=True)
             ]
             differs = np.abs(np.array(other) - force) > _BRANCH_DIFFERENCE * np.abs(force).max()
+            # A point is wrong if it restitutes while bodies approach, or compresses while they recede, and if
+            # its force is then noticeably another. Near a rate of zero it is not, and rounding would move
+            # points to and fro.
             wrong[mine] = differs & (restituting[mine] == (rate[mine] > 0))
+        # not of the Hessian, which Newton's method on a square system does not call
         for function in (block.value, block.jacobian):
             function.inputs[1][: block.count, RESTITUTING] = restituting ^ wrong
         return bool(wrong.any())
@@ -247,6 +260,7 @@ def _strained(t: ContactProgram, hit: PlannedCollision, stages: Sequence[Colloca
     """Mask of the program's elements in which a gear carries too much, from a finer collision."""
     share = gear_share(t.problem, hit.torque, hit.acceleration)[1:] > 1.0 + GEAR
     elements = sorted({s.members for s in stages})
+    # each element of the program is two of the finer ones
     out = np.zeros(len(elements) // 2, dtype=bool)
     for s, over in zip(stages, share, strict=True):
         out[elements.index(s.members) // 2] |= over
@@ -264,6 +278,7 @@ def _element_errors(new: Collision, old: Collision, z: Array, x: Array) -> Array
     ends = [
         float(found[i] - planned[k])
         for i, k in same_places(new.stages, old.stages)
+        # Radau's last stage is the element's end, which both meshes have, as elements are halved
         if k == old.stages[k].members[-1]
     ]
     return np.asarray(np.abs(np.diff([0.0, *ends])) * _scale(old, x))
@@ -281,6 +296,7 @@ def _impulse_error(new: Collision, old: Collision, z: Array, x: Array) -> float:
     apart = not new.holds and each[: last[0]].min(initial=0.0) < -_MISSED_EVENT_FORCE * peak
     if apart or (slope >= 0 and force[-1] > _MISSED_EVENT_FORCE * peak):
         return float(np.inf)
+    # impulse under a line from the force at the end down to zero: a triangle
     rest = 0.5 * float(force[-1]) ** 2 / -slope if slope < 0 else 0.0
     return _scale(old, x) * (float(new.p.read(z)[-1, 0] - old.p.read(x)[-1, 0]) + rest)
 
@@ -330,12 +346,15 @@ def _weights(
     """
     out = np.zeros((len(new), len(old) + 1))
     for i, s in enumerate(new):
+        # element of the old mesh that contains the new stage
         own = next(
             e.members for e in old if e.phase == s.phase and old[e.members[-1]].place >= s.place - 1e-9
         )
         first = old[own[0]]
         at, places = list(own), [old[k].place for k in own]
         if known or first.previous >= 0:
+            # the polynomial of an element goes through its beginning too; column len(old) has the value at
+            # contact
             begins = first.previous < 0 or (each_phase and first.new_phase)
             at.append(len(old) if begins else first.previous)
             places.append(0.0 if first.new_phase else old[first.previous].place)

@@ -109,6 +109,7 @@ class ContactSet:
             )
         if self.first:
             instances, first_parameters = zip(*(instant.instance() for instant in self.first), strict=True)
+            # added last of the contact's blocks, so `b.blocks[-1]` below is it
             at = b.add_block("first", list(instances), np.array(first_parameters))
             b.follow(self._update_first)
             for k, instant in enumerate(self.first):
@@ -129,6 +130,7 @@ class ContactSet:
 
     def update_parameters(self, *, anew: bool) -> None:
         """Take the parameters of the builder's problem (`Collision.update_parameters`)."""
+        # the mass is of the new problem's point
         self.__dict__.pop("mass", None)
         for collision in self.lasting:
             collision.update_parameters(self.mass, anew=anew)

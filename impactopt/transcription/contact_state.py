@@ -27,6 +27,8 @@ EVENT_PHASE_FRACTION, IMMEDIATE_PHASE_FRACTION = 0.1, 0.05
 TOUCH_PHASE_FRACTION = 0.01  # of each phase where striker and target separate and meet again
 # Where no least duration is given, it is the least of a fraction of a point mass's restitution, a time [s],
 # and a fraction of the longest duration.
+# Measured: with fractions of 0.05 to 0.6 arm_planar and punch have the same optimum (33 to 76 and 57
+# iterations).
 NATURAL_FRACTION, MAX_LEAST_DURATION, LONGEST_FRACTION = 0.15, 2e-3, 0.5
 SIMILAR_FACTOR = 3.0  # parameters within this factor share least durations
 
@@ -64,6 +66,7 @@ class ContactParameters:
         self.law, self.target = p.law.parameters, p.target.parameters
         if self.scenario is not None:
             self.law, self.target = self.scenario.numbers(p.law, p.target)
+        # the natural duration depends on these, beside the number of touches
         parameters = np.array([*self.law.values(), *self.target.values(), self.mass])
         if not anew and similar(parameters, self._parameters):
             return
@@ -87,6 +90,7 @@ class ContactParameters:
     def force_parameters(self) -> list[list[float]]:
         """Parameters of the block ``force`` at each stage."""
         p = self._b.problem
+        # one-hot mode of each phase of the contact, by which the block selects the target's smooth motion
         modes = np.eye(len(p.target.phases))[[phase.mode for phase in p.contact_phases]]
         phases = np.column_stack([modes, self.shortest])
         within = phases if p.target.guards else phases[:, :0]
@@ -117,6 +121,7 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
 
 def similar(parameters: Array, others: Array) -> bool:
     """True if contacts with these parameters (k,) last about as long, and can share least durations."""
+    # in this form, a parameter that is zero is similar to zero only
     sizes = np.sort(np.abs([parameters, others]), axis=0)
     return bool(np.all(sizes[1] <= SIMILAR_FACTOR * sizes[0]))
 
@@ -179,6 +184,7 @@ def _add_gains(b: Builder) -> Group:
     chosen = b.problem.gains
     if not chosen:
         return Group(GAINS, 0, 1, 0, np.zeros(0), ())
+    # as a logarithm a factor stays positive, and halving is as far as doubling
     least, largest = np.log([gain.factor for gain in chosen]).T
     labels = [", ".join(gain.joints) for gain in chosen]
     return b.layout.add(GAINS, 1, len(chosen), lower=least, upper=largest, labels=labels)

@@ -76,6 +76,7 @@ class InstantImpact:
 
         self.du = add("change of rate", b.ny, labels=c.labels)
         self.impulse_group = add("impulse", 1, lower=1e-3, scale=10.0)  # > 0, as the block divides by it
+        # [N s, N m s]: the weight for 0.05 s
         scale = 0.05 * b.limits.wrench_scale
         self.w = add("impulsive sole wrench", b.nw, **{**b.limits.of_wrenches, "scale": scale})
 
@@ -94,6 +95,8 @@ class InstantImpact:
         b, p, state = self._b, self._b.problem, self.contact.state
         slots = [state.y, state.legs, self.contact.u0[0], self.du[0], self.w[0], self.impulse_group[0]]
         rigid = float(self._without_rebound or p.collision == "rigid")
+        # Where these are not the law's, they are unused (rigid = 1), but the block divides by the stiffness.
+        # The restitution is 0 unless the collision is "rigid": hand and target then go on at one speed.
         law = [p.law.parameters.get(name, 1.0) for name in ("stiffness", "damping")]
         parameters = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass, self.speed_before]
         return {"impact": ([slots], [np.concatenate([parameters, b.robot.torque_limit, b.limits.units])])}
@@ -222,6 +225,7 @@ class FrozenCollision(Collision):
         self.carried = add("sole wrench that carries", count, b.nw, **b.limits.of_wrenches)
         self._meeting: InstantImpact | None = None
         if self.effects.jdot and not self.freezes:
+            # a surface that a force does not move at once, as a wall, stops the hand
             inverse_mass = float(target_start(b.problem.target, self.target)[0])
             mass = 1 / inverse_mass if inverse_mass > 0 else np.inf
             self._meeting = InstantImpact(b, contact, mass=mass, prefix=f"{self._prefix}meeting: ")
@@ -231,6 +235,7 @@ class FrozenCollision(Collision):
 
     def _add_reference(self, count: int) -> None:
         """Add variables of the reference: first at the beginnings of segments, then at their freezes."""
+        # without freezes the only segment begins at contact, where the freeze is, too
         count, labels = max(2 * self.freezes, 1), self._b.coordinates.leg_labels
         super()._add_reference(count)
         name = f"{self._prefix}coasting leg accelerations"
@@ -258,6 +263,7 @@ class FrozenCollision(Collision):
         # In the middle of its segment: the midpoint rule, whose error falls with 1 / freezes^2.
         phase, place = place_of((k + 0.5) / self.freezes, self.shares)
         s = self._element_at(phase, place)
+        # the freeze's rates and legs are values of its element's collocation polynomials, which are affine
         at = [self._ends(s)[0], *(self.stages[m].place for m in s.members)]
         weights = lagrange(at, place)
 
@@ -278,6 +284,7 @@ class FrozenCollision(Collision):
 
     def _instants(self) -> list[tuple[int, float]]:
         """Phase and place of each instant of the reference's variables: beginnings of segments, freezes."""
+        # a segment begins where the stage before its first one is
         firsts = [self.stages[self._segments.index(k)].previous for k in range(len(self._frozen))]
         begins = [(0, 0.0) if i < 0 else (self.stages[i].phase, self.stages[i].place) for i in firsts]
         return [*begins, *((at.phase, at.place) for at in self._frozen[: self.freezes])]
@@ -287,6 +294,7 @@ class FrozenCollision(Collision):
         at = self._frozen[k]
         s = self._element_at(at.phase, at.place)
         T1, d1, _ = self._before(at.phase)
+        # integral over the phase up to the element, to which that over the element's part is added
         d = Affine.zeros(self._b.ny) if s.new_phase else self.d[s.previous]
         places, begin = [self.stages[m].place for m in s.members], self._ends(s)[0]
         # Integral of the polynomial through the element's rates, from its beginning to the freeze: Gauss's
@@ -346,6 +354,8 @@ class FrozenCollision(Collision):
         """
         s, k = self.stages[i], self._segments[i]
         first = s.previous < 0 or self._segments[s.previous] != k
+        # as `_slots`, but the value before may be another than the last stage's: the freeze changes J, and
+        # with it the hand's speed of the same rates
         slope = self.speed[s.members[0]] * 0.0
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + self.speed[m] * w
@@ -354,6 +364,8 @@ class FrozenCollision(Collision):
     def _hand_slots(self, i: int) -> list[Affine]:
         """Slots of the block ``force``: the hand's motion by step 7b, not by forward kinematics."""
         s = self.stages[i]
+        # n . J is frozen, so the hand's position is the integral of its speed, and forward kinematics would
+        # differ
         before = self._mean_before(self.travel, self.joined_travel, s.phase)
         return [before, self._before(s.phase)[0], self.travel[i], self.T[s.phase][0], self.speed[i]]
 
@@ -367,7 +379,7 @@ class FrozenCollision(Collision):
             [*start, self._before(phase)[0], self.T[phase][0], *(group[k] for group in groups)]
             for k, (phase, _) in enumerate(self._instants())
         ]
-        return {"coasting": (slots, [[place, float(phase > 0)] for phase, place in self._instants()])}
+        return {"coasting": (slots, [[place] for _, place in self._instants()])}
 
     def _reference_groups(self) -> tuple[Group, ...]:
         """Variables of the reference's legs, in the order of the block ``coasting``."""
@@ -406,6 +418,7 @@ class FrozenCollision(Collision):
         return out
 
     def determined(self) -> list[Determined]:
+        # equal to an affine expression of the collocated legs, as lifted variables are to outputs
         out = [determined(Turn.LIFTED, group.index(0)) for group in self.frozen_legs if group.size]
         out += super().determined()
         for k in range(self.coast_legs.count):

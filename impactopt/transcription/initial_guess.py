@@ -53,9 +53,11 @@ def strike_rates(
         pin.framesForwardKinematics(model, data, c.join(at, legs))
         return np.concatenate([data.oMf[frame].translation for frame in frames])
 
+    # central differences: their error, h^2, and rounding, 1e-16 / h, are both below 1e-9
     h = 1e-6
     jac = np.stack([(point(y + h * e) - point(y - h * e)) / (2 * h) for e in np.eye(c.ny)], axis=1)
-    # least |rates / weight|, by the substitution rates = weight * r
+    # least |rates / weight|, by the substitution rates = weight * r. Measured: with `base` of 0.05 to
+    # 1 punch has the same optimum.
     weight = np.ones(c.ny)
     weight[: c.base] = base
     return np.asarray(weight * np.linalg.lstsq(jac * weight, np.tile(velocity, len(frames)), rcond=None)[0])
@@ -88,6 +90,7 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
         mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]
         speed = speed_that_leaves(p.law, p.target, mass, speed, bounds.least, bounds.most)
     options = {"base": 0.0} if c.drifts else {}  # momentum determines the rates of a floating base
+    # one factor for all rates below, so that the striking point still moves along the normal
     rates = strike_rates(c, p.strikers, y, legs, speed * p.normal, **options)
     return ReachedState(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
 
@@ -103,11 +106,14 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     zero, (swing_T, follow_T) = np.zeros(len(t.y0)), _durations(t)
     start, end = _ends(t.problem, t.coordinates, t.problem.blow)
     swing = quintic(start, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
-    # half of the rates is left after contact, as after an inelastic impact of two equal masses
+    # Half of the rates is left after contact, as after an inelastic impact of two equal masses. Measured:
+    # with 0.2 to 0.9 arm_planar and punch have the same optimum.
     back = quintic(hit.y, 0.5 * hit.rates, end, zero, follow_T, t.follow.breaks)
     curve = CubicSpline.fit(swing, t.swing.breaks, zero, hit.rates, swing_T)
     after = CubicSpline.fit(back, t.follow.breaks, 0.5 * hit.rates, zero, follow_T)
     if t.coordinates.drifts:
+        # A drifting base takes the striker elsewhere than inverse kinematics has it; what comes after begins
+        # there.
         curve = _drifting(t.problem, curve)
         hit = replace(hit, y=curve.sample(swing_T)[0][0], rates=curve.sample(swing_T)[1][0])
         after = _drifting(t.problem, after, hit)
@@ -123,6 +129,7 @@ def _drifting(problem: ImpactProblem, curve: CubicSpline, since: ReachedState | 
     since : state in which it begins; None: that of the spline.
     """
     breaks, c = curve.breaks, problem.coordinates
+    # the base is integrated with one Runge-Kutta step between two of these times
     fine = with_middles(with_middles(breaks))
     time = fine * curve.duration
 
@@ -157,6 +164,7 @@ def _draw_gains(t: ContactProgram, x: Array, noise: float, seed: int) -> None:
     gains = t.hit.contact.gains
     if noise and gains.size:
         k = gains.index(0)
+        # uniform in the logarithms, which the variables are
         x[k] = np.random.default_rng(seed).uniform(t.layout.lower[k], t.layout.upper[k])
 
 
@@ -174,6 +182,7 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
         _least_accelerations(t, t.swing.breaks, swing_T, start, y, end_rates=u),
         _least_accelerations(t, t.follow.breaks, follow_T, after, end, rates=rates),
     )
+    # the variables of the contact have the same names in both programs
     for name, group in strike.layout.groups.items():
         own = t.layout.groups.get(name)
         if own is not None and own.count == group.count:
@@ -215,6 +224,7 @@ def warm_start(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Ar
             continue
         if name.split()[0] in nodes and known.count != group.count:
             before, now = nodes[name.split()[0]]
+            # the old nodes are among the new ones; multipliers of added nodes are zero
             pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]
             group.write(new, np.column_stack([np.interp(now, before, column) for column in known.read(x).T]))
         elif known.count == len(old.hit.stages) and known.count != group.count:
@@ -370,6 +380,7 @@ def _least_accelerations(
             bounds = limits.y_lower[k] - 1e-9, limits.y_upper[k] + 1e-9
             found = lsq_linear(accelerations[:, free], -accelerations @ points, bounds)
             points[free] = found.x
+            # control points of the rate, which bound it
             largest = float(np.abs(factors * np.diff(points)).max()) / duration
             if largest < slowest:
                 slowest, control[:, k] = largest, points

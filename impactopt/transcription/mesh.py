@@ -73,6 +73,7 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     if plan.abort is not None:  # the abort motion has the follow-through's nodes
         for piece in plan.pieces(missed=True)[len(plan.before) + 1 :]:
             middles = _middles_violated(plan, plan.missed_reference, piece)
+            # one mesh for both motions to rest, so nodes that either needs
             found[piece.phase, piece.number] |= set(middles)
     stands = [
         {*known.of_stand(k), *(found[0 if k < blow else 2, k] if k != blow else ())}
@@ -92,10 +93,12 @@ def _middles_violated(plan: Plan, reference: Trajectory, piece: Piece) -> list[f
     if reference.stance.size:
         own &= reference.stance == piece.number
     nodes, duration = piece.nodes, piece.spline.duration
+    # without the instants of rest after the motion, which the reference goes on with
     at = np.flatnonzero(own & (reference.time <= piece.start + duration))
     torque = reference.torque[at]
     limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)
     ratio = np.abs(torque / p.robot.torque_limit).max(axis=1, initial=0.0)
+    # halfway from the problem's fraction to the motor's maximum
     violated = ratio > limit + max(_MARGIN_LOSS * (1.0 - limit), _TORQUE_LOSS)
     # Rates and positions of leg joints only: those of others are bounded everywhere by control points.
     violated |= (np.abs(reference.v[at, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
@@ -107,6 +110,7 @@ def _middles_violated(plan: Plan, reference: Trajectory, piece: Piece) -> list[f
     violated |= gear_share(p, torque, reference.a[at, joints]) > 1.0 + GEAR
     violated |= _soles_violated(p, piece.number, reference.sole_wrench[at])
     time = (reference.time[at[violated]] - piece.start) / duration
+    # interval of each violated instant: it gets one node, however many of its instants violate something
     between = np.searchsorted(nodes, time, side="right").clip(1, len(nodes) - 1)
     return [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
 
@@ -194,6 +198,7 @@ def collision_mesh(
 def lagrange(places: Sequence[float], at: float) -> Array:
     """Lagrange polynomials (k,) of k places, evaluated at one place."""
     x = np.asarray(places)
+    # prod over j != i of (at - x_j) / (x_i - x_j): ones on both diagonals leave j = i out
     denominators, numerators = x[:, None] - x + np.eye(len(x)), at - x + np.zeros((len(x), 1))
     np.fill_diagonal(numerators, 1.0)
     return np.asarray(np.prod(numerators / denominators, axis=1))
@@ -223,6 +228,7 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
     if problem.freezes < 2:
         return own
     shares = shares or guessed_shares(problem)
+    # One freeze lasts for the whole contact, so only two or more have a boundary between them.
     begins = [place_of(k / problem.freezes, shares) for k in range(1, problem.freezes)]
     return tuple(
         _cut(lengths, [s for at, s in begins if at == phase], _SHORTEST_ELEMENT / (problem.freezes * share))
@@ -239,6 +245,7 @@ def guessed_shares(problem: ImpactProblem) -> Shares:
 def place_of(fraction: float, shares: Shares) -> tuple[int, float]:
     """Phase index and fraction of that phase, of a fraction of the contact's time."""
     ends = np.cumsum(shares)
+    # rounding may put the last end below 1
     phase = min(int(np.searchsorted(ends, fraction)), len(ends) - 1)
     return phase, float((fraction - ends[phase]) / shares[phase] + 1)
 

@@ -70,6 +70,7 @@ def first_touch(plan: Plan) -> dict[str, float | None]:
     at = Places.of(p.robot, q, plan.travel(time), np.zeros(len(time), dtype=np.intp))
     distance = np.array([min(bodies.exact(at, k, pair) for pair in pairs) for k in range(len(time))])
     clear = np.flatnonzero(distance > 0)
+    # the last instant that still touches, going back from contact; 0 if bodies are clear there
     early = time[0] - time[clear[0] - 1] if clear.size and clear[0] else 0.0
     if not clear.size:
         early = time[0] - time[-1]
@@ -86,6 +87,7 @@ def ground_force_share(problem: ImpactProblem, normal: Array) -> list[float] | N
 
 def _slope(time: Array, values: Array) -> Array:
     """Difference quotients (< k, n) of values (k, n) at times (k,), without steps between equal times."""
+    # an instant stands twice where the reference jumps, which is no jerk
     step = np.diff(time)
     keep = step > 1e-9
     return np.diff(values, axis=0)[keep] / step[keep, None]
@@ -98,6 +100,7 @@ def _reversals(angle: Array) -> int:
     """
     count, direction, low, high = 0, 0, angle[0], angle[0]  # direction 0: none yet
     for value in angle.tolist():
+        # extremes since the last reversal
         low, high = min(low, value), max(high, value)
         up, down = value - low >= REVERSAL and direction <= 0, high - value >= REVERSAL and direction >= 0
         if up or down:

@@ -115,6 +115,7 @@ def add_cone_constraints(
         if leg.name in fading and not w.cols.size:  # the wrench is identically zero
             continue
         facets = contact_wrench_cone(leg.sole.polygon, b.limits.cone.friction, margin=margin)
+        # facets are of order one at unit normal force, so over the weight they are of order one here
         facets = facets / b.limits.weight
         normal, sole = w[2:3] * (1 / b.limits.weight), leg.end
         b.constraints.add(
@@ -211,6 +212,7 @@ class MotionPhase:
         self._last = len(self.breaks) + 1
         self._y0 = Affine.constant(b.y0)
         self.lead = _control_points(begins, {REST: 3, FREE: 0})
+        # at rest three equal control points are given at a start, and one variable stands for three at an end
         points = self._last + 1 - self.lead - _control_points(ends, {REST: 2, FREE: 0, COASTING: 1})
         nodes, limits = len(self.nodes), b.limits
         self.c = b.layout.add(f"{self.kind} control point", points, b.ny, **limits.of_y)
@@ -221,6 +223,8 @@ class MotionPhase:
         self.bend: Group | None = None
         self._drifting: tuple[int, ...] = ()  # control points whose base part is in `drift`
         if b.coordinates.drifts:
+            # At rest the first two points give position and speed, also of a base that drifts; from the third
+            # on its acceleration, which gravity causes, is free. At the end nothing of it is given.
             self._drifting = ((2,) if begins == REST else ()) + {
                 REST: (self._last - 1, self._last),
                 COASTING: (self._last,),

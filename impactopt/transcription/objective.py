@@ -82,6 +82,7 @@ def assemble(
         objective = objective - quantity.affine * gain
         if (group := quantity.squares) is not None:
             span = slice(group.offset, group.offset + group.count * group.size)
+            # 1/2 x'Qx has the factor 1/2, and x is in solver units: physical value = scale x
             diagonal[span] -= 2 * gain * np.tile(group.scale**2, group.count)
     return objective, prices.quadratic + sp.diags_array(diagonal), prices.linear
 
@@ -131,6 +132,7 @@ def _priced(
     residuals: list[Affine] = []
     for motion in motions:
         T = float(np.mean(motion.phase.duration))
+        # `np.gradient` gives each node half of the intervals beside it, and an end node the whole of its one.
         for s, length in zip(motion.nodes, np.gradient(motion.nodes), strict=True):
             _, y1, y2 = motion.at(s)
             # integral of (y''/T^2)^2 dt, dt = T ds
@@ -141,12 +143,14 @@ def _priced(
         # the jerk of a cubic spline is constant in an interval: y''' = step / (end - s)
         for s, end in pairwise(motion.breaks) if prices.jerk else ():
             step = motion.at(float(end))[2] - motion.at(float(s))[2]
+            # integral of (y'''/T^3)^2 dt over the interval, dt = T ds: step^2 / (T^5 (end - s))
             residuals.append(step * np.sqrt(2 * prices.jerk / (T**5 * (end - s))))
     m = sp.csr_array((0, n))
     constants = np.zeros(0)
     if residuals:
         stacked = stack(residuals)
         m, constants = stacked.matrix(n), stacked.const
+    # |M x + k|^2 / 2 = x'M'M x / 2 + k'M x + k'k / 2
     linear, constant = m.T @ constants, float(constants @ constants) / 2
     diagonal = np.zeros(n)
     for motion in to_rest:  # price (y_end - y_start)^2, without the pose of a free-floating base

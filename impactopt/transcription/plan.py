@@ -127,6 +127,7 @@ def drifting_reference(
     """
     c, robot = problem.coordinates, problem.robot
     model, data = robot.model, robot.model.createData()
+    # a swing's end is given, not its start: there the striking point has to be at the target
     order = np.arange(len(time))[:: -1 if backward else 1]
     y, yd, ydd = (np.array(part) for part in sample(time)[:3])
     no_legs, weight = np.zeros(0), np.append(np.array(model.gravity.linear), np.zeros(3))
@@ -604,6 +605,7 @@ class Plan:
         """
         t0, t1 = self.contact_start, self.segment(2, missed=missed)[1]
         within = sampled(t0, t1, step)
+        # an impact without duration has t1 = t0
         during = self.closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
         if reference is not None:
             parts = [
@@ -637,6 +639,7 @@ class Plan:
         (y0,), (u0,), _, _ = self.independent(0, np.array([t0]), missed=missed)
         (y1,), (u1,), _, _ = self.independent(2, np.array([t1]), missed=missed)
         span, chord, at = t1 - t0, y1 - y0, s[:, None]
+        # the cubic with the values y0, y1 and the slopes span u0, span u1 in s
         bend = at * (1 - at) * ((1 - at) * (span * u0 - chord) - at * (span * u1 - chord))
         return np.asarray(y0 + at * chord + bend)
 
@@ -652,6 +655,7 @@ class Plan:
         displacement = np.concatenate(
             [[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)]
         )
+        # the speed of a target that stays is zero after contact, up to rounding
         last = 0.0 if self.problem.target.stays else float(hit.target_speed[-1])
         before = float(self.problem.target.speed_before()) * np.minimum(since, 0.0)
         within = np.interp(since, hit.time, displacement, left=0.0)
@@ -684,6 +688,8 @@ class Plan:
                 q, v, _ = c.complete_motion(y, yd, ydd, c.solve_legs(y, c.start_legs))
                 pin.forwardKinematics(robot.model, data, q, v)
                 frame = robot.model.getFrameId(sole.frame)
+                # LOCAL: the corners are known in the sole's own axes, and the length of a velocity is the
+                # same in all
                 twist = pin.getFrameVelocity(robot.model, data, frame, pin.LOCAL)
                 corners = np.column_stack([sole.polygon, np.zeros(len(sole.polygon))])
                 speeds = twist.linear + np.cross(twist.angular, corners)
@@ -801,6 +807,7 @@ def motion_loads(robot: Robot, reference: Trajectory, hit: PlannedCollision) -> 
     """Loads of a reference before and after contact, and of the collision, at all known instants."""
     phase, base = reference.phase, robot.nv - robot.n
     rates, outside = reference.v[:, base:], phase != 1
+    # the reference's phase 1 coasts, so the jump by the impact is between the phases beside it
     jump = rates[phase == 2][0] - rates[phase == 0][-1]
     motion = reference.torque[outside], rates[outside], reference.a[outside, base:]
     return _loads(robot, motion, hit, jump)
@@ -841,6 +848,7 @@ def gear_share(problem: ImpactProblem, torque: Array, acceleration: Array) -> Ar
 
 def _loads(robot: Robot, motion: tuple[Array, ...], hit: PlannedCollision, jump: Array) -> DriveLoads:
     """motion : torque, velocity, acceleration (k, n) of the joints.  jump (n,) : of velocities, at impact."""
+    # an impact without duration has no accelerations, and no torques of its own
     parts = [motion, (hit.torque, hit.velocity, hit.acceleration)][: 1 + bool(hit.acceleration.size)]
     torque, velocity, acceleration = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     gear = gear_torque(robot, torque, acceleration)

@@ -281,6 +281,7 @@ def _code(tables: Mapping[ca.Function, InstructionTable], lanes: int, place: str
     data = []
     for k, table in enumerate(tables.values()):
         words = table.words.astype(np.dtype(place.removesuffix("_t"))).tobytes()
+        # a string literal: gcc reads half a million words in 0.2 s, as a list of numbers in 2.4 s
         text = "".join(map(_LITERAL.__getitem__, words))
         constants = ", ".join(map(_number, table.constants)) or "0"
         data.append(f"static const double constants_{k}[] = {{{constants}}};")

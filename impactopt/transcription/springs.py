@@ -93,6 +93,7 @@ def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) ->
     for one, other in pairwise(motion.breaks):
         samples = []
         for s in (one, (one + other) / 2, other):
+            # none at the start of a swing from rest, where the torque is known
             near = np.flatnonzero(np.isclose(motion.nodes, s))
             torque = torques[near[0]] if near.size else Affine.constant(start_torque(b))
             samples.append((torque, *motion.at(s)[:2]))
@@ -132,6 +133,7 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
     stiffness, damping = ((gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd))
     slots: list[list[Any]] = [[point.y, point.y1, point.T, gains] for point in points]
     at = b.add_block("spring", slots, np.concatenate([b.y0[c.base :], stiffness, damping]))
+    # The block's torque is zero in the start posture, where the springs carry what the robot's weight needs.
     rest, m = start_torque(b)[passive], b.ny - c.base
     position = np.array([int(np.flatnonzero(own == k)[0]) for k in passive])  # in the block's outputs (m,)
     names = [robot.joint_names[k] for k in passive]

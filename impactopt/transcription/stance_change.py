@@ -117,6 +117,7 @@ class PhaseSequence:
             node, phase = self._node(heavy, one, other), self.phases[heavy]
             names = [leg.name for leg in self.builders[heavy].coordinates.legs]
             light = self._soles(one + other - heavy)
+            # components of the heavier phase's soles that the lighter one has not
             changing = [6 * k + np.arange(6) for k, name in enumerate(names) if name not in light]
             phase.unloaded[node] = np.concatenate(changing)
 
@@ -256,12 +257,14 @@ class PhaseSequence:
             if sole in b.coordinates.soles:
                 continue
             lifted, lands = (j in self.numbers and sole.name in self._soles(j) for j in (k - 1, k + 1))
+            # inf if the sole was not on the ground before, or does not come down after: no ramp there
             since = np.where(lifted, phase.nodes * T, np.inf)  # [s] lift-off
             until = np.where(lands, (1 - phase.nodes) * T, np.inf)  # [s] touch-down
             ramp = np.minimum(np.minimum(since, until) / RAMP_TIME, 1.0)
             airborne = np.flatnonzero(ramp > 0)
             spots = [[phase.at(float(phase.nodes[j]))[0]] for j in airborne]
             at, corners = b.add_block(f"stance{k}_heights{i}", spots, sole.polygon.ravel()), len(sole.polygon)
+            # the next phase has the foothold: the placement at which it fixes the sole
             legs = self.builders[k + 1].coordinates.legs if lands else ()
             foothold = [leg.placement.translation[:2] for leg in legs if leg.name == sole.name]
             for number, j in enumerate(airborne):

@@ -47,6 +47,7 @@ class StrikeTranscription(ContactProgram):
         self.y = add("posture at contact", 1, b.ny, **limits.of_y)
         self.legs = add("legs at contact", 1, b.nl, **limits.of_legs)
         self.w = add("sole wrench at contact", 1, b.nw, **limits.of_wrenches)
+        # the base has no rate limit of its own
         fastest = np.full(b.ny, np.inf)
         fastest[c.base :] = limits.rate_limit[c.independent]
         coasting = add_coasting(b, {"lower": -fastest, "upper": fastest})
@@ -109,12 +110,15 @@ class StrikeTranscription(ContactProgram):
         """
         p, n = self.problem, self.layout.n
         T, linear, diagonal = float(np.mean(p.swing.duration)), np.zeros(n), np.zeros(n)
+        # in solver units, as coordinates and rates have a scale of one
         y, u = self.y.index(0), self.u0.index(0)
         # second derivatives by d, by d and u, and by u, with d = y - y0
         dd, du, uu = (2 * p.smoothness * k for k in (12 / T**3, -6 / T**2, 4 / T))
         diagonal[y], diagonal[u] = dd, uu
         linear[y], linear[u] = -dd * self.y0, -du * self.y0
+        # the mixed derivative by d and u stands at (y, u) and, by the transpose, at (u, y)
         mixed = sp.csr_array((np.full(len(y), du), (y, u)), shape=(n, n))
+        # a swing has a node at the end and in the middle of each interval
         of_swing = (self.w, 2 * p.swing.intervals)  # priced as one of the swing's nodes
         diagonal += wrench_prices(
             self.builder, [of_swing, *[(hit.w, hit.w.count) for hit in self.hit.collisions]]

@@ -211,6 +211,7 @@ class JacobianMap:
             z, out = z + b.count * b.n_in, out + b.count * b.n_out
         source, linear_index, length, factor = _concatenated(parts)
         at, values = _linear_indices(linear)
+        # All places that anything is ever added to, sorted by column and row: the same pattern at every x.
         pattern = union(np.concatenate([linear_index, at]), np.concatenate([length, np.ones_like(at)]))
         self._linear = np.bincount(np.searchsorted(pattern, at), values, pattern.size)  # A in that pattern
         self._template = sp.csc_array((self._linear, *_csc(pattern, self._shape)), shape=self._shape)
@@ -378,6 +379,7 @@ class StructuredProgram:
         self._of_nonlinear = output_of[self._nonlinear]  # and that output
         outputs, uses = np.unique(self._of_nonlinear, return_counts=True)
         if (uses > 1).any():
+            # Each output has one multiplier and one place in the scatter-adds, `constraint_of`.
             twice = self._nonlinear[self._of_nonlinear == outputs[uses > 1][0]]
             one, other = (self.origins[i] for i in twice[:2])
             raise InputError(
@@ -490,6 +492,7 @@ class StructuredProgram:
     def hessian(self, x: Array, sigma: float, multipliers: Array) -> sp.csc_array:
         t = time.perf_counter()
         found = self._hessian  # before the blocks are called: it sets the array that they write to
+        # outputs that are in no constraint keep zero, and contribute nothing
         lam = np.zeros(int(self._out_offset[-1]))  # multiplier of each output's constraint
         lam[self._of_nonlinear] = multipliers[self._nonlinear]
         for b, z, o in zip(self.blocks, self._lifted(x), self._out_offset, strict=False):

@@ -157,6 +157,8 @@ class Transcription(ContactProgram):
         shares: Shares = (),
     ) -> None:
         b, self.nodes = Builder(problem, coordinates, functions), nodes
+        # The phase with the impact is in both: its swing ends the first sequence, its follow-through begins
+        # the second.
         before, after = range(problem.blow + 1), range(problem.blow, max(1, len(problem.stances)))
         self.before = PhaseSequence(b, before, lambda begins, _: Swing(b, nodes.swing, begins), nodes)
         self.swing = cast(Swing, self.before.phases[problem.blow])
@@ -327,6 +329,8 @@ class Transcription(ContactProgram):
         b.equal("follow-through starts from the predicted state", "position", labels, first + 1, far)
         b.equal("follow-through starts from the predicted state", "rate", labels, first + 2, fast)
         if self.abort is not None:
+            # instances: expected collision, scenarios by number, abort motion; three outputs for each
+            # coordinate
             after = first + 3 * b.ny * len(hit.collisions)
             b.equal("abort motion starts where coasting ends", "position", labels, after + 1, far)
             b.equal("abort motion starts where coasting ends", "rate", labels, after + 2, fast)
@@ -387,6 +391,7 @@ class Transcription(ContactProgram):
         total = self.objective_sum(x)
         if not total:
             return np.inf, np.inf
+        # the program minimizes prices minus the sum
         return (self.program.objective(x) + total) / abs(total), self._style.evaluate(x) / abs(total)
 
     def body_states(self, x: Array) -> list[BodyState]:

@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from support.small_robots import arm, biped
@@ -35,7 +36,7 @@ from impactopt.problem.terms import (
     TorqueLimit,
     VelocityLimit,
 )
-from impactopt.robots.robot import Robot
+from impactopt.robots.robot import Robot, Striker
 
 Array = NDArray[np.float64]
 
@@ -114,6 +115,25 @@ def test_a_normal_within_rounding_of_a_unit_vector_is_made_one(robot: Robot) -> 
 def test_a_start_may_be_a_configuration(robot: Robot) -> None:
     q = posture(robot, elbow=1.0)
     np.testing.assert_array_equal(problem(robot, start=q).start_posture, q)
+
+
+def test_a_knee_strikes_of_a_leg_that_does_not_stand(robot: Robot) -> None:
+    """Joints of a standing leg follow from the others in a plan, and the striker would not know."""
+    robot = robot.with_striker(Striker(name="knee", frame="right knee", point=np.array([0.05, 0.0, 0.0])))
+    q = on_left(robot)
+    there = q.copy()
+    there[7 + robot.joint_index("right hip pitch")] -= 0.1
+    model = robot.model
+    data, frame = model.createData(), model.getFrameId("striker:knee")
+    places = []
+    for at in (q, there):
+        pin.framesForwardKinematics(model, data, at)
+        places.append(data.oMf[frame].translation.copy())
+    way = places[1] - places[0]
+    hit = {"striker": "knee", "point": places[1], "normal": way / np.linalg.norm(way)}
+    assert problem(robot, start=q, stance=OneSole("left"), **hit).contact_posture.shape == (robot.nq,)
+    with pytest.raises(InputError, match="the sole 'right' stands, so it cannot carry the striker 'knee'"):
+        problem(robot, **hit)
 
 
 def test_inputs_are_copied(robot: Robot) -> None:

@@ -86,6 +86,8 @@ def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool, slides: bool
     hand = ca.mtimes(root, ca.sparsify(tree.hand_row.T))
     held = ca.mtimes(root, ca.sparsify(tree.held_jacobian.T))
     others = robot.nv - n
+    # joints first, as the time loop needs these and the hand; the base's velocities, for the constraints, are
+    # last
     columns = [i - others if i >= others else n + 1 + i for i in range(robot.nv)]
     places = [(r, columns[c]) for r, c in _nonzeros(root)] + [(r, n) for r, _ in _nonzeros(hand)]
     out = [ca.vertcat(root.nz[:], hand.nz[:]), ca.densify(held.nz[:]), tree.hand_speed]
@@ -296,9 +298,11 @@ def _split(whole: Any, n_given: int) -> tuple[list[Any], list[str]]:
             held[write[0]] = f"a{write[0]}"
             lines.append(f"a{write[0]} = seeds[{read[0] - n_given}][{read[1]}]")
         elif kind not in (ca.OP_INPUT, ca.OP_CONST) and any(register in held for register in read):
+            # a tangent is linear in its direction, so there are no other operations of it
             lines.append(f"a{write[0]} = " + _LINEAR[kind].format(*map(operand, read)))
             held[write[0]] = f"a{write[0]}"
         else:
+            # CasADi uses a register again and again: from here on it has no direction
             held.pop(write[0], None)
             since[write[0]] = k
             if kind == ca.OP_INPUT:
@@ -372,6 +376,7 @@ def _blocks(collision: SteppedModel, fraction: float) -> int:
     """Largest number of steps in a fraction of the horizon, in whole blocks."""
     if collision.stepping == "implicit":
         return MOST_STEPS
+    # as `runge_kutta.run` does, so that the histories have as many columns
     return -(-number_of_steps(collision, fraction) // BLOCK) * BLOCK
 
 

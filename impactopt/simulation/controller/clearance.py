@@ -66,6 +66,7 @@ class Clearance:
         origins = self._update_bounds(data)
         least_distance = self._distance - (self._moved[self._pairs].sum(axis=1) - self._moved_then)
         most_speed = self._moved_last[self._pairs].sum(axis=1) / self._period
+        # with the least distance and the largest closing speed that these bounds permit
         near = np.flatnonzero(_least_second_rate(least_distance, -most_speed) > -MAX_CLOSING_ACCELERATION)
         if not len(near):
             return np.zeros((0, self._model.nv)), np.zeros(0)
@@ -87,6 +88,7 @@ class Clearance:
             for joint, arm, sign in zip(joints[k], arms[k], (-1.0, 1.0), strict=True):
                 if joint:  # joint 0 is the world
                     J = pin.getJointJacobian(self._model, data, int(joint), _AXES)
+                    # n . (v + omega x arm) = n . v + (arm x n) . omega
                     row += sign * (normals[k] @ J[:3] + np.cross(arm, normals[k]) @ J[3:])
         return jacobian, lower[chosen]
 

@@ -57,6 +57,7 @@ class Sensors:
     def __init__(self, robot: Robot, *, noise: float, rate: float, seed: int) -> None:
         self.n, self.noise = robot.n, noise
         self._random = np.random.default_rng(seed)
+        # the accuracy in the data sheet is that of roll and pitch; yaw has no constant error here
         self._tilt = TILT * self._random.standard_normal(3) * [1.0, 1.0, 0.0]
         self._bias = GYRO_BIAS * self._random.standard_normal(3)
         # a rate is a difference of two readings; white noise has the bandwidth rate / 2
@@ -65,6 +66,7 @@ class Sensors:
     def read(self, angles: Array, v: Array, rotation: Array, forces: Array) -> Measured:
         """Readings for joint angles (n,), velocity v (nv,), base rotation (3, 3) and forces (h,)."""
         s, n, drawn = self.noise, self.n, self._random.standard_normal(6 + 2 * self.n + len(forces))
+        # on the left: about the world's axes
         error = pin.exp3(s * (self._tilt + ORIENTATION_NOISE * drawn[:3]))
         gyro = v[3:6] if len(v) >= n + 6 else np.zeros(3)
         return Measured(
@@ -127,6 +129,7 @@ class StateEstimate:
             now = pin.updateFramePlacement(model, data, i)
             position += weight * (standing.act(point) - now.act(point))
             moves = pin.getFrameVelocity(model, data, i, pin.LOCAL)
+            # velocity of the sole's point: v + omega x point, in the sole's axes
             velocity -= weight * (now.rotation @ (moves.linear - pin.skew(point) @ moves.angular))
         q[:3], v[:3] = position, measured.rotation.T @ velocity
         return q, v

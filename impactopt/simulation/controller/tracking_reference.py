@@ -80,6 +80,7 @@ class Recovery:
         The rate falls linearly from 1 to the recovery's pace during `BRAKING`.
         """
         slower, braked = 1.0 - self.pace, min(since, BRAKING)
+        # the integral of the rate below
         passed = since - slower * (braked**2 / (2 * BRAKING) + since - braked)
         brakes = since < BRAKING
         return passed, 1.0 - slower * braked / BRAKING, -slower / BRAKING if brakes else 0.0
@@ -93,6 +94,7 @@ class Recovery:
         return ReferenceSample(
             q=np.array(pin.integrate(self.model, sample.q, self.shift)),
             v=rate * sample.v,
+            # chain rule of q(passed(t)); so for the centre of mass and the momentum
             a=rate**2 * sample.a + second_rate * sample.v,
             torque=np.zeros_like(sample.torque),
             com=com_aim,
@@ -138,6 +140,7 @@ def _com_goal(scene: Scene, com: Array, margin: float) -> Array:
     """
     centre = (scene.polygon.min(axis=0) + scene.polygon.max(axis=0)) / 2
     has, most = distance_inside(scene.polygon, np.stack([com, centre]))
+    # distance from the edges is concave, so this point has at least the margin
     fraction = 1.0 if most <= margin else np.clip((margin - has) / (most - has), 0.0, 1.0)
     return np.asarray(com + fraction * (centre - com))
 

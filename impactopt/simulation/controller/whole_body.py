@@ -83,12 +83,14 @@ class TorqueQP:
         inverse, _ = dtrtri(L, lower=1)
         columns, m = self._columns, self.m
         np.matmul(inverse, C.T, out=columns[:, :m])
+        # C x = (C L'^-1) y, so the transposed matrix is L^-1 C'; of the bounds, with C = I, it is L^-1
         columns[:, m:] = inverse
         scale = 1.0 / np.maximum(np.sqrt(np.einsum("ij,ij->j", columns, columns)), MIN_NORM)
         columns *= scale
         self._lower[:m], self._lower[m:] = c, low
         self._upper[m:] = high * scale[m:]
         self._solver.update(Ax=columns[self._nonzero], q=inverse @ q, l=self._lower * scale, u=self._upper)
+        # back from y: x = L'^-1 y
         x = inverse.T @ self._solver.solve(raise_error=False).x
         return np.minimum(np.maximum(x, low), high)
 
@@ -201,6 +203,7 @@ def wrench_cone(corners: Array, settings: ControllerSettings) -> Array:
     X, Y, cx, cy = (x1 - x0) / 2, (y1 - y0) / 2, (x0 + x1) / 2, (y0 + y1) / 2
     # from a wrench about the frame's origin to one about the rectangle's centre
     shift = np.eye(6)
+    # moment about the rectangle's centre: m - centre x f
     shift[3:, :3] = -pin.skew(np.array([cx, cy, 0.0]))
     rows = [[0.0, 0, 1, 0, 0, 0]]
     rows += [[i * a, (1 - i) * a, mu, 0, 0, 0] for i in (0, 1) for a in (1, -1)]
@@ -456,6 +459,7 @@ class WholeBodyController:
         P, g = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
         P[:n, :n], g[:n] = tasks.quadratic_form()
         effort = s.blow if servo_torques else (RECOVERY_TORQUE_WEIGHT if recovers else s.torque)
+        # flat stride n + 3 of the n + 2 columns is the diagonal
         P.flat[: n * (n + 2) : n + 3] += effort  # diagonal of the torques
         g[:n] -= effort * feed
         P.flat[n * (n + 3) :: n + 3], g[n:] = SLACK_SQUARE_WEIGHT, SLACK_WEIGHT  # diagonal of the slacks
@@ -536,6 +540,8 @@ class WholeBodyController:
         if recovers:  # the reference of the centre of mass is no longer that of the joints
             error[:3] = mass * aim.com[1] - data.hg.linear
         wanted = np.zeros(6)
+        # (c' + c''/omega) = -gain (c + c'/omega) for the errors: c'' = -omega gain c - (omega + gain) c'. The
+        # soles' wrenches over the mass are c'' - g.
         wanted[:3] = (
             aim.com[2]
             + self.kp * omega * gain * (aim.com[0] - com)

@@ -74,6 +74,7 @@ class Forces:
         """Torque (n,) [N m] of the servo before saturation; `moved`: angles (n,) [rad] since contact."""
         t, powers = min(time, self.reference_until), np.arange(1, self.reference.shape[1] + 1)
         # change of the reference's velocity up to t, after which it is constant, by powers; and its integral
+        # column k: coefficient times t^k, (n, k)
         velocity_change = self.reference * t**powers
         angle_change = velocity_change @ (t / (powers + 1) + (time - t))
         rate_error = self.velocity + velocity_change.sum(axis=1) - velocity

@@ -61,12 +61,14 @@ def coasting_reference(
             if until < _MIN_TIME:
                 raise
         else:
+            # the linear term is known, so the fit begins with t^2
             remainder = (velocities - start - np.outer(times, acceleration))[:, -robot.n :]
             powers = (times / until)[:, None] ** orders
             fitted = np.linalg.lstsq(powers, remainder, rcond=None)[0]
             if np.abs(powers @ fitted - remainder).max() < _MAX_ERROR or until * _SHRINK < shortest:
                 break
         until *= _SHRINK
+    # fitted in t / until, so that powers up to the tenth are of order one
     reference = np.column_stack([acceleration[-robot.n :], fitted.T / until**orders])
     return {"reference": reference, "reference_until": np.array(until)}
 

@@ -123,6 +123,7 @@ def contact_scales(body: Body, forces: Forces, rate: float, horizon: float) -> S
     closing = max(abs(rate), 1e-6)
     # penetration at which the contact's work, force x depth, equals the kinetic energy, speed^2 /
     # inverse_mass up to a factor
+    # from below any contact to how far the hand gets by the horizon
     depths = np.geomspace(1e-15, closing * horizon, 120)
     stopped = [forces.contact(x, closing, True) * inverse_mass * x > closing**2 for x in depths]
     time = float(depths[stopped.index(True) if True in stopped else -1]) / closing
@@ -205,6 +206,7 @@ class Motion:
                 self._advance(solver)
             except _Switches as switch:
                 # Approach the switch from before, and cross it by one tiny explicit Euler step.
+                # at least some units in the last place of the time, or the step would not move it
                 tiny = max(_SWITCH_STEP * self._scales.time, 8 * float(np.spacing(state.time)))
                 if switch.time - state.time <= tiny:
                     self._watched = None

@@ -80,6 +80,7 @@ class MujocoDynamics(ReferenceModel):
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
         # steps that resolve servo and friction; halved until they resolve the contact too
+        # explicit in the applied forces, so that a decay faster than 2 / step would grow
         step = min(self.step, 1 / fastest) if fastest > 0 else self.step
         first = None
         while first is None:
@@ -235,6 +236,7 @@ def march(
 
 def _fastest(forces: Forces, depth: float, rate: float, compressing: bool, scales: Scales) -> float:
     """Fastest rate [1/s] of the contact's spring and damper between free hand and target."""
+    # differences a thousandth of the contact's own depth and speed
     depth_step, speed_step = 1e-3 * scales.time * scales.speed, 1e-3 * scales.speed
     stiffness, damping = forces.contact_slopes(depth, rate, compressing, depth_step, speed_step)
     return max(sqrt(max(stiffness, 0.0) * scales.inverse_mass), abs(damping) * scales.inverse_mass)

@@ -363,11 +363,13 @@ class StanceCoordinates:
         self._build_symbolic_pieces()
         legs = ca.SX.sym("legs", self.nl)
         self.start, self.start_legs = self.split(posture)
-        self.start_determinants = np.array(
-            ca.Function("det", [legs], [self.leg_determinants(legs)])(self.start_legs)
-            if self.legs
-            else np.zeros(0)
-        ).ravel()
+        determinants = self.leg_determinants(legs) if self.legs else ca.SX(0, 1)
+        self._determinants = ca.Function("determinants", [legs], [determinants])
+        self.start_determinants = np.array(self._determinants(self.start_legs)).ravel()
+
+    def leg_extension(self, legs: Array) -> Array:
+        """Determinants (soles + hands,) of the Jacobians of legs (nl,) over those at the start."""
+        return np.array(self._determinants(legs)).ravel() / self.start_determinants
 
     def _leg_samples(self, frame: str, chain: Index, posture: Array) -> list[Array]:
         """Jacobians (6, 6) of a chain's last joints, at this posture and four random ones near it."""

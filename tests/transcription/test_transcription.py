@@ -71,6 +71,19 @@ def test_the_first_iterate_is_inside_its_bounds_and_all_constraints_finite(
     assert np.isfinite(program.jacobian(x).data).all()
 
 
+@pytest.mark.parametrize("speed", [4.0, 6.0])
+def test_the_first_iterate_of_a_fast_strike_keeps_the_knees_bent(
+    biped_transcription: Transcription, speed: float
+) -> None:
+    """Such speeds once took the base out of the legs' reach on the way."""
+    t = biped_transcription
+    x, c = first_iterate(t, speed=speed), t.coordinates
+    for phase in (t.swing, *t.follows):
+        spline = phase.spline(x)
+        for y in spline.sample(phase.nodes * spline.duration)[0]:
+            assert c.leg_extension(c.solve_legs(y, c.start_legs)).min() > 0.1
+
+
 @pytest.mark.parametrize("away", [0.0, 0.02], ids=["at the first iterate", "near it"])
 def test_jacobian_and_hessian_agree_with_differences(transcription: Transcription, away: float) -> None:
     program = transcription.program

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.cache import cached
 from impactopt.collision.batch import Batch
 from impactopt.collision.checks import (
+    ACCURACY,
     FREEZE_ERROR,
     Stability,
     breaks,
@@ -22,6 +23,8 @@ from impactopt.collision.checks import (
     check_steps,
     freeze_error,
     left_out_by_breaking,
+    too_large,
+    without_contact,
 )
 from impactopt.collision.derivatives import differentiable, export, in_order
 from impactopt.collision.graph import Description, collision_graph, describe, target_start
@@ -317,9 +320,8 @@ class SymbolicModel(SteppedModel):
             self.check_separation(result)
         if self._more_often is None or not result.separated:
             return result
-        impulse, one = np.array([result.impulse]), arguments[2] if self.effects.feedforward else None
-        (error,) = self._freeze_error(impulse, q[None], v[None], one, values, threads=1)
-        return replace(result, freeze_error=float(error), caution=self._caution(float(error)))
+        error = self._more_often._error_of(result.impulse, arguments, values)
+        return replace(result, freeze_error=error, caution=self._caution(error))
 
     # ------------------------------------------------------------ error of freezing
     @property
@@ -346,16 +348,37 @@ class SymbolicModel(SteppedModel):
         better = self._more_often.batch(q, v, torque, outputs=("impulse",), threads=threads, **settings)
         return freeze_error(impulse, better["impulse"], better["separated"])
 
-    def _by_steps(self, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> Collision:
-        frozen = self._stability.frozen(arguments[0], values)
-        if self.stepping != "implicit":
-            self.check_step(self._stability.longest(frozen, values))
-        names = self.available
+    def _error_of(self, impulse: float, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> float:
+        """Estimated relative error, by freezing, of the impulse [N s] of a model with fewer freezes."""
+        checked = ("impulse", "separated", "duration", "step_error")
+        found = self._evaluate(tuple(name for name in checked if name in self.available), arguments, values)
+        better, step = found["impulse"].ravel(), self.step_length if self.stepping in ACCURACY else 0.0
+        ends = (found["separated"] > 0.5) & ~without_contact(better, found["duration"], step)
+        if "step_error" in found:
+            ends &= ~too_large(self.stepping, found["step_error"])
+        return float(freeze_error(np.array([impulse]), better, ends.ravel())[0])
+
+    def _evaluate(
+        self, names: tuple[str, ...], arguments: list[Any], values: dict[str, NDArray[np.float64]]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Outputs of one collision by name."""
         found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
-        outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
+        return {name: np.array(x) for name, x in zip(names, found, strict=True)}
+
+    def _by_steps(self, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> Collision:
+        implicit = self.stepping == "implicit"
+        frozen = {} if implicit else self._stability.frozen(arguments[0], values)
+        if not implicit:
+            self.check_step(self._stability.longest(frozen, values))
+        outputs = self._evaluate(self.available, arguments, values)
+        if np.isnan(outputs["impulse"]).any():  # for the reason, if the frozen dynamics are it
+            self._stability.frozen(arguments[0], values)
         check_finite(outputs, self.step_length)
-        error = float(outputs.get("step_error", np.zeros(1)).item())
         result = Collision.from_outputs(outputs, self.target)
+        if implicit:
+            check_steps(self, result, 0.0)
+            return result
+        error = float(outputs["step_error"].item())
         if breaks(self):
             force = values["target_breaking_force"]
             error += float(left_out_by_breaking(self, result.impulse, outputs["target_result"][:, 0], force))

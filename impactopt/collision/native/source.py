@@ -34,8 +34,17 @@ from impactopt.errors import InputError
 __all__ = ["least_size", "native_collision", "native_differences", "native_gradient", "native_jacobian"]
 
 # files of the time stepping, and of its discrete adjoint
-_IMPLICIT = ("implicit", *(f"implicit_{part}" for part in ("factor", "step", "remainders", "events", "run")))
-_STEPS = {"rk4": ("rk4.h", "steps.h"), "implicit": tuple(f"{name}.h" for name in _IMPLICIT)}
+_STEPS = {
+    "rk4": ("rk4.h", "steps.h"),
+    "implicit": (
+        "implicit.h",
+        "implicit_factor.h",
+        "implicit_step.h",
+        "implicit_remainders.h",
+        "implicit_events.h",
+        "implicit_run.h",
+    ),
+}
 _ADJOINT = {"rk4": ("rk4_adjoint.h", "steps_adjoint.h"), "implicit": ("implicit_adjoint.h",)}
 # The generated code of the tree is long and without branches. These options make it a sixth faster than -Og
 # for half a second more of the compiler; -O2 takes another half and gains nothing.

@@ -348,7 +348,9 @@ class SymbolicModel(SteppedModel):
         better = self._more_often.batch(q, v, torque, outputs=("impulse",), threads=threads, **settings)
         return freeze_error(impulse, better["impulse"], better["separated"])
 
-    def _error_of(self, impulse: float, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> float:
+    def _error_of(
+        self, impulse: float, arguments: list[Any], values: dict[str, NDArray[np.float64]]
+    ) -> float:
         """Estimated relative error, by freezing, of the impulse [N s] of a model with fewer freezes."""
         checked = ("impulse", "separated", "duration", "step_error")
         found = self._evaluate(tuple(name for name in checked if name in self.available), arguments, values)

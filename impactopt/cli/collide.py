@@ -86,7 +86,7 @@ def collide(
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
         from impactopt.collide.single_collision import collide_once, problem_of_result
-        from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.files.sections.reading import CollisionFile, parse_settings
         from impactopt.report.console import SolveConsole
 
         check_loudness(quiet, verbose)
@@ -98,7 +98,7 @@ def collide(
         if saved and posture is not None:
             raise typer.BadParameter("a result has its own; leave it out", param_hint="--posture")
         changes = parse_settings(settings or ())
-        read = problem_of_result(what).changed(changes) if saved else read_problem_file(what, changes)
+        read = problem_of_result(what).changed(changes) if saved else CollisionFile.read(what, changes)
         at_contact: dict[str, Any] = {"model": model.value}
         if freezes is None and saved and model is Model.sdc:
             freezes = RESULT_FREEZES

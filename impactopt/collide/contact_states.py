@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 
 from impactopt.codegen.batched import BatchedFunction
 from impactopt.codegen.cache import cached, model_hash
+from impactopt.collision.coasting import coasting_reference
 from impactopt.collision.frozen import _inverse_of_cholesky
 from impactopt.errors import InputError, check_choice
-from impactopt.files.output import load_record
+from impactopt.files.record import load_record
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import Free, Stance
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
-from impactopt.simulation.reference import coasting_reference
 
 __all__ = ["ContactStates", "Posture", "States", "striking_functions"]
 

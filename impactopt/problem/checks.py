@@ -19,6 +19,7 @@ from impactopt.contact.friction import check_friction
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import (
+    MANY,
     MOST,
     InputError,
     check_array,
@@ -62,7 +63,6 @@ MOST_FREEZES = 64
 LONGEST_CONTACT = 100.0  # [s]
 MOST_ELEMENTS = 100  # of compression or restitution: two are accurate to a few per mille
 MOST_TOUCHES = 4
-MANY = 100  # scenarios or obstacles
 # Smaller mobilities along the normal, over the largest in any direction, count as zero.
 MIN_MOBILITY = 1e-12
 

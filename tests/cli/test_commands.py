@@ -229,7 +229,7 @@ def test_a_fault_of_ours_is_no_answer(file: Path, monkeypatch: pytest.MonkeyPatc
     def fail(*arguments: Any, **options: Any) -> Robot:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("impactopt.files.problem_file.robot_sections.load_robot", fail)
+    monkeypatch.setattr("impactopt.files.sections.robot.load_robot", fail)
     _, err = run("check", file, code=70)
     assert "ZeroDivisionError: a bug" in err and "fault of impactopt" in err
 

@@ -29,8 +29,8 @@ from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, 
 from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
-from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.files.problem_file.writing import sole_data, striker_data, tool_data
+from impactopt.files.toml import Place, plain_value, write_toml
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike

@@ -62,13 +62,19 @@ _FOLLOWER = "JointModelMimic"  # revolute or prismatic, which `_read_joint` find
 _KINDS = {
     "JointModelFreeFlyer": Kind.FREE,
     _FOLLOWER: Kind.REVOLUTE,
-    **{f"JointModel{name}": Kind.REVOLUTE for name in ("RX", "RY", "RZ", "RevoluteUnaligned")},
-    **{f"JointModel{name}": Kind.REVOLUTE for name in ("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned")},
-    **{f"JointModel{name}": Kind.PRISMATIC for name in ("PX", "PY", "PZ", "PrismaticUnaligned")},
+    "JointModelRX": Kind.REVOLUTE,
+    "JointModelRY": Kind.REVOLUTE,
+    "JointModelRZ": Kind.REVOLUTE,
+    "JointModelRevoluteUnaligned": Kind.REVOLUTE,
+    "JointModelRUBX": Kind.REVOLUTE,
+    "JointModelRUBY": Kind.REVOLUTE,
+    "JointModelRUBZ": Kind.REVOLUTE,
+    "JointModelRevoluteUnboundedUnaligned": Kind.REVOLUTE,
+    "JointModelPX": Kind.PRISMATIC,
+    "JointModelPY": Kind.PRISMATIC,
+    "JointModelPZ": Kind.PRISMATIC,
+    "JointModelPrismaticUnaligned": Kind.PRISMATIC,
 }
-
-# Q of axes x, y, z: a cyclic permutation, Q z = axis.
-_PERMUTATIONS = tuple(np.roll(np.eye(3), k + 1, axis=0) for k in range(3))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +262,7 @@ def _turn_to_z(axis: Any) -> Any:
     """A rotation Q with Q z = axis; a permutation where the axis is x, y or z."""
     for k in range(3):
         if abs(axis[k] - 1.0) < 1e-14:
-            return _PERMUTATIONS[k]
+            return np.roll(np.eye(3), k + 1, axis=0)  # a cyclic permutation
     side = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     side /= np.linalg.norm(side)
     return np.stack([side, np.cross(axis, side), axis], axis=1)

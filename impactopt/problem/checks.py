@@ -30,7 +30,7 @@ from impactopt.errors import (
     shortened,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.operational_space import Held
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.motion_style import STYLES
 from impactopt.problem.objectives import Penetration
@@ -192,7 +192,7 @@ def check_moves(problem: Any) -> None:
     """InputError if no joint moves the striking point along the normal where it meets the target."""
     c, n = problem.coordinates, problem.normal
     striker = problem.robot.striker(problem.striker).model_frame
-    mobility = Held.at(c.model, problem.contact_posture, c.frames, striker).inverse_mass()
+    mobility = ConstrainedDynamics.at(c.model, problem.contact_posture, c.frames, striker).inverse_mass()
     if n @ mobility @ n <= MIN_MOBILITY * np.linalg.norm(mobility):
         raise InputError(
             f"no joint of {problem.robot.name!r} moves {problem.striker!r} along the normal "

@@ -81,7 +81,8 @@ def collide(
     error of freezing, with advice if that is above --accuracy. With a posture, the striking point moves
     along the normal at --speed with the least kinetic energy, the soles are at rest, and the servo's
     reference keeps the joint velocities. A result has its own reference, which keeps the soles in place; its
-    planned numbers are printed too. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
+    planned numbers are printed too. Sections of a problem file that are about plans, such as [swing] or
+    [terms], are not checked. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
     limit, no separation), 2 bad input.
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:

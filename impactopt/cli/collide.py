@@ -6,7 +6,7 @@ import enum
 import math
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -81,8 +81,8 @@ def collide(
     error of freezing, with advice if that is above --accuracy. With a posture, the striking point moves
     along the normal at --speed with the least kinetic energy, the soles are at rest, and the servo's
     reference keeps the joint velocities. A result has its own reference, which keeps the soles in place; its
-    planned numbers are printed too. Sections of a problem file that are about plans, such as [swing] or
-    [terms], are not checked. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
+    planned numbers are printed too. Sections of a problem file that are about plans, such as swing and
+    terms, are not checked. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
     limit, no separation), 2 bad input.
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
@@ -100,15 +100,13 @@ def collide(
             raise typer.BadParameter("a result has its own; leave it out", param_hint="--posture")
         changes = parse_settings(settings or ())
         read = problem_of_result(what).changed(changes) if saved else CollisionFile.read(what, changes)
-        at_contact: dict[str, Any] = {"model": model.value}
         if freezes is None and saved and model is Model.sdc:
             freezes = RESULT_FREEZES
-        at_contact |= {} if freezes is None else {"freezes": freezes}
-        at_contact |= {"result": str(what.resolve())} if saved else {}
-        at_contact |= {} if posture is None else {"posture": posture}
+        given = {"model": model.value, "freezes": freezes, "posture": posture, "speed_m_s": speed}
+        given["result"] = str(what.resolve()) if saved else None
+        at_contact = {key: value for key, value in given.items() if value is not None}
         with SolveConsole(console, quiet=quiet) as progress:
             progress.say(f"{read.path} is read; computing the collision (compiles the first time)")
-            at_contact |= {} if speed is None else {"speed_m_s": speed}
             found = collide_once(read, at_contact, accuracy=accuracy / 100)
         if as_json:
             print_json(found, "reason" not in found)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.cache import cached
 from impactopt.collision.batch import Batch
 from impactopt.collision.checks import (
-    ACCURACY,
     FREEZE_ERROR,
     Stability,
     breaks,
@@ -23,8 +22,6 @@ from impactopt.collision.checks import (
     check_steps,
     freeze_error,
     left_out_by_breaking,
-    too_large,
-    without_contact,
 )
 from impactopt.collision.derivatives import differentiable, export, in_order
 from impactopt.collision.graph import Description, collision_graph, describe, target_start
@@ -251,8 +248,12 @@ class SymbolicModel(SteppedModel):
             self._functions[key] = Batch(self, own, self._stability, every=every)
         found: dict[str, NDArray[np.float64]] = self._functions[key](q, v, torque, settings, threads=threads)
         if FREEZE_ERROR in outputs:
-            error = self._freeze_error(found["impulse"], q, v, torque, settings, threads)
-            found[FREEZE_ERROR] = np.where(found["separated"], error, np.nan)
+            found[FREEZE_ERROR] = np.full(len(found["impulse"]), np.nan)
+            if self._more_often is not None:
+                given: dict[str, Any] = {"outputs": ("impulse",), "threads": threads, **settings}
+                better = self._more_often.batch(q, v, torque, **given)
+                error = freeze_error(found["impulse"], better["impulse"], better["separated"])
+                found[FREEZE_ERROR] = np.where(found["separated"], error, np.nan)
         return found
 
     def _compiled(self, name: str, what: tuple[Any, ...], build: Callable[[], Any]) -> Any:
@@ -333,32 +334,12 @@ class SymbolicModel(SteppedModel):
         """Warning about a relative error of the impulse that freezing causes; "" if it is small."""
         return ""
 
-    def _freeze_error(
-        self,
-        impulse: NDArray[np.float64],
-        q: ArrayLike,
-        v: ArrayLike,
-        torque: ArrayLike | None,
-        settings: Mapping[str, Any],
-        threads: int | None,
-    ) -> NDArray[np.float64]:
-        """Estimated relative error of each impulse (N) [N s] by freezing; nan if it is not estimated."""
-        if self._more_often is None:
-            return np.full(len(impulse), np.nan)
-        better = self._more_often.batch(q, v, torque, outputs=("impulse",), threads=threads, **settings)
-        return freeze_error(impulse, better["impulse"], better["separated"])
-
     def _error_of(
         self, impulse: float, arguments: list[Any], values: dict[str, NDArray[np.float64]]
     ) -> float:
         """Estimated relative error, by freezing, of the impulse [N s] of a model with fewer freezes."""
-        checked = ("impulse", "separated", "duration", "step_error")
-        found = self._evaluate(tuple(name for name in checked if name in self.available), arguments, values)
-        better, step = found["impulse"].ravel(), self.step_length if self.stepping in ACCURACY else 0.0
-        ends = (found["separated"] > 0.5) & ~without_contact(better, found["duration"], step)
-        if "step_error" in found:
-            ends &= ~too_large(self.stepping, found["step_error"])
-        return float(freeze_error(np.array([impulse]), better, ends.ravel())[0])
+        found = self._evaluate(("impulse", "separated"), arguments, values)
+        return float(freeze_error(np.array(impulse), found["impulse"], found["separated"] > 0.5).item())
 
     def _evaluate(
         self, names: tuple[str, ...], arguments: list[Any], values: dict[str, NDArray[np.float64]]

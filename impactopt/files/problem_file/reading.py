@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from impactopt.errors import InputError
-from impactopt.files.named_problems import problem_file
 from impactopt.files.problem_file.sections import File, SolverSettings
 from impactopt.files.sections.collision import with_kinds
 from impactopt.files.sections.diagnostics import Mistake
@@ -145,8 +144,7 @@ def read_problem_file(
     ------
     InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
     """
-    folder = problem_file(path).parent
-    return ProblemFile.read(path, settings, names=partial(_wrong_names, folder) if names else None)
+    return (_WithNames if names else ProblemFile).read(path, settings)
 
 
 def parse_problem_file(text: str, path: Path, settings: Mapping[str, Any] | None = None) -> ProblemFile:
@@ -159,11 +157,14 @@ def parse_problem_file(text: str, path: Path, settings: Mapping[str, Any] | None
     return ProblemFile.parse(text, path, settings)
 
 
-def _wrong_names(folder: Path, content: File) -> list[Mistake]:
-    """Mistakes in names of the robot's parts."""
-    found = Collector()
-    _built_robot(content, folder, found)
-    return found.mistakes
+class _WithNames(ProblemFile):
+    """A problem file whose mistakes include wrong names of the robot's parts."""
+
+    @classmethod
+    def wrong_names(cls, content: File, folder: Path) -> list[Mistake]:
+        found = Collector()
+        _built_robot(content, folder, found)
+        return found.mistakes
 
 
 def _built_robot(content: File, folder: Path, mistakes: Collector) -> tuple[Robot | None, Stance | None]:

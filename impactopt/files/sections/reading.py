@@ -47,7 +47,6 @@ LONGEST_KEY = 1000  # characters, dots included
 _WORD = re.compile(r"[A-Za-z_][\w -]*")
 _T = TypeVar("_T")
 _F = TypeVar("_F", bound="CollisionFile")
-_Names = Callable[[Any], list[Mistake]]  # mistakes in the names that checked sections have
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,40 +67,26 @@ class CollisionFile:
     changes: tuple[Place, ...] = field(repr=False, default=())
 
     @classmethod
-    def read(
-        cls: type[_F],
-        path: str | os.PathLike[str],
-        settings: Mapping[str, Any] | None = None,
-        *,
-        names: _Names | None = None,
-    ) -> _F:
+    def read(cls: type[_F], path: str | os.PathLike[str], settings: Mapping[str, Any] | None = None) -> _F:
         """A file, by path or name, checked as far as possible without its robot.
 
         settings : values by key path that replace the file's (`change_and_place`).
-        names : function that finds wrong names in the sections, if there are mistakes.
 
         Raises
         ------
         InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
         """
         path = problem_file(path)
-        return cls.parse(_read(path), path, settings, names=names)
+        return cls.parse(_read(path), path, settings)
 
     @classmethod
-    def parse(
-        cls: type[_F],
-        text: str,
-        path: Path,
-        settings: Mapping[str, Any] | None = None,
-        *,
-        names: _Names | None = None,
-    ) -> _F:
+    def parse(cls: type[_F], text: str, path: Path, settings: Mapping[str, Any] | None = None) -> _F:
         """A text, checked like a file at `path`, to whose folder paths in it are relative; as `read`."""
         try:
             data = read_toml(text)
         except TOMLError as error:
             raise InputError(f"{path} is not TOML: {error}") from error
-        return cls._checked(data, path, text, source=text, names=names).changed(settings or {}, names=names)
+        return cls._checked(data, path, text, text).changed(settings or {})
 
     @classmethod
     def from_data(cls: type[_F], data: Mapping[str, Any], path: Path) -> _F:
@@ -114,8 +99,8 @@ class CollisionFile:
             raise InputError(f"{path}: {error}") from error
         return cls._checked(data, path, text)
 
-    def changed(self: _F, settings: Mapping[str, Any], *, names: _Names | None = None) -> _F:
-        """The file with changed values, by key paths (`change_and_place`); names : as of `read`.
+    def changed(self: _F, settings: Mapping[str, Any]) -> _F:
+        """The file with changed values, by key paths (`change_and_place`).
 
         Raises
         ------
@@ -128,8 +113,7 @@ class CollisionFile:
             text = write_toml(data)
         except (InputError, TOMLError) as error:
             raise InputError(f"{self.path}: {error}") from error
-        changes = (*self.changes, *places)
-        return self._checked(data, self.path, text, source=self.source, changes=changes, names=names)
+        return self._checked(data, self.path, text, self.source, (*self.changes, *places))
 
     @classmethod
     def _checked(
@@ -137,10 +121,8 @@ class CollisionFile:
         data: Mapping[str, Any],
         path: Path,
         text: str,
-        *,
         source: str = "",
         changes: tuple[Place, ...] = (),
-        names: _Names | None = None,
     ) -> _F:
         for place in _LISTS:
             entries: Any = data
@@ -158,10 +140,15 @@ class CollisionFile:
             content = model.model_validate(data)
         except ValidationError as error:
             mistakes += mistakes_of(error, model)
-            mistakes += _further(cls.sections, data, mistakes, names)
+            mistakes += _further(cls, data, mistakes, path.parent)
         if mistakes:
             raise InputError(report_mistakes(str(path), _lines(source, changes), mistakes))
         return cls(path=path, text=text, data=data, content=content, source=source, changes=changes)
+
+    @classmethod
+    def wrong_names(cls, content: Any, folder: Path) -> list[Mistake]:
+        """Mistakes in the names of the robot's parts, where a subclass looks for them."""
+        return []
 
     def report(self, mistakes: Iterable[Mistake]) -> str:
         """One message for mistakes that are found later, with their lines."""
@@ -195,10 +182,10 @@ _ROUNDS = 4  # of correcting the mistakes found and checking again
 
 
 def _further(
-    sections: type[CollisionSections], data: Mapping[str, Any], mistakes: list[Mistake], names: _Names | None
+    kind: type[CollisionFile], data: Mapping[str, Any], mistakes: list[Mistake], folder: Path
 ) -> list[Mistake]:
     """Further mistakes of a file, which are found once the others are corrected: in checks of whole sections
-    and, by `names`, in names of the robot's parts, unless robot or stance is wrong.
+    and, by `wrong_names`, in names of the robot's parts, unless robot or stance is wrong.
 
     For that, misspelt keys get their probable names, wrong keys are left out, and required ones that are
     missing are substituted.
@@ -219,7 +206,7 @@ def _further(
             given = isinstance(corrected.get(section), dict) and section in data
             needed = {k: v for k, v in values.items() if not given or (section, k) in places}
             corrected[section] = needed | corrected.get(section, {})
-        model = with_kinds(sections, corrected)
+        model = with_kinds(kind.sections, corrected)
         try:
             content = model.model_validate(corrected)
         except ValidationError as error:
@@ -230,9 +217,10 @@ def _further(
             further += new
             continue
         wrong = {m.place[: 1 + (m.place[0] == "problem")] for m in [*mistakes, *further]}
-        if names is not None and not wrong & {("robot",), ("stance",), ("problem", "robot")}:
-            striker = corrected["problem"]["striker"] == _STAND_INS["problem"]["striker"]
-            further += [m for m in names(content) if not (striker and m.place == ("problem", "striker"))]
+        if not wrong & {("robot",), ("stance",), ("problem", "robot")}:
+            known = corrected["problem"]["striker"] != _STAND_INS["problem"]["striker"]
+            found = kind.wrong_names(content, folder)
+            further += [m for m in found if known or m.place != ("problem", "striker")]
         break
     return further
 

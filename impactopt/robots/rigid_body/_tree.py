@@ -58,23 +58,12 @@ class Kind(enum.Enum):
     PRISMATIC = "slides along z"
 
 
-_FOLLOWER = "JointModelMimic"  # revolute or prismatic, which `_read_joint` finds out
-_KINDS = {
-    "JointModelFreeFlyer": Kind.FREE,
-    _FOLLOWER: Kind.REVOLUTE,
-    "JointModelRX": Kind.REVOLUTE,
-    "JointModelRY": Kind.REVOLUTE,
-    "JointModelRZ": Kind.REVOLUTE,
-    "JointModelRevoluteUnaligned": Kind.REVOLUTE,
-    "JointModelRUBX": Kind.REVOLUTE,
-    "JointModelRUBY": Kind.REVOLUTE,
-    "JointModelRUBZ": Kind.REVOLUTE,
-    "JointModelRevoluteUnboundedUnaligned": Kind.REVOLUTE,
-    "JointModelPX": Kind.PRISMATIC,
-    "JointModelPY": Kind.PRISMATIC,
-    "JointModelPZ": Kind.PRISMATIC,
-    "JointModelPrismaticUnaligned": Kind.PRISMATIC,
-}
+_FOLLOWER = "Mimic"  # revolute or prismatic, which `_read_joint` finds out
+_UNBOUNDED = ("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned")
+_REVOLUTE = ("RX", "RY", "RZ", "RevoluteUnaligned", *_UNBOUNDED, _FOLLOWER)
+_PRISMATIC = ("PX", "PY", "PZ", "PrismaticUnaligned")
+_KINDS = {**dict.fromkeys(_REVOLUTE, Kind.REVOLUTE), **dict.fromkeys(_PRISMATIC, Kind.PRISMATIC)}
+_KINDS["FreeFlyer"] = Kind.FREE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,7 +214,8 @@ def _universe() -> Joint:
 
 def _read_joint(model: Any, i: int, turns: list[Any]) -> Joint:
     joint_model, name, parent = model.joints[i], model.names[i], int(model.parents[i])
-    kind = _KINDS.get(joint_model.shortname())
+    short = joint_model.shortname().removeprefix("JointModel")
+    kind = _KINDS.get(short)
     if kind is None:
         raise InputError(
             f"joint {name!r}: type {joint_model.shortname()} is not supported; use revolute, continuous or "
@@ -246,7 +236,7 @@ def _read_joint(model: Any, i: int, turns: list[Any]) -> Joint:
         parent=parent,
         v=int(joint_model.idx_v),
         q=int(joint_model.idx_q),
-        follows=joint_model.shortname() == _FOLLOWER,
+        follows=short == _FOLLOWER,
         ratio=ratio,
         continuous=joint_model.nq == 2,
         turn=turn,

@@ -3,6 +3,7 @@
 * sections.py   the sections and keys of a file, what they build, and their descriptions; those of a
   collision, and their types and mistakes, are in `impactopt.files.sections`
 * reading.py    file to problem, with changed values by key paths; writing.py: problem to file
+* ipopt_options.py   IPOPT options that a file may set
 * reference.py  docs/problem_files.md, and the comments of `impactopt new`
 """
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FARTHEST",
+    "MANY",
     "MOST",
     "CacheWarning",
     "InputError",
@@ -33,6 +34,7 @@ __all__ = [
 FARTHEST = 1e3  # [m] from the origin of a frame or the world; micrometres are still resolved there
 # largest magnitude of other inputs, in SI units: products of a few of them are still finite
 MOST = 1e15
+MANY = 100  # entries of a list of parts, such as scenarios or obstacles
 # characters that control a terminal, and surrogates, which cannot be written in UTF-8
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 

@@ -135,17 +135,17 @@ class Shapes:
     def __len__(self) -> int:
         return len(self.pairs)
 
-    def look(self, at: Placed, within: float, ways: Array, wanted: NDArray[np.bool_]) -> Looked:
+    def look(self, at: Placed, within: float, directions: Array, wanted: NDArray[np.bool_]) -> Looked:
         """Distances of the pairs ``wanted`` (P,); those above ``within`` [m] may be lower bounds.
 
-        ways (K, P, 3) : separating directions as initial guesses, zero if unknown; those found are written to
-            it.
+        directions (K, P, 3) : initial guesses of separating directions, zero if unknown; those found are
+            written to it.
         """
         (k, j), w, p = at.joints.shape[:2], at.world.shape[1], len(self)
         gaps, near = np.empty((k, p)), np.empty((k * p, 2), dtype=np.int64)
         chosen, library = wanted.astype(np.uint8), _library()
         if library is None:
-            found = separation_numpy.look(self, at, within, ways, wanted, gaps)
+            found = separation_numpy.look(self, at, within, directions, wanted, gaps)
             return Looked(gaps, *found)
         counts = (ctypes.c_int64(n) for n in (k, j, w, p))
         arrays = (at.joints, at.world, self.pairs, self._balls, self.hulls, self.radius, at.present, chosen)
@@ -154,7 +154,7 @@ class Shapes:
             *map(address, (*arrays, self.blocks)),
             ctypes.c_double(1 / ROUNDING),
             ctypes.c_double(within),
-            *map(address, (ways, gaps, self.room)),
+            *map(address, (directions, gaps, self.room)),
             ctypes.c_int64(len(near)),
             address(near),
         )
@@ -185,20 +185,22 @@ class Separations:
     z (count, n + 3) : shift of the second body's frame [m], joint positions [rad, m].
     """
 
-    def __init__(self, shapes: Shapes, joints: int, pairs: Index, numbers: Array, ways: Array) -> None:
-        """pairs (count,) : indices of pairs.  ways (count, 3) : initial guesses of the separating directions.
+    def __init__(self, shapes: Shapes, joints: int, pairs: Index, numbers: Array, directions: Array) -> None:
+        """pairs (count,) : indices of pairs.  directions (count, 3) : separating directions, initial guesses.
 
         numbers (count, 13 n + 13) : n + 1 placements, flags of the revolute joints, and the reach [m].
         """
         self._shapes, self._pairs, self.joints, self.count = shapes, pairs, joints, len(pairs)
-        self.numbers, self.ways = np.ascontiguousarray(numbers), np.ascontiguousarray(ways, dtype=float)
+        self.numbers = np.ascontiguousarray(numbers)
+        self.directions = np.ascontiguousarray(directions, dtype=float)
         self._hulls = np.ascontiguousarray(shapes.hulls[pairs])
         self._known, self._room = np.zeros((self.count, _SIDE)), shapes.room
         self.forget()
 
     def copy(self) -> Separations:
         """Copy with separate numbers and directions."""
-        return Separations(self._shapes, self.joints, self._pairs, self.numbers.copy(), self.ways.copy())
+        numbers, directions = self.numbers.copy(), self.directions.copy()
+        return Separations(self._shapes, self.joints, self._pairs, numbers, directions)
 
     def forget(self) -> None:
         """Clears the last result, as ``numbers`` have changed."""
@@ -220,7 +222,7 @@ class Separations:
             ctypes.c_int64(self.joints),
             *map(address, (z, self.numbers, self._hulls, self._shapes.blocks)),
             ctypes.c_double(1 / ROUNDING),
-            *map(address, (self.ways, self._known, self._seen, self._room)),
+            *map(address, (self.directions, self._known, self._seen, self._room)),
             ctypes.c_int64(what),
             *map(address, (by, out)),
         )

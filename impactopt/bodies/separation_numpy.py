@@ -191,9 +191,9 @@ def write(
     """NumPy version of `Separations.write`."""
     n = of.joints
     turn, shift, axis, origin, turns = _chain(n, z, of.numbers)
-    u, at = _Pairs(points, hulls, turn, shift).separate(of.ways)
+    u, at = _Pairs(points, hulls, turn, shift).separate(of.directions)
     if what:
-        of.ways[...] = u
+        of.directions[...] = u
     if what == 0:
         out[...] = (at.separation - of.numbers[:, -1]).reshape(out.shape)
         return
@@ -236,7 +236,7 @@ def _of_pairs(shapes: Any, at: Any, spot: Index, pair: Index) -> tuple[Array, Ar
 
 
 def look(
-    shapes: Any, at: Any, within: float, ways: Array, wanted: NDArray[np.bool_], gaps: Array
+    shapes: Any, at: Any, within: float, directions: Array, wanted: NDArray[np.bool_], gaps: Array
 ) -> tuple[Index, Index]:
     """NumPy version of `Shapes.look`: writes gaps and directions, returns the near pairs."""
     spot, pair = (a.ravel() for a in np.indices(gaps.shape))
@@ -263,12 +263,12 @@ def look(
     gaps[spot, pair] = bound
     close = bound <= within
     spot, pair, turn, shift, u = spot[close], pair[close], turn[close], shift[close], u[close]
-    known = ways[spot, pair]
+    known = directions[spot, pair]
     u = np.where(np.any(known != 0, axis=1)[:, None], known, u)
     if len(u):
         u, found = _Pairs(shapes.points, shapes.hulls[pair], turn, shift).separate(u)
         gaps[spot, pair] = found.separation - shapes.radius[pair]
-        ways[spot, pair] = u
+        directions[spot, pair] = u
     near = gaps[spot, pair] < within
     return spot[near], pair[near]
 

@@ -6,7 +6,7 @@ import enum
 import math
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -81,12 +81,13 @@ def collide(
     error of freezing, with advice if that is above --accuracy. With a posture, the striking point moves
     along the normal at --speed with the least kinetic energy, the soles are at rest, and the servo's
     reference keeps the joint velocities. A result has its own reference, which keeps the soles in place; its
-    planned numbers are printed too. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
+    planned numbers are printed too. Sections of a problem file that are about plans, such as swing and
+    terms, are not checked. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
     limit, no separation), 2 bad input.
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
         from impactopt.collide.single_collision import collide_once, problem_of_result
-        from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.files.sections.reading import CollisionFile, parse_settings
         from impactopt.report.console import SolveConsole
 
         check_loudness(quiet, verbose)
@@ -98,16 +99,14 @@ def collide(
         if saved and posture is not None:
             raise typer.BadParameter("a result has its own; leave it out", param_hint="--posture")
         changes = parse_settings(settings or ())
-        read = problem_of_result(what).changed(changes) if saved else read_problem_file(what, changes)
-        at_contact: dict[str, Any] = {"model": model.value}
+        read = problem_of_result(what).changed(changes) if saved else CollisionFile.read(what, changes)
         if freezes is None and saved and model is Model.sdc:
             freezes = RESULT_FREEZES
-        at_contact |= {} if freezes is None else {"freezes": freezes}
-        at_contact |= {"result": str(what.resolve())} if saved else {}
-        at_contact |= {} if posture is None else {"posture": posture}
+        given = {"model": model.value, "freezes": freezes, "posture": posture, "speed_m_s": speed}
+        given["result"] = str(what.resolve()) if saved else None
+        at_contact = {key: value for key, value in given.items() if value is not None}
         with SolveConsole(console, quiet=quiet) as progress:
             progress.say(f"{read.path} is read; computing the collision (compiles the first time)")
-            at_contact |= {} if speed is None else {"speed_m_s": speed}
             found = collide_once(read, at_contact, accuracy=accuracy / 100)
         if as_json:
             print_json(found, "reason" not in found)

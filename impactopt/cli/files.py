@@ -222,7 +222,7 @@ def _give(text: str, out: Path | None, as_json: bool = False) -> None:
     """Prints a file's text, or writes it to a new file; as JSON also its data."""
     from impactopt.codegen.files import write_atomically
     from impactopt.errors import InputError
-    from impactopt.files.problem_file.toml import read_toml
+    from impactopt.files.toml import read_toml
 
     if out is not None:
         if out.exists():

@@ -70,7 +70,7 @@ def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
 def _setting_keys(text: str) -> list[str]:
     """Key paths of a problem file's text; of any problem if it is not valid TOML."""
     from impactopt.files.problem_file.reading import key_paths
-    from impactopt.files.problem_file.toml import TOMLError, read_toml
+    from impactopt.files.toml import TOMLError, read_toml
 
     data: dict[str, Any] = {}
     with contextlib.suppress(TOMLError):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +18,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.codegen.batched import BatchedFunction
 from impactopt.codegen.cache import cached, model_hash
+from impactopt.collision.coasting import coasting_reference
 from impactopt.collision.frozen import _inverse_of_cholesky
 from impactopt.errors import InputError, check_choice
-from impactopt.files.output import load_record
+from impactopt.files.record import load_record
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import Free, Stance
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
-from impactopt.simulation.reference import coasting_reference
-from impactopt.transcription.batched import BatchedFunction
 
 __all__ = ["ContactStates", "Posture", "States", "striking_functions"]
 
@@ -197,7 +198,7 @@ class ContactStates:
     start: Array
     folder: Path
     _postures: dict[Any, Posture | str] = field(init=False, repr=False, default_factory=dict)
-    _compiled: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
+    _batched: dict[str, BatchedFunction] = field(init=False, repr=False, default_factory=dict)
 
     # ------------------------------------------------------------ postures
     def posture(self, name: str, result: str | None, point: tuple[float, ...]) -> Posture | str:
@@ -383,25 +384,20 @@ class ContactStates:
 
     def _call(self, name: str, inputs: Array) -> Array:
         """Outputs (N, ...) of a compiled function for inputs (N, size), in blocks of a fixed size."""
-        if "functions" not in self._compiled:
-            self._compiled["functions"] = striking_functions(
-                self.robot, striker=self.striker, stance=self.stance
-            )
-        size = 1 if len(inputs) == 1 else _BLOCK
-        key = (name, size)
-        if key not in self._compiled:
-            function = self._compiled["functions"][name]
-            self._compiled[key] = BatchedFunction(function, size, np.zeros((size, 0)))
-        function, out = self._compiled[key], []
-        for begin in range(0, len(inputs), size):
-            block = inputs[begin : begin + size]
-            filled = (
-                block
-                if len(block) == size
-                else np.vstack([block, np.repeat(block[-1:], size - len(block), 0)])
-            )
+        if len(inputs) == 1:
+            return np.array(self._functions[name](inputs[0], ())).reshape(1, -1)
+        if name not in self._batched:
+            self._batched[name] = BatchedFunction(self._functions[name], _BLOCK, np.zeros((_BLOCK, 0)))
+        function, out = self._batched[name], []
+        for begin in range(0, len(inputs), _BLOCK):
+            block = inputs[begin : begin + _BLOCK]
+            filled = np.vstack([block, np.repeat(block[-1:], _BLOCK - len(block), 0)])
             out.append(function(filled)[: len(block)].copy())
         return np.concatenate(out)
+
+    @cached_property
+    def _functions(self) -> dict[str, Any]:
+        return striking_functions(self.robot, striker=self.striker, stance=self.stance)
 
 
 def _set_reason(reason: Reasons, where: NDArray[np.bool_], text: str) -> None:

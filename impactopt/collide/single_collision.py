@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from impactopt.collide.contact_states import ContactStates, States
@@ -18,15 +18,15 @@ from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.sdc import frozen_model
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_choice
-from impactopt.files.output import Record, load_record, plain, replay_name
-from impactopt.files.problem_file import ProblemFile, parse_problem_file
-from impactopt.files.problem_file.diagnostics import mistakes_of, report_mistakes
-from impactopt.files.problem_file.sections import File
-from impactopt.files.problem_file.values import Positive, Section
+from impactopt.files.record import Record, load_record, plain, replay_name
+from impactopt.files.sections.collision import CollisionSections
+from impactopt.files.sections.diagnostics import mistakes_of, report_mistakes
+from impactopt.files.sections.reading import CollisionFile
+from impactopt.files.sections.values import Positive, Section
+from impactopt.files.toml import read_toml
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.robot import Robot
-from impactopt.simulation.reference import FullDynamics
 
 __all__ = [
     "MEASURES",
@@ -39,13 +39,13 @@ __all__ = [
     "collide_once",
     "collision_model",
     "full_names",
-    "one_collision",
     "planned_numbers",
     "problem_of_result",
 ]
 
 NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
 _FULL_DYNAMICS_STEP = 1e-4  # [s] between instants of its histories
+_IMPULSE_TOLERANCE = 1e-4  # relative, of the full dynamics
 
 
 class AtContact(Section):
@@ -100,7 +100,7 @@ def check_at_contact(given: Mapping[str, Any]) -> AtContact:
 
 
 def collision_model(
-    content: File, robot: Robot, stance: Stance, section: AtContact, accuracy: float = 1e-2
+    content: CollisionSections, robot: Robot, stance: Stance, section: AtContact, accuracy: float = 1e-2
 ) -> CollisionModel:
     """Collision model that [at_contact] names, for a problem file; accuracy as of `SDC`."""
     content.check_one_striker()
@@ -115,7 +115,10 @@ def collision_model(
     }
     friction = None if content.friction is None else content.friction.build()
     if section.model == "full":
-        return FullDynamics(**options, step=_FULL_DYNAMICS_STEP, contact_friction=friction)
+        from impactopt.simulation.reference import FullDynamics  # loads MuJoCo
+
+        options |= {"step": _FULL_DYNAMICS_STEP, "tolerance": _IMPULSE_TOLERANCE}
+        return FullDynamics(**options, contact_friction=friction)
     if section.model == "rigid":
         if friction is not None:
             raise InputError("[friction]: a rigid impact has none: take another model, or leave it out")
@@ -247,7 +250,6 @@ def _result(k: int) -> Measure:
     return Measure(outputs=("target_result",), what="of the target after the collision", of=of)
 
 
-_IMPULSE_TOLERANCE = 1e-4  # relative, of the full dynamics
 _CONTACT_DOES_NOT_END = (
     "the contact of the result does not end with this model: its freezes are placed by the duration that the "
     "first "
@@ -267,7 +269,7 @@ _MODEL_ERRORS = {
 }
 
 
-def problem_of_result(result: Path) -> ProblemFile:
+def problem_of_result(result: Path) -> CollisionFile:
     """Problem file that is stored in a directory of `impactopt solve` or `strike`.
 
     Raises
@@ -277,7 +279,7 @@ def problem_of_result(result: Path) -> ProblemFile:
     record = load_record(result)
     if not record.problem:
         raise InputError(f"{result} holds no problem file: collide with its problem, and give --speed")
-    return parse_problem_file(record.problem, record.problem_path or result / "problem.toml")
+    return CollisionFile.parse(record.problem, record.problem_path or result / "problem.toml")
 
 
 def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
@@ -311,7 +313,7 @@ def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
 
 
 def collide_once(
-    file: ProblemFile, at_contact: Mapping[str, Any], *, accuracy: float = 1e-2
+    file: CollisionFile, at_contact: Mapping[str, Any], *, accuracy: float = 1e-2
 ) -> dict[str, Any]:
     """One collision of a problem's robot with its target, as a table with units in its keys.
 
@@ -384,11 +386,11 @@ def _horizon(record: Record, default: float) -> float:
     return default * max(1, ceil(1.5 * duration / default))
 
 
-def _saved(file: ProblemFile, section: AtContact, record: Record) -> dict[str, Any]:
+def _saved(file: CollisionFile, section: AtContact, record: Record) -> dict[str, Any]:
     """Saved measures to show beside those of a collision from the same state."""
     given = section.model_fields_set - {"result", "model", "freezes", "horizon"}
     # for another problem or state they would mislead
-    same = record.problem and parse_problem_file(record.problem, file.path).data == file.data
+    same = record.problem and read_toml(record.problem) == file.data
     saved = planned_numbers(record) if same and not given else {}
     if not saved:
         return {}
@@ -417,15 +419,4 @@ def _collide(model: CollisionModel, state: States, section: AtContact) -> Collis
     known = getattr(model, "settings", settings)
     given = {name: x for name, x in settings.items() if name in known}
     q, v, torque = state.q[0], state.v[0], state.torque[0]
-    return one_collision(model, q, v, torque, **given)
-
-
-def one_collision(
-    model: CollisionModel, q: Array, v: Array, torque: Array, **settings: ArrayLike
-) -> Collision:
-    """Collision by any model; the steps of full dynamics are refined until the impulse converges."""
-    if isinstance(model, FullDynamics):
-        return model.converged(
-            q, v, torque, tolerance=_IMPULSE_TOLERANCE, require_separation=False, **settings
-        )[0]
-    return model.collide(q, v, torque, require_separation=False, **settings)
+    return model.collide(q, v, torque, require_separation=False, **given)

@@ -272,7 +272,11 @@ class Stability:
     """Stable steps of a model, with no joint saturated and all joint friction in its transition band."""
 
     def __init__(self, collision: SteppedModel) -> None:
-        self._collision, self._model = collision, joint_space_model(collision)
+        self._collision = collision
+
+    @cached_property
+    def _model(self) -> JointSpaceModel:
+        return joint_space_model(self._collision)
 
     @cached_property
     def _freeze(self) -> Any:

@@ -13,7 +13,6 @@ from typing import Any
 import casadi as ca
 
 from impactopt.collision.frozen import FrozenDynamics
-from impactopt.collision.implicit_numpy import ImplicitLoop
 from impactopt.collision.model import JointSpaceModel, Loop, SegmentedCollision, shape_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, Outputs, frozen_for
 from impactopt.collision.runge_kutta import rk4_step, run
@@ -155,6 +154,8 @@ def _explicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Lo
 
 def _implicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Loop:
     """Time loop of implicit steps, which the graph calls in NumPy."""
+    # makes its tables when it is imported, and is needed without a compiler only
+    from impactopt.collision.implicit_numpy import ImplicitLoop
 
     def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:
         recorded = record and every > 0

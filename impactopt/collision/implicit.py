@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from math import comb
 from typing import Any
 
@@ -129,6 +130,7 @@ STAGES = 8
 NODES = 7
 
 
+@cache
 def gamma() -> float:
     """Diagonal coefficient of the method: one over the fourth root of the Laguerre polynomial L_8."""
     return float(1.0 / roots_laguerre(STAGES)[0][3])
@@ -173,6 +175,7 @@ def tables() -> dict[str, Array | float]:
     }
 
 
+@cache
 def node_tables() -> tuple[Array, Array]:
     """AT_NODES and FROM_NODES of `tables`; Lobatto nodes, as they include the end of the step."""
     # the eight Lobatto nodes of [0, 1]: its ends and the roots of the derivative of P_7
@@ -202,8 +205,6 @@ def _node_responses(at: Array, back: Array) -> Array:
     return found
 
 
-_TABLES = tables()
-_AT_NODES, _FROM_NODES = np.asarray(_TABLES["AT_NODES"]), np.asarray(_TABLES["FROM_NODES"])
 # of Newton's method on the remainders: the last change, relative to what they are remainders of. Its error is
 # the square of that (native/implicit_remainders.h).
 _MAX_NEWTON_ITERATIONS, _NEWTON_TOLERANCE = 12, 1e-6
@@ -352,12 +353,12 @@ class Step:
 
     def at_nodes(self, terms: Array) -> Array:
         """Values at the nodes (7, ...) of polynomials given by their terms (9, ...)."""
-        found: Array = _AT_NODES @ terms
+        found: Array = node_tables()[0] @ terms
         return found
 
     def through_nodes(self, start: Any, function: Callable[[int], Any]) -> Array:
         """Terms (9, ...) of a polynomial with these values at the start and at node 0 ... 6."""
-        terms: Array = _FROM_NODES @ np.array([np.asarray(function(i)) - start for i in range(NODES)])
+        terms: Array = node_tables()[1] @ np.array([np.asarray(function(i)) - start for i in range(NODES)])
         terms[0] = start
         return terms
 
@@ -367,14 +368,14 @@ class Step:
         o are the arguments of law and target at the nodes, (penetration, rate, target's state), which are
         affine in the inputs: o = base + K n. R are the remainders at these arguments.
         """
-        inputs, rest = self._B.shape[1], 0.0 * rates
+        inputs, rest, from_nodes = self._B.shape[1], 0.0 * rates, node_tables()[1]
         base = self._arguments(self._series(self.y, self.h * rates, np.zeros((STAGES + 1, inputs))))
         arguments = base.shape[1]
         responses = np.zeros((NODES, arguments, NODES, inputs))
         for i in range(NODES):
             for a in range(inputs):
                 unit = np.zeros((STAGES + 1, inputs))
-                unit[:, a] = _FROM_NODES[:, i]
+                unit[:, a] = from_nodes[:, i]
                 responses[:, :, i, a] = self._argument_changes(self._series(rest, rest, unit))
                 if a == inputs - 1:
                     # the remainder of the target's velocity also acts on the rate directly
@@ -391,8 +392,8 @@ class Step:
             change = np.linalg.solve(np.eye(n.size) - R_by_o @ K, R.ravel() - n)
             n = n + change
             if (np.abs(change).reshape(NODES, inputs) <= _NEWTON_TOLERANCE * sizes).all():
-                return _FROM_NODES @ n.reshape(NODES, inputs), True
-        return _FROM_NODES @ n.reshape(NODES, inputs), False
+                return from_nodes @ n.reshape(NODES, inputs), True
+        return from_nodes @ n.reshape(NODES, inputs), False
 
     def _argument_changes(self, terms: Array) -> Array:
         """Changes of the arguments at the nodes (7, 2 + k) with a change of the state."""

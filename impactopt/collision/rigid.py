@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.collision.interface import Collision, CollisionModel
 from impactopt.contact import FreeMass, RigidWall
 from impactopt.errors import InputError, check_array, check_choice, check_number
-from impactopt.kinematics.operational_space import Held
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 
 __all__ = ["RigidImpact"]
 
@@ -63,7 +63,9 @@ class RigidImpact(CollisionModel):
     def _by_unit_impulse(self, q: Array) -> tuple[Array, Array]:
         """Jacobian n' J (nv,), and P J' n (nv,), the decrease of velocity by a unit impulse."""
         frames = self.held_by.constraint_frames(self.robot)
-        body = Held.at(self.robot.model, q, frames, self.robot.striker(self.striker).model_frame)
+        body = ConstrainedDynamics.at(
+            self.robot.model, q, frames, self.robot.striker(self.striker).model_frame
+        )
         hand = np.asarray(self.normal) @ body.hand
         compliance = np.tile(self.held_by.compliance, len(frames))
         return hand, body.by_impulses(hand[None], compliance)[:, 0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -248,8 +248,12 @@ class SymbolicModel(SteppedModel):
             self._functions[key] = Batch(self, own, self._stability, every=every)
         found: dict[str, NDArray[np.float64]] = self._functions[key](q, v, torque, settings, threads=threads)
         if FREEZE_ERROR in outputs:
-            error = self._freeze_error(found["impulse"], q, v, torque, settings, threads)
-            found[FREEZE_ERROR] = np.where(found["separated"], error, np.nan)
+            found[FREEZE_ERROR] = np.full(len(found["impulse"]), np.nan)
+            if self._more_often is not None:
+                given: dict[str, Any] = {"outputs": ("impulse",), "threads": threads, **settings}
+                better = self._more_often.batch(q, v, torque, **given)
+                error = freeze_error(found["impulse"], better["impulse"], better["separated"])
+                found[FREEZE_ERROR] = np.where(found["separated"], error, np.nan)
         return found
 
     def _compiled(self, name: str, what: tuple[Any, ...], build: Callable[[], Any]) -> Any:
@@ -318,9 +322,8 @@ class SymbolicModel(SteppedModel):
             self.check_separation(result)
         if self._more_often is None or not result.separated:
             return result
-        impulse, one = np.array([result.impulse]), arguments[2] if self.effects.feedforward else None
-        (error,) = self._freeze_error(impulse, q[None], v[None], one, values, threads=1)
-        return replace(result, freeze_error=float(error), caution=self._caution(float(error)))
+        error = self._more_often._error_of(result.impulse, arguments, values)
+        return replace(result, freeze_error=error, caution=self._caution(error))
 
     # ------------------------------------------------------------ error of freezing
     @property
@@ -332,31 +335,34 @@ class SymbolicModel(SteppedModel):
         """Warning about a relative error of the impulse that freezing causes; "" if it is small."""
         return ""
 
-    def _freeze_error(
-        self,
-        impulse: NDArray[np.float64],
-        q: ArrayLike,
-        v: ArrayLike,
-        torque: ArrayLike | None,
-        settings: Mapping[str, Any],
-        threads: int | None,
-    ) -> NDArray[np.float64]:
-        """Estimated relative error of each impulse (N) [N s] by freezing; nan if it is not estimated."""
-        if self._more_often is None:
-            return np.full(len(impulse), np.nan)
-        better = self._more_often.batch(q, v, torque, outputs=("impulse",), threads=threads, **settings)
-        return freeze_error(impulse, better["impulse"], better["separated"])
+    def _error_of(
+        self, impulse: float, arguments: list[Any], values: dict[str, NDArray[np.float64]]
+    ) -> float:
+        """Estimated relative error, by freezing, of the impulse [N s] of a model with fewer freezes."""
+        found = self._evaluate(("impulse", "separated"), arguments, values)
+        return float(freeze_error(np.array(impulse), found["impulse"], found["separated"] > 0.5).item())
+
+    def _evaluate(
+        self, names: tuple[str, ...], arguments: list[Any], values: dict[str, NDArray[np.float64]]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Outputs of one collision by name."""
+        found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
+        return {name: np.array(x) for name, x in zip(names, found, strict=True)}
 
     def _by_steps(self, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> Collision:
-        frozen = self._stability.frozen(arguments[0], values)
-        if self.stepping != "implicit":
+        implicit = self.stepping == "implicit"
+        frozen = {} if implicit else self._stability.frozen(arguments[0], values)
+        if not implicit:
             self.check_step(self._stability.longest(frozen, values))
-        names = self.available
-        found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
-        outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
+        outputs = self._evaluate(self.available, arguments, values)
+        if np.isnan(outputs["impulse"]).any():  # for the reason, if the frozen dynamics are it
+            self._stability.frozen(arguments[0], values)
         check_finite(outputs, self.step_length)
-        error = float(outputs.get("step_error", np.zeros(1)).item())
         result = Collision.from_outputs(outputs, self.target)
+        if implicit:
+            check_steps(self, result, 0.0)
+            return result
+        error = float(outputs["step_error"].item())
         if breaks(self):
             force = values["target_breaking_force"]
             error += float(left_out_by_breaking(self, result.impulse, outputs["target_result"][:, 0], force))

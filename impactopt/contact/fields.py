@@ -1,7 +1,7 @@
 """Metadata of dataclass fields, and expressions that laws and targets are written with.
 
 A field's metadata describe it once: the class checks its values with them, its docstring lists them, and
-the sections of problem files are made from them (`impactopt.files.problem_file.values`).
+the sections of problem files are made from them (`impactopt.files.sections.values`).
 """
 
 from __future__ import annotations

@@ -12,23 +12,29 @@ import contextlib
 import dataclasses
 import json
 import os
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.codegen.files import read_archive, read_plain, write_atomically
+from impactopt.codegen.files import write_atomically
 from impactopt.errors import InputError
 from impactopt.files.problem_file.reading import change_data
 from impactopt.files.problem_file.sections import comment_at
-from impactopt.files.problem_file.toml import read_toml, write_toml
-from impactopt.files.record_schema import check_arrays, check_summary
+from impactopt.files.record import (
+    FORMAT,
+    LARGEST,
+    NUMBERS,
+    SUMMARY,
+    Record,
+    load_record,
+    plain,
+    read_json,
+    replay_name,
+)
+from impactopt.files.toml import read_toml, write_toml
 from impactopt.kinematics.support import corners_at, support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
@@ -62,9 +68,6 @@ __all__ = [
     "write_file",
 ]
 
-FORMAT = 1  # of solution.npz; increased by a change that an older reader would misread
-LARGEST, MOST_ARRAYS = 1 << 29, 1000  # bytes and arrays of solution.npz; ours have some MB, and a hundred
-NUMBERS, SUMMARY = "solution.npz", "summary.json"
 # Bits of saved histories, by prefix, relative to each channel's largest value. References have 32 (5e-10 rad
 # of 2 rad): with 24, accelerations are beyond what `verify` allows. Replays have 15 (3e-5 rad, 15 mN of
 # 1 kN), which is finer than pictures and measurements.
@@ -79,56 +82,6 @@ DERIVED = (
         for picture in ("force", "zmp", "torque", "strobe", "motion", "ellipsoid", "iterations", "replay")
     ),
 )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Record:
-    """A solution as numbers and text: the content of its files, from which reports are made.
-
-    summary : the content of `summary.json`.
-    problem : text of the problem file, "" if there was none.
-    arrays : by name. `joints`, `torque_limit`, `velocity_limit`, `armature` (n,); `polygon` and `sole_<name>`
-        (k, 2) [m], corners on the ground, for a sole that steps in its first foothold; `reference_angle`,
-        `simulated_angle` (k, n), joint angles over time; and, field by field, `reference_*`
-        (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort motion, `missed_*`,
-        `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`),
-        `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on free soles, without
-        velocities and torques), `solver_*` (`SolverResult`), `history_*` (its iterations);
-        `program_statement`, names of the program's variables and constraints, as JSON. Histories of many
-        channels are rounded (`rounded`).
-    problem_path : path of the problem file, to which paths in it are relative; None if there was none.
-    """
-
-    summary: dict[str, Any]
-    problem: str = ""
-    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    problem_path: Path | None = None
-
-    def __repr__(self) -> str:
-        """One line, without the arrays."""
-        name, impulse = self.summary.get("problem", {}).get("name", ""), self.summary.get("impulse_Ns")
-        figure = "" if impulse is None else f", {impulse:.2f} N s"
-        return f"<Record of {name!r}: {self.summary.get('status')}{figure}>"
-
-    @property
-    def completed(self) -> bool:
-        """True if the planned motion is part of the record."""
-        return "reference_time" in self.arrays
-
-    @property
-    def simulated(self) -> bool:
-        """True if a re-simulation is part of the record."""
-        return "simulated_time" in self.arrays
-
-    @property
-    def replayed(self) -> bool:
-        """True if a replay on free soles is part of the record."""
-        return "replayed_time" in self.arrays
-
-
-def replay_name(summary: Mapping[str, Any]) -> str:
-    """Heading of MuJoCo's replay, in which soles are not fixed."""
-    return "free soles" if summary.get("sole_cop_margin_mm") else "MuJoCo"
 
 
 def record_of(
@@ -269,17 +222,6 @@ def _numbers(thing: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if isinstance(value, kinds)}
 
 
-def plain(value: Any) -> Any:
-    """`value` in the types of JSON; numbers that are not finite become null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def make_directory(directory: str | os.PathLike[str]) -> Path:
     """The directory, made if it does not exist; called before a solve, whose result it is for.
 
@@ -331,10 +273,6 @@ def _packed(array: NDArray[Any]) -> NDArray[Any]:
     return np.asfortranarray(short) if np.array_equal(short, array, equal_nan=True) else array
 
 
-def _unpacked(array: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(array, dtype=float) if array.dtype == np.float32 else array
-
-
 def remove_file(path: Path) -> None:
     """Remove a file if it is there.
 
@@ -363,52 +301,6 @@ def write_file(
         write_atomically(path, write, before=before)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from error
-
-
-def load_record(directory: str | os.PathLike[str]) -> Record:
-    """The record that `save_record` wrote into a directory, or of a path to `solution.npz`.
-
-    Raises
-    ------
-    InputError : there is none, it is damaged, or of a newer impactopt.
-    """
-    path = Path(directory)
-    path = path if path.name == NUMBERS and not os.path.isdir(path) else path / NUMBERS
-    fix = "solve again with `impactopt solve`"
-    try:
-        with np.load(read_archive(path, LARGEST, MOST_ARRAYS), allow_pickle=False) as file:
-            version = int(file["format"])
-            if version > FORMAT:
-                raise InputError(f"{path} is of a newer impactopt (format {version}); update impactopt")
-            arrays = {name: _unpacked(file[name]) for name in file.files}
-        summary = json.loads(str(arrays.pop("summary_json")))
-        problem = str(arrays.pop("problem_toml"))
-        problem.encode().decode()  # a damaged array may have invalid characters
-        relative = str(arrays.pop("problem_path", ""))
-        del arrays["format"]
-        check_summary(summary, whole="joints" in arrays)
-        check_arrays(arrays)
-    except InputError:
-        raise
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(f"there is no {path}; {fix}") from error
-    except PermissionError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    # errors of NumPy and zipfile for files that are truncated, overwritten or of another kind
-    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, NotImplementedError) as error:
-        raise InputError(f"{path} is damaged ({error}); {fix}") from error
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        tokenize.TokenError,
-        MemoryError,
-        OverflowError,
-        RecursionError,
-        RuntimeError,
-    ) as error:
-        raise InputError(f"{path} is damaged ({error}); {fix}") from error
-    problem_path = Path(os.path.normpath(path.parent.resolve() / relative)) if relative else None
-    return Record(summary=summary, problem=problem, arrays=arrays, problem_path=problem_path)
 
 
 FAILED = "failed"  # folder in a result's directory, for a failed result that does not replace a good one
@@ -480,14 +372,6 @@ def _status_in(directory: Path) -> Any:
     with contextlib.suppress(InputError):
         return load_record(directory).summary.get("status")
     return read_json(directory / SUMMARY).get("status")  # for a record of a newer version
-
-
-def read_json(path: Path, most: int = LARGEST) -> dict[str, Any]:
-    """Table in a JSON file of at most so many bytes; {} if it cannot be read."""
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        found = json.loads(read_plain(path, most))
-        return found if isinstance(found, dict) else {}
-    return {}
 
 
 def _remove(directory: Path, *names: str) -> None:

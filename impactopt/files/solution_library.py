@@ -15,8 +15,8 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.files.output import NUMBERS, load_record, make_directory, record_of, save_record
 from impactopt.files.problem_file import ProblemFile
-from impactopt.files.problem_file.toml import read_toml
 from impactopt.files.replay import problem_of, resumed
+from impactopt.files.toml import read_toml
 from impactopt.planning.budget import one_after_the_other
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve

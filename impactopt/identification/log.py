@@ -16,7 +16,7 @@ from scipy.integrate import trapezoid
 
 from impactopt.codegen.files import read_archive
 from impactopt.errors import MOST, InputError, check_array, check_direction, did_you_mean, shortened
-from impactopt.kinematics.operational_space import Held
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.robots.couplings import axis_of
 from impactopt.robots.robot import Robot
 
@@ -192,7 +192,7 @@ def _hand(
     for k, q in enumerate(_configurations(robot, angles)):
         pin.framesForwardKinematics(model, data, q)
         travel[k] = n @ data.oMf[model.getFrameId(frame)].translation
-        mass[k] = 1.0 / (n @ Held.at(model, q, (), frame).inverse_mass() @ n)
+        mass[k] = 1.0 / (n @ ConstrainedDynamics.at(model, q, (), frame).inverse_mass() @ n)
     return travel, mass
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.errors import InputError
-from impactopt.files.problem_file.toml import write_toml
+from impactopt.files.toml import write_toml
 from impactopt.identification.free_parameters import MASS
 
 __all__ = ["Estimate", "Identification", "LawFit"]

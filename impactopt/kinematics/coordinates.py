@@ -320,7 +320,7 @@ class StanceCoordinates:
     undriven : indices in v of unactuated coordinates, which only the soles' wrenches move: base, soles'
         hinges.
     labels : names of the independent coordinates.
-    posture : (nq,) the given one.  start, start_legs : (ny,), (nl,) its coordinates and legs.
+    posture : (nq,) the given one.
     """
 
     def __init__(
@@ -359,17 +359,6 @@ class StanceCoordinates:
         base_labels = ["base x", "base y", "base z", "base roll", "base pitch", "base yaw"][: self.base]
         self.labels = (*base_labels, *(robot.joint_names[j] for j in self.independent))
         self.leg_labels = tuple(robot.joint_names[j] for j in self.dependent)
-        self.rb = RigidBody(self.model, base="rpy", springs=robot.springs)
-        self._build_symbolic_pieces()
-        legs = ca.SX.sym("legs", self.nl)
-        self.start, self.start_legs = self.split(posture)
-        determinants = self.leg_determinants(legs) if self.legs else ca.SX(0, 1)
-        self._determinants = ca.Function("determinants", [legs], [determinants])
-        self.start_determinants = np.array(self._determinants(self.start_legs)).ravel()
-
-    def leg_extension(self, legs: Array) -> Array:
-        """Determinants (soles + hands,) of the Jacobians of legs (nl,) over those at the start."""
-        return np.array(self._determinants(legs)).ravel() / self.start_determinants
 
     def _leg_samples(self, frame: str, chain: Index, posture: Array) -> list[Array]:
         """Jacobians (6, 6) of a chain's last joints, at this posture and four random ones near it."""
@@ -397,25 +386,49 @@ class StanceCoordinates:
         return tuple(leg.frame for leg in self.legs)
 
     # ------------------------------------------------------------------ symbolic
-    def _build_symbolic_pieces(self) -> None:
-        rb = self.rb
-        self._motion = None
-        if self.base:
-            qd, qdd = ca.SX.sym("qd", rb.nv), ca.SX.sym("qdd", rb.nv)
-            v = ca.mtimes(rb.velocity_map(), qd)[:6]
-            a = rb.acceleration(qd, qdd)[:6]
-            self.base_motion = ca.Function("base_motion", [rb.q, qd, qdd], [v, a])
-        # for calls with the base at the world's origin, without rotation: then all is in the base's own frame
-        self._sole = []
+    @cached_property
+    def rb(self) -> RigidBody:
+        """Expressions of the robot's dynamics, in coordinates whose base has roll, pitch and yaw."""
+        return RigidBody(self.model, base="rpy", springs=self.robot.springs)
+
+    @cached_property
+    def base_motion(self) -> Any:
+        """ca.Function (q, qd, qdd) -> velocity and acceleration (6,) of the free-flyer, in its own frame."""
+        rb, qd, qdd = self.rb, ca.SX.sym("qd", self.rb.nv), ca.SX.sym("qdd", self.rb.nv)
+        v, a = ca.mtimes(rb.velocity_map(), qd)[:6], rb.acceleration(qd, qdd)[:6]
+        return ca.Function("base_motion", [rb.q, qd, qdd], [v, a])
+
+    @cached_property
+    def _sole(self) -> list[Any]:
+        """Kinematics of each leg's frame, for calls with the base at the world's origin, without rotation.
+
+        There all is in the base's own frame.
+        """
+        rb, out = self.rb, []
         for leg in self.legs:
             rotation, point = rb.frame(leg.frame)
             chain = [self.base + int(j) for j in (*leg.before, *leg.joints)]
             jac = rb.jacobian(leg.frame)[:, chain]
             twist = rb.frame_velocity(leg.frame, rb.v)
             acc = rb.frame_acceleration(leg.frame, rb.v, rb.a)
-            self._sole.append(
-                ca.Function("sole", [rb.q, rb.v, rb.a], [rotation, point, ca.densify(jac), twist, acc])
-            )
+            found = [rotation, point, ca.densify(jac), twist, acc]
+            out.append(ca.Function("sole", [rb.q, rb.v, rb.a], found))
+        return out
+
+    @cached_property
+    def start_determinants(self) -> Array:
+        """`leg_determinants` (legs,) of the given posture."""
+        return np.array(self._determinants(self.start_legs)).ravel()
+
+    @cached_property
+    def _determinants(self) -> Any:
+        legs = ca.SX.sym("legs", self.nl)
+        found = self.leg_determinants(legs) if self.legs else ca.SX(0, 1)
+        return ca.Function("determinants", [legs], [found])
+
+    def leg_extension(self, legs: Array) -> Array:
+        """Determinants (soles + hands,) of the Jacobians of legs (nl,) over those at the start."""
+        return np.array(self._determinants(legs)).ravel() / self.start_determinants
 
     def embed(self, base: Any, independent: Any, dependent: Any) -> Any:
         """Vector over base and joints (nv) from its three parts (SX)."""
@@ -565,6 +578,16 @@ class StanceCoordinates:
             independent=self.base + self.independent,
             join=self.join,
         )
+
+    @cached_property
+    def start(self) -> Array:
+        """Coordinates (ny,) of the given posture."""
+        return self.split(self.posture)[0]
+
+    @cached_property
+    def start_legs(self) -> Array:
+        """Legs (nl,) of the given posture."""
+        return self.split(self.posture)[1]
 
     def split(self, q_pin: Array) -> tuple[Array, Array]:
         """Coordinates y (ny,) and legs (nl,) of a Pinocchio configuration (nq,)."""

@@ -20,7 +20,14 @@ from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
-__all__ = ["Held", "across", "holding_torque", "static_wrenches", "striking_point", "striking_velocity"]
+__all__ = [
+    "ConstrainedDynamics",
+    "across",
+    "holding_torque",
+    "static_wrenches",
+    "striking_point",
+    "striking_velocity",
+]
 
 Array = NDArray[np.float64]
 
@@ -56,7 +63,7 @@ _DEPENDENT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class ConstrainedDynamics:
     """Dynamics of a model with fixed frames, at one configuration, in world axes.
 
     inertia (nv, nv); held (c, nv) : Jacobian of the fixed frames; hand (3, nv) : linear Jacobian of the
@@ -68,7 +75,7 @@ class Held:
     hand: Array
 
     @classmethod
-    def at(cls, model: pin.Model, q: Array, frames: Sequence[str], striker: str) -> Held:
+    def at(cls, model: pin.Model, q: Array, frames: Sequence[str], striker: str) -> ConstrainedDynamics:
         """Dynamics at a configuration q (nq,).  frames : fixed ones.  striker : striking point's frame."""
         inertia = mass_matrix(model, model.createData(), q)
         jacobians = _jacobians(model, q, [*frames, striker])
@@ -119,7 +126,7 @@ def striking_velocity(
     speed = float(check_array("speed [m/s]", speed, (), most=MOST))
     held_by = usual_stance(robot) if stance is None else stance
     frames = held_by.constraint_frames(robot)
-    body = Held.at(robot.model, q, frames, robot.striker(striker).model_frame)
+    body = ConstrainedDynamics.at(robot.model, q, frames, robot.striker(striker).model_frame)
     J = np.vstack([body.held, body.hand])
     required = np.concatenate([np.zeros(len(body.held)), speed * n])
     # minimum of v'Hv/2 subject to J v = required: v = H^-1 J' (J H^-1 J')^-1 required

@@ -178,7 +178,7 @@ class Watch:
         number = {name: k for k, name in enumerate(self._names)}
         for key, held in t.clearance_constraints.items():
             at = number[key.place], self._shapes.index[key[1:]]
-            self._has[at], self._directions[at] = True, held.way
+            self._has[at], self._directions[at] = True, held.vector
         neighbours = self._shapes.between < NEIGHBOUR_JOINTS
         self._include = np.where(neighbours, INCLUDE_NEIGHBOURS, INCLUDE)
         self._trigger = np.where(neighbours, TRIGGER_NEIGHBOURS, TRIGGER)

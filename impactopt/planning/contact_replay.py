@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.collision.coasting import coasting_reference
 from impactopt.collision.sdc import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import independent_rates
@@ -24,7 +25,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.engines import scene_of
 from impactopt.simulation.pinocchio_engine import Followed, follow_contact
-from impactopt.simulation.reference.coasting import coasting_reference
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.plan import Plan, PlannedStrike, Trajectory

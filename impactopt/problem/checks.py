@@ -19,6 +19,7 @@ from impactopt.contact.friction import check_friction
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import (
+    MANY,
     MOST,
     InputError,
     check_array,
@@ -29,7 +30,7 @@ from impactopt.errors import (
     shortened,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.operational_space import Held
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.motion_style import STYLES
 from impactopt.problem.objectives import Penetration
@@ -63,7 +64,6 @@ MOST_FREEZES = 64
 LONGEST_CONTACT = 100.0  # [s]
 MOST_ELEMENTS = 100  # of compression or restitution: two are accurate to a few per mille
 MOST_TOUCHES = 4
-MANY = 100  # scenarios or obstacles
 # Smaller mobilities along the normal, over the largest in any direction, count as zero.
 MIN_MOBILITY = 1e-12
 
@@ -202,7 +202,7 @@ def check_moves(problem: Any) -> None:
     """InputError if no joint moves the striking point along the normal where it meets the target."""
     c, n = problem.coordinates, problem.normal
     striker = problem.robot.striker(problem.striker).model_frame
-    mobility = Held.at(c.model, problem.contact_posture, c.frames, striker).inverse_mass()
+    mobility = ConstrainedDynamics.at(c.model, problem.contact_posture, c.frames, striker).inverse_mass()
     if n @ mobility @ n <= MIN_MOBILITY * np.linalg.norm(mobility):
         raise InputError(
             f"no joint of {problem.robot.name!r} moves {problem.striker!r} along the normal "

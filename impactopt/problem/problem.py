@@ -36,7 +36,7 @@ from impactopt.errors import (
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
-from impactopt.kinematics.stance import BothSoles, Free, Stance
+from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, Free, Stance
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.checks import (
     COLLISIONS,
@@ -160,7 +160,7 @@ class ImpactProblem:
     second: SecondStriker | None = None
     stance: Stance = field(default_factory=BothSoles)
     stances: tuple[StancePhase, ...] = ()
-    start: str | Array = "half_sitting"
+    start: str | Array = USUAL_POSTURE
     swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
     follow: Phase = field(default_factory=lambda: Phase(duration=(1.0, 1.0)))
     contact_duration: tuple[float, float] = (0.0, 0.2)

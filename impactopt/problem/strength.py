@@ -23,7 +23,7 @@ from impactopt.robots.robot import Robot
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["Blow", "Strength", "best_share", "drawn_blows"]
+__all__ = ["EstimatedImpact", "Strength", "best_share", "drawn_impacts"]
 
 Array = NDArray[np.float64]
 MAX_SWING = 1.2  # [rad], [m] travel of a joint from rest to contact
@@ -40,7 +40,7 @@ STIFFNESS_DEPTH = 1e-3  # [m] penetration at which the secant stiffness of a law
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Blow:
+class EstimatedImpact:
     """Estimated impact: configuration q (nq,) and velocity v (nv,) at contact, point (3,) [m], normal (3,),
     and impulse [N s].
     """
@@ -61,7 +61,7 @@ class Strength:
     law: ContactLaw
     target: Target
 
-    def at(self, q: Array, normals: Sequence[Array]) -> list[Blow]:
+    def at(self, q: Array, normals: Sequence[Array]) -> list[EstimatedImpact]:
         """Impacts in a configuration (nq,), one along each normal (3,) along which the striking point can
         move.
 
@@ -106,7 +106,7 @@ class Strength:
             speed, direction = best[0], best[2]
             mass = 1.0 / (inverse_mass + self._target_inverse_mass())
             speed = min(speed, self._gear_speed(response @ n, mass))
-            out.append(Blow(q=q, v=speed * direction, point=point, normal=n, impulse=mass * speed))
+            out.append(EstimatedImpact(q=q, v=speed * direction, point=point, normal=n, impulse=mass * speed))
         return out
 
     def _target_inverse_mass(self) -> float:
@@ -146,9 +146,9 @@ def _least_squares(matrix: Array, n: Array) -> Array:
     return np.asarray(np.linalg.lstsq(matrix, n, rcond=1e-9)[0])
 
 
-def drawn_blows(
+def drawn_impacts(
     strength: Strength, q: Array, normals: Sequence[Array] = NORMALS, *, with_face: bool = True
-) -> list[Blow]:
+) -> list[EstimatedImpact]:
     """Estimated impacts ahead of the base, the hardest first: in `POSTURES` postures, along each normal.
 
     The joints that move the striker are drawn within their limits; the others are as in q (nq,). A single
@@ -164,7 +164,7 @@ def drawn_blows(
     rng, limb = np.random.default_rng(0), np.array(robot.limb(robot.striker(strength.striker).model_frame))
     low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
     low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
-    own, blows = robot.joint_positions(q)[limb], list[Blow]()
+    own, impacts = robot.joint_positions(q)[limb], list[EstimatedImpact]()
     count = 0
     for _ in range(MAX_DRAWN):
         step = np.zeros(robot.nv)
@@ -180,16 +180,16 @@ def drawn_blows(
             face_normal = data.oMf[frame].rotation @ face.normal
             directions = [n for n in directions if n @ face_normal >= min_face_cosine]
         if directions:
-            blows += strength.at(posture, directions)
+            impacts += strength.at(posture, directions)
             count += 1
         if count == POSTURES:
             break
-    reach = max((float(np.linalg.norm(blow.point[:2])) for blow in blows), default=0.0)
-    front = [b for b in blows if b.point[0] > MIN_AHEAD * reach and b.impulse > 0]
-    return sorted(front, key=lambda blow: -blow.impulse)
+    reach = max((float(np.linalg.norm(impact.point[:2])) for impact in impacts), default=0.0)
+    front = [b for b in impacts if b.point[0] > MIN_AHEAD * reach and b.impulse > 0]
+    return sorted(front, key=lambda impact: -impact.impulse)
 
 
-def best_share(problem: ImpactProblem) -> tuple[float, Blow] | None:
+def best_share(problem: ImpactProblem) -> tuple[float, EstimatedImpact] | None:
     """Estimated impulse of a problem over that of the hardest impact nearby, and that impact.
 
     Nearby are points within 0.4 m, hit along the problem's normal, to the front, to a side or down. The
@@ -205,9 +205,11 @@ def best_share(problem: ImpactProblem) -> tuple[float, Blow] | None:
         guess = pin.integrate(p.robot.model, p.contact_posture, rng.standard_normal(p.robot.nv))
         with suppress(InputError):
             postures.append(inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1))
-    own = [blow.impulse for q in postures for blow in strength.at(q, [p.normal])]
-    drawn = drawn_blows(strength, p.start_posture, (*NORMALS, p.normal), with_face=p.term(FirstTouch).enabled)
-    near = [blow for blow in drawn if np.linalg.norm(blow.point - p.point) < NEARBY]
+    own = [impact.impulse for q in postures for impact in strength.at(q, [p.normal])]
+    drawn = drawn_impacts(
+        strength, p.start_posture, (*NORMALS, p.normal), with_face=p.term(FirstTouch).enabled
+    )
+    near = [impact for impact in drawn if np.linalg.norm(impact.point - p.point) < NEARBY]
     if not near or not own or not near[0].impulse > 0:
         return None
     return min(max(own) / near[0].impulse, 1.0), near[0]

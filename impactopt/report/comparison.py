@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.files.output import Record, plain
-from impactopt.files.problem_file.toml import TOMLError, read_toml
+from impactopt.files.toml import TOMLError, read_toml
 from impactopt.report.histories import at_contact, ground_wrenches, planned_torque, thinned, zmp_margins
 from impactopt.report.page import html_page
 from impactopt.report.report import Report

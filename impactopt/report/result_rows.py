@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.files.output import replay_name
+from impactopt.files.record import replay_name
 from impactopt.robots.loads import SHARE, margin_between_nodes
 from impactopt.solvers.program import MINOR
 

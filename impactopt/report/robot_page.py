@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.robot_bodies import RobotBodies, bodies_of
 from impactopt.bodies.solids import Solid
 from impactopt.bodies.world import WorldBody
+from impactopt.kinematics.stance import USUAL_POSTURE
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.page import html_page
 from impactopt.report.report import Report
@@ -23,12 +24,11 @@ from impactopt.robots.robot import Robot
 __all__ = ["bodies_page", "bodies_page_of_problem"]
 
 Array = NDArray[np.float64]
-DEFAULT_POSTURE = "half_sitting"  # of a robot without a problem, if the robot has it
 
 
 def bodies_page(robot: Robot) -> Report:
-    """Page of a robot's bodies in `DEFAULT_POSTURE`, else in its first posture, or else in the neutral."""
-    names = sorted(robot.postures, key=lambda name: name != DEFAULT_POSTURE)
+    """Page of a robot's bodies in `USUAL_POSTURE`, else in its first posture, or else in the neutral."""
+    names = sorted(robot.postures, key=lambda name: name != USUAL_POSTURE)
     posture = robot.posture(names[0]) if names else pin.neutral(robot.model)
     return _page(robot, posture, names[0] if names else "neutral", robot.name)
 

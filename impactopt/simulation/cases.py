@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from impactopt.collision import Collision, effective_mass
 from impactopt.errors import InputError, check_positive
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.stance import Stance, usual_stance
+from impactopt.kinematics.stance import USUAL_POSTURE, Stance, usual_stance
 from impactopt.kinematics.support import margin as margin_in
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.robot import Robot
@@ -54,9 +54,9 @@ def posture_of_effective_mass(
         posture found (with the nearest mass).
     """
     check_positive("mass [kg]", mass)
-    if start is None and "half_sitting" not in robot.postures:
-        raise InputError(f"robot {robot.name!r} has no posture half_sitting; give start=")
-    q0 = robot.posture("half_sitting") if start is None else robot.check_configuration(start, name="start")
+    if start is None and USUAL_POSTURE not in robot.postures:
+        raise InputError(f"robot {robot.name!r} has no posture {USUAL_POSTURE}; give start=")
+    q0 = robot.posture(USUAL_POSTURE) if start is None else robot.check_configuration(start, name="start")
     search = _PostureSearch(robot, float(mass), striker, normal, stance, q0, inside)
     d, error = np.zeros(robot.nv), np.inf
     for _ in range(4):  # SLSQP may stop early by a bad estimate of the Hessian: restart it from there

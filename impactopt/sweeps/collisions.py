@@ -26,7 +26,6 @@ from impactopt.collide.single_collision import (
     chosen,
     collision_model,
     full_names,
-    one_collision,
 )
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import FREEZE_ERROR, too_large
@@ -35,7 +34,7 @@ from impactopt.collision.rigid import RigidImpact
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError, did_you_mean, raw_array
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file
-from impactopt.files.problem_file.toml import Place, plain_value
+from impactopt.files.toml import Place, plain_value
 
 __all__ = [
     "SERVO",
@@ -309,7 +308,9 @@ def one_by_one(
     for i in range(count):
         own = {name: x[0 if len(x) == 1 else i] for name, x in settings.items()}
         try:
-            result = one_collision(model, states.q[i], states.v[i], states.torque[i], **own)
+            result = model.collide(
+                states.q[i], states.v[i], states.torque[i], require_separation=False, **own
+            )
         except InputError as error:
             collisions.append(None)
             reason[i] = str(error)

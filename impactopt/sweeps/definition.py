@@ -19,8 +19,8 @@ from impactopt.codegen.files import is_plain_file, read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.named_problems import problem_file, sweep_file
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
-from impactopt.files.problem_file.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
-from impactopt.files.problem_file.toml import (
+from impactopt.files.sections.diagnostics import Mistake, key_lines, mistakes_of, report_mistakes
+from impactopt.files.toml import (
     LONGEST_TEXT,
     Place,
     TOMLError,

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from impactopt.files.problem_file.diagnostics import Mistake
-from impactopt.files.problem_file.values import Positive, Section, optional, required
+from impactopt.files.sections.diagnostics import Mistake
+from impactopt.files.sections.values import Positive, Section, optional, required
 
 __all__ = ["CaseKind", "Figure", "SpanSection", "SweepFile", "flat", "of_other_kinds", "put"]
 

@@ -249,13 +249,13 @@ class ClearanceKey(NamedTuple):
 class SeparatingDirection(NamedTuple):
     """Direction and least distance of a clearance constraint.
 
-    way (3) : unit vector from the other body to the link, in the other's frame. The maximization of the
+    vector (3) : unit vector from the other body to the link, in the other's frame. The maximization of the
         separation starts there.
     reach : least distance [m].
     travel : of the target [m], if the other body moves with it.
     """
 
-    way: tuple[float, ...]
+    vector: tuple[float, ...]
     reach: float
     travel: float = 0.0
 
@@ -296,7 +296,7 @@ def add_clearance_constraints(
         group = groups.setdefault(len(chain.columns), _Group())
         group.keys.append(key)
         group.pairs.append(n)
-        group.ways.append(direction.way)
+        group.directions.append(direction.vector)
         group.patterns.append(pattern)
         group.spots.append(spot_of[key.place])
         # capsules and spheres are their axes and centres, at a distance that is larger by their radius
@@ -321,7 +321,7 @@ def add_clearance_constraints(
             length,
             np.array(group.pairs),
             np.array(group.parameters),
-            np.array(group.ways, dtype=float),
+            np.array(group.directions, dtype=float),
         )
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
         first = b.append(SeparationBlock.of_separations(f"apart{length}", of, lift))
@@ -388,7 +388,7 @@ class _Group:
 
     keys: list[ClearanceKey] = field(default_factory=list)
     pairs: list[int] = field(default_factory=list)
-    ways: list[tuple[float, ...]] = field(default_factory=list)
+    directions: list[tuple[float, ...]] = field(default_factory=list)
     origins: list[ConstraintOrigin] = field(default_factory=list)
     patterns: list[tuple[Index, Index, Array]] = field(default_factory=list)
     spots: list[int] = field(default_factory=list)

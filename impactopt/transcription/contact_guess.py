@@ -22,7 +22,7 @@ from impactopt.contact.targets import FreeMass, Nail, Target
 from impactopt.contact.targets.base import contact_phases
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.operational_space import Held
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.problem.checks import MOST_TOUCHES
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import VelocityLimit
@@ -77,7 +77,9 @@ def effective_mass(
     With two strikers: the mean of the masses at each one, as both change speed alike, and the mean speed.
     """
     q, v = c.join(y, legs), c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
-    bodies = [Held.at(c.model, q, c.frames, c.robot.striker(name).model_frame) for name in strikers]
+    bodies = [
+        ConstrainedDynamics.at(c.model, q, c.frames, c.robot.striker(name).model_frame) for name in strikers
+    ]
     J_hand, J_c = np.array([normal @ body.hand for body in bodies]), bodies[0].held
     speed, m = float((J_hand @ v).mean()), len(J_c)
     both = np.vstack([J_c, J_hand])

@@ -29,12 +29,13 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from impactopt.codegen.batched import BatchedFunction
 from impactopt.codegen.compiler import address, native_library
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import solve_in_order
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.program import Determined
-from impactopt.transcription.batched import BatchedFunction, Block
+from impactopt.transcription.batched import Block
 from impactopt.transcription.layout import Affine, Array, Constraints, Index, Layout, stack
 
 __all__ = [

@@ -480,10 +480,10 @@ def statement_of(t: Transcription) -> str:
     # Separating directions at the solution. An evaluation that starts from those of an earlier round may find
     # a local maximum of the separation, which is not the distance.
     directions = [
-        d.tolist() for block in t.blocks if isinstance(block, SeparationBlock) for d in block.of.ways
+        d.tolist() for block in t.blocks if isinstance(block, SeparationBlock) for d in block.of.directions
     ]
     clearance: list[dict[str, Any]] = [
-        {**constraint._asdict(), **held._asdict(), "way": direction}
+        {**constraint._asdict(), "way": direction, "reach": held.reach, "travel": held.travel}
         for (constraint, held), direction in zip(t.clearance_constraints.items(), directions, strict=True)
     ]
     return json.dumps(

@@ -13,7 +13,7 @@ from benchmarks.virtual_base import exact_inverse_mass
 from impactopt.collision import SDC, effective_mass
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.kinematics.operational_space import Held
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import BothSoles
 from impactopt.simulation.reference import FullDynamics
 
@@ -41,7 +41,9 @@ def masses_of(mass: float, cases: int, seed: int) -> list[Found]:
         first = robot.nv - 3 if k % 3 == 0 else robot.nv - robot.n
         dq[first:] = rng.uniform(-0.8, 0.8, robot.nv - first)
         q = pin.integrate(robot.model, pin.neutral(robot.model), dq)
-        body = Held.at(robot.model, q, stance.sole_frames(robot), robot.striker("tip").model_frame)
+        body = ConstrainedDynamics.at(
+            robot.model, q, stance.sole_frames(robot), robot.striker("tip").model_frame
+        )
         expected = 1.0 / float(exact_inverse_mass(body, X, 1 / Decimal(mass)))
         error = abs(float(function(q)) / expected - 1.0)
         verdict = "nan" if np.isnan(error) else "agree" if error < 1e-6 else "wrong"

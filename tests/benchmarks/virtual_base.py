@@ -27,7 +27,7 @@ from impactopt.collision.runge_kutta import rk4_step
 from impactopt.collision.runge_kutta import run as time_loop
 from impactopt.collision.stepped import number_of_steps
 from impactopt.errors import InputError
-from impactopt.kinematics.operational_space import Held
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import BothSoles
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
@@ -193,13 +193,15 @@ def _strike(robot: Robot) -> Any:
 
 
 # ---------------------------------------------------------------- many digits
-def _body(robot: Robot, q: Array, model: Any = None) -> Held:
+def _body(robot: Robot, q: Array, model: Any = None) -> ConstrainedDynamics:
     """Of the robot, or of a model with its frames."""
     frames = BothSoles().sole_frames(robot)
-    return Held.at(robot.model if model is None else model, q, frames, robot.striker(STRIKER).model_frame)
+    return ConstrainedDynamics.at(
+        robot.model if model is None else model, q, frames, robot.striker(STRIKER).model_frame
+    )
 
 
-def exact_inverse_mass(body: Held, normal: Any, compliance: Decimal | int) -> Decimal:
+def exact_inverse_mass(body: ConstrainedDynamics, normal: Any, compliance: Decimal | int) -> Decimal:
     """[1/kg] n' J P J' n with that compliance [1/kg, 1/(kg m2)] of the soles, in 60-digit arithmetic."""
     with localcontext(Context(prec=DIGITS)):
         rows = _decimals(np.vstack([body.held, np.asarray(normal) @ body.hand]))

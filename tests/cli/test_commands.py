@@ -160,6 +160,18 @@ def test_collide_shows_a_table_and_takes_settings(file: Path) -> None:
     assert heavy["impulse_Ns"] > light["impulse_Ns"]
 
 
+def test_a_collision_needs_no_sections_of_plans(file: Path) -> None:
+    words = ("collide", file, "--speed", 0.5, "--json", "-q")
+    right = json.loads(run(*words)[0])
+    wrong = f"{file.read_text()}\n[terms.ceiling]\n"
+    file.write_text(wrong)
+    assert json.loads(run(*words)[0]) == right
+    assert "ceiling: unknown section" in run("check", file, code=2)[1]
+    assert "no collision depends on [swing]" in run(*words, "--set", "swing.intervals=9", code=2)[1]
+    file.write_text(wrong.replace("[contact]", "[contakt]"))
+    assert "did you mean 'contact'" in run(*words, code=2)[1]
+
+
 def test_a_collision_that_there_is_not_exits_1(file: Path) -> None:
     out, _ = run("collide", file, "--speed", 0.5, "--set", "problem.point.0=3", code=1)
     assert "no collision: the point is out of reach" in out
@@ -229,7 +241,7 @@ def test_a_fault_of_ours_is_no_answer(file: Path, monkeypatch: pytest.MonkeyPatc
     def fail(*arguments: Any, **options: Any) -> Robot:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("impactopt.files.problem_file.robot_sections.load_robot", fail)
+    monkeypatch.setattr("impactopt.files.sections.robot.load_robot", fail)
     _, err = run("check", file, code=70)
     assert "ZeroDivisionError: a bug" in err and "fault of impactopt" in err
 

@@ -28,7 +28,7 @@ from impactopt import (
 from impactopt.collision import Effects
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
-from impactopt.kinematics.operational_space import Held, holding_torque, striking_velocity
+from impactopt.kinematics.operational_space import ConstrainedDynamics, holding_torque, striking_velocity
 from impactopt.kinematics.stance import BothSoles, FixedBase, Free
 from impactopt.problem.terms import GearLoad
 from impactopt.robots.robot import Robot, Striker
@@ -246,7 +246,7 @@ def test_the_change_of_momentum_is_in_the_cone() -> None:
     across = lost - n * (n @ lost)
     assert n @ lost == pytest.approx(found.impulse, rel=1e-6)
     assert 0.3 * found.impulse < np.linalg.norm(across) < 0.6 * found.impulse
-    hand = Held.at(model, q, (), robot.striker("fist").model_frame).hand @ v
+    hand = ConstrainedDynamics.at(model, q, (), robot.striker("fist").model_frame).hand @ v
     assert across @ (hand - n * (n @ hand)) > 0  # against the slide
 
 

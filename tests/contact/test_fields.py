@@ -15,7 +15,7 @@ from impactopt.contact.fields import About, Described, about, abouts, snake_case
 from impactopt.contact.laws import LAWS
 from impactopt.contact.targets import TARGETS
 from impactopt.errors import InputError
-from impactopt.files.problem_file.values import section_of
+from impactopt.files.sections.values import section_of
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.terms import TERMS
 

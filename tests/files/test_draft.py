@@ -28,7 +28,7 @@ from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.draft.robot import draft_robot
 from impactopt.files.draft.strikers import find_striker
 from impactopt.files.problem_file import load_problem
-from impactopt.files.problem_file.toml import read_toml
+from impactopt.files.toml import read_toml
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import doubts

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.problem_texts import ARM, write
 
-import impactopt.files.problem_file.robot_sections as robot_sections
 import impactopt.files.problem_file.sections as sections
+import impactopt.files.sections.robot as robot_sections
 from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.contact import (
     Board,
@@ -30,8 +30,8 @@ from impactopt.contact.laws import LAWS
 from impactopt.contact.targets import TARGETS
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, read_problem_file
-from impactopt.files.problem_file.diagnostics import key_lines
-from impactopt.files.problem_file.values import Section, attribute_docs
+from impactopt.files.sections.diagnostics import key_lines
+from impactopt.files.sections.values import Section, attribute_docs
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem import objectives, terms
 from impactopt.problem.problem import COLLISIONS, ImpactProblem, Phase

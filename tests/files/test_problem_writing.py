@@ -30,7 +30,7 @@ from impactopt.files.problem_file import (
     write_problem,
 )
 from impactopt.files.problem_file.reference import problem_template, reference
-from impactopt.files.problem_file.values import Section
+from impactopt.files.sections.values import Section
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem import objectives, terms
 from impactopt.problem.problem import ImpactProblem, Phase

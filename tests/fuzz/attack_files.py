@@ -13,7 +13,7 @@ from fuzz.attack_cases import Found, Generator, attempt, odd_number, pick
 from fuzz.attack_sound import wrong_with_problem
 from impactopt.files.named_problems import problem_file, problem_names
 from impactopt.files.problem_file import load_problem
-from impactopt.files.problem_file.toml import read_toml, write_toml
+from impactopt.files.toml import read_toml, write_toml
 
 __all__ = ["attack_file", "mutated_file", "odd_text", "spoil_bytes", "spoil_data", "texts"]
 

@@ -280,7 +280,7 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
 /* ---- search for near pairs. Placements of joints (K, J, 12) and of the world's bodies (K, W, 12): rotation by rows,
  * translation.  pairs (P, 2): joint, and joint or -1 - the world's body.  balls (P, 8): centre and radius of both; of a
  * body of the world half sides and radius.  hulls (P, 4).  extra (P,): inflation of the second body.  present (K, W).
- * ways (K, P, 3): directions, updated; zero if unknown.  gaps (K, P): separations, or lower bounds of those that are not
+ * directions (K, P, 3): updated; zero if unknown.  gaps (K, P): separations, or lower bounds of those that are not
  * below `within`.  Returns the number of pairs below `within`; their indices are in near (2 each), at most `most`. */
 /* Placement of a in b's frame. */
 static void relative(const double *a, const double *b, double *R) {
@@ -292,11 +292,11 @@ static void relative(const double *a, const double *b, double *R) {
 }
 EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, const double *joints, const double *world,
                     const int64_t *pairs, const double *balls, const int64_t *hulls, const double *extra,
-                    const uint8_t *present, const uint8_t *wanted, const double *points, double sharp, double within, double *ways,
+                    const uint8_t *present, const uint8_t *wanted, const double *points, double sharp, double within, double *directions,
                     double *gaps, double *far, int64_t most, int64_t *near) {
     int64_t found = 0;
     for (int64_t k = 0; k < K; ++k) for (int64_t i = 0; i < P; ++i) {
-        double *u = ways + 3 * (k * P + i), *gap = gaps + k * P + i;
+        double *u = directions + 3 * (k * P + i), *gap = gaps + k * P + i;
         *gap = 1e3;
         if (!wanted[i]) continue;
         int64_t other = pairs[2 * i + 1];

@@ -34,8 +34,7 @@ from impactopt.errors import InputError
 __all__ = ["least_size", "native_collision", "native_differences", "native_gradient", "native_jacobian"]
 
 # files of the time stepping, and of its discrete adjoint
-_IMPLICIT = ("implicit", *(f"implicit_{part}" for part in ("factor", "step", "remainders", "events", "run")))
-_STEPS = {"rk4": ("rk4.h", "steps.h"), "implicit": tuple(f"{name}.h" for name in _IMPLICIT)}
+_IMPLICIT = ("", "_factor", "_step", "_remainders", "_events", "_run")  # parts of implicit.h
 _ADJOINT = {"rk4": ("rk4_adjoint.h", "steps_adjoint.h"), "implicit": ("implicit_adjoint.h",)}
 # The generated code of the tree is long and without branches. These options make it a sixth faster than -Og
 # for half a second more of the compiler; -O2 takes another half and gains nothing.
@@ -212,7 +211,8 @@ def _code(
         *of_differences,
     ]
     method = collision.stepping
-    files_used = ["freeze.h", "instant.h", "histories.h", *_STEPS[method], "segments.h"]
+    steps = ["rk4.h", "steps.h"] if method == "rk4" else [f"implicit{part}.h" for part in _IMPLICIT]
+    files_used = ["freeze.h", "instant.h", "histories.h", *steps, "segments.h"]
     if gradient:
         files_used += (
             ["final_outputs.h"]

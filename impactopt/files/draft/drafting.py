@@ -26,11 +26,11 @@ from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_edge, find_striker
 from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest, touches
-from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
+from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
-from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.files.problem_file.writing import sole_data, striker_data, tool_data
+from impactopt.files.toml import Place, plain_value, write_toml
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike
@@ -105,7 +105,7 @@ def draft_problem(
     say = report or (lambda text: None)
     say("reading the robot and the shapes of its links")
     drafted = draft_robot(path, mjcf=mjcf, bolted=bolted)
-    model, forward = drafted.robot.model, np.array(WAYS[0])
+    model, forward = drafted.robot.model, np.array(STRIKE_DIRECTIONS[0])
     soles: list[Sole] = []
     if drafted.legs:
         soles, forward = find_soles(model, drafted.legs, drafted.pieces)
@@ -163,7 +163,7 @@ def _punch(
     """
     robot, _, q = _standing(drafted, soles, strikers, forward)
     arms = _renumbered(arms, drafted, robot)
-    q, way = ready(robot, arms, q, ways=WAYS[:1])
+    q, way = ready(robot, arms, q, directions=STRIKE_DIRECTIONS[:1])
     data = _data(drafted, robot, soles, strikers, q, folder)
     data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
     return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
@@ -211,7 +211,9 @@ def _bolted(
         messages = [result, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
     else:
         try:
-            q, way = ready(robot, arms, q, ways=[tuple(DOWN)] if motion in FROM_ABOVE else WAYS)
+            q, way = ready(
+                robot, arms, q, directions=[tuple(DOWN)] if motion in FROM_ABOVE else STRIKE_DIRECTIONS
+            )
             data = {**_data(drafted, robot, [], strikers, q, folder), **hit.data}
             data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
         except InputError as no_target:
@@ -297,13 +299,13 @@ def _stroke(
     """
     robot, _, q = _standing(drafted, soles, strikers, forward)
     (hand,) = _renumbered([arm], drafted, robot)
-    q, _ = ready(robot, [hand], q, ways=WAYS[:1])
+    q, _ = ready(robot, [hand], q, directions=STRIKE_DIRECTIONS[:1])
     name = arm.name.removesuffix("hand") + "edge"
     edge, below = find_edge(robot.model, hand.limb, name, bodies_of(robot).of_joint, arm.axis, q)
     strikers = [*strikers, edge]
     robot, _, q = _standing(drafted, soles, strikers, forward)
     (hand,) = _renumbered([Arm(limb=arm.limb, name=name, axis=below)], drafted, robot)
-    q, way = ready(robot, [hand], q, ways=[tuple(DOWN)])
+    q, way = ready(robot, [hand], q, directions=[tuple(DOWN)])
     # the easiest target: on soles, a strike alone is far harder than the strike of a whole motion
     data = {**_data(drafted, robot, soles, strikers, q, folder), **hits(motion, robot)[-1].data}
     data = _aimed(data, name, aims(robot, hand, q, way), way, folder)
@@ -370,7 +372,7 @@ def _kick(
     data["target"] = {"mass_kg": mass, "body": {"shape": "ball", "size_m": [size]}}
     data["contact"] = {"stiffness_N_m": 2e4, "damping_N_s_m": 20.0}
     points = (np.round([part * hip_height, at[1], size / 2], 3) + 0.0 for part in KICKS)
-    data = _aimed(data, toe.name, points, np.array(WAYS[0]), folder)
+    data = _aimed(data, toe.name, points, np.array(STRIKE_DIRECTIONS[0]), folder)
     return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
 
 

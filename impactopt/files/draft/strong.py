@@ -20,7 +20,7 @@ from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.strength import Blow, Strength, drawn_blows
+from impactopt.problem.strength import EstimatedImpact, Strength, drawn_impacts
 from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
@@ -67,8 +67,8 @@ def strongest(
     given = {**hit.given, "terms": () if with_face else (FirstTouch(enabled=False),)}
     strength = Strength(robot=robot, striker=arm.name, law=hit.law, target=hit.target)
     found, unsolved = list[Strong](), list[SolverResult]()
-    blows = drawn_blows(strength, q, hit.normals, with_face=with_face)
-    for problem, blow in _candidates(robot, arm, blows, given):
+    impacts = drawn_impacts(strength, q, hit.normals, with_face=with_face)
+    for problem, impact in _candidates(robot, arm, impacts, given):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
             solved = optimize_strike(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
@@ -76,7 +76,7 @@ def strongest(
             found.append(
                 Strong(
                     start=problem.start_posture,
-                    contact=blow.q,
+                    contact=impact.q,
                     point=problem.point,
                     normal=problem.normal,
                     objective=sum(solved.objectives.values()),
@@ -104,54 +104,54 @@ def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float
 
 
 def _candidates(
-    robot: Robot, arm: Arm, blows: list[Blow], given: Mapping[str, Any]
-) -> Iterator[tuple[ImpactProblem, Blow]]:
+    robot: Robot, arm: Arm, impacts: list[EstimatedImpact], given: Mapping[str, Any]
+) -> Iterator[tuple[ImpactProblem, EstimatedImpact]]:
     """Feasible problems of the best estimated impacts, with different hit points or normals."""
-    blows = [blow for blow in blows if blow.point[2] > LOWEST / 2]
-    reach = max((float(np.linalg.norm(blow.point)) for blow in blows), default=0.0)
-    taken: list[Blow] = []
-    for blow in blows[:MAX_CANDIDATES]:
-        near = [b for b in taken if b.normal @ blow.normal > 0.9]
-        if any(np.linalg.norm(b.point - blow.point) < MIN_DISTANCE * reach for b in near):
+    impacts = [impact for impact in impacts if impact.point[2] > LOWEST / 2]
+    reach = max((float(np.linalg.norm(impact.point)) for impact in impacts), default=0.0)
+    taken: list[EstimatedImpact] = []
+    for impact in impacts[:MAX_CANDIDATES]:
+        near = [b for b in taken if b.normal @ impact.normal > 0.9]
+        if any(np.linalg.norm(b.point - impact.point) < MIN_DISTANCE * reach for b in near):
             continue
-        problem = _problem(robot, arm, blow, min(BEHIND[0], BEHIND[1] * reach), given)
+        problem = _problem(robot, arm, impact, min(BEHIND[0], BEHIND[1] * reach), given)
         if problem is None:
             continue
-        taken.append(blow)
-        yield problem, blow
+        taken.append(impact)
+        yield problem, impact
         if len(taken) == MAX_STRIKES:
             return
 
 
 def _problem(
-    robot: Robot, arm: Arm, blow: Blow, behind: float, given: Mapping[str, Any]
+    robot: Robot, arm: Arm, impact: EstimatedImpact, behind: float, given: Mapping[str, Any]
 ) -> ImpactProblem | None:
     """Problem of an estimated impact, with a start posture at least `behind` [m] behind the target's plane;
     None if no start posture is feasible.
     """
     # fewer than three joints reach a curve or a surface only, from which rounding would move the point
-    point = np.round(blow.point, 3 if len(arm.limb.path) > 2 else 9) + 0.0
-    size = float(np.abs(blow.v).max())
-    way = blow.v / size * float(np.clip(RUN_UP * size, *TRAVEL))
+    point = np.round(impact.point, 3 if len(arm.limb.path) > 2 else 9) + 0.0
+    size = float(np.abs(impact.v).max())
+    way = impact.v / size * float(np.clip(RUN_UP * size, *TRAVEL))
     for factor in TRAVEL_FACTORS:
-        start = np.array(pin.integrate(robot.model, blow.q, -factor * way))
+        start = np.array(pin.integrate(robot.model, impact.q, -factor * way))
         angles = robot.joint_positions(start)
         edge = 0.02 * np.minimum(robot.upper - robot.lower, 1.0)
         inside = np.all(angles > robot.lower + edge) and np.all(angles < robot.upper - edge)
         at = striking_point(robot, arm.name, start)
-        if not inside or blow.normal @ (point - at) < behind or at[2] < LOWEST / 2:
+        if not inside or impact.normal @ (point - at) < behind or at[2] < LOWEST / 2:
             continue
         try:
             problem = ImpactProblem(
                 robot=robot,
                 striker=arm.name,
                 point=point,
-                normal=blow.normal,
+                normal=impact.normal,
                 stance=FixedBase(),
                 start=start,
                 **given,
             )
-            clear = not touches(problem, start, blow.q)
+            clear = not touches(problem, start, impact.q)
         except InputError:
             continue
         if clear and not hopeless(problem):

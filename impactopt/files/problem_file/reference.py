@@ -10,22 +10,22 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, PlainValidator
 from pydantic.fields import FieldInfo
 
-from impactopt.errors import FARTHEST, MOST
+from impactopt.errors import FARTHEST, MANY, MOST
 from impactopt.files.named_problems import problem_file, problem_summary
-from impactopt.files.problem_file.diagnostics import range_of, section_at
-from impactopt.files.problem_file.reading import LONGEST_KEY, read_problem_file
+from impactopt.files.problem_file.reading import read_problem_file
 from impactopt.files.problem_file.sections import (
-    LAWS,
-    TARGETS,
     File,
     TermSections,
     about_section,
     comment_at,
-    with_kinds,
+    defaults_of,
 )
-from impactopt.files.problem_file.toml import DEEPEST, LONGEST_TEXT, Place, plain_value, write_toml
-from impactopt.files.problem_file.values import Section
-from impactopt.problem.checks import LONGEST_CONTACT, MANY, MOST_ELEMENTS
+from impactopt.files.sections.collision import LAWS, TARGETS, with_kinds
+from impactopt.files.sections.diagnostics import range_of, section_at
+from impactopt.files.sections.reading import LONGEST_KEY
+from impactopt.files.sections.values import Section
+from impactopt.files.toml import DEEPEST, LONGEST_TEXT, Place, plain_value, write_toml
+from impactopt.problem.checks import LONGEST_CONTACT, MOST_ELEMENTS
 from impactopt.problem.scenario import FINEST, LONGEST, SHORTEST, STEEPEST
 from impactopt.robots.checks import HEAVIEST
 
@@ -53,7 +53,7 @@ def problem_template(name: str) -> str:
         table: Any = data
         for part in place:
             table = table[part]
-        defaults = section.defaults()
+        defaults = defaults_of(section)
         keys = {f: info.alias or f for f, info in section.model_fields.items() if f != section.choice}
         left = {f: key for f, key in keys.items() if key not in table and defaults.get(f) not in (None, ())}
         return {key: _short(f, plain_value(defaults[f])) for f, key in left.items() if _is_value(defaults[f])}
@@ -209,7 +209,7 @@ def _common(keys: Sequence[str], others: Sequence[str]) -> int:
 
 def _keys(section: type[BaseModel]) -> Iterator[str]:
     """A line for each key of the section itself."""
-    defaults = section.defaults() if issubclass(section, Section) else {}
+    defaults = defaults_of(section) if issubclass(section, Section) else {}
     for name, info in section.model_fields.items():
         if _inner(info)[0] is not None or name == getattr(section, "choice", ""):
             continue  # a subsection, or in the header

@@ -9,53 +9,39 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from functools import cache
-from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar, cast, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, Field, create_model
 
-from impactopt.bodies.world import Ground, Obstacle, TargetBody
-from impactopt.contact import laws, targets
+from impactopt.bodies.world import Ground, Obstacle
 from impactopt.contact.fields import snake_case
-from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
-from impactopt.files.problem_file.diagnostics import section_at
-from impactopt.files.problem_file.robot_sections import RobotSection
-from impactopt.files.problem_file.toml import Place
-from impactopt.files.problem_file.values import (
+from impactopt.files.problem_file.ipopt_options import IpoptOptions
+from impactopt.files.sections.collision import CollisionSections, ProblemSection, with_kinds
+from impactopt.files.sections.diagnostics import section_at
+from impactopt.files.sections.values import (
     AtLeastOne,
     ContactDuration,
     Duration,
     Fractions,
-    Freezes,
-    HandNames,
-    IpoptOptions,
     NotNegative,
     Positive,
-    Posture,
-    Preset,
     Restitution,
     Section,
-    Touches,
-    UnitVector,
     Vector,
     attribute_docs,
-    one_of,
     optional,
     required,
     section_of,
     sections_of,
 )
-from impactopt.kinematics.stance import BothSoles, FixedBase, Free, OneSole, Stance
+from impactopt.files.toml import Place
+from impactopt.problem.checks import MOST_FREEZES, MOST_TOUCHES
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario, SecondStriker
 from impactopt.problem.stances import StancePhase
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS, TERMS
-from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
 from impactopt.solvers.options import IPMOptions, SolverOptions, SQPOptions
 
@@ -122,103 +108,7 @@ ObjectiveSections: Any = sections_of(
 )
 
 
-_FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # defaults
-TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)
-LawKind: Any = one_of(kind.word for kind in laws.LAWS)
-
-
-Body: Any = section_of(TargetBody)
-
-
-class Target(Section):
-    """Target of the impact; the keys depend on its kind."""
-
-    model_config = ConfigDict(extra="ignore")
-    choice: ClassVar[str] = "target_kind"
-    apart: ClassVar[tuple[str, ...]] = ("body",)
-    target_kind: TargetKind = Field(default=_FIRST_TARGET, alias="kind", description="kind of target")
-    body: Body = optional("")
-
-
-class _KnownTarget(Target):
-    """Target of a known kind, without other keys."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
-class Contact(Section):
-    """Contact between hand and target; the keys depend on the law."""
-
-    model_config = ConfigDict(extra="ignore")
-    choice: ClassVar[str] = "law"
-    law: LawKind = Field(default=_FIRST_LAW, description="contact law")
-
-
-class _KnownContact(Contact):
-    """Contact of a known law, without other keys."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
-TARGETS: dict[str, type[Target]] = {kind.word: section_of(kind, _KnownTarget) for kind in targets.TARGETS}
-LAWS: dict[str, type[Contact]] = {kind.word: section_of(kind, _KnownContact) for kind in laws.LAWS}
-
-AnyFile = TypeVar("AnyFile", bound=Section)
-
-
-def with_kinds(file: type[AnyFile], data: Mapping[str, Any]) -> type[AnyFile]:
-    """The model of a file, with [target] and [contact] of the kinds in its data."""
-    found = {
-        "target": _section_of_kind(data, "target", "kind", TARGETS, Target, _FIRST_TARGET),
-        "contact": _section_of_kind(data, "contact", "law", LAWS, Contact, _FIRST_LAW),
-    }
-    return cast(type[AnyFile], _file_with(file, found["target"], found["contact"]))
-
-
-@cache  # a sweep reads thousands of files
-def _file_with(file: type[Section], target: type[Section], contact: type[Section]) -> type[Section]:
-    fields: dict[str, Any] = {"target": (target, ...), "contact": (contact, ...)}
-    return create_model(file.__name__, __base__=file, **fields)
-
-
-def _section_of_kind(
-    data: Mapping[str, Any],
-    section: str,
-    key: str,
-    kinds: Mapping[str, type[Section]],
-    unknown: type[Section],
-    default: str,
-) -> type[Section]:
-    given = data.get(section)
-    name = given.get(key, default) if isinstance(given, Mapping) else default
-    return kinds.get(name, unknown) if isinstance(name, str) else unknown
-
-
 ELEMENTS = ("compression", "restitution")  # keys of ImpactProblem.collision_elements
-
-
-def _of_problem(section: type[Section]) -> dict[str, Any]:
-    """Defaults of the fields of `ImpactProblem` that a section sets."""
-    known = {f.name: f.default for f in fields(ImpactProblem) if f.default is not MISSING}
-    return {name: known[name] for name in section.model_fields if name in known}
-
-
-class ProblemSection(Section):
-    """The robot, its striker, and the hit point."""
-
-    name: str = optional("name of the problem in reports")
-    robot: Preset = optional("see `impactopt robots`; else a section [robot]")
-    striker: str = required("the robot's striker")
-    point: Vector = required("hit point: x forward, y left, z up from the ground [m]", "point_m")
-    normal: UnitVector = required("direction in which the target is pushed")
-    start: Posture = Field(
-        default=ImpactProblem.start,
-        description="start posture: its name, or a configuration of Pinocchio",
-    )
-
-    @classmethod
-    def defaults(cls) -> dict[str, Any]:
-        return _of_problem(cls)
 
 
 class SecondSection(Section):
@@ -227,19 +117,6 @@ class SecondSection(Section):
     kind = SecondStriker
     striker: str = required("the robot's other striker")
     point: Vector = required("its hit point on the target [m]", "point_m")
-
-
-class StanceSection(Section):
-    """Fixed soles, and supporting hands."""
-
-    soles: str = Field(
-        default="both",
-        description='"both", or one; "none": the robot floats freely',
-    )
-    hands: HandNames = Field(
-        default=[],
-        description="strikers that are fixed at their places in the start posture; see [terms.grip]",
-    )
 
 
 class StancePhaseSection(Section):
@@ -295,7 +172,7 @@ class CollisionSection(Section):
         '"auto": the cheapest that is accurate enough; "virtual-mass", "rigid": no duration',
         "model",
     )
-    freezes: Freezes = optional('of the model "sdc", during contact')
+    freezes: Annotated[int, Field(ge=0, le=MOST_FREEZES)] = optional('of the model "sdc", during contact')
     auto_impulse_pct: Positive = optional('of "auto": largest change of the impulse by full dynamics [%]')
     auto_zmp_mm: Positive = optional('of "auto": largest change of the ZMP [mm]')
     coefficient_of_restitution: Restitution = optional('of "rigid": speed of separation over approach')
@@ -304,19 +181,16 @@ class CollisionSection(Section):
         "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    touches: Touches = optional("number of contacts with a board; left out: that of a point-mass model")
+    touches: Annotated[int, Field(ge=1, le=MOST_TOUCHES)] = optional(
+        "number of contacts with a board; left out: that of a point-mass model"
+    )
     compression: Fractions = optional("lengths of its collocation elements")
     restitution: Fractions = optional("lengths of its collocation elements")
-
-    @classmethod
-    def defaults(cls) -> dict[str, Any]:
-        return _of_problem(cls) | dict(zip(ELEMENTS, ImpactProblem.collision_elements, strict=True))
 
 
 ScenarioSection: Any = section_of(Scenario)
 ObstacleSection: Any = section_of(Obstacle)
 GroundSection: Any = section_of(Ground)
-FrictionSection: Any = section_of(ContactFriction)
 ControllerSection: Any = section_of(ControllerSettings)
 
 
@@ -332,21 +206,11 @@ class ObjectiveSection(Section):
     wrench_price: NotNegative = optional("price of the soles' wrenches")
     return_price: NotNegative = optional("price of ending away from the start posture [N s per rad^2]")
 
-    @classmethod
-    def defaults(cls) -> dict[str, Any]:
-        return _of_problem(cls)
 
-
-class File(Section):
+class File(CollisionSections):
     """A whole problem file; `with_kinds` sets the classes of [target] and [contact]."""
 
-    problem: ProblemSection
-    robot: RobotSection = optional("")
-    target: Target
-    contact: Contact
-    friction: FrictionSection = optional("")
     second: SecondSection = optional("")
-    stance: StanceSection = optional("")
     stances: list[StancePhaseSection] = optional("")
     swing: SwingSection = optional("")
     follow: FollowSection = optional("")
@@ -360,63 +224,12 @@ class File(Section):
     solver: SolverSection = optional("")
     controller: ControllerSection = optional("")
 
-    def make_robot(self, folder: Path) -> Robot:
-        """The robot of [robot], or the preset in [problem]."""
-        section = RobotSection(preset=self.problem.robot) if self.robot is None else self.robot
-        return section.make(folder)
-
-    def robot_mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
-        """All errors of `make_robot`, with their places; error : the first one."""
-        if "robot" not in self.model_fields_set:
-            return [(("problem", "robot"), error)]
-        return [(("robot", *place), wrong) for place, wrong in self.robot.mistakes(folder, error)]
-
-    def leg_mistake(self, folder: Path) -> InputError | None:
-        """Mistake in the legs of a robot that cannot be built, if its model can be."""
-        if "robot" not in self.model_fields_set:
-            return None
-        return self.robot.leg_mistake(folder, self.stance.soles if self.stance else "both")
-
     def given_terms(self) -> Iterator[tuple[str, Any]]:
         """Names and terms of the file's sections below [terms]."""
         for name in TermSections.model_fields if self.terms is not None else ():
             section = getattr(self.terms, name)
             if section is not None:
                 yield name, section.build()
-
-    def make_stance(self, robot: Robot) -> Stance:
-        """Stance of a robot by [stance]; InputError if the robot cannot have it."""
-        if self.stance and self.stances:
-            raise InputError("[stance] is one stance for the whole motion: leave it or [[stances]] out")
-        soles = self.stance.soles if self.stance else "both"
-        hands = tuple(self.stance.hands) if self.stance else ()
-        stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
-        if soles == "none":
-            if hands:
-                raise InputError(
-                    "[stance]: a robot that floats freely has no supporting hands: leave hands out"
-                )
-            stance = Free()
-        if not robot.floating:
-            if self.stance:
-                raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
-            stance = FixedBase()
-        stance.constraint_frames(robot)
-        return stance
-
-    def check_one_striker(self) -> None:
-        """InputError if there are two strikers, for commands that compute a collision alone."""
-        if self.second is not None:
-            raise InputError(
-                "[second]: a collision model has one striker: leave the section out, or solve the problem"
-            )
-
-    def make_start(self, robot: Robot) -> NDArray[np.float64]:
-        """The start posture (nq,); InputError for one that the robot cannot have."""
-        start = self.problem.start
-        return (
-            robot.posture(start) if isinstance(start, str) else robot.check_configuration(start, name="start")
-        )
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `ImpactProblem` that the file gives, without robot and stance."""
@@ -452,6 +265,15 @@ class File(Section):
                 found = (getattr(section, field) for field in type(section).model_fields)
                 out[name] = tuple(part.build() for part in found if part is not None)
         return out
+
+
+def defaults_of(section: type[Section]) -> dict[str, Any]:
+    """Default values by field; a field without a default is left out."""
+    if section not in (ProblemSection, CollisionSection, ObjectiveSection):
+        return section.defaults()
+    known = {f.name: f.default for f in fields(ImpactProblem) if f.default is not MISSING}
+    known |= zip(ELEMENTS, ImpactProblem.collision_elements, strict=True)
+    return {name: known[name] for name in section.model_fields if name in known}
 
 
 def about_section(section: type[BaseModel]) -> str:

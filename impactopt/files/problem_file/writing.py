@@ -16,21 +16,15 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.files.problem_file.reading import problem_file_from_data
-from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.sections import (
     ELEMENTS,
-    LAWS,
-    TARGETS,
-    Body,
     CollisionSection,
     File,
     FollowSection,
-    FrictionSection,
     GroundSection,
     ObjectiveSection,
     ObjectiveSections,
     ObstacleSection,
-    ProblemSection,
     ScenarioSection,
     SecondSection,
     SolverSettings,
@@ -38,9 +32,12 @@ from impactopt.files.problem_file.sections import (
     SwingSection,
     TermSections,
     comment_at,
+    defaults_of,
 )
-from impactopt.files.problem_file.toml import plain_value, write_toml
-from impactopt.files.problem_file.values import Section
+from impactopt.files.sections.collision import LAWS, TARGETS, Body, FrictionSection, ProblemSection
+from impactopt.files.sections.robot import RobotSection
+from impactopt.files.sections.values import Section
+from impactopt.files.toml import plain_value, write_toml
 from impactopt.kinematics.stance import OneSole
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS
@@ -370,7 +367,7 @@ def _section(section: type[Section], thing: Any, without: Sequence[str] = ()) ->
 
 def _different(section: type[Section], values: Mapping[str, Any]) -> dict[str, Any]:
     """Values by key that are not the section's defaults."""
-    defaults, out = section.defaults(), {}
+    defaults, out = defaults_of(section), {}
     for name, value in values.items():
         if name not in defaults or not _equal(defaults[name], value):
             out[section.model_fields[name].alias or name] = _written(name, value)

@@ -58,17 +58,12 @@ class Kind(enum.Enum):
     PRISMATIC = "slides along z"
 
 
-_FOLLOWER = "JointModelMimic"  # revolute or prismatic, which `_read_joint` finds out
-_KINDS = {
-    "JointModelFreeFlyer": Kind.FREE,
-    _FOLLOWER: Kind.REVOLUTE,
-    **{f"JointModel{name}": Kind.REVOLUTE for name in ("RX", "RY", "RZ", "RevoluteUnaligned")},
-    **{f"JointModel{name}": Kind.REVOLUTE for name in ("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned")},
-    **{f"JointModel{name}": Kind.PRISMATIC for name in ("PX", "PY", "PZ", "PrismaticUnaligned")},
-}
-
-# Q of axes x, y, z: a cyclic permutation, Q z = axis.
-_PERMUTATIONS = tuple(np.roll(np.eye(3), k + 1, axis=0) for k in range(3))
+_FOLLOWER = "Mimic"  # revolute or prismatic, which `_read_joint` finds out
+_UNBOUNDED = ("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned")
+_REVOLUTE = ("RX", "RY", "RZ", "RevoluteUnaligned", *_UNBOUNDED, _FOLLOWER)
+_PRISMATIC = ("PX", "PY", "PZ", "PrismaticUnaligned")
+_KINDS = {**dict.fromkeys(_REVOLUTE, Kind.REVOLUTE), **dict.fromkeys(_PRISMATIC, Kind.PRISMATIC)}
+_KINDS["FreeFlyer"] = Kind.FREE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +214,8 @@ def _universe() -> Joint:
 
 def _read_joint(model: Any, i: int, turns: list[Any]) -> Joint:
     joint_model, name, parent = model.joints[i], model.names[i], int(model.parents[i])
-    kind = _KINDS.get(joint_model.shortname())
+    short = joint_model.shortname().removeprefix("JointModel")
+    kind = _KINDS.get(short)
     if kind is None:
         raise InputError(
             f"joint {name!r}: type {joint_model.shortname()} is not supported; use revolute, continuous or "
@@ -240,7 +236,7 @@ def _read_joint(model: Any, i: int, turns: list[Any]) -> Joint:
         parent=parent,
         v=int(joint_model.idx_v),
         q=int(joint_model.idx_q),
-        follows=joint_model.shortname() == _FOLLOWER,
+        follows=short == _FOLLOWER,
         ratio=ratio,
         continuous=joint_model.nq == 2,
         turn=turn,
@@ -256,7 +252,7 @@ def _turn_to_z(axis: Any) -> Any:
     """A rotation Q with Q z = axis; a permutation where the axis is x, y or z."""
     for k in range(3):
         if abs(axis[k] - 1.0) < 1e-14:
-            return _PERMUTATIONS[k]
+            return np.roll(np.eye(3), k + 1, axis=0)  # a cyclic permutation
     side = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     side /= np.linalg.norm(side)
     return np.stack([side, np.cross(axis, side), axis], axis=1)

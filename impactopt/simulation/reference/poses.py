@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.world import WorldBody
-from impactopt.kinematics.operational_space import Held
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
@@ -76,10 +76,12 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
 
 
 def inverse_mass(problem: ImpactProblem, q: Array) -> Array:
-    """J P J' (3, 3) [1/kg] of the striking point, as in `impactopt.kinematics.operational_space.Held`."""
+    """J P J' (3, 3) [1/kg] of the striking point, as `ConstrainedDynamics.inverse_mass`."""
     robot = problem.robot
     frames = problem.stance.constraint_frames(robot)
-    return Held.at(robot.model, q, frames, robot.striker(problem.striker).model_frame).inverse_mass()
+    return ConstrainedDynamics.at(
+        robot.model, q, frames, robot.striker(problem.striker).model_frame
+    ).inverse_mass()
 
 
 def _bones(robot: Robot) -> list[tuple[int, int]]:

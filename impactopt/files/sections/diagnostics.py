@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from impactopt.errors import did_you_mean, shortened
-from impactopt.files.problem_file.toml import Place
+from impactopt.files.toml import Place
 
 # No two parts of these patterns match the same character, so that matching takes linear time.
 _HEADER = re.compile(r"""^\s*(\[\[?)([\w."'\s-]+)\]\]?\s*(?:#.*)?$""")

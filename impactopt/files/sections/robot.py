@@ -10,7 +10,7 @@ import pinocchio as pin
 from pydantic import model_validator
 
 from impactopt.errors import InputError
-from impactopt.files.problem_file.values import (
+from impactopt.files.sections.values import (
     Factor,
     Inertia,
     JointNames,

@@ -1,0 +1,235 @@
+"""Sections that a collision needs: robot, target, contact, and how the robot stands.
+
+A problem file has them, and others that make a plan of them (`impactopt.files.problem_file`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, create_model
+
+from impactopt.bodies.world import TargetBody
+from impactopt.contact import laws, targets
+from impactopt.contact.friction import ContactFriction
+from impactopt.errors import InputError
+from impactopt.files.sections.robot import RobotSection
+from impactopt.files.sections.values import (
+    HandNames,
+    Posture,
+    Preset,
+    Restitution,
+    Section,
+    UnitVector,
+    Vector,
+    one_of,
+    optional,
+    required,
+    section_of,
+)
+from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, FixedBase, Free, OneSole, Stance
+from impactopt.robots.robot import Robot
+
+__all__ = [
+    "LAWS",
+    "TARGETS",
+    "CollisionSections",
+    "ProblemSection",
+    "RigidSection",
+    "StanceSection",
+    "with_kinds",
+]
+
+_FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # defaults
+TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)
+LawKind: Any = one_of(kind.word for kind in laws.LAWS)
+
+
+Body: Any = section_of(TargetBody)
+
+
+class Target(Section):
+    """Target of the impact; the keys depend on its kind."""
+
+    model_config = ConfigDict(extra="ignore")
+    choice: ClassVar[str] = "target_kind"
+    apart: ClassVar[tuple[str, ...]] = ("body",)
+    target_kind: TargetKind = Field(default=_FIRST_TARGET, alias="kind", description="kind of target")
+    body: Body = optional("")
+
+
+class _KnownTarget(Target):
+    """Target of a known kind, without other keys."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Contact(Section):
+    """Contact between hand and target; the keys depend on the law."""
+
+    model_config = ConfigDict(extra="ignore")
+    choice: ClassVar[str] = "law"
+    law: LawKind = Field(default=_FIRST_LAW, description="contact law")
+
+
+class _KnownContact(Contact):
+    """Contact of a known law, without other keys."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+TARGETS: dict[str, type[Target]] = {kind.word: section_of(kind, _KnownTarget) for kind in targets.TARGETS}
+LAWS: dict[str, type[Contact]] = {kind.word: section_of(kind, _KnownContact) for kind in laws.LAWS}
+
+AnyFile = TypeVar("AnyFile", bound=Section)
+
+
+def with_kinds(file: type[AnyFile], data: Mapping[str, Any]) -> type[AnyFile]:
+    """The model of a file, with [target] and [contact] of the kinds in its data."""
+    found = {
+        "target": _section_of_kind(data, "target", "kind", TARGETS, Target, _FIRST_TARGET),
+        "contact": _section_of_kind(data, "contact", "law", LAWS, Contact, _FIRST_LAW),
+    }
+    return cast(type[AnyFile], _file_with(file, found["target"], found["contact"]))
+
+
+@cache  # a sweep reads thousands of files
+def _file_with(file: type[Section], target: type[Section], contact: type[Section]) -> type[Section]:
+    fields: dict[str, Any] = {"target": (target, ...), "contact": (contact, ...)}
+    return create_model(file.__name__, __base__=file, **fields)
+
+
+def _section_of_kind(
+    data: Mapping[str, Any],
+    section: str,
+    key: str,
+    kinds: Mapping[str, type[Section]],
+    unknown: type[Section],
+    default: str,
+) -> type[Section]:
+    given = data.get(section)
+    name = given.get(key, default) if isinstance(given, Mapping) else default
+    return kinds.get(name, unknown) if isinstance(name, str) else unknown
+
+
+class ProblemSection(Section):
+    """The robot, its striker, and the hit point."""
+
+    name: str = optional("name of the problem in reports")
+    robot: Preset = optional("see `impactopt robots`; else a section [robot]")
+    striker: str = required("the robot's striker")
+    point: Vector = required("hit point: x forward, y left, z up from the ground [m]", "point_m")
+    normal: UnitVector = required("direction in which the target is pushed")
+    start: Posture = Field(
+        default=USUAL_POSTURE,
+        description="start posture: its name, or a configuration of Pinocchio",
+    )
+
+
+class StanceSection(Section):
+    """Fixed soles, and supporting hands."""
+
+    soles: str = Field(
+        default="both",
+        description='"both", or one; "none": the robot floats freely',
+    )
+    hands: HandNames = Field(
+        default=[],
+        description="strikers that are fixed at their places in the start posture; see [terms.grip]",
+    )
+
+
+FrictionSection: Any = section_of(ContactFriction)
+
+
+class _Rigid(Section):
+    """The key of [collision] that a rigid impact needs; the others are a plan's."""
+
+    model_config = ConfigDict(extra="ignore")
+    coefficient_of_restitution: Restitution = optional('of "rigid": speed of separation over approach')
+
+
+RigidSection: Any = _Rigid
+
+
+class CollisionSections(Section):
+    """A problem file as a collision needs it: the content of a plan's sections is not checked.
+
+    `with_kinds` sets the classes of [target] and [contact].
+    """
+
+    problem: ProblemSection
+    robot: RobotSection = optional("")
+    target: Target
+    contact: Contact
+    friction: FrictionSection = optional("")
+    second: Any = optional("")
+    stance: StanceSection = optional("")
+    stances: Any = optional("")
+    swing: Any = optional("")
+    follow: Any = optional("")
+    collision: RigidSection = optional("")
+    scenarios: Any = optional("")
+    obstacles: Any = optional("")
+    ground: Any = optional("")
+    objectives: Any = optional("")
+    objective: Any = optional("")
+    terms: Any = optional("")
+    solver: Any = optional("")
+    controller: Any = optional("")
+
+    def make_robot(self, folder: Path) -> Robot:
+        """The robot of [robot], or the preset in [problem]."""
+        section = RobotSection(preset=self.problem.robot) if self.robot is None else self.robot
+        return section.make(folder)
+
+    def robot_mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
+        """All errors of `make_robot`, with their places; error : the first one."""
+        if "robot" not in self.model_fields_set:
+            return [(("problem", "robot"), error)]
+        return [(("robot", *place), wrong) for place, wrong in self.robot.mistakes(folder, error)]
+
+    def leg_mistake(self, folder: Path) -> InputError | None:
+        """Mistake in the legs of a robot that cannot be built, if its model can be."""
+        if "robot" not in self.model_fields_set:
+            return None
+        return self.robot.leg_mistake(folder, self.stance.soles if self.stance else "both")
+
+    def make_stance(self, robot: Robot) -> Stance:
+        """Stance of a robot by [stance]; InputError if the robot cannot have it."""
+        if self.stance and self.stances:
+            raise InputError("[stance] is one stance for the whole motion: leave it or [[stances]] out")
+        soles = self.stance.soles if self.stance else "both"
+        hands = tuple(self.stance.hands) if self.stance else ()
+        stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
+        if soles == "none":
+            if hands:
+                raise InputError(
+                    "[stance]: a robot that floats freely has no supporting hands: leave hands out"
+                )
+            stance = Free()
+        if not robot.floating:
+            if self.stance:
+                raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
+            stance = FixedBase()
+        stance.constraint_frames(robot)
+        return stance
+
+    def check_one_striker(self) -> None:
+        """InputError if there are two strikers, for commands that compute a collision alone."""
+        if self.second is not None:
+            raise InputError(
+                "[second]: a collision model has one striker: leave the section out, or solve the problem"
+            )
+
+    def make_start(self, robot: Robot) -> NDArray[np.float64]:
+        """The start posture (nq,); InputError for one that the robot cannot have."""
+        start = self.problem.start
+        return (
+            robot.posture(start) if isinstance(start, str) else robot.check_configuration(start, name="start")
+        )

@@ -103,7 +103,7 @@ class _DualActiveSet:
         self._warm_start(guess)
         while self.iterations < max_iterations and time.perf_counter() < deadline:
             v = self._M @ self._w
-            # The largest violation as a distance in w is added first, as in the paper's step 1.
+            # Step 1 takes any violated constraint; ours is the one at the largest distance in w.
             excess = np.maximum(self._lower - v, v - self._upper) - self._slack
             # Met up to rounding by construction; a second time they would be dependent on themselves.
             excess[self.active] = -np.inf

@@ -224,6 +224,7 @@ def _clean_strike(
     if margins is None or not outcome.usable:
         return outcome
     depth, pairs = deepest_penetration(outcome.program, outcome.result.x, margins)
+    # deepest_penetration is negative without one.
     if depth <= 0:
         return outcome
     names = (" and ".join(margins.bodies.names(pair)) for pair in pairs)
@@ -240,6 +241,7 @@ class Freezes:
     def missing(self, outcome: Outcome[StrikeTranscription]) -> Additions[StrikeTranscription] | None:
         """Program whose phases have the fractions of the contact that the solution has."""
         t, x = outcome.program, outcome.result.x
+        # None while the freezes are where the program has them.
         shares = t.hit.drifted(x)
         if shares is None:
             return None

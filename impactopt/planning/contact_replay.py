@@ -212,6 +212,7 @@ def _coasting(problem: ImpactProblem, strike: PlannedStrike) -> Trajectory:
     rates, zero = independent_rates(c, y, strike.velocity), np.zeros(c.ny)
     times, samples = np.linspace(0.0, longest, max(2, round(longest / _SAMPLE_STEP) + 1)), []
     for t in times:
+        # The last legs are the guess of the next: they move little in a millisecond.
         legs = c.solve_legs(y + rates * t, legs)
         samples.append(c.complete_motion(y + rates * t, rates, zero, legs))
     # the first sample stands twice: in the phase before contact (0), and in contact (1)
@@ -243,6 +244,7 @@ def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = Non
         return None
     y, legs = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x)
     q, v, _ = c.complete_motion(y, t.u0.read(x)[0], np.zeros(c.ny), legs)
+    # The variable is scaled by the limit.
     torque = t.feedforward.read(x)[0] * problem.robot.torque_limit
     return collision_error(problem, q, v, torque, max(sum(t.expected.durations(x)), 1e-2))
 
@@ -267,6 +269,7 @@ def collision_error(
     scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
     scene["horizon"] = max(_MIN_HORIZON, 4 * duration)
     own = frozen_model(problem.collision, problem.freezes, **scene)
+    # Four times as often as the model itself, to be more accurate than it.
     freezes = min(max(_MIN_FREEZES, 4 * problem.freezes), _MAX_FREEZES)
     try:
         reference: dict[str, Any] = {**coasting_reference(problem.coordinates, q, v, until=2 * duration)}

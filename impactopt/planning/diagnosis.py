@@ -39,6 +39,7 @@ def ipopt_retry(budget: Budget, program: NonlinearProgram, start: Array, old: So
     if old.status is Status.FAILED and violation <= VIOLATED < old.max_violation:
         return old  # its constraints are met: it was refused for a penetration or its replay
     budget.say("our solver ends without a diagnosis: IPOPT tries once, from the same initial guess")
+    # Options are those of our solver.
     new = replace(budget, solver="ipopt", options=None).run(program, start)
     if new.status is Status.INTERRUPTED or _rank(new) < _rank(old):
         return new

@@ -108,6 +108,7 @@ def with_factors_of(t: ContactProgram, robot: Robot, start: SolverResult) -> Sol
         ratios = np.array([robot.kp[k] / own.kp[k] for k in joints if own.kp[k] > 0])
         factor = float(np.median(ratios)) if ratios.size and np.all(ratios > 0) else 1.0
         logs.append(np.log(np.clip(factor, *gain.factor)))
+    # The room for stiffer gains changes the torque limits, by which torques are scaled.
     start = _with_rescaled_torques(t, robot, start)
     t.hit.contact.gains.write(start.x, logs)
     return start
@@ -126,6 +127,7 @@ def chosen_gains(t: ContactProgram, x: Array) -> tuple[ChosenGains, ...]:
     """Gains that solver variables (n,) choose for the problem's open ones."""
     if not t.problem.gains:
         return ()
+    # Variables are logarithms of factors: halving and doubling are alike, and a factor stays positive.
     factors = np.exp(t.hit.contact.gains.read(x)[0])
     names, robot = t.robot.joint_names, with_chosen(t.problem, factors).robot
     return tuple(

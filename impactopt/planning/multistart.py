@@ -50,6 +50,7 @@ def check_starts(starts: int, seed: int, workers: int, callback: object, *, give
         several processes.
     """
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
+        # True is an int, too.
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise InputError(f"{name} is {value!r}; give a whole number >= {least}")
     if given and starts > 1:
@@ -76,6 +77,7 @@ def drawn_guesses(
     name: str, make: Callable[[dict[str, Any]], Guess[Program]], which: range, seed: int
 ) -> Guesses[Program]:
     """Named initial guesses of drawn reaches, each made when it is needed."""
+    # All draws up to the last, so that a worker's start is the one that a single process would draw.
     draws = drawn(which.stop, seed)
     return ((f"{name} {k + 1}", partial(make, draws[k])) for k in which)
 
@@ -171,10 +173,12 @@ def _best_on_workers(
     found = dict[int, AnySolution]()
     jobs = each_on_workers(
         _one,
+        # Functions of the caller may not be picklable.
         (run, replace(budget, report=None), ends),
         enumerate(range(starts)),
         workers=min(workers, starts),
     )
+    # Closing ends the workers, also after Ctrl-C.
     with contextlib.closing(jobs):  # type: ignore[type-var]
         try:
             for k, solution in jobs:

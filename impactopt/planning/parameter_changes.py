@@ -28,6 +28,7 @@ def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
 
     The posture at contact is searched from the old one.
     """
+    # `dataclasses.replace` would lose the cached properties, bodies and coordinates among them.
     new = object.__new__(type(problem))
     new.__dict__.update({f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)} | fields)
     # set before the checks (`__post_init__`), which use the cached properties
@@ -140,6 +141,7 @@ def parameter_of(problem: ImpactProblem, name: str) -> Parameter:
     for section, field in (("target", "target"), ("contact", "law")):
         numbers = getattr(problem, field).parameters
         known |= {f"{section}.{key}": (field, key, float(value)) for key, value in numbers.items()}
+    # Terms that hold by default have parameters, too.
     others = [term for term in DEFAULT_TERMS if not any(isinstance(t, type(term)) for t in problem.terms)]
     for term in (*problem.terms, *others):
         section = snake_case(type(term).__name__)

@@ -73,6 +73,7 @@ class ParametricProgram:
         ------
         InputError : the other problem's program has other variables or constraints.
         """
+        # Moving sets numbers only; a new program takes the building of all its blocks.
         if self._movable is not None and _alike(problem, self.solution.problem):
             self._movable.move_to(problem, anew=anew)
             return self._movable
@@ -90,6 +91,7 @@ class ParametricProgram:
         except InputError:
             return None
         t.move_to(problem)
+        # A part that does not follow would keep the other problem's numbers.
         return t if t.program.same_parameters(self.program.program) else None
 
     def _built(self, problem: ImpactProblem, report: Callable[[str], None] | None = None) -> Transcription:
@@ -242,6 +244,7 @@ def _slope(family: ParametricProgram, parameter: Parameter, half: float) -> tupl
     for value in (parameter.value + half, parameter.value - half):
         t = family.program_for(parameter.at(value))
         offset = family.system.offset(t.program)
+        # By p at fixed variables and multipliers, as the implicit function theorem has it.
         residual = np.concatenate([getattr(offset, name) for name in Offset.PARTS])
         sides.append((residual, np.array(t.impulse(x)), np.array(t.program.objective(x))))
     residual, impulse, objective = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))
@@ -269,6 +272,7 @@ def _binding(family: ParametricProgram) -> tuple[Binding, ...]:
     program, out = t.program, list[Binding]()
     inequality = program.g_lower < program.g_upper
     for i in np.flatnonzero(system.constraints * inequality):
+        # A multiplier's sign is the side of its bound; relaxing outward never costs.
         price, origin = abs(float(system.y[i])), t.constraints.origins[int(i)]
         measure = origin.measure
         # the program's constraints are scaled: ``factor`` leads back to the unit of the bound

@@ -93,6 +93,8 @@ class RobotBodies:
                     continue
                 kept = []
                 (centre_a, radius_a), (centre_b, radius_b) = self.balls[a], self.balls[b]
+                # Balls first: most pairs are far apart, and exact distances of all pairs of
+                # pieces would take much longer.
                 between = np.linalg.norm(data.oMi[a].act(centre_a) - data.oMi[b].act(centre_b))
                 far = between > radius_a + radius_b
                 for one in self.of_joint[a]:
@@ -173,14 +175,17 @@ def striker_face(
     if not pieces:
         return None
     to_frame = frame.placement.inverse()
+    # From the joint's frame to the striker's, then relative to the striking point.
     vertices = np.concatenate([p.vertices for p in pieces]) @ to_frame.rotation.T + to_frame.translation
     away = vertices - np.asarray(hit.point)
     hull = ConvexHull(away)
     if axis is not None:
         return StrikerFace(np.asarray(axis, dtype=float), _leading(away[hull.vertices], np.asarray(axis)))
+    # Qhull: normal . p + offset <= 0 inside; at the striking point, the origin, that is the offset.
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
     nearest = normals[np.argmax(offsets)]  # the facet that the point is least inside of, or farthest outside
     corners = away[hull.simplices]
+    # Twice the areas, which as weights are the same.
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     same = (normals @ nearest > FLAT) & (np.abs(offsets - offsets.max()) < MERGED)
     normal = (normals * areas[:, None])[same].sum(axis=0)
@@ -192,6 +197,7 @@ def _leading(points: Array, normal: Array) -> Array:
     """Points that are foremost in some direction of a cone about the normal, without near duplicates."""
     # directions on a Fibonacci lattice, which covers the cone's cap evenly
     k = np.arange(DIRECTIONS) + 0.5
+    # Heights in equal steps are rings of equal area (Archimedes); the golden angle spreads them around.
     height, turn = 1 - (1 - np.cos(CONE)) * k / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
     wide = np.sqrt(1 - height**2)
     across = np.linalg.svd(normal[None])[2][1:]
@@ -199,6 +205,7 @@ def _leading(points: Array, normal: Array) -> Array:
         np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]
     )
     farthest, chosen = set((points @ directions.T).argmax(axis=0).tolist()), list[Array]()
+    # The foremost first, so that it stays of near duplicates.
     for index in np.argsort(-(points @ normal)):
         if index in farthest and all(np.linalg.norm(points[index] - c) > MERGED for c in chosen):
             chosen.append(points[index])

@@ -146,6 +146,7 @@ def _optimized(
     budget = budget.started()
     t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
+        # Only its variables: clearance constraints enter by themselves.
         start = carried_start(t, partial(_program_of, start), start, start.apart).x
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     solve = partial(_clean_strike, budget, Margins(problem) if problem.keeps_apart else None)

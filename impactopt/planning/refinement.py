@@ -183,6 +183,7 @@ class Outcome(Generic[Program]):
             max_violation=r.max_violation,
             iterations=r.iterations,
             seconds=r.seconds,
+            # The latest is kept until another one is (`then`, `best_of`).
             kept=True,
         )
 

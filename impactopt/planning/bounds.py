@@ -351,6 +351,7 @@ def _violation(t: Transcription, x: Array, select: Selector, *, torques: bool = 
     """Largest violation of the selected inequalities, and of the bounds of ``torques``, at variables (n,)."""
     found = _inequalities(t, select)
     most = constraint_violations(t.program, t.program.constraints(x))[found].max(initial=0.0)
+    # The torque limit bounds variables, not constraints.
     if torques:
         j = _torques(t)
         beyond = np.maximum(t.program.x_lower[j] - x[j], x[j] - t.program.x_upper[j])

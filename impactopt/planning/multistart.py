@@ -134,6 +134,7 @@ def best_of(
         found.append((name, new))
         if new.result.status is Status.INTERRUPTED or budget.left == 0:
             break
+    # Of equals the first one is kept.
     best = min((outcome for _, outcome in found), key=lambda outcome: rank_of(outcome.result))
     attempts = [replace(outcome.attempt(name), kept=outcome is best) for name, outcome in found]
     result = best.result
@@ -197,12 +198,14 @@ def _best_on_workers(
     if not found:
         raise InputError("no start has ended: give more time, or workers=1 to see why")
     best = min(found.values(), key=lambda solution: rank_of(solution.result))
+    # In the order of the starts, not in that in which workers ended.
     attempts = [
         replace(attempt, kept=attempt.kept and found[k] is best)
         for k in sorted(found)
         for attempt in found[k].attempts
     ]
     seconds = time.perf_counter() - began
+    # Wall time of all starts; the best one's build is counted by itself.
     return replace(best, attempts=tuple(attempts), solve_seconds=seconds - best.build_seconds)
 
 

@@ -36,6 +36,8 @@ def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
     cached = (*_CACHED, *_CACHED_BODIES) if same_bodies else _CACHED
     new.__dict__.update({name: problem.__dict__[name] for name in cached if name in problem.__dict__})
     if "contact_posture" in problem.__dict__:
+        # From the old posture the search ends in the nearest one, so a small change of
+        # the point changes it little.
         near, point = problem.contact_posture, fields.get("point", problem.point)
         with contextlib.suppress(InputError):  # then the checks search from the start posture
             new.__dict__["contact_posture"] = (
@@ -92,6 +94,7 @@ def _with(thing: Any, name: str, value: float) -> Any:
 
 
 def with_term(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
+    # A problem has one term of a kind.
     others = [other for other in problem.terms if type(other) is not type(term)]
     return (*others, term)
 

@@ -18,7 +18,16 @@ from impactopt.bodies.convex_hulls import Piece, file_pieces, pieces_of
 from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 
-__all__ = ["Pair", "RobotBodies", "StrikerFace", "bodies_of", "distance", "striker_face", "transform"]
+__all__ = [
+    "Pair",
+    "RobotBodies",
+    "StrikerFace",
+    "bodies_of",
+    "bounding_ball",
+    "distance",
+    "striker_face",
+    "transform",
+]
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]
@@ -56,12 +65,10 @@ class RobotBodies:
     @cached_property
     def balls(self) -> dict[int, tuple[Array, float]]:
         """Bounding ball of each joint's pieces: centre (3,) and radius [m]."""
-        out = {}
-        for j, pieces in self.of_joint.items():
-            points = np.concatenate([p.vertices for p in pieces])
-            centre = (points.max(axis=0) + points.min(axis=0)) / 2
-            out[j] = centre, float(np.linalg.norm(points - centre, axis=1).max())
-        return out
+        return {
+            j: bounding_ball(np.concatenate([p.vertices for p in pieces]))
+            for j, pieces in self.of_joint.items()
+        }
 
     @cached_property
     def _names(self) -> dict[int, str]:
@@ -121,6 +128,12 @@ def bodies_of(robot: Robot) -> RobotBodies:
         too_large = tuple(piece for piece in known if piece not in pieces)
         _KNOWN[robot] = RobotBodies(robot=robot, pieces=pieces, source=source, too_large=too_large)
     return _KNOWN[robot]
+
+
+def bounding_ball(points: Array) -> tuple[Array, float]:
+    """Centre (3,) and radius [m] of a ball that contains points (k, 3)."""
+    centre = (points.max(axis=0) + points.min(axis=0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
 def transform(rotation: Array, translation: Array) -> Any:

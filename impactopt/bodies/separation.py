@@ -31,7 +31,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from impactopt.bodies import separation_numpy
 from impactopt.bodies.convex_hulls import Piece
-from impactopt.bodies.robot_bodies import Pair, RobotBodies
+from impactopt.bodies.robot_bodies import Pair, RobotBodies, bounding_ball
 from impactopt.bodies.separation_numpy import ROUNDING
 from impactopt.bodies.solids import cached_arrays
 from impactopt.bodies.world import WorldBody
@@ -101,7 +101,7 @@ class Shapes:
         # A capsule or sphere is its axis or point, and its radius is subtracted from the distance.
         corners = [_corners(body.half) for body in world]
         own = {id(piece): _thinned_piece(piece) for piece in links.pieces}
-        ball = {id(piece): _bounding_ball(piece.vertices) for piece in links.pieces}
+        ball = {id(piece): np.append(*bounding_ball(piece.vertices)) for piece in links.pieces}
         self.points, self.blocks, ranges = packed([*own.values(), *corners])
         keys: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
         where = dict(zip(keys, ranges, strict=True))
@@ -313,13 +313,6 @@ def _corners(half: Array) -> Array:
     """Distinct corners of a box with half sides (3,), some of which may be zero."""
     # Zero half sides make corners coincide, and copies would count twice in the smoothed support function.
     return np.unique(half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]), axis=0)
-
-
-def _bounding_ball(vertices: Array) -> tuple[float, float, float, float]:
-    """Centre and radius [m] of a sphere that contains the vertices."""
-    centre = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
-    x, y, z = centre.tolist()
-    return x, y, z, float(np.linalg.norm(vertices - centre, axis=1).max())
 
 
 @functools.cache

@@ -303,8 +303,13 @@ def is_stationary_violation(
     slope = np.where(at_bound, 0.0, slope)
     # With the rows J_i, |J' v| <= sum |J_i| |v_i|: what the slope would be if no two constraints opposed each
     # other. Without a violation the point counts as stationary (0 <= 1e-300).
-    row_norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
-    return bool(np.linalg.norm(slope) <= tolerance * max(float(row_norms @ np.abs(v)), 1e-300))
+    return bool(np.linalg.norm(slope) <= tolerance * max(float(row_norms(jacobian) @ np.abs(v)), 1e-300))
+
+
+def row_norms(matrix: Any) -> Vector:
+    """Euclidean norms (m,) of the rows of a matrix (m, n), sparse or dense."""
+    squares = matrix.multiply(matrix) if sp.issparse(matrix) else matrix**2
+    return np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
 
 
 def worst_violations(
@@ -437,7 +442,7 @@ class Point:
     @cached_property
     def row_norms(self) -> Vector:
         """Euclidean norms of the rows of the Jacobian (m,); 1 for zero rows."""
-        norms = np.sqrt(np.asarray(self.jacobian.multiply(self.jacobian).sum(axis=1)).ravel())
+        norms = row_norms(self.jacobian)
         return np.where(norms > 1e-12, norms, 1.0)
 
     @cached_property

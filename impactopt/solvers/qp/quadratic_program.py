@@ -16,7 +16,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from impactopt.solvers.program import Matrix, Vector
+from impactopt.solvers.program import Matrix, Vector, row_norms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +84,7 @@ class QuadraticProgram:
     @cached_property
     def row_scale(self) -> Vector:
         """Factors of the rows of [A; I] in `stacked`, (m + n,)."""
-        squares = self.A**2 if self.dense else self.A.multiply(self.A)
-        norms = np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
+        norms = row_norms(self.A)
         return np.concatenate([1.0 / np.where(norms > 1e-12, norms, 1.0), np.ones(self.n)])
 
     def residuals(self, x: Vector, y: Vector, z: Vector) -> tuple[float, float, float]:

@@ -25,7 +25,15 @@ import scipy.sparse as sp
 from impactopt.solvers.elimination.condense import Condenser, Elimination, find_eliminations
 from impactopt.solvers.elimination.kernels import kernels
 from impactopt.solvers.options import SQPOptions
-from impactopt.solvers.program import Determined, Matrix, Point, TimedProgram, Vector, constraint_violations
+from impactopt.solvers.program import (
+    Determined,
+    Matrix,
+    Point,
+    TimedProgram,
+    Vector,
+    constraint_violations,
+    row_norms,
+)
 from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
 
 Index = npt.NDArray[np.intp]
@@ -169,7 +177,7 @@ class Reduction:
         """
         own = point.jacobian_csr[self.others]
         by_free = own @ self._Z
-        norms, whole = _norms(by_free), _norms(own)
+        norms, whole = row_norms(by_free), row_norms(own)
         # A gradient that cancels along Z is rounding; over its own norm it would be a constraint of noise.
         norms = np.maximum(norms, _MIN_RELATIVE_NORM * whole)
         along = by_free if self._null_space is None else by_free @ self._null_space
@@ -188,11 +196,6 @@ def _key(equations: Matrix, determined: Sequence[Determined]) -> bytes:
     for array in (equations.indptr, equations.indices, *[variables for _, variables in determined]):
         digest.update(np.ascontiguousarray(array, dtype=np.int64).tobytes())
     return digest.digest()
-
-
-def _norms(rows: Any) -> Vector:
-    squares = rows.multiply(rows) if sp.issparse(rows) else rows**2
-    return np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
 
 
 def _without_zeros(Z: np.ndarray) -> Matrix:

@@ -39,6 +39,9 @@ from impactopt.solvers.run import BarrierState, Run, Watch
 
 _MAX_CORRECTIONS = 4  # p_max of Waechter and Biegler, step: second-order corrections of a step
 _KAPPA_SOC = 0.99  # a correction that leaves more than this fraction of the violation is the last
+# The first two of these change no plan, and iterations little: gains of 1 to 2 and fractions of 0.5 to
+# 0.99 were tried on seven problems. With ten times the violation arm7 takes 175 iterations for 142,
+# and punch_standin 66 for 42.
 _MIN_BENT_GAIN = 1.2  # a step is bent only if that makes it this many times as long
 _BENT_SLACK_FRACTION = 0.9  # of its distance to the bound, that each slack may take in a bent step
 _MAX_BENT_VIOLATION = 1.0  # of any constraint, before and after a bent step
@@ -169,7 +172,9 @@ def _second_order_correction(
     for k in range(_MAX_CORRECTIONS):
         if not trial.point.finite:
             break
-        # c_soc = alpha c(x) + c(x + alpha d) (section 2.4): the same matrix, another right-hand side
+        # c_soc = alpha c(x) + c(x + alpha d) (section 2.4): the same matrix, another right-hand side. The
+        # paper has the alpha of the correction before, ours that of the first trial; on 60 random
+        # programs of four variables the one took 867 iterations, the other 856.
         corrected_residual = longest * corrected_residual + problem.residual(trial.point, trial.slack)
         step = problem.step_for(corrected_residual)
         trial = problem.trial(step, problem.max_length(step))

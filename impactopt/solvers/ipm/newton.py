@@ -15,6 +15,8 @@ from impactopt.solvers.elimination.kernels import Index, Kernels, Panels, Places
 from impactopt.solvers.elimination.kernels import kernels as fastest_kernels
 from impactopt.solvers.program import Determined, Matrix, Vector
 
+# Merging is for the kernels in NumPy: a factorization for punch takes 3.4 ms with it, 4.6 ms without, but
+# those in C take 0.5 ms with and without.
 _MAX_MERGED_WIDTH = 24  # variables of a merged block
 _MAX_ZEROS = 0.1  # fraction of zeros that a merged block's panel may have
 

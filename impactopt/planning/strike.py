@@ -36,9 +36,7 @@ from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
-# First barriers: of robots without soles, whose solves are faster and succeed more often with it (humanoids'
-# do not); and of a warm start with other constraints.
-BARRIER_ARM, BARRIER_WARM = 0.03, 1e-2
+BARRIER_WARM = 1e-2  # first barrier of a warm start with other constraints
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 
 
@@ -200,8 +198,6 @@ def clear_strike(
     constraints.
     """
     t = guess.program
-    if budget.interior and not t.coordinates.soles:
-        budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
 
     def solve(guess: Guess[StrikeTranscription]) -> Outcome[StrikeTranscription]:
         return refine(

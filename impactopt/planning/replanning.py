@@ -144,6 +144,7 @@ def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
 def _slightly_changed(problem: ImpactProblem) -> ImpactProblem:
     """A problem with a slightly different point, law and target."""
     law, target = (
+        # A parameter of 0 stays 0: whether the program follows it is not tested.
         type(part)(**{name: _TRIAL_FACTOR * value for name, value in part.parameters.items()})
         for part in (problem.law, problem.target)
     )

@@ -98,6 +98,8 @@ def minimum_jerk_baseline(
             if _keeps_limits(problem, duration, slow):
                 heapq.heappush(reaches, (-_fastest(problem, duration, slow, speed, tolerance), 0, duration))
             elif best:
+                # It permits less than the fastest known one, whose speed bounds it now: it returns if that
+                # one fails.
                 heapq.heappush(reaches, (-slow, 1, duration))
         elif (found := _replayed(problem, duration, speed)) is not None:
             return found

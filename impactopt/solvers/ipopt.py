@@ -314,6 +314,7 @@ def solve_ipopt(
         settings["max_wall_time"] = max(float(time_limit), 1e-3)
     tolerance = float(check_array("constr_viol_tol", settings["constr_viol_tol"], ()))
     start = time.perf_counter()
+    # Besides IPOPT's own limit, which it tests between iterations: a single evaluation may take long.
     functions = Functions(
         program, tolerance, deadline=start + time_limit if time_limit is not None else np.inf
     )
@@ -435,6 +436,8 @@ def _build(
         alive.append(given["hess_lag"])
     # f and g are callbacks, so nlpsol has to be given all derivatives; it can differentiate nothing.
     x = ca.MX.sym("x", n)
+    # no_nlp_grad: nlpsol would differentiate the callbacks for it. Trial points with nan are no reason for
+    # warnings.
     own = {"print_time": False, "no_nlp_grad": True, "show_eval_warnings": False, "ipopt": dict(settings)}
     try:
         solver = ca.nlpsol("ipopt", "ipopt", {"x": x, "f": f(x), "g": g(x)}, {**given, **own})

@@ -157,6 +157,7 @@ class OsqpSolver:
             return True
         solver = osqp.OSQP(algebra="builtin")  # without, its search for others takes longer than a small QP
         try:
+            # No scaling, as rows have norm 1 already, and no polishing: `_refined` does that.
             solver.setup(
                 P, qp.q, sp.csc_matrix(C), lower, upper,
                 eps_abs=self._eps, eps_rel=self._eps, scaling=0, polishing=False,

@@ -87,6 +87,7 @@ def cylinder(radius: float, length: float, *, tip: float = 1.0, sides: int = 20)
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
     up = np.array([0.0, 0.0, length / 2])
+    # Lower ring, upper ring, then the middles of both ends.
     vertices = np.concatenate([radius * ring - up, radius * tip * ring + up, [-up, up]])
     k, n = np.arange(sides), (np.arange(sides) + 1) % sides
     bottom, top = np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
@@ -106,6 +107,7 @@ def sphere(radius: float, *, sides: int = 16) -> Solid:
         ],
         axis=-1,
     ).reshape(-1, 3)
+    # Rings from north to south, then the two poles.
     vertices = radius * np.concatenate([grid, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
     k, n = np.arange(sides), (np.arange(sides) + 1) % sides
     north, south, last = np.full(sides, len(grid)), np.full(sides, len(grid) + 1), (rings - 2) * sides

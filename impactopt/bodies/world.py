@@ -283,6 +283,7 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
     if isinstance(target, Nail):
         out = max(NAIL_LENGTH - target.depth, 0.0)
         block = box("target's block", size, out, strikable=True)
+        # Too short for a capsule, whose ends are half spheres.
         if out < 2 * NAIL_RADIUS:
             return [block]
         # A capsule's ends extend beyond its axis by the radius.

@@ -188,6 +188,7 @@ def surroundings_of(world: Sequence[WorldBody]) -> list[Part]:
 
 def _half(board: WorldBody, support: WorldBody) -> Part:
     """Half of a board that lies on this support."""
+    # Half sides; `box` takes sides, so a width of `wide` is half of the board.
     wide, high, thick = board.half
     # In the board's axes: across, up, deep (`target_bodies`).
     across, _, _ = board.rotation.T @ (support.place - board.place)

@@ -298,6 +298,7 @@ class Bodies:
                 seen.add(interval)
         touches = []
         for pair, penetrations in found.items():
+            # One touch a pair, from its first penetration to its last, also if it is interrupted.
             instants = time[[k for k, _ in penetrations]]
             depth = -min(d for _, d in penetrations)
             touches.append(Touch(*self.names(pair), float(instants.min()), float(instants.max()), depth))

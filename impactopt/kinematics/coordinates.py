@@ -489,6 +489,7 @@ class StanceCoordinates:
         a_base = self.base_motion(q, qd, qdd)[1]
         accs = []
         for s, leg in enumerate(self.legs):
+            # v is whole and a has no legs yet: acc is A + Jdot qdot of the module's docstring.
             _, _, jac, _, acc, _ = self.sole_terms(s, y, legs, v, self.embed(a_base, ydd[6:], still))
             accs.append(solve_in_order(jac, -acc, leg.order)[0])
         return v, self.embed(a_base, ydd[6:], ca.vertcat(*accs))

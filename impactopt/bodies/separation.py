@@ -300,7 +300,7 @@ def _chosen(vertices: Array) -> Index:
         except QhullError:  # the first vertices are in a plane
             return np.arange(len(vertices))
         # Signed distance to the farthest facet's plane, which is at most the distance to the hull: beyond a
-        # sharp edge an omitted vertex may be farther out than THIN (of TALOS's and G1's hulls one is, by 2 %).
+        # sharp edge an omitted vertex may be farther out than THIN (one of TALOS's hulls, by 2 %).
         out = (vertices @ planes[:, :3].T + planes[:, 3]).max(axis=1)
         k = int(out.argmax())
         if out[k] <= THIN:

@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.clearance import DEEPEST, MISSED, Bodies, Places
+from impactopt.bodies.clearance import DEEPEST, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
-from impactopt.bodies.separation import ROUNDING, THIN, Looked, Placed
+from impactopt.bodies.separation import ROUNDING, Looked, Placed
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.refinement import Guess, Outcome, Program
 from impactopt.problem.problem import ImpactProblem
@@ -426,7 +426,7 @@ def _near(margins: Margins, at: Places, share: float) -> list[tuple[int, Pair, f
     bodies, shapes, out = margins.bodies, margins.bodies.shapes, list[tuple[int, Pair, float]]()
     directions = np.zeros((len(at), len(shapes), 3))
     # Smooth distances may exceed the exact ones by the thinning; what is near by them is checked exactly.
-    found = shapes.look(bodies.placed(at), margins.most + THIN, directions, margins.wanted)
+    found = shapes.look(bodies.placed(at), margins.most + SLACK, directions, margins.wanted)
     candidates = {
         (k, tuple(pair))
         for k, pair in zip(found.spot.tolist(), shapes.pairs[found.pair].tolist(), strict=True)

@@ -74,6 +74,8 @@ class IPMOptions(SolverOptions):
         barrier.
     """
 
+    # Seven plans take 457 iterations with these values; 583 with a barrier of 0.1, 483 with one of 3e-3,
+    # and 508 with a push of 1e-3.
     complementarity_tolerance: float = 1e-6
     barrier: float = 3e-2
     barrier_warm: float = 1e-5

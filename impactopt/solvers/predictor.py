@@ -134,6 +134,7 @@ class ActiveSystem:
         x, g = point.x, program.constraints(point.x)
         return Offset(
             dual=np.asarray(program.gradient(x) + program.jacobian(x).T @ point.y + point.z),
+            # Softness times the multiplier's change: 0 at the solution itself, as its slack is no residual.
             constraints=_bound_residual(g, program.g_lower, program.g_upper, self.constraints)
             - self._soft_constraints * (point.y - self.y),
             variables=_bound_residual(x, program.x_lower, program.x_upper, self.bounds)
@@ -224,6 +225,7 @@ class Predictor:
     def __init__(self, program: NonlinearProgram, x: Vector, y: Vector, z: Vector) -> None:
         """x (n,), y (m,), z (n,) : as of `impactopt.solvers.program.SolverResult`."""
         self.x, self.y, self.z = x, y, z
+        # A copy, as a program that is moved to other parameters may reuse its arrays.
         jacobian, self._hessian = program.jacobian(x), program.hessian(x, 1.0, y).copy()
         self._moves = program.x_upper - program.x_lower > 1e-12
         bounded = (np.isfinite(program.x_lower) | np.isfinite(program.x_upper)) & self._moves
@@ -380,6 +382,8 @@ class _QP:
         self._y = np.zeros(len(self._off))
         self._y[:m] = found[:m]
         self._y[m:][c.bounded] = found[m:]
+        # The bounds of free variables are a diagonal of the matrix, so their
+        # multipliers are weight x (d + off).
         self._y[m:] += of_free * (d + off[m:])
         return d
 

@@ -359,6 +359,7 @@ class CompiledKernels(Kernels):
             work = np.zeros(max(nt * nc, r * (nu + nc) + max(r * nu, spread), r + max(nt, nc, nu)) + 1)
             within = _runs(a.hcc.ravel(), np.arange(k)[:, None] * a.hcc.shape[1] + _rows_of_triangle(nc))
             beyond = _runs(a.hcv.transpose(0, 2, 1).ravel(), np.arange(k * (nu - nc) if nc else 0) * nc)
+            # Kept in `keep`, as the struct holds their addresses only.
             arrays = [*[getattr(a, name) for name in _STAGE_ARRAYS], work, within, beyond]
             structs.append(_Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in arrays]))
             keep.append(arrays)

@@ -127,6 +127,7 @@ def _durations(t: Transcription) -> Iterator[Bound]:
     for kind, numbers in found.items():
         at = np.array(numbers, dtype=np.intp)
 
+        # Defaults bind the loop's variables as they are now; a closure would see the last ones.
         def causes(x: Array, at: Index = at, kind: str = kind) -> Iterator[Cause]:
             low, high = p.contact_duration if kind == "contact" else motion_phases(p)[kind].duration
             times = x[at] * scale[kind]

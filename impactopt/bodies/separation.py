@@ -147,6 +147,7 @@ class Shapes:
         """
         (k, j), w, p = at.joints.shape[:2], at.world.shape[1], len(self)
         gaps, near = np.empty((k, p)), np.empty((k * p, 2), dtype=np.int64)
+        # `near` has room for all pairs at all instants; the C code returns how many it has written.
         chosen, library = wanted.astype(np.uint8), _library()
         if library is None:
             found = separation_numpy.look(self, at, within, ways, wanted, gaps)

@@ -362,7 +362,7 @@ def _violation(t: Transcription, x: Array, select: Selector, *, torques: bool = 
 
 def _inequalities(t: Transcription, select: Selector) -> Index:
     """Indices of the selected constraints that are inequalities."""
-    # Equalities are equations of motion or of the contact: no parameter relaxes them.
+    # Equalities have no side to relax.
     found = np.array([i for i, origin in enumerate(t.program.origins) if select(origin)], dtype=np.intp)
     return found[t.program.g_lower[found] < t.program.g_upper[found]]
 

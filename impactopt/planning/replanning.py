@@ -245,7 +245,6 @@ def _slope(family: ParametricProgram, parameter: Parameter, half: float) -> tupl
     for value in (parameter.value + half, parameter.value - half):
         t = family.program_for(parameter.at(value))
         offset = family.system.offset(t.program)
-        # By p at fixed variables and multipliers, as the implicit function theorem has it.
         residual = np.concatenate([getattr(offset, name) for name in Offset.PARTS])
         sides.append((residual, np.array(t.impulse(x)), np.array(t.program.objective(x))))
     residual, impulse, objective = ((one - other) / (2 * half) for one, other in zip(*sides, strict=True))

@@ -170,7 +170,6 @@ class Solution(Solved):
         """
         if any(o.name not in self.objectives for o in self.problem.objectives):
             return np.nan
-        # Costs count negative.
         total = sum(
             (-o.weight if o.cost else o.weight) * self.objectives[o.name] for o in self.problem.objectives
         )

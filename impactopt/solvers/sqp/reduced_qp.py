@@ -114,7 +114,7 @@ class Reduction:
         self._A = point.jacobian_csr[self.equalities]
         self._condenser.load(equations, self._empty)
         Z = np.zeros((self._n, self.free.size))
-        # The identity for free variables; below it the steps -A_D^-1 A_F of the determined ones.
+        # The identity for free variables; the rows of the determined ones become -A_D^-1 A_F.
         Z[self.free, np.arange(self.free.size)] = 1.0
         self._condenser.expand_basis(Z)
         Z = self._Z = _without_zeros(Z) if self.sparse else Z
@@ -142,7 +142,7 @@ class Reduction:
         d = self._condenser.particular((g - self._level)[self._equations])
         if self.equalities.size:
             off = -(g[self.equalities] - self._level[self.equalities] + self._A @ d)
-            # R' has full row rank, up to dependent equalities, which are met as well as possible.
+            # R' has full column rank; dependent equalities are met as well as possible, by least squares.
             along = np.linalg.lstsq(self._R.T, off[self._order], rcond=None)[0]
             d = d + self._Z @ (self._Y @ along)
         return d

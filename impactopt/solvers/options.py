@@ -75,8 +75,7 @@ class IPMOptions(SolverOptions):
     """
 
     # Iterations of seven plans: 457 with these values; 583 and 483 with barriers of 0.1 and 3e-3; 508, 355,
-    # 333 and 498 with pushes of 1e-3, 0.03, 0.1 and 0.3, of which arm7's are 177, 57, 47 and 150 in place of
-    # 142.
+    # 333 and 498 with pushes of 1e-3, 0.03, 0.1 and 0.3. But with a push of 0.1 punch_step takes 340 for 100.
     complementarity_tolerance: float = 1e-6
     barrier: float = 3e-2
     barrier_warm: float = 1e-5

@@ -135,6 +135,7 @@ class Bodies:
         self.world_pairs: list[Pair] = []
         for w, body in enumerate(world):
             for j in self.links.joints:
+                # Fixed soles stand on the ground, and a fixed base is mounted on it.
                 rooted = j in standing or (not robot.floating and parent_body(robot.model, j) == 0)
                 on_ground = body.ground and rooted
                 strikes = j in striking
@@ -147,6 +148,7 @@ class Bodies:
                         f"at the start the link {self.links.name(j)!r} is in the body {body.name!r}: start "
                         "from another posture, or move the body or make it smaller"
                     )
+                # A lifted foot or a knee on the ground at the start: a constraint would be violated at once.
                 if body.ground and self.exact(at, 0, (j, -1 - w)) <= 0:
                     self.touching.append((self.links.name(j), body.name))
                     continue
@@ -165,6 +167,7 @@ class Bodies:
         present = np.zeros((k, len(self.world)), dtype=np.uint8)
         for w, body in enumerate(self.world):
             world[:, w, :9] = body.rotation.ravel()
+            # Only the target moves, along its normal.
             world[:, w, 9:] = body.place + np.outer(at.travel, self.normal) * body.moves
             present[:, w] = self.present(body, at)
         return Placed(np.ascontiguousarray(joints), world, present)
@@ -227,6 +230,7 @@ class Bodies:
         return self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
 
     def _transform(self, at: Places, k: int, body: int) -> Any:
+        # Cached, as all pairs of a body need it.
         known = at.transforms.get((k, body))
         if known is None:
             known = at.transforms[k, body] = transform(*self.placement(at, k, body))
@@ -254,6 +258,7 @@ class Bodies:
             for gap, k, number in zip(near.gap, near.spot.tolist(), near.pair.tolist(), strict=True):
                 a, b = shapes.pairs[number].tolist()
                 key = first + k, (a, b)
+                # Of all pieces of two bodies the nearest two count.
                 found[key] = min(float(gap), found.get(key, np.inf))
         for (k, pair), gap in sorted(found.items(), key=lambda item: item[1]):
             yield gap, k, pair
@@ -277,8 +282,10 @@ class Bodies:
         found: dict[Pair, list[tuple[int, float]]] = {}
         seen: set[tuple[Pair, int]] = set()
         for bound, k, pair in self.lower_bounds(at, within):
+            # Bounds rise from here on, so no pair is nearer than the least distance, nor penetrates.
             if bound - SLACK >= max(least, 0.0):
                 break
+            # A deep pair penetrates at many instants in a row, of which one an interval is enough.
             interval = pair, int(time[k] / _DEEP_INTERVAL)
             if interval in seen:
                 continue
@@ -291,6 +298,7 @@ class Bodies:
                 seen.add(interval)
         touches = []
         for pair, penetrations in found.items():
+            # One touch a pair, from its first penetration to its last, also if it is interrupted.
             instants = time[[k for k, _ in penetrations]]
             depth = -min(d for _, d in penetrations)
             touches.append(Touch(*self.names(pair), float(instants.min()), float(instants.max()), depth))

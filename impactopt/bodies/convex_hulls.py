@@ -95,6 +95,7 @@ def pieces_of(robot: Robot, known: Sequence[Piece] | None = None) -> tuple[tuple
         found, source = list(_from_inertia(robot)), "boxes of its links' inertia"
     else:
         bare = bare_joints(robot, {piece.joint for piece in known})
+        # A joint that keeps one plausible shape needs no box.
         large = {piece.joint for piece in known} - {piece.joint for piece in found}
         found += [piece for piece in _from_inertia(robot) if piece.joint in bare | large]
         source += f", and boxes of the inertia of {len(bare)} that have lost their meshes" if bare else ""
@@ -115,6 +116,7 @@ def bare_joints(robot: Robot, shown: Collection[int]) -> set[int]:
 
 def _from_urdf(robot: Robot) -> Iterator[Piece]:
     solid = list(shapes_of(robot.model, robot.urdf, "collision"))
+    # Visual shapes stand in link by link, where a link has no collision shape.
     seen = shapes_of(robot.model, robot.urdf, "visual", without={shape.link for shape in solid})
     yield from _hulls([*solid, *seen])
 
@@ -160,7 +162,10 @@ def _from_inertia(robot: Robot) -> Iterator[Piece]:
 def inertia_box(inertia: Any) -> Solid:
     """Rounded box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis."""
     moments, axes = np.linalg.eigh(np.array(inertia.inertia))
+    # With sides a, b, c the moments are m (b^2 + c^2) / 12 and so on: their sum less
+    # twice the first gives a^2.
     squares = 6.0 / inertia.mass * (moments.sum() - 2 * moments)
+    # eigh's axes may be left-handed, and a reflection would turn the solid inside out.
     axes = axes if np.linalg.det(axes) > 0 else -axes
     sides = np.sqrt(np.maximum(squares, _SHORTEST_SIDE**2))
     return rounded_box(sides).moved(axes, np.array(inertia.lever))
@@ -186,6 +191,7 @@ def tool_solids(tool: Tool) -> list[Solid]:
 def _rod(start: Array, end: Array, radius: float) -> Solid:
     """Cylinder from one point to another [m]; at least 24 mm long."""
     length = max(float(np.linalg.norm(end - start)), 2 * ROD)
+    # A point has no direction, and so short a rod none that matters: then it is upright.
     along = (end - start) / length if length > 2 * ROD else np.array([0.0, 0.0, 1.0])
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
     return cylinder(radius, length).moved(np.eye(3), np.array([0.0, 0.0, length / 2])).moved(turn, start)
@@ -209,6 +215,7 @@ def _hull_of(points: Array) -> dict[str, NDArray[Any]]:
             return {"vertices": np.zeros((0, 3)), "triangles": np.zeros((0, 3), dtype=np.intp)}
         if np.bincount(hull.simplices.ravel()).max() <= _MAX_NEIGHBOURS:
             break
+        # One point a cell of a grid, coarser each time, until no vertex has too many neighbours.
         points = points[np.unique(np.round(points / near), axis=0, return_index=True)[1]]
         near *= 2
     index = np.full(len(points), -1)  # of each point among the hull's vertices
@@ -217,6 +224,7 @@ def _hull_of(points: Array) -> dict[str, NDArray[Any]]:
     # Qhull does not order a facet's corners: reverse those whose normal points inwards
     vertices = points[hull.vertices]
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    # Qhull's equations have outward normals.
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]
     return {"vertices": vertices, "triangles": triangles}
@@ -275,6 +283,7 @@ def distance_to_link(model: pin.Model, piece: Piece, beside: Sequence[Piece]) ->
         for j in range(1, model.njoints)
         if int(model.parents[j]) == own
     ]
+    # coal has no point.
     shapes = [(coal.Sphere(1e-9), coal.Transform3s(np.eye(3), place)) for place in places]
     shapes += [(other.shape, coal.Transform3s()) for other in beside if other is not piece]
     return min(_distance(piece, shape, at) for shape, at in shapes)

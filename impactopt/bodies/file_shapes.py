@@ -62,6 +62,8 @@ def shapes_of(
             solid = _urdf_solid(element.find("geometry"), Path(str(urdf)))
             origin = _origin(element.find("origin"))
             if solid is not None and origin is not None:
+                # A link's frame may be fixed to the joint at a distance, as Pinocchio
+                # merges links of fixed joints.
                 place = frame.placement * origin
                 moved = solid.moved(place.rotation, place.translation)
                 if not (np.abs(moved.vertices) <= FARTHEST).all():
@@ -82,6 +84,7 @@ def lost_meshes(model: Any, urdf: str | None, *, without: Collection[int] = ()) 
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
         if int(frame.parentJoint) in without:
             continue
+        # Of collision and visual shapes alike.
         for mesh in link.iterfind("*/geometry/mesh"):
             file = mesh.get("filename", "")
             if reason := lack_of(file, Path(str(urdf))):
@@ -140,6 +143,7 @@ class Geom:
 
 def geoms_of(model: Any, mjcf: str) -> list[Geom]:
     """Geoms of a pin.Model's bodies; planes, height fields and signed distance fields are left out."""
+    # The time of the last change is a part of the cache's key.
     return list(_geoms(model, _compiled(mjcf, Path(mjcf).stat().st_mtime_ns)))
 
 
@@ -155,6 +159,7 @@ def _geoms(model: Any, mj: Any) -> Iterator[Geom]:
         if solid is None or not model.existFrame(name, pin.FrameType.BODY):
             continue
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+        # MuJoCo's quaternions have w first, as pin.Quaternion's constructor; its `coeffs` has it last.
         w, x, y, z = (float(a) for a in mj.geom_quat[g])
         place = frame.placement * pin.SE3(pin.Quaternion(w, x, y, z).matrix(), np.array(mj.geom_pos[g]))
         material = int(mj.geom_matid[g])
@@ -176,6 +181,7 @@ def _mjcf_solid(mj: Any, g: int) -> Solid | None:
     a, b, c = (float(x) for x in mj.geom_size[g])
     if kind == int(kinds.mjGEOM_SPHERE):
         return sphere(a)
+    # MuJoCo's sizes are halves; a capsule's length is that of its cylinder.
     if kind == int(kinds.mjGEOM_CAPSULE):
         return capsule(a, 2 * b)
     if kind == int(kinds.mjGEOM_CYLINDER):

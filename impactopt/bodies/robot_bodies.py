@@ -18,7 +18,16 @@ from impactopt.bodies.convex_hulls import Piece, file_pieces, pieces_of
 from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 
-__all__ = ["Pair", "RobotBodies", "StrikerFace", "bodies_of", "distance", "striker_face", "transform"]
+__all__ = [
+    "Pair",
+    "RobotBodies",
+    "StrikerFace",
+    "bodies_of",
+    "bounding_ball",
+    "distance",
+    "striker_face",
+    "transform",
+]
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]
@@ -56,12 +65,10 @@ class RobotBodies:
     @cached_property
     def balls(self) -> dict[int, tuple[Array, float]]:
         """Bounding ball of each joint's pieces: centre (3,) and radius [m]."""
-        out = {}
-        for j, pieces in self.of_joint.items():
-            points = np.concatenate([p.vertices for p in pieces])
-            centre = (points.max(axis=0) + points.min(axis=0)) / 2
-            out[j] = centre, float(np.linalg.norm(points - centre, axis=1).max())
-        return out
+        return {
+            j: bounding_ball(np.concatenate([p.vertices for p in pieces]))
+            for j, pieces in self.of_joint.items()
+        }
 
     @cached_property
     def _names(self) -> dict[int, str]:
@@ -93,6 +100,8 @@ class RobotBodies:
                     continue
                 kept = []
                 (centre_a, radius_a), (centre_b, radius_b) = self.balls[a], self.balls[b]
+                # Balls first: most pairs are far apart, and exact distances of all pairs of
+                # pieces would take much longer.
                 between = np.linalg.norm(data.oMi[a].act(centre_a) - data.oMi[b].act(centre_b))
                 far = between > radius_a + radius_b
                 for one in self.of_joint[a]:
@@ -119,6 +128,12 @@ def bodies_of(robot: Robot) -> RobotBodies:
         too_large = tuple(piece for piece in known if piece not in pieces)
         _KNOWN[robot] = RobotBodies(robot=robot, pieces=pieces, source=source, too_large=too_large)
     return _KNOWN[robot]
+
+
+def bounding_ball(points: Array) -> tuple[Array, float]:
+    """Centre (3,) and radius [m] of a ball that contains points (k, 3)."""
+    centre = (points.max(axis=0) + points.min(axis=0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
 def transform(rotation: Array, translation: Array) -> Any:
@@ -173,14 +188,17 @@ def striker_face(
     if not pieces:
         return None
     to_frame = frame.placement.inverse()
+    # From the joint's frame to the striker's, then relative to the striking point.
     vertices = np.concatenate([p.vertices for p in pieces]) @ to_frame.rotation.T + to_frame.translation
     away = vertices - np.asarray(hit.point)
     hull = ConvexHull(away)
     if axis is not None:
         return StrikerFace(np.asarray(axis, dtype=float), _leading(away[hull.vertices], np.asarray(axis)))
+    # Qhull: normal . p + offset <= 0 inside; at the striking point, the origin, that is the offset.
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
     nearest = normals[np.argmax(offsets)]  # the facet that the point is least inside of, or farthest outside
     corners = away[hull.simplices]
+    # Twice the areas, which as weights are the same.
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     same = (normals @ nearest > FLAT) & (np.abs(offsets - offsets.max()) < MERGED)
     normal = (normals * areas[:, None])[same].sum(axis=0)
@@ -192,6 +210,7 @@ def _leading(points: Array, normal: Array) -> Array:
     """Points that are foremost in some direction of a cone about the normal, without near duplicates."""
     # directions on a Fibonacci lattice, which covers the cone's cap evenly
     k = np.arange(DIRECTIONS) + 0.5
+    # Heights in equal steps are rings of equal area (Archimedes); the golden angle spreads them around.
     height, turn = 1 - (1 - np.cos(CONE)) * k / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
     wide = np.sqrt(1 - height**2)
     across = np.linalg.svd(normal[None])[2][1:]
@@ -199,6 +218,7 @@ def _leading(points: Array, normal: Array) -> Array:
         np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]
     )
     farthest, chosen = set((points @ directions.T).argmax(axis=0).tolist()), list[Array]()
+    # The foremost first, so that it stays of near duplicates.
     for index in np.argsort(-(points @ normal)):
         if index in farthest and all(np.linalg.norm(points[index] - c) > MERGED for c in chosen):
             chosen.append(points[index])

@@ -31,7 +31,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from impactopt.bodies import separation_numpy
 from impactopt.bodies.convex_hulls import Piece
-from impactopt.bodies.robot_bodies import Pair, RobotBodies
+from impactopt.bodies.robot_bodies import Pair, RobotBodies, bounding_ball
 from impactopt.bodies.separation_numpy import ROUNDING
 from impactopt.bodies.solids import cached_arrays
 from impactopt.bodies.world import WorldBody
@@ -98,9 +98,10 @@ class Shapes:
         pairs_with_world: Iterable[Pair],
     ) -> None:
         """pairs_of_links : pairs of pieces by joints.  pairs_with_world : joint, index of a world body."""
+        # A capsule or sphere is its axis or point, and its radius is subtracted from the distance.
         corners = [_corners(body.half) for body in world]
         own = {id(piece): _thinned_piece(piece) for piece in links.pieces}
-        ball = {id(piece): _bounding_ball(piece.vertices) for piece in links.pieces}
+        ball = {id(piece): np.append(*bounding_ball(piece.vertices)) for piece in links.pieces}
         self.points, self.blocks, ranges = packed([*own.values(), *corners])
         keys: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
         where = dict(zip(keys, ranges, strict=True))
@@ -119,6 +120,8 @@ class Shapes:
                 pairs.append((j, -1 - w))
                 number.append(k)
                 hulls.append((*where[id(one)], *where["world", w]))
+                # A body of the world has half sides in place of a centre: large ones, such as
+                # walls, would have huge balls.
                 balls.append((*ball[id(one)], *body.half, body.radius))
                 radius.append(body.radius)
         self.pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
@@ -126,6 +129,7 @@ class Shapes:
         self.hulls = np.array(hulls, dtype=np.int64).reshape(-1, 4)
         self.radius = np.array(radius, dtype=float)
         self._balls = np.array(balls, dtype=float).reshape(-1, 8)
+        # Joints from the root to each; those of only one of the two are between them.
         supports = [set(joints) for joints in links.robot.model.supports]
         self.between = np.array(
             [len(supports[a] ^ supports[b]) if b >= 0 else len(supports) for a, b in pairs]
@@ -143,6 +147,7 @@ class Shapes:
         """
         (k, j), w, p = at.joints.shape[:2], at.world.shape[1], len(self)
         gaps, near = np.empty((k, p)), np.empty((k * p, 2), dtype=np.int64)
+        # `near` has room for all pairs at all instants; the C code returns how many it has written.
         chosen, library = wanted.astype(np.uint8), _library()
         if library is None:
             found = separation_numpy.look(self, at, within, directions, wanted, gaps)
@@ -204,6 +209,7 @@ class Separations:
 
     def forget(self) -> None:
         """Clears the last result, as ``numbers`` have changed."""
+        # nan equals no z, so everything is computed anew.
         self._seen = np.full((self.count, self.joints + 3), np.nan)
 
     def write(self, what: int, z: Array, out: Array, factors: Array | None = None) -> None:
@@ -258,6 +264,7 @@ def _clustered(vertices: Array) -> Index:
             continue
         points, middle = vertices[order[own]], own.start + blocks // 2 * _BLOCK
         longest = int(np.ptp(points, axis=0).argmax())
+        # Split at the median along the longest side, as in a k-d tree, at a multiple of the block.
         order[own] = order[own][np.argsort(points[:, longest], kind="stable")]
         parts += [slice(own.start, middle), slice(middle, own.stop)]
     return order
@@ -280,6 +287,7 @@ def thinned(vertices: Array) -> Array:
     """
     if len(vertices) <= _SMALL_HULL:
         return vertices
+    # "2" is the version of the algorithm; rounding makes the key independent of the last digits.
     digest = hashlib.sha256(f"2 {THIN}".encode() + np.round(vertices, 9).tobytes()).hexdigest()
     return vertices[cached_arrays("thin", digest, lambda: {"chosen": _chosen(vertices)})["chosen"]]
 
@@ -294,6 +302,8 @@ def _chosen(vertices: Array) -> Index:
             planes = ConvexHull(vertices[chosen]).equations
         except QhullError:  # the first vertices are in a plane
             return np.arange(len(vertices))
+        # Signed distance to the farthest facet's plane, which is at most the distance to the hull: beyond a
+        # sharp edge an omitted vertex may be farther out than THIN (one of TALOS's hulls, by 2 %).
         out = (vertices @ planes[:, :3].T + planes[:, 3]).max(axis=1)
         k = int(out.argmax())
         if out[k] <= THIN:
@@ -304,14 +314,8 @@ def _chosen(vertices: Array) -> Index:
 
 def _corners(half: Array) -> Array:
     """Distinct corners of a box with half sides (3,), some of which may be zero."""
+    # Zero half sides make corners coincide, and copies would count twice in the smoothed support function.
     return np.unique(half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]), axis=0)
-
-
-def _bounding_ball(vertices: Array) -> tuple[float, float, float, float]:
-    """Centre and radius [m] of a sphere that contains the vertices."""
-    centre = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
-    x, y, z = centre.tolist()
-    return x, y, z, float(np.linalg.norm(vertices - centre, axis=1).max())
 
 
 @functools.cache

@@ -54,6 +54,7 @@ def _gathered(points: Array, hulls: Index) -> tuple[Array, NDArray[np.bool_]]:
 
 def _support(vertices: Array, real: NDArray[np.bool_], u: Array) -> _Support:
     sharp = _SHARP
+    # Padding has weight exp(-inf) = 0.
     height = np.where(real, np.einsum("mki,mi->mk", vertices, u), -np.inf)
     most = height.max(axis=1)
     # exponents relative to the largest, against overflow
@@ -82,6 +83,7 @@ class _Pairs:
     def side(self, u: Array) -> _Side:
         """Separations in directions u (m, 3)."""
         turn = self.rotation
+        # h_A(-u) of the moved body: u turned back into its own frame.
         a = _support(*self.one, -np.einsum("mji,mj->mi", turn, u))
         b = _support(*self.two, u)
         point = np.einsum("mij,mj->mi", turn, a.mean) + self.translation
@@ -90,8 +92,11 @@ class _Pairs:
         x = np.cross(u, away)
         x /= np.linalg.norm(x, axis=1, keepdims=True)
         tangents = np.stack([x, np.cross(u, x)], axis=1)
+        # Gradient of u . t - h_A(-u) - h_B(u): the vector between the two support points.
         slope = point - b.mean
         along = np.einsum("mi,mi->m", u, slope)
+        # Covariances over e are the Hessians of the smoothed support functions. On the sphere the gradient's
+        # own component along u is added to the curvature.
         neg_hessian = _SHARP * tangents @ (one + b.spread) @ tangents.transpose(0, 2, 1)
         neg_hessian += along[:, None, None] * np.eye(2)
         separation = np.einsum("mi,mi->m", u, self.translation) - a.height - b.height
@@ -113,10 +118,12 @@ class _Pairs:
             up = axes[saddle, :, 0]
             slope2 = np.einsum("mki,mi->mk", at.tangents[saddle], at.slope[saddle])
             step2[saddle] = 0.1 * up * np.where((up * slope2).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+            # 0.1 rad along the direction of positive curvature, on the side that the slope favours.
             size[saddle], gain[saddle] = 0.1, 0.0
             going &= size >= 1e-11
             if not going.any():
                 break
+            # A tangent step is a rotation only while it is small against a radian.
             part = np.minimum(1.0, _MAX_STEP / np.maximum(size, 1e-300))
             waiting = going.copy()  # pairs whose step has not been accepted
             for _ in range(_MAX_TRIES):
@@ -136,6 +143,7 @@ class _Pairs:
                 waiting[n[accepted]] = False
                 part[n[~accepted]] *= 0.4
             low = np.linalg.eigvalsh(at.neg_hessian)[:, 0]
+            # Quadratic convergence: after a step of 1e-7 rad the next one would be rounding.
             going &= ~waiting & ((part * size >= 1e-7) | (low < -1e-9))
         return u, at
 
@@ -168,10 +176,12 @@ def _chain(n: int, z: Array, numbers: Array) -> tuple[Array, Array, Array, Array
     """
     m = len(z)
     places = numbers[:, : 12 * (n + 1)].reshape(m, n + 1, 12)
+    # Layout of `numbers` (13 n + 13): n + 1 placements of 12, n flags, the reach.
     turns = numbers[:, 12 * (n + 1) : 13 * n + 12] > 0.5
     turn, shift = places[:, 0, :9].reshape(m, 3, 3).copy(), places[:, 0, 9:] + z[:, :3]
     axis, origin = np.zeros((m, n, 3)), np.zeros((m, n, 3))
     for k in range(n):
+        # Joints turn about, or slide along, z of their frame.
         axis[:, k], origin[:, k] = turn[:, :, 2], shift
         angle, along = np.where(turns[:, k], z[:, 3 + k], 0.0), np.where(turns[:, k], 0.0, z[:, 3 + k])
         c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
@@ -204,6 +214,7 @@ def write(
         return
     # Hessian s_qq - s_qu (s_uu)^-1 s_uq, see separation.py: `own` is s_qq by joints, `mixed` is s_qu on the
     # tangents
+    # u x axis: how the direction u moves, seen from the first body, when the joint turns.
     turning = np.where(turns[:, :, None], np.cross(u[:, None], axis), 0.0)
     spread = np.einsum("mij,mkj->mki", at.spread_one, turning)
     moved = np.concatenate([np.broadcast_to(np.eye(3), (len(z), 3, 3)), arm - _SHARP * spread], axis=1)
@@ -211,6 +222,7 @@ def write(
     found = mixed @ _inverse(at.neg_hessian) @ mixed.transpose(0, 2, 1)
     own = np.einsum("mki,mli->mkl", turning, arm) - _SHARP * np.einsum("mki,mli->mkl", turning, spread)
     columns, rows = np.triu_indices(n + 3)  # lower triangle, column by column
+    # The first three of z shift the body without turning it: the support functions do not change with them.
     inner = columns >= 3
     values = found[:, rows, columns]
     values[:, inner] += own[:, columns[inner] - 3, rows[inner] - 3]
@@ -253,6 +265,7 @@ def look(
     out = np.abs(x) - balls[:, 4:7]
     outside, deepest = np.maximum(out, 0.0), out.max(axis=1)
     box = np.where(deepest > 0, np.linalg.norm(outside, axis=1), deepest)
+    # balls[:, 7]: the second ball's radius, or the inflation of a body of the world.
     bound = np.where(world, box, np.linalg.norm(x, axis=1)) - balls[:, 3] - balls[:, 7]
     # initial direction: between the centres; from a box, its nearest corner's, edge's or face's
     face = np.where(outside.any(axis=1)[:, None], outside, np.eye(3)[out.argmax(axis=1)]) * np.where(
@@ -278,10 +291,13 @@ def may_meet(
 ) -> tuple[Index, Index]:
     """NumPy version of `Shapes.may_meet`."""
     before, after = one[1].gaps, two[1].gaps
+    # Pairs farther apart than 5 m cannot meet in a step; this also leaves out those with the gap 1e3.
     spot, pair = np.nonzero(wanted & (before > 0) & (after > 0) & (before + after <= 5.0))
     (turn0, shift0), (turn1, shift1) = (_of_pairs(shapes, p[0], spot, pair) for p in (one, two))
     centre, radius = shapes._balls[pair, :3], shapes._balls[pair, 3]
     moved = np.einsum("mij,mj->mi", turn1 - turn0, centre) + shift1 - shift0
+    # trace(R0' R1) = 1 + 2 cos of the angle between both: no point of the ball moves farther than the
+    # centre's way and angle times radius.
     cosine = (np.einsum("mij,mij->m", turn0, turn1) - 1) / 2
     far = np.linalg.norm(moved, axis=1) + np.arccos(np.clip(cosine, -1.0, 1.0)) * radius
     met = far >= before[spot, pair] + after[spot, pair]

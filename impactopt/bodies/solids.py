@@ -77,6 +77,7 @@ def box(sides: ArrayLike) -> Solid:
 def rounded_box(sides: ArrayLike) -> Solid:
     """Superellipsoid |x/a|^6 + |y/b|^6 + |z/c|^6 = 1 in a box of these sides (3,) [m]."""
     round_ = sphere(1.0, sides=24)
+    # Each vertex of the sphere is moved along its ray to the surface.
     size = (np.abs(round_.vertices) ** 6).sum(axis=1) ** (1 / 6)
     return Solid(vertices=round_.vertices / size[:, None] * np.asarray(sides) / 2, triangles=round_.triangles)
 
@@ -86,6 +87,7 @@ def cylinder(radius: float, length: float, *, tip: float = 1.0, sides: int = 20)
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
     up = np.array([0.0, 0.0, length / 2])
+    # Lower ring, upper ring, then the middles of both ends.
     vertices = np.concatenate([radius * ring - up, radius * tip * ring + up, [-up, up]])
     k, n = np.arange(sides), (np.arange(sides) + 1) % sides
     bottom, top = np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
@@ -105,6 +107,7 @@ def sphere(radius: float, *, sides: int = 16) -> Solid:
         ],
         axis=-1,
     ).reshape(-1, 3)
+    # Rings from north to south, then the two poles.
     vertices = radius * np.concatenate([grid, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
     k, n = np.arange(sides), (np.arange(sides) + 1) % sides
     north, south, last = np.full(sides, len(grid)), np.full(sides, len(grid) + 1), (rings - 2) * sides
@@ -122,6 +125,7 @@ def capsule(radius: float, length: float, *, sides: int = 50) -> Solid:
         cylinder.
     """
     round_ = sphere(radius, sides=sides)
+    # Each half of the sphere is moved outwards; a ring at z = 0 would stay behind.
     lift = np.sign(round_.vertices[:, 2:]) * [0.0, 0.0, length / 2]
     return Solid(vertices=round_.vertices + lift, triangles=round_.triangles)
 
@@ -135,6 +139,7 @@ def simplified(solid: Solid, cell: float) -> Solid:
     v, t = solid.vertices, solid.triangles
     cube = np.floor((v - v.min(axis=0)) / cell).astype(np.int64)
     sizes = cube.max(axis=0) + 1
+    # One integer a cube, as np.unique of rows takes longer.
     _, label = np.unique((cube[:, 0] * sizes[1] + cube[:, 1]) * sizes[2] + cube[:, 2], return_inverse=True)
     n = int(label.max()) + 1
     mean = _sums(label, v, n) / np.bincount(label, minlength=n)[:, None]
@@ -183,6 +188,7 @@ def find_mesh(name: str, urdf: Path) -> Path:
         path = Path(name.removeprefix("package://").lstrip("/"))
     else:
         path = Path(name.removeprefix("file://"))
+    # The nearest folder first.
     above = [*urdf.resolve().parents]
     places = [folder / path for folder in above]
     if name.startswith("package://"):  # the folder's name may differ from the package's
@@ -264,6 +270,7 @@ def cached_arrays(kind: str, digest: str, make: Callable[[], Mapping[str, NDArra
         np.savez(file, **make())  # type: ignore[arg-type]  # of keywords that are not arrays
         return file.getvalue()
 
+    # Pickles in a cache could run code.
     with np.load(io.BytesIO(kept(kind, digest, archive)), allow_pickle=False) as found:
         return dict(found)
 

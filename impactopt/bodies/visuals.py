@@ -92,6 +92,7 @@ def _from_inertia(robot: Robot) -> list[Visual]:
         parent = int(model.parents[j])
         if parent or not robot.floating:
             found.append(Visual(joint=j, solid=sphere(THICK), colour=JOINT))
+        # No bone to the world, nor to a free-flyer's joint.
         if parent > robot.floating:
             found += _bone(parent, np.array(model.jointPlacements[j].translation))
     return found + _bones_to(robot, robot.strikers.values())
@@ -187,7 +188,9 @@ def surroundings_of(world: Sequence[WorldBody]) -> list[Part]:
 
 def _half(board: WorldBody, support: WorldBody) -> Part:
     """Half of a board that lies on this support."""
+    # Half sides; `box` takes sides, so a width of `wide` is half of the board.
     wide, high, thick = board.half
+    # In the board's axes: across, up, deep (`target_bodies`).
     across, _, _ = board.rotation.T @ (support.place - board.place)
     side = float(np.sign(across))
     edge = float(abs(across) - support.half[0])

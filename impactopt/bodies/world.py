@@ -143,6 +143,7 @@ class Obstacle(Described):
             if self._length < 1e-9:
                 return np.eye(3)
             along = np.subtract(self.end or (), self.start or ()) / self._length
+            # Columns across, up, along: z is the capsule's axis, and a cyclic order stays right-handed.
             return face_axes(along)[[1, 2, 0]].T
         return np.asarray(pin.rpy.rpyToMatrix(*self.rpy))
 
@@ -282,8 +283,10 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
     if isinstance(target, Nail):
         out = max(NAIL_LENGTH - target.depth, 0.0)
         block = box("target's block", size, out, strikable=True)
+        # Too short for a capsule, whose ends are half spheres.
         if out < 2 * NAIL_RADIUS:
             return [block]
+        # A capsule's ends extend beyond its axis by the radius.
         half = np.array([0.0, 0.0, out / 2 - NAIL_RADIUS])
         shank = solid("target", half, out / 2, radius=NAIL_RADIUS, moves=True, strikable=True)
         return [shank, block]

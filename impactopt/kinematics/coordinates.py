@@ -123,9 +123,12 @@ class LegClosure:
             worst = 0.0
             for frame, placement, columns, own in self._limbs:
                 m = pin.updateFramePlacement(model, data, frame)
+                # The twist, in the frame's own axes, that leads to its placement in unit time;
+                # LOCAL, as the Jacobian is.
                 error = pin.log6(m.actInv(placement)).vector
                 worst = max(worst, float(np.abs(error).max()))
                 jac = pin.getFrameJacobian(model, data, frame, pin.LOCAL)[:, columns]
+                # Levenberg-Marquardt with a damping that matters only where the Jacobian is singular.
                 step = dgesv(jac.T @ jac + _DAMPING, jac.T @ error)[2]
                 legs[own] += np.minimum(np.maximum(step, -_LARGEST_STEP), _LARGEST_STEP)
             if worst < _CONVERGED:
@@ -154,6 +157,7 @@ class LegClosure:
         for k, y in enumerate(coordinates):
             weights = np.array(_EXTRAPOLATION[len(previous) - 1])
             legs = self._close(q[k], y, weights @ np.array(previous))
+            # The caller's guess is no solution of an instant, so it is not extrapolated from.
             previous = [*(previous if k else ())[-2:], legs]
             yield q[k], legs
 
@@ -181,6 +185,7 @@ class LegClosure:
         jac = self.jacobians(q)
         if self._frames:
             block = jac[:, self._dependent]
+            # v has no leg rates yet: jac @ v is V, the soles' twists with the legs at rest.
             v[self._dependent] = solved(block, -jac @ v)
             pin.forwardKinematics(model, data, q, v, a)  # a has no legs yet: A + Jdot qdot
             drift = [pin.getFrameAcceleration(model, data, k, pin.LOCAL).vector for k in self._frames]
@@ -240,6 +245,7 @@ def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:
         for w in work:
             w[[k, k + r]] = w[[k + r, k]]
             w[:, [k, k + c]] = w[:, [k + c, k]]
+            # The samples are eliminated too, for the sizes of the pivots that follow.
             w[k + 1 :, k:] -= np.outer(w[k + 1 :, k] / w[k, k], w[k, k:])
     return rows, cols
 
@@ -348,6 +354,7 @@ class StanceCoordinates:
             placement = self.data.oMf[self.model.getFrameId(frame)].copy()
             if sole is not None:
                 check_held(self.model, sole, posture, self.base + chain[-LEG:])
+            # Pivots that are large at all samples: elimination in this order is stable near the posture.
             order = elimination_order(self._leg_samples(frame, chain, posture))
             self.legs.append(Leg(name, sole, frame, chain[-LEG:], chain[:-LEG], order, placement))
         self.hands = [leg for leg in self.legs if leg.sole is None]
@@ -362,6 +369,7 @@ class StanceCoordinates:
 
     def _leg_samples(self, frame: str, chain: Index, posture: Array) -> list[Array]:
         """Jacobians (6, 6) of a chain's last joints, at this posture and four random ones near it."""
+        # A fixed seed, as the order is a part of compiled functions, which are cached on disk.
         rng = np.random.default_rng(0)
         out = []
         angles = self.robot.joint_positions(posture)[chain]
@@ -373,6 +381,7 @@ class StanceCoordinates:
                 step[self.base + chain] -= angles
             qk = pin.integrate(self.model, posture, step)
             if self.robot.floating:
+                # As in `sole_terms`, the base at the world's origin: world axes are then the base's own.
                 qk[:7] = [0, 0, 0, 0, 0, 0, 1]
             jac = pin.computeFrameJacobian(
                 self.model, self.data, qk, self.model.getFrameId(frame), pin.LOCAL_WORLD_ALIGNED
@@ -449,6 +458,8 @@ class StanceCoordinates:
         Rotation, position, Jacobian of the dependent joints, twist, acceleration, and Jacobian of the joints
         before these.
         """
+        # With the base at the origin the terms depend on joints only, and the
+        # base's pose costs no operations.
         q = self.embed(ca.SX.zeros(self.base), y[self.base :], legs)
         rotation, point, jac, twist, acc = self._sole[k](q, v, a)
         return rotation, point, jac[:, -LEG:], twist, acc, jac[:, :-LEG]
@@ -470,6 +481,7 @@ class StanceCoordinates:
         leg_rates = []
         for s, leg in enumerate(self.legs):
             jac = self.sole_terms(s, y, legs, nothing, nothing)[2]
+            # The twist is linear in v: with leg rates of zero it is V of the module's docstring.
             twists = [
                 self.sole_terms(s, y, legs, self.embed(b, rates[6:, i], still), nothing)[3]
                 for i, b in enumerate(base)
@@ -492,6 +504,7 @@ class StanceCoordinates:
         a_base = self.base_motion(q, qd, qdd)[1]
         accs = []
         for s, leg in enumerate(self.legs):
+            # v is whole and a has no legs yet: acc is A + Jdot qdot of the module's docstring.
             _, _, jac, _, acc, _ = self.sole_terms(s, y, legs, v, self.embed(a_base, ydd[6:], still))
             accs.append(solve_in_order(jac, -acc, leg.order)[0])
         return v, self.embed(a_base, ydd[6:], ca.vertcat(*accs))
@@ -557,6 +570,7 @@ class StanceCoordinates:
             rotation, point, jac, _, _, before = self.sole_terms(k, y, legs, zero_v, zero_v)
             w = wrenches[6 * k : 6 * k + 6]
             f, n = ca.mtimes(rotation, w[:3]), ca.mtimes(rotation, w[3:])
+            # Moved to the base's origin, in the base's own axes, as Pinocchio's free-flyer has its force.
             base = base + ca.vertcat(f, n + ca.cross(point, f))
             leg_tau.append(ca.mtimes(jac.T, ca.vertcat(f, n)))
             tau = ca.mtimes(before.T, ca.vertcat(f, n))
@@ -614,6 +628,7 @@ class StanceCoordinates:
         The Jacobians are in each sole's own frame, the placements in the world.
         """
         jac = self.leg_closure.jacobians(q)
+        # `jacobians` has placed the joints; frames follow from them.
         pin.updateFramePlacements(self.model, self.data)
         return jac, [self.data.oMf[self.model.getFrameId(leg.frame)].copy() for leg in self.legs]
 

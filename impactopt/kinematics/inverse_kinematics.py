@@ -60,6 +60,7 @@ def reach(
     inward, offset = inward_edges(polygon) if len(polygon) else (np.zeros((0, 2)), np.zeros(0))
 
     def errors(step: Array) -> Array:
+        # step (nv,) is a tangent vector at the guess: quaternions need no constraint.
         q = pin.integrate(model, guess, step)
         pin.forwardKinematics(model, data, q)
         pin.updateFramePlacements(model, data)
@@ -69,9 +70,11 @@ def reach(
         return np.concatenate([*residuals, 1e-4 * step])  # the last makes the solution unique
 
     angles = robot.joint_positions(guess)
+    # A narrow range keeps its middle half.
     slack = np.minimum(joint_margin, (robot.upper - robot.lower) / 4)
     lower, upper = np.full(robot.nv, -UNBOUNDED), np.full(robot.nv, UNBOUNDED)
     upper[base:] = np.minimum(robot.upper - slack - angles, UNBOUNDED)
+    # least_squares requires lower < upper, also of a guess that is outside its limits.
     lower[base:] = np.minimum(np.maximum(robot.lower + slack - angles, -UNBOUNDED), upper[base:] - 1e-9)
     start = np.clip(np.zeros(robot.nv), lower, upper)
     found = least_squares(errors, start, bounds=(lower, upper), xtol=1e-10, ftol=1e-12, max_nfev=80)
@@ -126,6 +129,7 @@ def inverse_kinematics(
     joints = robot.joint_models
     limited = np.array([k for k, j in enumerate(joints) if j.nq == 1], dtype=np.intp)
     place = np.array([joints[k].idx_q for k in limited], dtype=np.intp)
+    # A fixed seed: the same problem has the same posture.
     rng = np.random.default_rng(0)
     base = coordinates.base
     # weights of a step (larger: cheaper). The base is expensive, as a reach with the arm keeps the centre of
@@ -173,6 +177,8 @@ def inverse_kinematics(
             for _ in range(3):
                 j = jac[:, free]
                 step[:] = 0.0
+                # Weighted damped least squares in the small space, W J' (J W J' + D)^-1 e: a system of
+                # as many unknowns as errors.
                 jw = j * ease[free]
                 step[free] = jw.T @ np.linalg.solve(jw @ j.T + np.diag(damping), e)
                 joint = step[base:][limited]
@@ -183,6 +189,7 @@ def inverse_kinematics(
                 if not (violates & free[base:]).any():
                     break
                 free[base:] &= ~violates
+            # Linearization is good for some tenths of a radian.
             q = pin.integrate(model, q, np.clip(step, -0.15, 0.15))
     pin.framesForwardKinematics(model, data, guess)
     fid, point = hands[0]

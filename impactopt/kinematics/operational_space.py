@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 
 def across(direction: Array) -> Array:
     """(2, 3) Two unit vectors at right angles to a direction (3,) and to each other."""
+    # The right singular vectors of a row: the row itself, then two that span its null space.
     return np.asarray(np.linalg.svd(direction.reshape(1, 3))[2][1:])
 
 
@@ -50,9 +51,11 @@ def static_wrenches(c: StanceCoordinates, y: Array, legs: Array) -> Array:
         return np.zeros(0)
     q = c.join(y, legs)
     tau = c.robot.generalized_gravity(c.model.createData(), q)
+    # Only undriven coordinates constrain wrenches: the joints' torques supply the rest.
     jac = c.sole_jacobians(q)[0][: 6 * len(c.soles), c.undriven]
     # moments weigh more, which keeps the centre of pressure inside the sole
     lever = np.array([1, 1, 1, 10, 10, 10] * len(c.soles))
+    # Least norm of lever x wrench.
     found = np.linalg.lstsq(jac.T / lever, tau[c.undriven], rcond=None)[0] / lever
     return np.concatenate([found, np.zeros(6 * len(c.hands))])
 
@@ -79,6 +82,7 @@ class ConstrainedDynamics:
         """Dynamics at a configuration q (nq,).  frames : fixed ones.  striker : striking point's frame."""
         inertia = mass_matrix(model, model.createData(), q)
         jacobians = _jacobians(model, q, [*frames, striker])
+        # Of the striking point the linear part only: its rotation is free.
         return cls(inertia, jacobians[:-6], jacobians[-6:-3])
 
     def inverse_mass(self) -> Array:
@@ -98,6 +102,7 @@ class ConstrainedDynamics:
         """
         responses = np.linalg.solve(self.inertia, np.vstack([self.held, jacobian]).T)  # H^-1 [J_c' J']
         held, free = np.split(responses, [len(self.held)], axis=1)
+        # Paper, eqs. 1-4: compliances of the virtual base; 0 is the exact constraint.
         inner = self.held @ held + compliance * np.eye(len(self.held))
         return np.asarray(free - held @ np.linalg.lstsq(inner, self.held @ free, rcond=_DEPENDENT)[0])
 
@@ -133,6 +138,7 @@ def striking_velocity(
     responses = np.linalg.solve(body.inertia, J.T)
     v = responses @ np.linalg.lstsq(J @ responses, required, rcond=_DEPENDENT)[0]
     off = float(np.abs(J @ v - required).max())
+    # `not <=` refuses nan, too.
     if not off <= 1e-6 * max(1.0, abs(speed)):
         raise InputError(
             f"q: here {striker!r} cannot move along {np.round(n, 3).tolist()} with the stance's frames at "
@@ -159,6 +165,7 @@ def holding_torque(
     if not np.all(np.isfinite(bias)):
         raise InputError("q, v: the forces of this motion are no finite numbers; give smaller ones")
     held = _jacobians(robot.model, q, held_by.constraint_frames(robot))
+    # Columns S' and J_c': joints' torques, and the wrenches of fixed frames.
     columns = np.hstack([np.eye(robot.nv)[:, -robot.n :], held.T])
     return np.array(np.linalg.lstsq(columns, bias, rcond=None)[0][: robot.n])
 

@@ -25,12 +25,14 @@ def graded_breaks(intervals: int, ratio: float, *, fine_end: bool) -> Array:
     lengths = ratio ** np.linspace(0.0, 1.0, intervals)
     lengths /= lengths.sum()
     breaks = np.concatenate([[0.0], np.cumsum(lengths)])
+    # Rounding of the sum.
     breaks[-1] = 1.0
     return np.asarray(1.0 - breaks[::-1] if fine_end else breaks)
 
 
 def knots(breaks: Array) -> Array:
     """Clamped knot vector (N + 7,) of cubic splines with N + 1 breaks."""
+    # End knots four times (degree + 1): the curve begins and ends at a control point.
     return np.concatenate([[breaks[0]] * 3, breaks, [breaks[-1]] * 3])
 
 
@@ -44,6 +46,7 @@ def basis(breaks: Array, s: ArrayLike) -> tuple[Array, Array, Array]:
 def rate_weights(breaks: Array) -> Array:
     """Factors (N + 2,) of the derivative's control points  factor_j (c_{j+1} - c_j),  which bound it."""
     t = knots(breaks)
+    # Derivative of a B-spline of degree p: control points p (c_{j+1} - c_j) / (t_{j+p+1} - t_{j+1}); p = 3.
     return np.asarray(3.0 / (t[4:-1] - t[1:-4]))
 
 
@@ -72,6 +75,7 @@ class CubicSpline:
     ) -> CubicSpline:
         """Interpolant of ``values`` (N + 1, d) at the breaks with given end velocities (d,) [1/s]."""
         value, rate, _ = basis(breaks, breaks)
+        # N + 1 values and two rates for N + 3 control points.
         a = np.vstack([value, rate[:1] / duration, rate[-1:] / duration])
         b = np.vstack([values, start_rate, end_rate])
         return cls(control=np.linalg.solve(a, b).astype(np.float64), breaks=breaks, duration=duration)
@@ -86,6 +90,8 @@ def quintic(
     """
     s = np.atleast_1d(np.asarray(s, dtype=float))[:, None]
     v0, v1, gap = start_rate * duration, end_rate * duration, end - start
+    # c2 = 0, as the acceleration at s = 0 is zero; the other three meet position, rate
+    # and acceleration at s = 1.
     c3 = 10 * gap - 6 * v0 - 4 * v1
     c4 = -15 * gap + 8 * v0 + 7 * v1
     c5 = 6 * gap - 3 * (v0 + v1)

@@ -81,7 +81,9 @@ def _of_legs(
     found = motion(symbols)
     if not c.legs:
         return found, []
+    # Implicit definition: the sole's twist or acceleration vanishes.
     zero = [c.sole_terms(k, y, legs, *found)[term] for k in count]
+    # With zero in place of the symbols it is the right-hand side, as it is affine in them.
     rest = [c.sole_terms(k, y, legs, *motion(ca.SX.zeros(c.nl))) for k in count]
     blocks = tuple((terms[2], leg.order) for terms, leg in zip(rest, c.legs, strict=True))
     solved = [

@@ -24,6 +24,7 @@ _ON_LINE = 1e-9  # [m] a corner nearer to a line than this lies on it
 def inward_edges(polygon: Array) -> tuple[Array, Array]:
     """Inward unit normals (k, 2), offsets (k,) [m] of a counter-clockwise polygon; inside, n.p >= offset."""
     edge = np.roll(polygon, -1, axis=0) - polygon
+    # A quarter turn to the left of an edge points inside, as corners are counter-clockwise.
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return inward, np.einsum("ij,ij->i", inward, polygon)
 
@@ -50,6 +51,7 @@ def _clip(corners: Array, inside: Array) -> Array:
     """Part of a convex polygon where the signed distances ``inside`` [m] of its corners are positive."""
     out: list[Array] = []
     for k in range(len(corners)):
+        # Sutherland and Hodgman's clipping, by one line.
         a, b = inside[k - 1], inside[k]
         if min(a, b) < -_ON_LINE and max(a, b) > _ON_LINE:  # the line cuts the edge that ends at corner k
             out.append(corners[k - 1] + a / (a - b) * (corners[k] - corners[k - 1]))
@@ -78,6 +80,7 @@ def _facets(corners: tuple[tuple[float, float], ...], friction: float) -> Array:
     rays = []
     for x, y in corners:
         for fx, fy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            # Facets do not depend on the length of rays, so f_z = 1.
             f = np.array([friction * fx, friction * fy, 1.0])
             rays.append(np.concatenate([f, np.cross([x, y, 0.0], f)]))
     r = np.array(rays)
@@ -94,6 +97,8 @@ def _facets(corners: tuple[tuple[float, float], ...], friction: float) -> Array:
     # Qhull cuts a facet into simplices, which have equal equations: normal (5,) and offset, <= 0 inside
     equations = np.unique(np.round(hull.equations, 10), axis=0)
     facets = np.zeros((len(equations), 6))
+    # normal . p + offset <= 0 for p = (others / size) / f_z, times -f_z: the offset
+    # is the coefficient of f_z.
     facets[:, [0, 1, 3, 4, 5]] = -equations[:, :5] / size
     facets[:, 2] = -equations[:, 5]
     return facets
@@ -125,6 +130,7 @@ def convex_polygon(points: Array) -> Array:
     while k < len(hull):  # by rounding a point in the middle of an edge may be a corner of the hull
         before, after = hull[k - 1], hull[(k + 1) % len(hull)]
         along, arm = (after - before) / np.linalg.norm(after - before), hull[k] - before
+        # `along` is a unit vector: the cross product is the corner's distance from the line.
         if len(hull) > 3 and abs(along[0] * arm[1] - along[1] * arm[0]) < COLLINEAR:
             hull.pop(k)
         else:
@@ -150,4 +156,5 @@ def margin(polygon: Array, points: Array) -> Array:
 def zmp(wrench: Array) -> Array:
     """ZMP (n, 2) [m] on the ground z = 0 from ground wrenches (n, 6) [N, N m] about the world's origin."""
     w = np.atleast_2d(wrench)
+    # Where the horizontal moment vanishes (paper, section II-B): m_x = p_y f_z and m_y = -p_x f_z on z = 0.
     return np.stack([-w[:, 4] / w[:, 2], w[:, 3] / w[:, 2]], axis=1)

@@ -56,9 +56,11 @@ class BetweenNodes:
         """Outcome checked by its replay; if bodies penetrate, the last outcome without penetration instead,
         or a failed one.
         """
+        # `missing` has found the last outcome clear already.
         if self._margins is None or not outcome.usable or outcome is self._clear:
             return outcome.checked()
         with contextlib.suppress(InputError):
+            # Only penetration refuses a solution; a part of a margin may be lost.
             found = clearance_violations(outcome.program, outcome.result.x, self._margins, share=1.0)
             if found is not None and found.depth > 0:
                 if self._clear is not None:
@@ -93,6 +95,7 @@ class BetweenNodes:
             shares = t.hit.drifted(x) or shares
             if shares != t.hit.shares:
                 elements = contact_elements(t.problem, shares)
+            # Nodes for clearance do not count as a refinement of the mesh.
             self._refined += nodes != for_clearance or elements is not None
         # If the coarse contact misses an event, its optimum is not near one of the finer program.
         missed = error is not None and error.missed
@@ -124,6 +127,7 @@ class BetweenNodes:
                     constraints=constraints,
                     report=self._budget.report,
                 )
+            # Same variables, same mesh: no new program has to be built.
             elif raised:
                 finer = t.with_clearance(constraints)
             # With the same variables and other clearance constraints, there are three guesses: the solution

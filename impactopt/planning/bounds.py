@@ -118,6 +118,7 @@ def _durations(t: Transcription) -> Iterator[Bound]:
     found: dict[str, list[int]] = {}
     for name, group in t.layout.groups.items():
         if name.endswith(" duration"):
+            # Names are those of the transcription's groups; an abort motion has the follow-through's bounds.
             kind = name.split()[0].removesuffix("-abort").replace("abort", "follow")
             kind = kind if kind in ("swing", "follow") or kind.startswith("stance") else "contact"
             found.setdefault(kind, []).append(group.offset)
@@ -126,9 +127,11 @@ def _durations(t: Transcription) -> Iterator[Bound]:
     for kind, numbers in found.items():
         at = np.array(numbers, dtype=np.intp)
 
+        # Defaults bind the loop's variables as they are now; a closure would see the last ones.
         def causes(x: Array, at: Index = at, kind: str = kind) -> Iterator[Cause]:
             low, high = p.contact_duration if kind == "contact" else motion_phases(p)[kind].duration
             times = x[at] * scale[kind]
+            # Several phases share a bound: the one farthest outside decides.
             longer = times.max() > high
             value = float(times.max() if longer else times.min())
             if not longer and value >= low:
@@ -145,6 +148,7 @@ def _durations(t: Transcription) -> Iterator[Bound]:
             name=kind,
             select=None,
             variables=at,
+            # Relative to the bound itself, so that durations of contact and of swings cost alike.
             unit=float(t.program.x_upper[at].max()),
             causes=causes,
             is_time=True,
@@ -174,6 +178,7 @@ def _duration_cause(
     """Cause that a duration [s] has to be outside of its bounds, low and high."""
     bound = high if longer else low
     value = _outward(value, bound)
+    # A fixed duration stays fixed.
     both = (value, value) if low == high else (low, value) if longer else (value, high)
     changes: dict[str, object]
     if name == "contact":
@@ -200,6 +205,8 @@ def _clearances(t: Transcription) -> Iterator[Bound]:
             x: Array, select: Selector = select, term: str = term, pair: str = pair
         ) -> Iterator[Cause]:
             missing = 1e3 * _violation(t, x, select)
+            # Pairs have no parameter of their own: the problem that shows the cause
+            # is the one without the term.
             free = (KeepOut if term == KeepOut.name else SelfCollision)(enabled=False)
             yield Cause(
                 kind="the floor" if "ground" in pair.split(" and ")[1:] else term,
@@ -290,6 +297,7 @@ def _term_causes(t: Transcription, x: Array, term: Term, select: Selector) -> It
         where = f"; {name.partition(', ')[2]}"
     for field in fields(term):
         old = getattr(term, field.name)
+        # Only numbers are searched for a value; an infinite one bounds nothing.
         if isinstance(old, bool) or not isinstance(old, float) or not np.isfinite(old):
             continue
 
@@ -344,6 +352,7 @@ def _violation(t: Transcription, x: Array, select: Selector, *, torques: bool = 
     """Largest violation of the selected inequalities, and of the bounds of ``torques``, at variables (n,)."""
     found = _inequalities(t, select)
     most = constraint_violations(t.program, t.program.constraints(x))[found].max(initial=0.0)
+    # The torque limit bounds variables, not constraints.
     if torques:
         j = _torques(t)
         beyond = np.maximum(t.program.x_lower[j] - x[j], x[j] - t.program.x_upper[j])
@@ -353,6 +362,7 @@ def _violation(t: Transcription, x: Array, select: Selector, *, torques: bool = 
 
 def _inequalities(t: Transcription, select: Selector) -> Index:
     """Indices of the selected constraints that are inequalities."""
+    # Equalities have no side to relax.
     found = np.array([i for i, origin in enumerate(t.program.origins) if select(origin)], dtype=np.intp)
     return found[t.program.g_lower[found] < t.program.g_upper[found]]
 

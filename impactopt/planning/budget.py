@@ -58,6 +58,7 @@ def stopping() -> Iterator[Stop]:
     main = threading.current_thread() is threading.main_thread()
     numbers = [signal.SIGINT, signal.SIGTERM] if main else []
     for number in numbers:
+        # A handler that is a bound method of a Stop is that of an outer context.
         outer = getattr(signal.getsignal(number), "__self__", None)
         if isinstance(outer, Stop):
             yield outer
@@ -107,6 +108,7 @@ class Budget:
             known = [f.name for f in fields(kind)]
             for name in self.options:
                 check_choice(f"the solver {self.solver!r} has no option", name, known)
+            # Only for its checks.
             kind(**self.options)
 
     def started(self) -> Budget:
@@ -162,6 +164,8 @@ class Budget:
         most : largest number of iterations of our solvers, unless the options set it.
         watch, state : as of `solve_ipm`.
         """
+        # After a stop the callback ends the solve at its first iterate; a limit of no
+        # time would be a TIME_LIMIT.
         left, y, z = None if self.stop.asked else self.left, None, None
         if isinstance(start, SolverResult):
             x0, y, z = start.x, start.multipliers, start.bound_multipliers
@@ -175,6 +179,7 @@ class Budget:
         if most is not None:
             settings.setdefault("max_iterations", most)
         if left is not None:
+            # The options refuse 0.
             settings["time_limit"] = max(left, 1e-9)
         common: dict[str, Any] = {"callback": self._on_iteration, "multipliers": y, "bound_multipliers": z}
         if not self.interior:
@@ -186,6 +191,7 @@ class Budget:
 
 def rank_of(result: SolverResult) -> tuple[bool, float]:
     """Sorting key, best first: feasible results by their objective, then the others by their violation."""
+    # Stopped solves count as feasible too, if they are.
     met = result.status.usable or result.max_violation <= VIOLATED
     return not met, result.objective if met else result.max_violation
 
@@ -214,5 +220,6 @@ def touching(result: SolverResult, depth: float, names: Iterable[str], what: str
     pairs = "; ".join(sorted(set(names))[:3])
     found = f"no {what} was found in which they do not"
     message = f"Bodies penetrate each other by {1e3 * depth:.1f} mm, and {found}: {pairs}."
+    # Above VIOLATED however shallow, as `Outcome.refused` compares with it.
     worst = max(result.max_violation, depth, 2 * VIOLATED)
     return replace(result, status=Status.FAILED, max_violation=worst, message=message)

@@ -92,6 +92,7 @@ class _CauseSearch:
 
     def __init__(self, t: Transcription, result: SolverResult, budget: Budget) -> None:
         self.given, self._budget = t.problem, budget
+        # In iterations, not seconds, so that the result does not depend on the machine.
         self._iterations = max(_MIN_ITERATIONS, result.iterations)
         # With the constraints of all lazy terms, or a changed bound would be confirmed by a motion that
         # violates those.
@@ -99,9 +100,11 @@ class _CauseSearch:
         p = with_lazy_constraints(t.problem, names)
         self.t = program_for(t, p)
         zero_multipliers = np.zeros(t.program.m), np.zeros(t.layout.n)
+        # Multipliers of an infeasible program are no guess of any solution's.
         own = warm_start(self.t, t, result.x, *zero_multipliers)[0]
         shortest, longest = p.contact_duration
         phases, fixed = motion_phases(p), (TYPICAL_DURATION, TYPICAL_DURATION)
+        # Wider than the problem allows, as a duration far from its bound may be the only cure.
         loose = changed(
             p,
             **phase_changes(p, {name: _loosened(phase) for name, phase in phases.items()}),
@@ -119,6 +122,7 @@ class _CauseSearch:
         if relaxed is None:
             return Search(causes=tuple(self._stiffness()))
         x, sizes = relaxed
+        # Nothing had to be relaxed: the failed solve was no proof.
         if sizes.max(initial=0.0) <= _NOT_RELAXED and self._is_feasible(x):
             return Search(met=(self.t, x))
         # those that were relaxed most first, then all durations
@@ -127,11 +131,13 @@ class _CauseSearch:
         candidates += [bound for bound in self.bounds if bound.is_time and bound not in candidates]
         causes: list[Cause] = []
         for bound in candidates[:_MAX_SINGLE]:
+            # From the point where all bounds are relaxed: it already meets what is not relaxed.
             alone = self._relaxed([bound], x, _ITERATIONS_SINGLE)
             if alone is not None:
                 causes += filter(None, map(self._confirmed, bound.causes(alone[0])))
         if not any(cause.problem for cause in causes):
             causes += self._stiffness()
+        # Stable: those that would do come first, in the order found.
         causes.sort(key=lambda cause: cause.problem is None)
         return Search(causes=tuple(causes))
 
@@ -158,6 +164,7 @@ class _CauseSearch:
             if one.problem is None:
                 break
             t = program_for(self.t, one.problem)
+            # A confirmation does not take from the search.
             self._iterations += _ITERATIONS_CHANGED
             if self._run(t.program, first_iterate(t), _ITERATIONS_CHANGED) is not None:
                 return replace(one, nearer=None)
@@ -171,6 +178,7 @@ class _CauseSearch:
         known = p.law.parameters.get("stiffness")
         self._iterations = _ITERATIONS_STIFFNESS * len(_STIFFNESS_FACTORS)
         for factor in () if known is None else _STIFFNESS_FACTORS:
+            # Two digits are what the message gives, so it is what is tried.
             value = float(f"{known * factor:.2g}")
             law: ContactLaw = replace(p.law, stiffness=value)  # type: ignore[type-var]
             new = changed_or_none(p, law=law)
@@ -219,6 +227,7 @@ class _CauseSearch:
         finally:
             program.x_lower, program.x_upper = wide
         durations = np.array([j for bound in bounds if bound.is_time for j in bound.variables], dtype=np.intp)
+        # Relaxed bounds of variables become constraints (`RelaxedProgram`); the loose ones stay bounds.
         relaxed.x_lower[durations] = np.maximum(relaxed.x_lower[durations], wide[0][durations])
         relaxed.x_upper[durations] = np.minimum(relaxed.x_upper[durations], wide[1][durations])
         result = self._run(relaxed, relaxed.start(guess, _BARRIER), most, barrier=_BARRIER, push=_PUSH)
@@ -229,6 +238,7 @@ class _CauseSearch:
 
 def _loosened(phase: Phase) -> Phase:
     shortest, longest = phase.duration
+    # A typical duration has to be inside, as one guess has it.
     shortest = min(shortest / _DURATION_FACTOR, TYPICAL_DURATION)
     longest = max(longest * _DURATION_FACTOR, TYPICAL_DURATION)
     return replace(phase, duration=(max(shortest, SHORTEST), min(longest, LONGEST)))

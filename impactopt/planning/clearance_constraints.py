@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.clearance import DEEPEST, MISSED, Bodies, Places
+from impactopt.bodies.clearance import DEEPEST, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
-from impactopt.bodies.separation import ROUNDING, THIN, Looked, Placed
+from impactopt.bodies.separation import ROUNDING, Looked, Placed
 from impactopt.planning.budget import Budget, one_after_the_other
 from impactopt.planning.refinement import Guess, Outcome, Program
 from impactopt.problem.problem import ImpactProblem
@@ -94,18 +94,23 @@ class Margins:
         )
         self._required: dict[Pair, float] = {}
         shapes = self.bodies.shapes
+        # The second entry is a joint, or -1 - index of a body of the world.
         own = shapes.pairs[:, 1] >= 0  # both bodies are links
         self.wanted = np.where(own, self.own.enabled, self.world.enabled)
         margin = np.where(own, self.own.margin, self.world.margin)
+        # A rounded distance is less than the exact one; half of a margin is kept where the margin is small.
         self.pieces = np.maximum(margin - EDGE_ROUNDING, margin / 2)
         # the margin of a pair that is farther apart than this at the start is not reduced
         reduced_within = self.most / START_FRACTION
+        # No separating direction is known yet: zeros.
         no_directions = np.zeros((1, len(shapes), 3))
         near = shapes.look(self.bodies.placed(self._start), reduced_within, no_directions, self.wanted)
         exact = np.array([self.bodies.exact_piece(self._start, 0, n) for n in near.pair.tolist()])
         # Constraints are on rounded distances, which are less than the exact ones by up to ROUNDING. Required
         # clearances are reduced by the same amount, or a posture that is allowed would violate them.
         at_start = START_FRACTION * exact - np.minimum(exact - near.gap, EDGE_ROUNDING)
+        # At most half of the rounded gap, so that the start is inside its own constraint; a pair in
+        # penetration may stay as deep, and a little deeper.
         at_start = np.where(
             near.gap > 0, np.clip(at_start, 0.0, near.gap / 2), near.gap - START_PENETRATION_SLACK
         )
@@ -204,6 +209,7 @@ class Watch:
             out[ClearanceKey(self._names[k], joint, other, number)] = SeparatingDirection(
                 tuple(direction), distance, float(self._travel[k])
             )
+        # Each (instant, pair) occurs once in `near`, so that fancy assignment is safe.
         self._has[near.spot, near.pair] |= new
         self.left = False
         return out
@@ -214,6 +220,7 @@ class Watch:
     def lacks(self, x: Array) -> bool:
         self._go_to(x)
         self.left, self.state = False, None
+        # Beyond that the solve goes on without further constraints: what penetrates is found in its solution.
         if self._interruptions < _MAX_INTERRUPTIONS and self._bare(self._found[1], self._trigger).any():
             self._interruptions += 1
             self.left = True
@@ -221,6 +228,7 @@ class Watch:
 
     def limit(self, x: Array, step: Array, most: float) -> float:
         self._go_to(x)
+        # Distances are checked at the step's end and half way, not along the step.
         here, length = self._found, most
         for _ in range(_MAX_HALVINGS):
             trial = x + length * step
@@ -230,6 +238,8 @@ class Watch:
             if clear and not self._passes(x, step, length, here, found):
                 self._next = trial, directions, found
                 break
+            # After the last halving the step is taken as it is, 2^-8 of the first: no step
+            # at all would end the solve.
             length *= 0.5
         return length
 
@@ -238,6 +248,7 @@ class Watch:
         """Update placements, gaps and separating directions to an iterate (n,)."""
         if self._x is not None and np.array_equal(self._x, x):
             return
+        # The solver mostly moves to the trial that `limit` accepted last: its placements are known.
         if self._next is not None and np.array_equal(self._next[0], x):
             _, self._directions, self._found = self._next
         else:
@@ -264,6 +275,7 @@ class Watch:
 
     def _violates_clearance(self, before: Looked, found: Looked) -> bool:
         """True if a step has brought bodies without a constraint too close to each other."""
+        # Gaps of far pairs are lower bounds above TRIGGER, half of which is above MIN_GAP: no fall is missed.
         fell = found.gap < GAP_FRACTION * before.gaps[found.spot, found.pair]
         return bool((fell & self._bare(found, MIN_GAP)).any())
 
@@ -374,17 +386,20 @@ def clearance_violations(
     """
     plan, bodies, nodes = t.decode(x), margins.bodies, node_placements(t, x)
     worst, depth = dict[tuple[tuple[int, ...], Pair], _Approach](), -np.inf
+    # The motion after a missed target exists only with an abort motion.
     for missed in (False, True) if plan.abort is not None else (False,):
         motion = plan.motion(SAMPLE_STEP, missed=missed)
         at = Places.of(t.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
         for k, pair, distance in _near(margins, at, share):
             depth = max(depth, -distance)
             approach = _Approach(distance, float(motion.time[k]), missed)
+            # One node for all instants of an interval: the deepest of a pair counts.
             key = tuple(_adjacent_nodes(nodes, approach.time, missed)), pair
             worst[key] = min(worst.get(key, approach), approach)
     if not worst:
         return None
     raised, added = _RaisedClearances(t, nodes, margins), _AddedNodes(t, plan)
+    # The deepest first: its node may serve the others of the interval.
     for (adjacent, pair), approach in sorted(worst.items(), key=lambda item: item[1].distance):
         allowed = (1 - LOST_AT_NODES) * margins.of(pair) + DEEPEST
         at_nodes = [k for k in adjacent if bodies.exact(nodes.at, k, pair) < allowed]
@@ -410,7 +425,8 @@ def _near(margins: Margins, at: Places, share: float) -> list[tuple[int, Pair, f
     """Instants and pairs that lose more than a share of their margin, with their exact distances [m]."""
     bodies, shapes, out = margins.bodies, margins.bodies.shapes, list[tuple[int, Pair, float]]()
     directions = np.zeros((len(at), len(shapes), 3))
-    found = shapes.look(bodies.placed(at), margins.most + THIN, directions, margins.wanted)
+    # Smooth distances may exceed the exact ones by the thinning; what is near by them is checked exactly.
+    found = shapes.look(bodies.placed(at), margins.most + SLACK, directions, margins.wanted)
     candidates = {
         (k, tuple(pair))
         for k, pair in zip(found.spot.tolist(), shapes.pairs[found.pair].tolist(), strict=True)
@@ -492,6 +508,7 @@ def _adjacent_nodes(nodes: NodePlacements, time: float, missed: bool) -> list[in
     target.
     """
     of_motion = nodes.at.phase != (AFTER_CONTACT if missed else MISSED)
+    # The two motions after contact overlap in time: the nodes of one of them are searched.
     order = np.flatnonzero(of_motion)[np.argsort(nodes.time[of_motion], kind="stable")]
     k = int(np.searchsorted(nodes.time[order], time))
     return [int(order[j]) for j in sorted({max(k - 1, 0), min(k, len(order) - 1)})]

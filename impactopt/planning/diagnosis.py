@@ -39,6 +39,7 @@ def ipopt_retry(budget: Budget, program: NonlinearProgram, start: Array, old: So
     if old.status is Status.FAILED and violation <= VIOLATED < old.max_violation:
         return old  # its constraints are met: it was refused for a penetration or its replay
     budget.say("our solver ends without a diagnosis: IPOPT tries once, from the same initial guess")
+    # Options are those of our solver.
     new = replace(budget, solver="ipopt", options=None).run(program, start)
     if new.status is Status.INTERRUPTED or _rank(new) < _rank(old):
         return new
@@ -47,6 +48,7 @@ def ipopt_retry(budget: Budget, program: NonlinearProgram, start: Array, old: So
 
 def _rank(result: SolverResult) -> tuple[bool, bool, float]:
     """Sorting key: solutions first, then diagnosed results, then by the violation."""
+    # A program that is known to be infeasible is worth more than one that failed with less violation.
     return not result.status.usable, result.status is not Status.INFEASIBLE, result.max_violation
 
 
@@ -69,6 +71,7 @@ def with_reason(
         return result
     would_do = [cause for cause in causes if cause.problem is not None]
     weak = too_weak(t.problem)
+    # By falling certainty: what cannot be, a bound whose change was tried, an estimate by point masses.
     if known:
         why = f"Infeasible: {'; '.join(known)}."
     elif would_do:
@@ -110,6 +113,7 @@ def _too_stiff(t: ContactProgram) -> str:
     joints allow; "" if it may.
     """
     p = t.problem
+    # With several touches planned, parting before the event is what is planned.
     if not isinstance(t.expected, Collision) or not p.target.guards or p.planned_touches > 1:
         return ""
     limit = fastest_at_contact(p)

@@ -105,9 +105,11 @@ def with_factors_of(t: ContactProgram, robot: Robot, start: SolverResult) -> Sol
     """
     own, logs = t.problem.robot, []
     for joints, gain in zip(t.problem.gain_joints, t.problem.gains, strict=True):
+        # The joints of one factor may have other ratios in the solution's robot: the median stands for them.
         ratios = np.array([robot.kp[k] / own.kp[k] for k in joints if own.kp[k] > 0])
         factor = float(np.median(ratios)) if ratios.size and np.all(ratios > 0) else 1.0
         logs.append(np.log(np.clip(factor, *gain.factor)))
+    # The room for stiffer gains changes the torque limits, by which torques are scaled.
     start = _with_rescaled_torques(t, robot, start)
     t.hit.contact.gains.write(start.x, logs)
     return start
@@ -126,6 +128,7 @@ def chosen_gains(t: ContactProgram, x: Array) -> tuple[ChosenGains, ...]:
     """Gains that solver variables (n,) choose for the problem's open ones."""
     if not t.problem.gains:
         return ()
+    # Variables are logarithms of factors: halving and doubling are alike, and a factor stays positive.
     factors = np.exp(t.hit.contact.gains.read(x)[0])
     names, robot = t.robot.joint_names, with_chosen(t.problem, factors).robot
     return tuple(
@@ -154,7 +157,9 @@ def with_gains_fixed(
     factors = "; ".join(f"{', '.join(c.joints)} x {c.factor:.3g}" for c in chosen)
     budget.say(f"gains are chosen: {factors}; solving again with these fixed")
     new = program_for(t, with_chosen(t.problem, [c.factor for c in chosen]))
+    # The robot with chosen gains may have other torque limits than the one with room for the stiffest.
     result = _with_rescaled_torques(new, t.robot, carried(new, t, old))
+    # Without a solution, or time, the last iterate stays, on the robot with its gains.
     if old.status.usable and budget.left != 0:
         polished = budget.near_by().run(new.program, result, _BARRIER)
         if polished.status.usable:

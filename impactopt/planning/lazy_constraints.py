@@ -60,6 +60,7 @@ def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: floa
     most = problem.gear_load.most(problem.robot)
     worst, message = 1.0 + more, ""
     for loads in found:
+        # nan: a joint without a drive (`DriveLoads`).
         ratio = np.nan_to_num(loads.gear / most)
         k = int(ratio.argmax())
         if ratio[k] > worst:
@@ -80,10 +81,12 @@ def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> 
 
 def slide(problem: ImpactProblem, plan: Plan) -> float:
     """Largest distance [m] of the striking point, across the normal, from where contact begins."""
+    # An impact without duration: nothing slides.
     if len(plan.collision.time) < 2 or plan.collision.time[-1] <= 0:
         return 0.0
     postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, CONTACT_SAMPLES)))
     points = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
+    # From where contact begins, unlike `slides_beyond`, which is about the hit point.
     tangential = (points - points[0]) @ across(problem.normal).T
     return float(np.linalg.norm(tangential, axis=1).max())
 
@@ -93,6 +96,7 @@ def slides_beyond(term: Slide, plan: Plan) -> str:
     limit along each tangent, but for a tolerance.
     """
     problem = plan.problem
+    # The constraint bounds the offset along each tangent, so it is a square, not a circle.
     after = plan.closed(plan.through_contact(np.ones(1)))[0]
     offset = striking_point(problem.robot, problem.striker, after) - problem.point
     far = float(np.abs(across(problem.normal) @ offset).max())
@@ -143,6 +147,8 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
         for phase, group in zip(t.problem.contact_phases, hit.T, strict=True):
             j = group.offset
             if result.x[j] * group.scale[0] >= (1 - _AT_BOUND) * longest:
+                # A gain of the minimized objective per unit of the bound, times the bound:
+                # scales of variables cancel.
                 price += max(float(result.bound_multipliers[j]), 0.0) * float(result.x[j])
                 named.append(phase.name)
     if not named or objective <= 0 or price < _COSTLY * objective:
@@ -174,6 +180,7 @@ def with_lazy_constraints(problem: ImpactProblem, names: Iterable[str]) -> Impac
     """Problem with the constraints of these lazy terms from the start; itself if it has them, or has switched
     them off.
     """
+    # `extra` also finds a term that is switched off, which stays so.
     kinds = [_KINDS[name] for name in names if name in _KINDS and problem.extra(_KINDS[name]) is None]
     if not kinds:
         return problem
@@ -205,6 +212,7 @@ class LazyTerms(Generic[Program]):
             return Guess.mapped(new, t, outcome.result, barrier=_BARRIER)
 
         def cold() -> Guess[Program]:
+            # From the first guess: clearance constraints of the old motion would not suit the new one.
             new = program_for(origin.program, bounded, constraints={}, report=self._report)
             return Guess(program=new, start=start_of(new, origin.program, origin.x))
 
@@ -241,6 +249,7 @@ class LazyTerms(Generic[Program]):
     def _gears(self, outcome: Outcome[Program]) -> list[DriveLoads]:
         """Gear loads of a solution."""
         error = outcome.at.contact_error if self._finer else None
+        # A contact that misses an event on the finer mesh is another contact.
         finer = () if error is None or error.missed else error.finer
         return _loads(outcome.program.robot, outcome.at.planned, finer)
 
@@ -251,6 +260,7 @@ def _loads(
     """Gear and motor loads of all motions and all collisions."""
     collisions = finer or [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
     if isinstance(planned, PlannedStrike):
+        # Gear loads do not depend on the jump of velocities.
         zero = np.zeros(robot.nv)
         return [strike_loads(robot, zero, zero, collision) for collision in collisions]
     with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it

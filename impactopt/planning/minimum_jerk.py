@@ -84,6 +84,8 @@ def minimum_jerk_baseline(
         raise InputError("a minimum-jerk reach keeps one stance: there is none for stance phases")
     # Queue of (-speed, is_bound, duration), the fastest first. A speed is that of a reach that keeps the
     # limits without contact; or, with is_bound = 1, an upper bound of it.
+    # A best-first search: a duration is bisected only while its upper bound is the
+    # largest value in the queue.
     reaches = [(-fastest, 1, duration) for duration in SWING_DURATIONS]
     heapq.heapify(reaches)
     while reaches:
@@ -96,6 +98,8 @@ def minimum_jerk_baseline(
             if _keeps_limits(problem, duration, slow):
                 heapq.heappush(reaches, (-_fastest(problem, duration, slow, speed, tolerance), 0, duration))
             elif best:
+                # It permits less than the fastest known one, whose speed bounds it now: it returns if that
+                # one fails.
                 heapq.heappush(reaches, (-slow, 1, duration))
         elif (found := _replayed(problem, duration, speed)) is not None:
             return found
@@ -109,6 +113,7 @@ def _fastest(problem: ImpactProblem, duration: float, slow: float, fast: float, 
     and an upper bound.
     """
     while fast > (1 + tolerance) * slow:
+        # The geometric mean, as the tolerance is relative and MIN_SPEED is far below usual speeds.
         middle = float(np.sqrt(fast * slow))
         slow, fast = (middle, fast) if _keeps_limits(problem, duration, middle) else (slow, middle)
     return slow
@@ -123,6 +128,7 @@ def _replayed(problem: ImpactProblem, duration: float, speed: float) -> Baseline
     )
     del summary["impulse_error_pct"]  # nothing was planned
     margins, ratios = summary.get("zmp_margin_m", {"": 0.0}), summary["torque_ratio"]
+    # ZMP outside the support polygon, or more torque demanded than the servo has.
     if min(margins.values()) < 0 or max(ratios.values()) > 1.0:
         return None
     return Baseline(
@@ -165,6 +171,7 @@ def _keeps_limits(problem: ImpactProblem, swing_duration: float, speed: float, n
     lower, upper = inside(r, problem.term(PositionLimit).margin)
     legs0 = c.start_legs
     for duration, ends in _phases(problem, swing_duration, speed):
+        # Without the first instant: the start posture at rest.
         y, yd, ydd = _profile(duration, ends, np.linspace(0, duration, nodes)[1:])
         wrench = np.tile(static_wrenches(c, ends[0], legs0), (len(y), 1))
         try:
@@ -187,6 +194,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     """
     c, r = problem.coordinates, problem.robot
     tau = r.inverse_dynamics(c.data, q, v, a)
+    # Nothing drives a sole's hinge.
     limit = problem.term(TorqueLimit).fraction * np.where(r.hinges, 0.0, r.torque_limit)
     if not c.legs:
         return bool(np.all(np.abs(tau) <= limit))
@@ -199,6 +207,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
             grip = problem.extra(Grip)
             assert grip is not None  # the problem has it
             block = np.zeros((12, n))
+            # A hand's wrench in a box, by Grip's force and moment.
             block[:6, 6 * k : 6 * k + 6], block[6:, 6 * k : 6 * k + 6] = np.eye(6), -np.eye(6)
             rows.append(block)
             bounds.append(np.tile(np.repeat([grip.force, grip.moment], 3), 2))
@@ -213,6 +222,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     rows += [-legs, legs]
     bounds += [limit - tau[c.base :], limit + tau[c.base :]]
     found = linprog(
+        # No objective: only feasibility counts.
         np.zeros(n),
         A_ub=np.vstack(rows),
         b_ub=np.concatenate(bounds),

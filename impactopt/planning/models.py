@@ -53,6 +53,7 @@ def carried_start(
     old : makes the solution's program.  constraints : clearance constraints of the new one.
     """
     before, now = ((p.collision, p.freezes, lazy_terms_of(p), p.gains) for p in (start.problem, t.problem))
+    # Same variables and constraints: the result fits as it is.
     if before == now:
         return start.result
     new = t.with_clearance(constraints)
@@ -70,6 +71,7 @@ def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactPr
     if met_once(problem) or problem.touches == 1 or (problem.scenarios and problem.touches is None):
         return problem
     mass, most = mass_at_contact(problem), fastest_at_contact(problem)
+    # Without limits of velocity point masses say nothing.
     if not np.isfinite(most):
         return problem
     event = problem.target.guards[-1]
@@ -118,6 +120,7 @@ def climbed(
     models = _MODELS[1:] if _skips_first(problem, budget.say) else _MODELS
     done: AnySolution | None = None
     for model in models:
+        # One time limit for both models; 0 would be refused.
         left = None if limit is None else max(limit - (time.perf_counter() - began), 1e-3)
         new = run(replace(problem, collision=model), done, replace(budget, time_limit=left))
         done = new if done is None else _both(done, new)
@@ -157,6 +160,7 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
         rates = strike_rates(c, problem.strikers, y, legs, speed * problem.normal)
         q, v, _ = c.complete_motion(y, rates, np.zeros(c.ny), legs)
         torque = holding_torque(problem.robot, q, v, stance=problem.stance)
+    # No posture to test in: the model is tried in a program.
     except InputError:
         return False
     error = collision_error(first, q, v, torque, 0.05)

@@ -30,6 +30,7 @@ def with_first_scale(t: Transcription) -> Transcription:
     that is far less than `_REFERENCE_OBJECTIVE`, unscaled prices would outweigh the objective.
     """
     p = t.problem
+    # A scale that a user or a solution has given stays.
     if p.price_scale != 1.0 or p.style_prices == MotionPrices():
         return t
     objective = t.objective_sum(first_iterate(t))
@@ -59,6 +60,8 @@ class MotionPrice:
         share, style = t.price_shares(outcome.result.x)  # of all prices, and of the style's
         if share <= allowed * (1 + _TOLERANCE):
             return None
+        # What the other prices leave of the aim; the style's share is proportional to
+        # the scale, to first order.
         left = max(_AIM * allowed - (share - style), 0.0) if np.isfinite(share) else 0.0
         scale = t.problem.price_scale * left / style if style > 0 else 0.0
 

@@ -50,6 +50,7 @@ def check_starts(starts: int, seed: int, workers: int, callback: object, *, give
         several processes.
     """
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
+        # True is an int, too.
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise InputError(f"{name} is {value!r}; give a whole number >= {least}")
     if given and starts > 1:
@@ -76,6 +77,7 @@ def drawn_guesses(
     name: str, make: Callable[[dict[str, Any]], Guess[Program]], which: range, seed: int
 ) -> Guesses[Program]:
     """Named initial guesses of drawn reaches, each made when it is needed."""
+    # All draws up to the last, so that a worker's start is the one that a single process would draw.
     draws = drawn(which.stop, seed)
     return ((f"{name} {k + 1}", partial(make, draws[k])) for k in which)
 
@@ -132,6 +134,7 @@ def best_of(
         found.append((name, new))
         if new.result.status is Status.INTERRUPTED or budget.left == 0:
             break
+    # Of equals the first one is kept.
     best = min((outcome for _, outcome in found), key=lambda outcome: rank_of(outcome.result))
     attempts = [replace(outcome.attempt(name), kept=outcome is best) for name, outcome in found]
     result = best.result
@@ -171,10 +174,12 @@ def _best_on_workers(
     found = dict[int, AnySolution]()
     jobs = each_on_workers(
         _one,
+        # Functions of the caller may not be picklable.
         (run, replace(budget, report=None), ends),
         enumerate(range(starts)),
         workers=min(workers, starts),
     )
+    # Closing ends the workers, also after Ctrl-C.
     with contextlib.closing(jobs):  # type: ignore[type-var]
         try:
             for k, solution in jobs:
@@ -193,12 +198,14 @@ def _best_on_workers(
     if not found:
         raise InputError("no start has ended: give more time, or workers=1 to see why")
     best = min(found.values(), key=lambda solution: rank_of(solution.result))
+    # In the order of the starts, not in that in which workers ended.
     attempts = [
         replace(attempt, kept=attempt.kept and found[k] is best)
         for k in sorted(found)
         for attempt in found[k].attempts
     ]
     seconds = time.perf_counter() - began
+    # Wall time of all starts; the best one's build is counted by itself.
     return replace(best, attempts=tuple(attempts), solve_seconds=seconds - best.build_seconds)
 
 

@@ -97,6 +97,7 @@ def drive_nail(
             return Series(blows=tuple(blows), reason=f"the nail is not in yet at {1e3 * at:.1f} mm")
         here = dataclasses.replace(
             problem,
+            # The head has moved with the nail, along the blow.
             point=problem.point + (at - nail.depth) * problem.normal,
             target=dataclasses.replace(nail, depth=at),
         )
@@ -115,6 +116,7 @@ def drive_nail(
                 f"blow {len(blows)}: {1e3 * driven:.1f} mm with {solution.impulse:.2f} N s; "
                 f"{1e3 * at:.1f} mm in all"
             )
+        # Wood that hardens with depth may stop the nail before.
         if driven < MIN_ADVANCE and at < depth:
             return Series(blows=tuple(blows), reason=f"the nail moves no more at {1e3 * at:.1f} mm")
     return Series(blows=tuple(blows), reason="")

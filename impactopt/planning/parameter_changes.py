@@ -29,6 +29,7 @@ def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
 
     The posture at contact is searched from the old one.
     """
+    # `dataclasses.replace` would lose the cached properties, bodies and coordinates among them.
     new = object.__new__(type(problem))
     new.__dict__.update({f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)} | fields)
     # set before the checks (`__post_init__`), which use the cached properties
@@ -36,6 +37,8 @@ def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
     cached = (*_CACHED, *_CACHED_BODIES) if same_bodies else _CACHED
     new.__dict__.update({name: problem.__dict__[name] for name in cached if name in problem.__dict__})
     if "contact_posture" in problem.__dict__:
+        # From the old posture the search ends in the nearest one, so a small change of
+        # the point changes it little.
         near, point = problem.contact_posture, fields.get("point", problem.point)
         with contextlib.suppress(InputError):  # then the checks search from the start posture
             new.__dict__["contact_posture"] = (
@@ -95,6 +98,7 @@ def _with(thing: Any, name: str, value: float) -> Any:
 
 
 def with_term(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
+    # A problem has one term of a kind.
     others = [other for other in problem.terms if type(other) is not type(term)]
     return (*others, term)
 
@@ -144,6 +148,7 @@ def parameter_of(problem: ImpactProblem, name: str) -> Parameter:
     for section, field in (("target", "target"), ("contact", "law")):
         numbers = getattr(problem, field).parameters
         known |= {f"{section}.{key}": (field, key, float(value)) for key, value in numbers.items()}
+    # Terms that hold by default have parameters, too.
     others = [term for term in DEFAULT_TERMS if not any(isinstance(t, type(term)) for t in problem.terms)]
     for term in (*problem.terms, *others):
         section = snake_case(type(term).__name__)

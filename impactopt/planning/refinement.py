@@ -84,6 +84,8 @@ class Guess(Generic[Program]):
     @property
     def warm(self) -> SolverResult | None:
         """Result for a warm start; None if its multipliers are those of other constraints."""
+        # Only their number is compared: programs with as many constraints have the same
+        # ones, or `carried` maps them.
         fits = isinstance(self.start, SolverResult) and len(self.start.multipliers) == self.program.program.m
         return self.start if fits and isinstance(self.start, SolverResult) else None
 
@@ -159,6 +161,8 @@ class Outcome(Generic[Program]):
     @property
     def refused(self) -> bool:
         """True if the constraints are met, and the solution is refused for penetration or its replay."""
+        # `touching` and the replay's `checked` write the depth or the error into max_violation, and the
+        # program's own violation stays.
         failed = self.result.status is Status.FAILED and self.result.max_violation > VIOLATED
         return failed and self.own_violation <= VIOLATED
 
@@ -179,6 +183,7 @@ class Outcome(Generic[Program]):
             max_violation=r.max_violation,
             iterations=r.iterations,
             seconds=r.seconds,
+            # The latest is kept until another one is (`then`, `best_of`).
             kept=True,
         )
 
@@ -192,6 +197,7 @@ class Outcome(Generic[Program]):
         """New outcome after a failure; this one if the new one has failed with a larger violation. Either has
         the effort of both.
         """
+        # An interruption ends the work: its result is the latest, whatever its rank.
         both, ended = self.then(new), new.usable or new.result.status is Status.INTERRUPTED
         if ended or not rank_of(self.result) < rank_of(new.result):
             return both
@@ -248,6 +254,7 @@ def refine(
         return outcome
     before: Sequence[Oracle[Program]] = oracles[:-1]
     oracle = oracles[-1]
+    # Recursion from the last oracle to the first: the first one is the innermost loop, and runs most often.
     outcome = refine(outcome, before, solve, budget)
 
     # an addition changes the motion, so the oracles before have to accept it again before this one is called
@@ -303,6 +310,7 @@ def program_for(
     """Program like ``t`` for another problem, on another mesh, or with other clearance constraints."""
     constraints = t.clearance_constraints if constraints is None else constraints
     problem = problem or t.problem
+    # Given elements forbid a force that pulls (`ContactSet.guarded`): a program's default ones are not given.
     elements = elements or (t.hit.elements if t.hit.guarded else ())
     shares = t.hit.shares if shares is None else shares
     functions = block_functions(problem, problem.coordinates, report, elements)
@@ -324,4 +332,5 @@ def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> S
 
 def start_of(new: Program, old: Program, x: Array) -> Array:
     """Variables (n,) of a program mapped to another one."""
+    # Without multipliers: for a guess from which no solve has ended.
     return warm_start(new, old, x, np.zeros(old.program.m), np.zeros(old.layout.n))[0]

@@ -73,6 +73,7 @@ class ParametricProgram:
         ------
         InputError : the other problem's program has other variables or constraints.
         """
+        # Moving sets numbers only; a new program takes the building of all its blocks.
         if self._movable is not None and _alike(problem, self.solution.problem):
             self._movable.move_to(problem, anew=anew)
             return self._movable
@@ -90,6 +91,7 @@ class ParametricProgram:
         except InputError:
             return None
         t.move_to(problem)
+        # A part that does not follow would keep the other problem's numbers.
         return t if t.program.same_parameters(self.program.program) else None
 
     def _built(self, problem: ImpactProblem, report: Callable[[str], None] | None = None) -> Transcription:
@@ -142,6 +144,7 @@ def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
 def _slightly_changed(problem: ImpactProblem) -> ImpactProblem:
     """A problem with a slightly different point, law and target."""
     law, target = (
+        # A parameter of 0 stays 0: whether the program follows it is not tested.
         type(part)(**{name: _TRIAL_FACTOR * value for name, value in part.parameters.items()})
         for part in (problem.law, problem.target)
     )
@@ -269,6 +272,7 @@ def _binding(family: ParametricProgram) -> tuple[Binding, ...]:
     program, out = t.program, list[Binding]()
     inequality = program.g_lower < program.g_upper
     for i in np.flatnonzero(system.constraints * inequality):
+        # A multiplier's sign is the side of its bound; relaxing outward never costs.
         price, origin = abs(float(system.y[i])), t.constraints.origins[int(i)]
         measure = origin.measure
         # the program's constraints are scaled: ``factor`` leads back to the unit of the bound

@@ -173,6 +173,7 @@ class Solution(Solved):
         total = sum(
             (-o.weight if o.cost else o.weight) * self.objectives[o.name] for o in self.problem.objectives
         )
+        # The program minimizes prices minus objectives, so this sum is the prices.
         return 100 * (self.result.objective + total) / abs(total) if total else np.nan
 
     @property
@@ -388,6 +389,7 @@ def solution_of(
         contact_error=contact_error,
         plan=at.planned,
         nodes=t.nodes,
+        # (): the default elements, which a program of this problem has again.
         elements=t.hit.elements if t.hit.guarded else (),
         shares=t.hit.shares,
         apart=t.clearance_constraints,

@@ -152,6 +152,7 @@ def _planned(
     """
     began = time.perf_counter()
     t, given = _program(problem, start, budget)
+    # From here on the time limit counts: a first run compiles for longer than it solves.
     budget = budget.started()
     if isinstance(given, SolverResult) and Outcome.of(t, given).own_violation <= VIOLATED:
         budget = budget.near_by()  # a feasible warm start may be the optimum
@@ -162,17 +163,21 @@ def _planned(
     solver = PlanSolver(budget=budget, margins=margins, refined=refined and margins is not None)
     if isinstance(start, Solution) and margins is not None and same_bodies(t.problem, start.problem):
         t = t.with_clearance(start.apart)
+    # A start's draw depends on seed and number only, so further ones continue the sequence.
     built, guesses = time.perf_counter(), _guesses(t, given, range(which.start, last), seed, solver)
     outcome = best_of(guesses, solver.from_guess, budget, len(which))
     if refined and margins is None:
         outcome = solver.on(outcome)
+    # Reasons that need no search come first.
     known = hopeless(t.problem) if ended_with_violations(outcome.program, outcome.result) else []
     causes: tuple[Cause, ...] = ()
     if not known:
         outcome, causes = _diagnosed(outcome, solver)
     gains = chosen_gains(outcome.program, outcome.result.x)
+    # Before the replay, which needs a robot with gains of its own.
     outcome = with_gains_fixed(outcome, gains, budget)
     t, solved = outcome.program, time.perf_counter()
+    # The replay is last, and of usable outcomes only.
     outcome = replace(outcome, result=with_reason(t, outcome.result, causes, known=known)).checked()
     usable = outcome.usable
     solution = solution_of(
@@ -195,6 +200,7 @@ def _program(
     if not isinstance(start, Solution):
         problem = with_touches(problem, budget.say)
         t = program_on(with_room_for_gains(problem), NO_MORE, (), (), budget.report)
+        # The scale of prices is taken from the plain reach, so a vector of variables gets none.
         if isinstance(start, str):
             return with_first_scale(t), start
         return t, check_array("start", start, (t.program.n,))
@@ -224,6 +230,7 @@ class PlanSolver:
 
     def from_guess(self, guess: Guess[Transcription]) -> Outcome[Transcription]:
         """Outcome of an initial guess, with the lazy constraints and the prices of motion that it needs."""
+        # Prices last: each reduction changes the motion, and the lazy terms are checked again.
         oracles: list[Oracle[Transcription]] = [LazyTerms(self.budget.report), MotionPrice()]
         return refine(self._solved(guess), oracles, self._solved, self.budget)
 
@@ -236,6 +243,7 @@ class PlanSolver:
         def solve(guess: Guess[Transcription]) -> Outcome[Transcription]:
             return solve_with_clearance(self.budget, self.margins, guess)
 
+        # The lazy terms were checked on the coarse mesh; what refinement has changed is checked again below.
         outcome = refine(outcome, [BetweenNodes(self.budget, self.margins)], solve, self.budget)
         return refine(outcome, [LazyTerms(self.budget.report)], refining._solved, self.budget)
 
@@ -244,8 +252,10 @@ class PlanSolver:
         diagnosis.
         """
         outcome = solve_with_clearance(self.budget, self.margins, guess)
+        # Without clearance constraints the best start alone is refined later, by `on`.
         if not self.refined:
             return outcome if self.margins is not None else self._retried(outcome)
+        # A program without clearance constraints would be solved again as it is.
         if self._stuck(outcome.result) and outcome.program.clearance_constraints and self.budget.left != 0:
             outcome = self._solved_without_clearance(outcome)
         else:
@@ -278,6 +288,7 @@ class PlanSolver:
         self.budget.say("no motion was found with clearance constraints: solving without them first")
         free = stuck.program.with_clearance({})
         found = self._between(Outcome.of(free, self.budget.run(free.program, stuck.origin.x), stuck.origin))
+        # Either way the result has the effort of both.
         return stuck.then(found) if found.usable else found.then(stuck)
 
 
@@ -293,6 +304,7 @@ def _diagnosed(
     limited = old.status is Status.ITERATION_LIMIT and "max_iterations" in (budget.options or {})
     if limited or not ended_with_violations(outcome.program, old) or budget.left == 0:
         return outcome, ()
+    # Prices exclude no motion, but with them the solver may stall on the way to one.
     if outcome.origin.program.problem.style_prices != MotionPrices():
         budget.say("no motion was found: solving again without prices on motion")
         free = unpriced(outcome.origin.program)

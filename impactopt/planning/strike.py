@@ -36,9 +36,7 @@ from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
-# First barriers: of robots without soles, whose solves are faster and succeed more often with it (humanoids'
-# do not); and of a warm start with other constraints.
-BARRIER_ARM, BARRIER_WARM = 0.03, 1e-2
+BARRIER_WARM = 1e-2  # first barrier of a warm start with other constraints
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 
 
@@ -146,6 +144,7 @@ def _optimized(
     budget = budget.started()
     t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
+        # Only its variables: clearance constraints enter by themselves.
         start = carried_start(t, partial(_program_of, start), start, start.apart).x
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     solve = partial(_clean_strike, budget, Margins(problem) if problem.keeps_apart else None)
@@ -199,8 +198,6 @@ def clear_strike(
     constraints.
     """
     t = guess.program
-    if budget.interior and not t.coordinates.soles:
-        budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
 
     def solve(guess: Guess[StrikeTranscription]) -> Outcome[StrikeTranscription]:
         return refine(
@@ -224,6 +221,7 @@ def _clean_strike(
     if margins is None or not outcome.usable:
         return outcome
     depth, pairs = deepest_penetration(outcome.program, outcome.result.x, margins)
+    # deepest_penetration is negative without one.
     if depth <= 0:
         return outcome
     names = (" and ".join(margins.bodies.names(pair)) for pair in pairs)
@@ -240,6 +238,7 @@ class Freezes:
     def missing(self, outcome: Outcome[StrikeTranscription]) -> Additions[StrikeTranscription] | None:
         """Program whose phases have the fractions of the contact that the solution has."""
         t, x = outcome.program, outcome.result.x
+        # None while the freezes are where the program has them.
         shares = t.hit.drifted(x)
         if shares is None:
             return None

@@ -39,6 +39,7 @@ class Pattern:
     def __init__(self, matrix: Matrix, *, upper: bool = False):
         """upper : the upper triangle only."""
         matrix = _canonical(matrix)
+        # Copies, as a program may reuse its arrays.
         self._shape, self._indptr, self._indices = matrix.shape, matrix.indptr.copy(), matrix.indices.copy()
         self._upper: npt.NDArray[np.intp] | None = None
         if upper:
@@ -50,6 +51,8 @@ class Pattern:
         return full if self._upper is None else ca.triu(full)
 
     def values(self, matrix: Matrix) -> Vector:
+        # IPOPT gets the pattern once and then only values: an entry dropped where it is
+        # zero would shift all after it.
         if not self._same(matrix):
             matrix = _canonical(matrix)  # unsorted or with duplicates
             if not self._same(matrix):
@@ -90,6 +93,7 @@ class Functions:
         """Consider the initial guess, so that there always is an iterate to return."""
         x0 = np.clip(x0, self.program.x_lower, self.program.x_upper)
         self.best.consider(x0, float(self.program.objective(x0)), self.program.constraints(x0))
+        # Not finite there: still the only point to return.
         if self.best.x is None:
             self.best.x = x0
 
@@ -114,6 +118,7 @@ class Functions:
         return self.jacobian_pattern.values(self._at(x, "jacobian", self.program.jacobian))
 
     def hessian(self, x: Vector, _p: None, sigma: Vector, multipliers: Vector) -> Any:
+        # Copies, as x and the multipliers are views of CasADi's buffers.
         matrix = self._timed(lambda: self.program.hessian(x.copy(), float(sigma[0]), multipliers.copy()))
         return self.hessian_pattern.values(matrix)
 
@@ -130,6 +135,7 @@ class Functions:
         return self.out_of_time or self.error is not None
 
     def _at(self, x: Vector, name: str, function: Callable[[Vector], Any]) -> Any:
+        # CasADi asks for f, g and their derivatives at one point in separate calls.
         if not np.array_equal(x, self._x):
             self._x, self._known = x.copy(), {}
         if name not in self._known:
@@ -172,6 +178,7 @@ class IterationCallback:
         )
         self.history.append(record)
         if self._callback is not None and self._callback(record) is True:
+            # Like Ctrl-C: a status, no exception of `solve_ipopt`.
             functions.error = KeyboardInterrupt()
         return 1.0 if functions.stopped() else 0.0
 
@@ -216,9 +223,11 @@ class BufferFunction(ca.Callback):
         owner = self._owner
         inputs = [None if a is None else np.frombuffer(a, dtype=np.float64) for a in arguments]
         for function, buffer in zip(self._functions, results, strict=True):
+            # CasADi may ask for some outputs only, and a pattern may have no entries.
             if buffer is None or len(buffer) == 0:
                 continue
             out = np.frombuffer(buffer, dtype=np.float64)
+            # The callback's output is a flag; 1 requests a stop.
             stopping = 1.0 if self._progress is not None else np.nan
             if owner.stopped():
                 out[:] = stopping
@@ -227,6 +236,7 @@ class BufferFunction(ca.Callback):
                 out[:] = function(*inputs) if len(self._functions) == 1 else function(inputs[0])
             except (ArithmeticError, np.linalg.LinAlgError):
                 out[:] = np.nan  # undefined at this point: IPOPT shortens its step
+            # KeyboardInterrupt too; other errors are raised again at the end of `solve_ipopt`.
             except BaseException as error:
                 owner.error = error
                 out[:] = stopping
@@ -300,9 +310,11 @@ def solve_ipopt(
     x0 = check_program(program, x0)
     settings = {**IPOPT_DEFAULTS, **(options or {})}
     if time_limit is not None:
+        # IPOPT takes positive limits only.
         settings["max_wall_time"] = max(float(time_limit), 1e-3)
     tolerance = float(check_array("constr_viol_tol", settings["constr_viol_tol"], ()))
     start = time.perf_counter()
+    # Besides IPOPT's own limit, which it tests between iterations: a single evaluation may take long.
     functions = Functions(
         program, tolerance, deadline=start + time_limit if time_limit is not None else np.inf
     )
@@ -339,6 +351,7 @@ def _result(
 ) -> SolverResult:
     program, best = functions.program, functions.best
     status = _STATUS.get(outcome, Status.FAILED)
+    # We end it by a requested stop or by nan, so its own status does not give the cause.
     if functions.out_of_time:
         status = Status.TIME_LIMIT
     elif functions.error is not None:
@@ -346,6 +359,7 @@ def _result(
     x, y, z = progress.x, progress.multipliers, progress.bound_multipliers
     if answer is not None and functions.error is None and not functions.out_of_time:
         x, y, z = (np.array(answer[key]).ravel() for key in ("x", "lam_g", "lam_x"))
+    # What the result has is evaluated anew below, at x.
     functions.release()
     if not status.usable and best.x is not None:
         x = best.x
@@ -420,7 +434,10 @@ def _build(
             functions.hessian,
         )
         alive.append(given["hess_lag"])
+    # f and g are callbacks, so nlpsol has to be given all derivatives; it can differentiate nothing.
     x = ca.MX.sym("x", n)
+    # no_nlp_grad: nlpsol would differentiate the callbacks for it. Trial points with nan are no reason for
+    # warnings.
     own = {"print_time": False, "no_nlp_grad": True, "show_eval_warnings": False, "ipopt": dict(settings)}
     try:
         solver = ca.nlpsol("ipopt", "ipopt", {"x": x, "f": f(x), "g": g(x)}, {**given, **own})

@@ -98,6 +98,7 @@ class ActiveSystem:
         self.bounds, self._soft_bounds = _active_sides(x, program.x_lower, program.x_upper, z)
         n = program.n
         self._constraints, self._bounds = np.flatnonzero(self.constraints), np.flatnonzero(self.bounds)
+        # A = [J of the active constraints; unit rows of the active bounds].
         jacobian = sp.csr_array(program.jacobian(x))[self._constraints]
         active_bounds = sp.csr_array(
             (np.ones(len(self._bounds)), (np.arange(len(self._bounds)), self._bounds)),
@@ -133,6 +134,7 @@ class ActiveSystem:
         x, g = point.x, program.constraints(point.x)
         return Offset(
             dual=np.asarray(program.gradient(x) + program.jacobian(x).T @ point.y + point.z),
+            # Softness times the multiplier's change: 0 at the solution itself, as its slack is no residual.
             constraints=_bound_residual(g, program.g_lower, program.g_upper, self.constraints)
             - self._soft_constraints * (point.y - self.y),
             variables=_bound_residual(x, program.x_lower, program.x_upper, self.bounds)
@@ -149,6 +151,8 @@ class ActiveSystem:
         given = -np.concatenate(
             [offset.dual, offset.constraints[self._constraints], offset.variables[self._bounds]]
         )
+        # The regularized factors refine towards the true matrix's solution, so no error of the regularization
+        # is left. If that does not converge, the next one is tried.
         for regularization in _REGULARIZATIONS:
             factor = self._factor(regularization)
             found = factor.solve(given)
@@ -162,6 +166,7 @@ class ActiveSystem:
                 break
         else:
             raise InputError(_SINGULAR)
+        # Inactive constraints keep a multiplier of 0, to first order.
         n, k = len(self.x), len(self._constraints)
         y, z = np.zeros(len(self.y)), np.zeros(n)
         y[self._constraints], z[self._bounds] = found[n : n + k], found[n + k :]
@@ -170,6 +175,7 @@ class ActiveSystem:
 
 def _active_sides(values: Vector, lower: Vector, upper: Vector, multipliers: Vector) -> tuple[Sides, Vector]:
     """Side at which each value is active, and its softness: slack over multiplier, 0 for equalities."""
+    # slack x multiplier = mu at an interior-point solution, so slack / multiplier is mu / multiplier^2.
     gap = np.abs(np.where(multipliers > 0, upper - values, values - lower))
     size = np.abs(multipliers)
     equal = lower == upper
@@ -219,6 +225,7 @@ class Predictor:
     def __init__(self, program: NonlinearProgram, x: Vector, y: Vector, z: Vector) -> None:
         """x (n,), y (m,), z (n,) : as of `impactopt.solvers.program.SolverResult`."""
         self.x, self.y, self.z = x, y, z
+        # A copy, as a program that is moved to other parameters may reuse its arrays.
         jacobian, self._hessian = program.jacobian(x), program.hessian(x, 1.0, y).copy()
         self._moves = program.x_upper - program.x_lower > 1e-12
         bounded = (np.isfinite(program.x_lower) | np.isfinite(program.x_upper)) & self._moves
@@ -233,6 +240,7 @@ class Predictor:
         # free variables with bounds: these are not among the condenser's constraints
         self._free = np.zeros(program.n, dtype=bool)
         self._free[self._newton.condenser.free] = bounded[self._newton.condenser.free]
+        # From here on constraints and variables are one list (m + n,), constraints first.
         lower, upper = self._bounds(program)
         self._equal = lower == upper
         limited = np.isfinite(lower) | np.isfinite(upper)
@@ -240,6 +248,7 @@ class Predictor:
         values, own = np.concatenate([program.constraints(x), x])[i], np.concatenate([y, z])[i]
         self._weak = np.where(np.abs(own) < _WEAK_MULTIPLIER, own, 0.0)  # multipliers that stay constant
         slack = np.maximum(np.where(own > 0, upper[i] - values, values - lower[i]), 0.0)
+        # A weak multiplier, or none, counts as inactive: there is no side to keep a slack from.
         self._slack = np.where(self._weak == own, 0.0, slack)  # of active constraints, which stays
         self._sides = np.sign(own - self._weak).astype(np.int8)
 
@@ -264,6 +273,7 @@ class Predictor:
                 qp = _QP(self, program, x, g, np.concatenate([y, z]))
                 if not qp.solve(sides):
                     break
+                # The augmented Lagrangian violates bounds by a multiplier's change over its weight.
                 x = np.clip(x + qp.d, program.x_lower, program.x_upper)
                 (y, z), sides, g = qp.multipliers(), qp.sides, program.constraints(x)
                 violation = max_violation(program, x, g)
@@ -291,6 +301,7 @@ class _QP:
         lower, upper = of._bounds(program)
         values = np.concatenate([g, x])
         self._off = np.where(of._equal, values - lower, 0.0)  # residuals (m + n,) of equalities
+        # Equal bounds are those of fixed variables, which the Newton system does not move.
         self._off[program.m :] = 0.0
         self._values = values[i]
         # active constraints keep the slack that the known solution has
@@ -314,6 +325,7 @@ class _QP:
         i, short = self._of._unequal, 0
         at = np.zeros(len(i))  # change of the inequalities' linearized values by d
         for k in range(_MAX_ACTIVE_SETS):
+            # The exact minimum for this active set; the QP is solved if its active set is the same.
             d = self._step(sides)
             if d is None or not np.isfinite(d).all():
                 return False
@@ -355,6 +367,7 @@ class _QP:
                 self._jacobian,
                 of._hessian,
                 of_free[c.free],
+                # Unlike those of a barrier's slacks, these weights do not depend on the shift.
                 lambda shift: condensed,
                 hard=True,
                 proximal=_PROXIMAL,
@@ -369,6 +382,8 @@ class _QP:
         self._y = np.zeros(len(self._off))
         self._y[:m] = found[:m]
         self._y[m:][c.bounded] = found[m:]
+        # The bounds of free variables are a diagonal of the matrix, so their
+        # multipliers are weight x (d + off).
         self._y[m:] += of_free * (d + off[m:])
         return d
 
@@ -378,6 +393,7 @@ class _QP:
         at, along : changes of the inequalities' linearized values, so far and by the step.
         """
         hessian, shift = self._of._hessian, _PROXIMAL + self._newton.shift
+        # The augmented Lagrangian is convex and piecewise quadratic: its slope rises piecewise linearly.
         linear = float((self._q + hessian @ self.d + shift * self.d) @ step)
         square = float(step @ (hessian @ step) + shift * (step @ step))
 
@@ -385,6 +401,8 @@ class _QP:
             multipliers = self._inequality_multipliers(at + length * along)
             return linear + length * square + float(multipliers @ along)
 
+        # brentq needs a change of sign. A slope that is still negative at the end
+        # makes the full step the best.
         if slope(1.0) <= 0 or slope(0.0) >= 0:
             return 1.0
         return float(brentq(slope, 0.0, 1.0, xtol=1e-6))
@@ -394,5 +412,6 @@ class _QP:
         found = self._y + self._constant
         y, z = found[: self._m], found[self._m :].copy()
         fixed = ~self._of._moves
+        # What makes a fixed variable stationary, as in `BarrierProblem.update_multipliers`.
         z[fixed] = -(self._gradient + self._jacobian.T @ y + self._of._hessian @ self.d)[fixed]
         return y, z

@@ -222,6 +222,7 @@ def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
         lower = check_array(f"{kind}_lower", getattr(program, f"{kind}_lower"), (size,), finite=False)
         upper = check_array(f"{kind}_upper", getattr(program, f"{kind}_upper"), (size,), finite=False)
         # ~(a <= b), as NaN fails that too
+        # A lower bound of inf, or an upper one of -inf, leaves no value either.
         bad = np.flatnonzero(~((lower <= upper) & (lower < np.inf) & (upper > -np.inf)))
         if bad.size:
             i = int(bad[0])
@@ -275,6 +276,8 @@ def complementarity(
     lower = np.concatenate([program.g_lower, program.x_lower])
     upper = np.concatenate([program.g_upper, program.x_upper])
     y = np.concatenate([multipliers, bound_multipliers])
+    # The sign of a multiplier tells which bound it belongs to; the distance counts
+    # on both sides of that bound.
     gap = np.where(y > 0, np.abs(upper - value), np.abs(value - lower))
     gap[np.isinf(gap)] = 1.0  # a multiplier of the wrong sign counts by its size: one of 1e-8 is rounding
     return float(np.max(np.abs(y[y != 0]) * gap[y != 0], initial=0.0))
@@ -288,14 +291,25 @@ def is_stationary_violation(
     The criterion: the gradient J' v, projected on the variables' bounds, is small relative to |J||v|.
     """
     v = np.maximum(g - program.g_upper, 0.0) - np.maximum(program.g_lower - g, 0.0)
+    # v_i is positive above the upper bound and negative below the lower one, so J' v is
+    # the gradient of |v|^2 / 2.
     slope = jacobian.T @ v
+    # Interior-point iterates stop short of their bounds, so a variable near its bound counts as at it.
+    # Descent is along -slope: at a bound, a component that leads outside does not count.
     margin = 1e-6 * (1.0 + np.abs(x))
     at_bound = ((x >= program.x_upper - margin) & (slope < 0)) | (
         (x <= program.x_lower + margin) & (slope > 0)
     )
     slope = np.where(at_bound, 0.0, slope)
-    row_norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
-    return bool(np.linalg.norm(slope) <= tolerance * max(float(row_norms @ np.abs(v)), 1e-300))
+    # With the rows J_i, |J' v| <= sum |J_i| |v_i|: what the slope would be if no two constraints opposed each
+    # other. Without a violation the point counts as stationary (0 <= 1e-300).
+    return bool(np.linalg.norm(slope) <= tolerance * max(float(row_norms(jacobian) @ np.abs(v)), 1e-300))
+
+
+def row_norms(matrix: Any) -> Vector:
+    """Euclidean norms (m,) of the rows of a matrix (m, n), sparse or dense."""
+    squares = matrix.multiply(matrix) if sp.issparse(matrix) else matrix**2
+    return np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
 
 
 def worst_violations(
@@ -312,6 +326,7 @@ def worst_violations(
     Of a term's constraints at a node only the worst is listed; with ``once_a_term``, of all its constraints.
     """
     violations = np.concatenate([constraint_violations(program, g), bound_violations(program, x)])
+    # A constraint that cannot be evaluated comes first; argsort would put nan last.
     violations = np.where(np.isnan(violations), np.inf, violations)
     m, out, seen = program.m, list[Violation](), set[tuple[str, str]]()
     described = program if isinstance(program, DescribedProgram) else None
@@ -342,6 +357,7 @@ def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, 
     worst = [violation for violation in worst if violation.amount >= MINOR * worst[0].amount]
     listed = "; ".join(str(violation) for violation in worst)
     heading = _HEADINGS[status is Status.INFEASIBLE]
+    # ~(v <= tolerance) counts nan, too.
     more = int(
         np.sum(~(constraint_violations(program, g) <= tolerance))
         + np.sum(~(bound_violations(program, x) <= tolerance))
@@ -372,6 +388,7 @@ class BestIterate:
         if not (np.isfinite(objective) and np.isfinite(g).all()):
             return False
         violation = max_violation(self._program, x, g)
+        # Among points that meet the tolerance the objective alone decides.
         rank = (max(violation, self._tolerance), objective)
         if self.x is not None and rank >= (max(self.violation, self._tolerance), self.objective):
             return False
@@ -383,6 +400,7 @@ class BestIterate:
 class Point:
     """f and g at x, and their derivatives, which are evaluated when first used."""
 
+    # A search refuses many points for their values alone; derivatives take several times as long.
     x: Vector
     objective: float
     g: Vector
@@ -398,6 +416,7 @@ class Point:
         """True if f, g and their derivatives are finite."""
         if not self.finite:
             return False
+        # Finite values do not imply finite derivatives (sqrt at 0), and some programs raise in place of inf.
         try:
             return bool(np.isfinite(self.gradient).all() and np.isfinite(self.jacobian.data).all())
         except (ArithmeticError, np.linalg.LinAlgError):
@@ -411,6 +430,7 @@ class Point:
     @cached_property
     def jacobian(self) -> Matrix:
         """dg/dx, csc_array (m, n)."""
+        # A program may return any sparse format; the solvers read data, indices and indptr by columns.
         found = self.program.jacobian(self.x)
         return found if isinstance(found, sp.csc_array) else sp.csc_array(found)
 
@@ -422,7 +442,7 @@ class Point:
     @cached_property
     def row_norms(self) -> Vector:
         """Euclidean norms of the rows of the Jacobian (m,); 1 for zero rows."""
-        norms = np.sqrt(np.asarray(self.jacobian.multiply(self.jacobian).sum(axis=1)).ravel())
+        norms = row_norms(self.jacobian)
         return np.where(norms > 1e-12, norms, 1.0)
 
     @cached_property
@@ -475,13 +495,16 @@ class TimedProgram:
 
     def unknown(self, x: Vector) -> Point:
         """Point without values: nothing is evaluated."""
+        # Not finite, so that neither a search nor `BestIterate` takes it for an iterate.
         return Point(x=x, objective=np.nan, g=np.full(self.m, np.nan), program=self)
 
     def weigh(self, point: Point) -> None:
         """Set the weights to 1 over the gradients' norms, 1 at most: one price suits all constraints."""
+        # Over its gradient's norm a violation is the distance to the linearized constraint.
         self.weights = 1.0 / np.clip(point.row_norms, 1.0, 1e6)
 
     def _timed(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        # In `finally`, so that evaluations that raise count too.
         def timed(*arguments: Any) -> Any:
             begin = time.perf_counter()
             try:

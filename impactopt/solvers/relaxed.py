@@ -43,6 +43,7 @@ class RelaxedProgram:
         self._program, self._more = program, len(relaxations)
         n, m = program.n, program.m
         self.determined: tuple[Determined, ...] = tuple(getattr(program, "determined", ()))
+        # The program's objective may be of any size, also zero.
         self._weight = _OBJECTIVE_WEIGHT / max(1.0, abs(program.objective(x)))
         x_lower, x_upper = program.x_lower.copy(), program.x_upper.copy()
         upper, lower = program.g_upper.copy(), program.g_lower.copy()
@@ -55,9 +56,12 @@ class RelaxedProgram:
             # A constraint with both bounds cannot move both by one coefficient: its lower side becomes a
             # constraint of its own, as bounds of variables do.
             both = np.isfinite(lower[i]) & np.isfinite(upper[i])
+            # g - unit s <= upper and g + unit s >= lower, so that s >= 0 moves a bound outward.
             coupled += [(i[np.isfinite(upper[i])], k, -unit), (i[~np.isfinite(upper[i])], k, unit)]
             parts = [
                 (i[both], lower[i[both]], np.full(both.sum(), np.inf), unit),
+                # A variable's bound cannot depend on s: x + unit s >= x_lower and x - unit s
+                # <= x_upper are constraints.
                 (m + j, x_lower[j], np.full(j.size, np.inf), unit),
                 (m + j, np.full(j.size, -np.inf), x_upper[j], -unit),
             ]
@@ -69,6 +73,7 @@ class RelaxedProgram:
                 lows.append(low[bounded])
                 highs.append(high[bounded])
                 size += count
+            # The moved sides are removed where they were; otherwise they would still hold without relaxation.
             lower[i[both]], x_lower[j], x_upper[j] = -np.inf, -np.inf, np.inf
         # number of the program's constraint, or m + number of the variable, for each constraint
         self._source = np.concatenate(sources)
@@ -94,6 +99,7 @@ class RelaxedProgram:
         weights = self._coupling.copy()
         self._weights = weights.data
         weights.data = own + 2 + np.arange(weights.nnz)
+        # [J; I] picked by source: rows of J for constraints, of the identity for bounds of variables.
         picked = sp.csr_array(sp.vstack([numbers, ones]))[self._source]
         numbered = sp.csc_array(sp.hstack([picked, weights]))
         numbered.sort_indices()
@@ -110,6 +116,8 @@ class RelaxedProgram:
         g = self.constraints(whole)
         short = np.maximum(np.maximum(self.g_lower - g, g - self.g_upper), 0.0)
         entries = self._coupling.tocoo()
+        # One relaxation moves many bounds: it takes the largest shortage, hence
+        # `maximum.at` and not assignment.
         np.maximum.at(whole, self._program.n + entries.col, short[entries.row] / np.abs(entries.data))
         whole[self._program.n :] += room
         return whole
@@ -134,8 +142,11 @@ class RelaxedProgram:
     def hessian(self, x: Vector, sigma: float, multipliers: Vector) -> Matrix:
         of_rows = self._source < self._program.m
         summed = np.zeros(self._program.m)
+        # A constraint and its lower side, split off, have the same curvature: their multipliers add up.
+        # Bounds of variables have none.
         np.add.at(summed, self._source[of_rows], multipliers[of_rows])
         found = self._program.hessian(x[: self._program.n], sigma * self._weight, summed)
+        # Relaxations enter linearly: their columns of the Hessian are empty.
         indptr = np.concatenate([found.indptr, np.full(self._more, found.nnz, dtype=found.indptr.dtype)])
         return sp.csc_array((found.data, found.indices, indptr), shape=(self.n, self.n))
 

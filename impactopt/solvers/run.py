@@ -60,6 +60,7 @@ class Report:
 
     def iteration(self, point: Point, kkt: float, note: str) -> bool:
         """Record an iteration and call the callback; True if that requests a stop."""
+        # Before the callback, which may end the solve by an exception.
         self.best.consider(point.x, point.objective, point.g)
         step = 0.0 if self._last is None else float(np.max(np.abs(point.x - self._last.x), initial=0.0))
         self._last = point
@@ -73,12 +74,15 @@ class Report:
             note=note,
         )
         self._history.append(record)
+        # `is True`, as a callback that prints or appends may return anything.
         return self._callback is not None and self._callback(record) is True
 
     def result(
         self, status: Status, program: TimedProgram, point: Point, y: Vector, z: Vector
     ) -> SolverResult:
         """Result with a status: at the point if it is a solution, else at the best iterate."""
+        # y and z stay those of the last iterate, as none are stored with the best:
+        # kkt is then of this mixture.
         if not status.usable and self.best.x is not None:
             point = program.point(self.best.x)
         message = explain(self._program, status, point.x, point.g, tolerance=self._tolerance)
@@ -90,6 +94,7 @@ class Report:
             bound_multipliers=z,
             objective=point.objective,
             status=status,
+            # The first record is the initial guess.
             iterations=max(len(self._history) - 1, 0),
             seconds=self.elapsed(),
             seconds_functions=program.seconds,
@@ -182,10 +187,12 @@ class Run(ABC, Generic[_Options]):
         self.report = Report(program, options.violation_tolerance, callback)
         self.program, self.options = TimedProgram(program), options
         self.determined: Sequence[Determined] = getattr(program, "determined", ())
+        # Nothing is evaluated before `solve`, in which interruption is a status.
         self.point = self.program.unknown(x0)
 
     def solve(self) -> SolverResult:
         """Result of the solve; infeasible programs, interruption (Ctrl-C) and limits are statuses."""
+        # The limit is per solve and not global: other code of the process keeps its threads.
         with threads().limit(limits=1, user_api="blas"):
             try:
                 status = self.iterate()

@@ -59,12 +59,15 @@ def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> lis
     The systems of each list that is returned can be eliminated at once, list after list.
     """
     row_left, column_left = np.ones(touches.shape[0], dtype=bool), np.ones(touches.shape[1], dtype=bool)
+    # The masks are dense: n^2 bytes for couples, 11 MB for the demo's punch (n = 3347).
     touched_by = np.ascontiguousarray(touches.T)  # a copy, as columns are read as often as rows
     out = []
     for elimination in eliminations:
         waiting = list(zip(*elimination, strict=True))
         while waiting:
             systems, waiting = _independent(waiting, touched_by, couples, row_left)
+            # First for all systems of the list, so that none counts the equalities
+            # or variables of another one.
             for q, e in systems:
                 row_left[q] = column_left[e] = False
             found = []
@@ -73,6 +76,7 @@ def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> lis
                 c = np.flatnonzero(touches[q].any(axis=0) & column_left)
                 more = couples[e].any(axis=0) & column_left
                 more[c] = False
+                # c comes first in u: kernels take c as the first columns of u.
                 u = np.concatenate([c, np.flatnonzero(more)])
                 # e is replaced by a function of c: in the equalities t, and in the Hessian
                 for rows, columns in ((t, c), (t, e), (q, e)):
@@ -90,6 +94,7 @@ def _independent(
     systems: _Systems, touched_by: Any, couples: Any, row_left: Any
 ) -> tuple[_Systems, _Systems]:
     """Systems that neither a constraint nor the Hessian couples to one before them, and the others."""
+    # Greedy, in the order given: the earliest of a chain is taken, the next one waits for the next round.
     rows, variables = np.zeros(touched_by.shape[1], dtype=bool), np.zeros(touched_by.shape[0], dtype=bool)
     now, later = _Systems(), _Systems()
     for q, e in systems:
@@ -176,6 +181,7 @@ class HessianPlaces:
 
     def at(self, i: Index, j: Index) -> Places:
         """Places (k,) of entries (k,); 0 for entries outside the pattern."""
+        # In 64 bits, as n^2 exceeds 32 from 46 341 variables on.
         wanted = i.astype(np.int64) * self._n + j
         found = np.searchsorted(self._keys, wanted).clip(max=self._keys.size - 1)
         return np.where(self._keys[found] == wanted, found + 1, 0).astype(np.int32)
@@ -192,6 +198,8 @@ class HessianPlaces:
 
     def of_matrix(self, lower: Index, matrix: Matrix) -> Places:
         """Places of those entries of a csc matrix that ``lower`` selects from its lower triangle."""
+        # The Hessian's pattern stays when constraints are added, so one look-up
+        # serves all programs of a solve.
         cached, pattern = self._of_matrix, (matrix.indices, matrix.indptr)
         if cached is None or not all(map(np.array_equal, cached[:2], pattern)):
             found = self.at(matrix.indices[lower], _columns(matrix)[lower])
@@ -212,9 +220,11 @@ def elimination_stage(systems: list[Touched], J_places: Places, W_places: Places
 
     J_places, W_places : of the entries of the equalities and of W, as of `number_entries`.
     """
+    # All of one shape: (k, r) of q and e, (k, nt), (k, nc) and (k, nu).
     q, e, t, c, u = (np.array([getattr(s, name) for s in systems]) for name in ("q", "e", "t", "c", "u"))
     i, j = _lower(c.shape[1])
     places = {
+        # (k, column, row), which is LAPACK's storage by columns.
         "qe": J_places[q[:, None, :], e[:, :, None]],
         "qc": J_places[q[:, None, :], c[:, :, None]],
         "te": J_places[t[:, :, None], e[:, None, :]],
@@ -241,6 +251,7 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
     """
     touches = jacobian.tocsc()
     start, touching = touches.indptr, touches.indices
+    # Inequalities count as taken, so only equalities are found.
     taken, touched = ~equal, np.zeros(equal.size, dtype=bool)
     found: dict[tuple[tuple[int, ...], int], list[tuple[Index, Index]]] = {}
     for rank, variables in determined:
@@ -251,15 +262,20 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
             continue
         system = np.zeros((equalities.size, equalities.size), dtype=bool)
         for k, column in enumerate(columns):
+            # One mask for all systems, set and cleared by index: a new one each time would
+            # cost m entries a variable.
             touched[column] = True
             system[k] = touched[equalities]
             touched[column] = False
+        # A perfect matching of equalities and variables is necessary for a regular system, not sufficient:
+        # values may still be singular, which `Condenser.load` finds.
         if not _structurally_regular(system.tobytes(), equalities.size):
             continue
         taken[equalities] = True
         found.setdefault((rank, variables.size), []).append((equalities, variables))
     return [
         Elimination(np.array([r for r, _ in found[key]]), np.array([v for _, v in found[key]]))
+        # By rank, the order of elimination, and by size: systems of one shape are treated together.
         for key in sorted(found)
     ]
 
@@ -326,6 +342,7 @@ class Condenser:
         own_rows, own_columns = own[own >= 0], _columns(jacobian)[own >= 0]
         touches = np.zeros((int(equal.sum()), n), dtype=bool)
         touches[own_rows, own_columns] = True
+        # An inequality has a weight, and so couples all its variables in the Hessian: w J_i' J_i.
         groups = group_rows(jacobian, np.flatnonzero(~equal))
         couples = np.eye(n, dtype=bool)
         couples[hessian.indices, _columns(hessian)] = True
@@ -356,12 +373,14 @@ class Condenser:
         self.remaining_equalities = [
             (np.flatnonzero(t), J_places[k, self.free[t]]) for k, t in zip(self._left, of_left, strict=True)
         ]
+        # The Newton system adds a penalty, A' diag(w) A, so they couple as inequalities do.
         for columns, _ in self.remaining_equalities:
             self.pattern[np.ix_(columns, columns)] = True
         at = (np.concatenate([none, *[one[k] for one in self.remaining_equalities]]) for k in (0, 1))
         self._A_entries = np.repeat(np.arange(self._left.size), of_left.sum(axis=1)), *at
         place = np.full(n, -1)
         place[self.free] = np.arange(self.free.size)
+        # i and j are of the lower triangle, in the order of W's places, which begin at 1.
         inside = (place[i] >= 0) & (place[j] >= 0)
         self.free_entries = (np.flatnonzero(inside) + 1).astype(np.int32), place[i[inside]], place[j[inside]]
 
@@ -385,8 +404,10 @@ class Condenser:
         row, column = hessian.indices, _columns(hessian)
         lower = np.flatnonzero(row >= column)
         to = self._hessian_places.of_matrix(lower, hessian)
+        # Place 0 means that the pattern lacks an entry.
         if not (to.all() and all(p.to.all() for p in found)):
             return False
+        # Before the list is replaced: C's arguments are cached by the list's identity.
         self._kernels.forget(self._products)
         self._products, self._own_hessian = found, (lower.astype(np.int32), to)
         at = np.flatnonzero(row == column)
@@ -410,6 +431,7 @@ class Condenser:
         self._jacobian, self._hessian = (
             np.ascontiguousarray(a.data, dtype=float) for a in (jacobian, hessian)
         )
+        # Also fill-in that the last elimination left.
         self.J[:] = 0.0
         where, to = self._own_jacobian
         self._kernels.copy(self._jacobian, where, self.J, to)
@@ -437,6 +459,7 @@ class Condenser:
         weights (m,) of the constraints: those of equalities have no effect.  diagonal (n,).
         """
         self.W[:] = 0.0
+        # The lower triangle only.
         where, to = self._own_hessian
         self._kernels.copy(self._hessian, where, self.W, to)
         self.W[self._diagonal] += diagonal

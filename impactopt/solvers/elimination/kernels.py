@@ -143,6 +143,7 @@ class Kernels:
     def add_products(self, products: Sequence[Products], values: Vector, weights: Vector, W: Vector) -> None:
         """W += J' diag(weights) J."""
         for p in products:
+            # (k, p); a row's product with itself by its lower triangle only, p (p + 1) / 2 entries.
             part = values[p.values]
             i, j = np.tril_indices(part.shape[1])
             _add(W, np.repeat(p.to, p.counts, axis=0), weights[p.rows][:, None] * part[:, i] * part[:, j])
@@ -160,15 +161,19 @@ class Kernels:
             # matrix
             for i, (B, N) in enumerate(zip(J[a.qe], J[a.qc], strict=True)):
                 lu, pivots, info = la.lapack.dgetrf(B.T)
+                # Only a pivot that is exactly zero; what a nearly singular B costs in digits is
+                # left to the step's refinement.
                 if info:
                     raise np.linalg.LinAlgError(_SINGULAR)
                 a.lu[i], a.pivots[i] = lu.T, pivots
                 a.X[i] = la.lapack.dgetrs(lu, pivots, N.T)[0].T
+            # (k, nt, r) times (k, r, nc)
             _add(J, a.tc, -(a.T @ a.X.swapaxes(1, 2)))
 
     def reduce(self, stages: Sequence[EliminationStage], W: Vector) -> None:
         """Replace d_e in the quadratic form of W by -X d_c."""
         for a in stages:
+            # Gathered once, (k, r, r) and (k, nu, r): `forward` uses them for every right-hand side.
             a.H[:], a.G[:] = W[a.hee], W[a.heu]
             G, nc = -a.G, a.X.shape[1]
             # W_cc += C + C' with C = X (H X' / 2 - G'), as each of the two has half of the symmetric term;
@@ -182,6 +187,7 @@ class Kernels:
     def forward(self, stages: Sequence[EliminationStage], g: Vector, off: Vector) -> None:
         """Replace d_e in gradient and residual by -(x0 + X d_c), with x0 = B^-1 residual."""
         for a in stages:
+            # Kept for `expand`.
             a.x0[:] = self._solve(a, off[a.q], transposed=0)
             _add(off, a.t, -(a.T @ a.x0[..., None])[..., 0])
             # g_c -= X (g_e - H x0), g_u -= G x0
@@ -192,6 +198,7 @@ class Kernels:
     def expand(self, stages: Sequence[EliminationStage], d: Vector) -> None:
         """Set d_e of all stages, the last stage first."""
         for a in reversed(stages):
+            # The variables c may be determined by a later stage, hence the reversed order.
             d[a.e] = -a.x0 - (d[a.c][:, None] @ a.X)[:, 0]
 
     def multipliers(self, stages: Sequence[EliminationStage], v: Vector, y: Vector) -> None:
@@ -216,6 +223,7 @@ class Kernels:
             panel[:own], info = la.lapack.dpotrf(panel[:own], lower=1)
             if info:
                 return False
+            # L_under L_own' = K_under; then the whole update of later panels is one product.
             under = la.blas.dtrsm(1.0, panel[:own], panel[own:], side=1, lower=1, trans_a=1)
             panel[own:] = under
             update = under @ under.T
@@ -254,6 +262,7 @@ class Kernels:
 
 def _add(to: Vector, places: Places, values: Stack) -> None:
     """Add values; places may repeat."""
+    # to[places] += values would add only one of the values at a repeated place.
     np.add.at(to, places.ravel(), values.ravel())
 
 
@@ -284,6 +293,7 @@ def _library() -> Any:
     library = native_library(__package__, "newton")
     if library is None:
         return None
+    # SciPy's own BLAS: C links against none, and the limit of BLAS's threads (`run.threads`) holds here, too.
     pointers = (ctypes.c_void_p * len(_ROUTINES))(*[_pointer(*routine) for routine in _ROUTINES])
     library.newton_setup(pointers)
     return library
@@ -291,6 +301,7 @@ def _library() -> Any:
 
 def _pointer(module: Any, name: str) -> int:
     """Address of one of SciPy's BLAS and LAPACK routines, which it exports to Cython as capsules."""
+    # PyCapsule_GetPointer wants the capsule's own name, which is the routine's C signature.
     api, capsule = ctypes.pythonapi, module.__pyx_capi__[name]
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
@@ -348,6 +359,7 @@ class CompiledKernels(Kernels):
             work = np.zeros(max(nt * nc, r * (nu + nc) + max(r * nu, spread), r + max(nt, nc, nu)) + 1)
             within = _runs(a.hcc.ravel(), np.arange(k)[:, None] * a.hcc.shape[1] + _rows_of_triangle(nc))
             beyond = _runs(a.hcv.transpose(0, 2, 1).ravel(), np.arange(k * (nu - nc) if nc else 0) * nc)
+            # Kept in `keep`, as the struct holds their addresses only.
             arrays = [*[getattr(a, name) for name in _STAGE_ARRAYS], work, within, beyond]
             structs.append(_Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in arrays]))
             keep.append(arrays)

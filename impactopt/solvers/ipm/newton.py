@@ -15,6 +15,8 @@ from impactopt.solvers.elimination.kernels import Index, Kernels, Panels, Places
 from impactopt.solvers.elimination.kernels import kernels as fastest_kernels
 from impactopt.solvers.program import Determined, Matrix, Vector
 
+# Merging is for the kernels in NumPy: a factorization for punch takes 3.4 ms with it, 4.6 ms without, but
+# those in C take 0.5 ms with and without.
 _MAX_MERGED_WIDTH = 24  # variables of a merged block
 _MAX_ZEROS = 0.1  # fraction of zeros that a merged block's panel may have
 
@@ -29,12 +31,16 @@ def elimination_blocks(pattern: Any) -> list[Index]:
 
     pattern (n, n) : which entries may be nonzero, symmetric.
     """
+    # With the diagonal, coupled variables with the same other neighbours have the same row. They stay
+    # indistinguishable when others are eliminated: the 1104 free variables of the demo's punch are 99 groups.
     neighbours = np.asarray(pattern, dtype=bool) | np.eye(len(pattern), dtype=bool)
     members: dict[bytes, list[int]] = {}
     for i, row in enumerate(np.packbits(neighbours, axis=1)):
+        # Rows as bytes, a bit a variable: hashing finds equal ones without comparing all pairs.
         members.setdefault(row.tobytes(), []).append(i)
     groups = [np.array(same) for same in members.values()]
     first, sizes = (np.array([of(g) for g in groups], dtype=np.intp) for of in (np.min, np.size))
+    # One member stands for its group, and the group's size counts in degrees.
     order, below = _minimum_degree(neighbours[np.ix_(first, first)], sizes)
     roots = _merged_blocks(order, below, sizes)
     return [np.concatenate([groups[g] for g in b.groups]) for root in roots for b in root.in_order()]
@@ -44,6 +50,7 @@ def _minimum_degree(neighbours: Any, sizes: Index) -> tuple[Index, Any]:
     """Order of the groups (g,), and the later neighbours of each when it is eliminated (g, g)."""
     neighbours, left = neighbours.copy(), np.ones(sizes.size, dtype=bool)
     order, below = np.zeros_like(sizes), np.zeros_like(neighbours)
+    # In variables, those of the group itself included.
     degree = neighbours @ sizes
     for i in range(sizes.size):
         k = order[i] = int(np.argmin(np.where(left, degree, np.inf)))
@@ -52,6 +59,7 @@ def _minimum_degree(neighbours: Any, sizes: Index) -> tuple[Index, Any]:
         # elimination makes all neighbours of k neighbours of each other
         rows = np.flatnonzero(below[k])
         neighbours[np.ix_(rows, rows)] = True
+        # Only the neighbours of k have new degrees.
         degree[rows] = (neighbours[rows] & left) @ sizes
     return order, below
 
@@ -111,6 +119,8 @@ def _merged_blocks(order: Index, below: Any, sizes: Index) -> list[_Block]:
                 block.children.append(child)
             else:
                 block = merged
+        # The first group below the diagonal is the parent in the elimination tree (Davis, section 4.1): it is
+        # the first that waits for this block.
         later = np.flatnonzero(block.below)
         parent = int(later[np.argmin(place[later])]) if later.size else -1
         waiting.setdefault(parent, []).append(block)
@@ -182,6 +192,7 @@ class BlockCholesky:
         row, column = self._block[low], self._block[high]
         p = self._panels
         across, down = high - p.start[column], p.row_at[row, column] + low - p.start[row]
+        # By columns, with the panel's height as the leading dimension.
         out: Index = p.at[column] + p.height[column] * across + down
         return out
 
@@ -192,6 +203,7 @@ class BlockCholesky:
 
     def solve(self, right: Vector) -> Vector:
         """K^-1 times a vector (n,) or columns (n, k)."""
+        # BLAS takes columns; a vector is one.
         x = np.asfortranarray(right[self._order].reshape(self._n, -1))
         x = self._kernels.solve(self._panels, self._values, x)
         out = np.empty(x.shape)
@@ -286,6 +298,7 @@ class NewtonSystem:
         self._A = c.A
         of_all = np.zeros(c.n)
         of_all[c.free] = diagonal
+        # Elastic equalities have weights as inequalities do: they need not be met exactly.
         penalty = self._penalty() if hard else None
         self.shift = self._initial_shift()
         while True:
@@ -300,8 +313,12 @@ class NewtonSystem:
             self.shift = self._next_shift()
             if self.shift > _SHIFT_MAX:
                 return False
+        # The last shift that was needed, not the last: after iterations without one it is
+        # where the next search begins.
         self._last = self.shift or self._last
         if hard and self._equal.size:
+            # With F = K^-1 A', of shape (f, l), the Schur complement of the l equalities that remain is A F;
+            # l is small (5 of 2248 in the demo's punch), so it is dense.
             self._spread = self._matrix.solve(self._A.T)
             # pseudo-inverse of the Schur complement, as equalities may depend on each other
             self._inverse = np.linalg.pinv(self._A @ self._spread, rcond=_RANK_TOLERANCE)
@@ -342,6 +359,7 @@ class NewtonSystem:
         values = np.zeros(self._matrix.size)
         W = c.reduce(self._weights, self._diagonal)
         self._kernels.copy(W, self._from, values, self._to)
+        # Fixed variables keep their places in the pattern; this diagonal leaves them no step.
         values[self._diagonal_to[self.fixed]] += _FIXED_WEIGHT
         self._kernels.add_products(self._products, c.J, self._weights[self._equal], values)
         return values
@@ -355,9 +373,11 @@ class NewtonSystem:
         c, w, equal = self.condenser, self._weights.copy(), self._equal
         w[equal] = 0.0
         exact = np.concatenate([c.eliminated, equal]) if self._hard else c.eliminated
+        # y = w (J d + r) in the Lagrangian's gradient: w r is constant, w J belongs to the matrix.
         g, left, worst = q + self._transposed_product(w * r), r, np.inf
         d, y, change = np.zeros(c.n), np.zeros(c.m), np.zeros(c.m)
         for _ in range(_MAX_SOLVES):
+            # Iterative refinement with the same factors: each solve is for the residual of the sum so far.
             more_d, more_y, more_change, g = self._solve_once(g, left, w)
             d, y, change = d + more_d, y + more_y, change + more_change
             # what rounding leaves of the equalities, and of the gradient of the Lagrangian
@@ -365,6 +385,7 @@ class NewtonSystem:
             left[exact] = (change + r)[exact]
             of_equalities[c.eliminated], of_equalities[equal] = more_y[c.eliminated], more_y[equal]
             g += self._transposed_product(of_equalities)
+            # Bounds of fixed variables have the multiplier that makes them stationary.
             g[c.free[self.fixed]] = 0.0
             before, worst = worst, max(np.abs(g).max(initial=0.0), np.abs(left).max(initial=0.0))
             if worst <= tolerance or worst > _REFINEMENT_FACTOR * before:
@@ -380,6 +401,7 @@ class NewtonSystem:
         c, equal = self.condenser, self._equal
         penalty = self._weights[equal]
         by_free, off = c.forward(g, r)
+        # The penalty's term is penalty / 2 |A d + off|^2, whose gradient has this constant part.
         by_free += self._A.T @ (penalty * off)
         by_free[self.fixed] = 0.0
         free = -self._matrix.solve(by_free)
@@ -389,11 +411,14 @@ class NewtonSystem:
             free -= self._spread @ extra
         free[self.fixed] = 0.0
         d = c.expand(free)
+        # The condenser's constraints: the program's, then the bounds of eliminated variables, whose
+        # gradients are unit vectors.
         change = np.concatenate([self._jacobian @ d, d[c.bounded]])
         y = w * change
         dual = g + self._hessian @ d + self._diagonal * d + self._transposed_product(y)
         # the penalty's force is a part of these multipliers
         y[equal] = penalty * (self._A @ free + off) + extra
+        # Last, as these multipliers make the eliminated variables stationary for all others.
         y[c.eliminated] = c.multipliers(dual, y[equal])
         return d, y, change, dual
 
@@ -426,6 +451,8 @@ def acquire(
     determined : variables that constraints determine.  equal (m,) : which constraints are equalities.
     bounded, moves (n,) : which variables have a finite bound, and which are not fixed.
     """
+    # The key has two parts. Programs with the same first part have the same equalities, bounds and variables:
+    # their systems differ in inequalities at most, and can be adapted.
     mine = equal[jacobian.indices]
     starts = np.append(0, np.cumsum(mine))[jacobian.indptr]
     of_equalities = np.cumsum(equal)[jacobian.indices[mine]], starts
@@ -433,6 +460,7 @@ def acquire(
     structure = _digest([rank for rank, _ in determined], *of_equalities, *variables, bounded, moves)
     patterns = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
     key = structure + _digest(None, *patterns, equal)
+    # Taken out of the cache while it is in use: it has state, and solves may be nested.
     system = _systems.pop(key, None) or _adapted(structure, jacobian, hessian, equal)
     if system is None:
         kernels = fastest_kernels()

@@ -44,6 +44,7 @@ class ActiveSetSolver:
             method = _DualActiveSet(P, qp.q, C, lower, upper)
         except la.LinAlgError:  # P is not positive definite
             return failure
+        # Only which multipliers are nonzero matters, and their signs.
         guess = np.zeros(size) if start is None else np.concatenate(start[1:])
         deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
         status = method.run(guess, self._max_iterations, deadline)
@@ -80,12 +81,14 @@ class _DualActiveSet:
     """
 
     def __init__(self, P: np.ndarray, q: Vector, C: np.ndarray, lower: Vector, upper: Vector):
+        # In w the objective is |w|^2 / 2 about w = 0, the unconstrained minimum, so gradients are rows of M.
         self._L = la.cholesky(P, lower=True, check_finite=False)
         self._w0 = -la.solve_triangular(self._L, q, lower=True, check_finite=False)
         self._M = la.solve_triangular(self._L, C.T, lower=True, check_finite=False).T
         offset = self._M @ self._w0
         self._lower, self._upper = lower - offset, upper - offset
         self._equal = lower == upper
+        # The nearer bound, as the other one may be infinite.
         self._slack = _MAX_VIOLATION * (1.0 + np.minimum(np.abs(lower), np.abs(upper)))
         self._norms = np.linalg.norm(self._M, axis=1)
         n = q.size
@@ -100,7 +103,9 @@ class _DualActiveSet:
         self._warm_start(guess)
         while self.iterations < max_iterations and time.perf_counter() < deadline:
             v = self._M @ self._w
+            # Step 1 takes any violated constraint; ours is the one at the largest distance in w.
             excess = np.maximum(self._lower - v, v - self._upper) - self._slack
+            # Met up to rounding by construction; a second time they would be dependent on themselves.
             excess[self.active] = -np.inf
             j = int(np.argmax(np.where(excess > 0, excess / np.maximum(self._norms, 1e-12), -np.inf)))
             if excess[j] <= 0:
@@ -123,17 +128,21 @@ class _DualActiveSet:
 
     def _warm_start(self, guess: Vector) -> None:
         wanted = np.flatnonzero((self._equal | (np.abs(guess) > 0)) & (self._norms > 0))
+        # Equalities belong to every active set; their sign is arbitrary, their multiplier's too.
         signs = np.where((guess[wanted] > 0) | self._equal[wanted], 1.0, -1.0)
         bounded = np.isfinite(np.where(signs > 0, self._upper[wanted], self._lower[wanted]))
         wanted, signs = wanted[bounded], signs[bounded]
         # One QR factorization for all: pivoting puts constraints that depend on others last.
         lengths = signs * self._norms[wanted]
         self._Q, R, order = la.qr(self._M[wanted].T / lengths, pivoting=True, check_finite=False)
+        # Gradients have norm 1 here, so a diagonal entry is the sine of the angle
+        # to the span of those before.
         rank = int((np.abs(np.diagonal(R)) > _DEPENDENT).sum())
         kept = order[:rank]
         self._R = R[:, :rank] * np.abs(lengths[kept])
         self.active, self.signs, self._y = wanted[kept], signs[kept], np.zeros(rank)
         self._solve()
+        # The dual method needs a dual feasible start: wrong signs are dropped, the worst first.
         while (negative := (self._y < 0) & ~self._equal[self.active]).any():
             self._drop(int(np.argmin(np.where(negative, self._y, 0.0))))
             self._solve()
@@ -147,6 +156,7 @@ class _DualActiveSet:
             self.iterations += 1
             k = self.active.size
             c = self._Q.T @ a
+            # a = Q c: the part of a outside the span of the active gradients, by the columns of Q beyond k.
             z = self._Q[:, k:] @ c[k:]  # direction of the iterate
             r = _triangular(self._R[:k], c[:k])  # direction of the multipliers
             # partial step: until a multiplier is zero; full step: until constraint j is met
@@ -155,13 +165,19 @@ class _DualActiveSet:
             partial = max(float(ratios.min(initial=np.inf)), 0.0)
             curvature = float(z @ a)
             dependent = curvature <= (_DEPENDENT * self._norms[j]) ** 2
+            # (a w - b) / (a z): constraint j is met with equality. A dependent one cannot be met by moving;
+            # only multipliers change, until one of them is zero.
             full = np.inf if dependent else (float(a @ self._w) - bound) / curvature
             t = min(partial, full)
+            # No multiplier limits it and no step meets it: the dual is unbounded,
+            # so the primal is infeasible.
             if not np.isfinite(t):
                 return False
             self._y, y_j = self._y - t * r, y_j + t
             if not dependent:
                 self._w = self._w - t * z
+            # The violated constraint enters; else the active one whose multiplier became zero
+            # leaves, and it is tried again.
             if full <= partial:
                 self._insert(j, sign)
                 self._solve()

@@ -58,6 +58,7 @@ class OsqpSolver:
     ) -> QPSolution:
         """Solve the QP from the initial guess (x, y, z); see `QPSolver`."""
         C, lower, upper = qp.stacked
+        # OSQP would refuse these as invalid data.
         if (lower > upper).any():
             return without_solution(qp, QPStatus.INFEASIBLE)
         if start is not None:
@@ -69,6 +70,7 @@ class OsqpSolver:
             return without_solution(qp, QPStatus.FAILED)
         assert self._solver is not None
         if start is not None:
+            # OSQP sees the normalized constraints: C = row_scale * A, so y_C = y / row_scale.
             self._solver.warm_start(x=start[0], y=np.concatenate(start[1:]) / qp.row_scale)
         deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
         return self._iterate(qp, deadline)
@@ -78,6 +80,7 @@ class OsqpSolver:
     ) -> QPSolution | None:
         """Solution, if the initial guess has its active set but for a few constraints."""
         if qp.n <= _MAX_DENSE:
+            # Few iterations: a test of the guess, not a search for the active set.
             found = self._near.solve(qp, start=start)
             exact = found.status is QPStatus.SOLVED and qp.error(found.x, found.y, found.z) <= self.tolerance
             return dataclasses.replace(found, iterations=0) if exact else None
@@ -95,6 +98,7 @@ class OsqpSolver:
             left = deadline - time.perf_counter()
             if left <= 0.0:
                 break
+            # 1e10 is OSQP's default: no limit.
             self._solver.update_settings(max_iter=more, time_limit=min(left, 1e10))
             found = self._solver.solve(raise_error=False)
             status = found.info.status_val
@@ -115,6 +119,8 @@ class OsqpSolver:
                 least_error = error
                 reached = QPStatus.SOLVED if error <= self.tolerance else QPStatus.INACCURATE
                 best = solution_of(qp, x, unit, reached, iterations)
+            # OSQP goes on from its own state in the next stage; solved to eps it would end
+            # at once with the same point.
             if least_error <= self.tolerance or status == osqp.SolverStatus.OSQP_SOLVED:
                 break
         return dataclasses.replace(best, iterations=iterations)
@@ -125,6 +131,7 @@ class OsqpSolver:
         """Solution refined from OSQP's, or that itself if it is better; with its error."""
         error = qp.error(x, *split(qp, unit))
         if qp.n <= _MAX_DENSE:
+            # +1, 0 and -1 stand for multipliers: the method reads signs only.
             guess = (x, *split(qp, active_set(qp, x, unit).astype(float)))
             left = None if deadline == np.inf else deadline - time.perf_counter()
             exact = self._active_set.solve(qp, start=guess, time_limit=left)
@@ -150,6 +157,7 @@ class OsqpSolver:
             return True
         solver = osqp.OSQP(algebra="builtin")  # without, its search for others takes longer than a small QP
         try:
+            # No scaling, as rows have norm 1 already, and no polishing: `_refined` does that.
             solver.setup(
                 P, qp.q, sp.csc_matrix(C), lower, upper,
                 eps_abs=self._eps, eps_rel=self._eps, scaling=0, polishing=False,

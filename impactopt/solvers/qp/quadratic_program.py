@@ -16,7 +16,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from impactopt.solvers.program import Matrix, Vector
+from impactopt.solvers.program import Matrix, Vector, row_norms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +69,7 @@ class QuadraticProgram:
         the QP.
         """
         if self.dense:
+            # Bounds have norm 1 already.
             C: Any = np.vstack([self.row_scale[: self.m, None] * self.A, np.eye(self.n)])
         else:
             C = sp.csc_array(
@@ -83,8 +84,7 @@ class QuadraticProgram:
     @cached_property
     def row_scale(self) -> Vector:
         """Factors of the rows of [A; I] in `stacked`, (m + n,)."""
-        squares = self.A**2 if self.dense else self.A.multiply(self.A)
-        norms = np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
+        norms = row_norms(self.A)
         return np.concatenate([1.0 / np.where(norms > 1e-12, norms, 1.0), np.ones(self.n)])
 
     def residuals(self, x: Vector, y: Vector, z: Vector) -> tuple[float, float, float]:
@@ -95,6 +95,7 @@ class QuadraticProgram:
         """
         C, lower, upper = self.stacked
         v = C @ x
+        # C = row_scale [A; I], so its multipliers are those of the QP over row_scale.
         multipliers = np.concatenate([y, z]) / self.row_scale
         primal = np.max(np.maximum(np.maximum(lower - v, v - upper), 0.0), initial=0.0)
         dual = np.max(np.abs(self.P @ x + self.q + C.T @ multipliers), initial=0.0)
@@ -185,6 +186,7 @@ def refine(qp: QuadraticProgram, x: Vector, y: Vector, *, rounds: int = 10) -> R
     C, lower, upper = qp.stacked
     rows = C if qp.dense else C.tocsr()
     best: Refined | None = None
+    # Corrections may cycle: an active set that was tried before ends them.
     seen: set[bytes] = set()
     for _ in range(rounds):
         sides = active_set(qp, x, y)
@@ -231,6 +233,7 @@ def solve_equality_qp(P: Matrix, q: Vector, A: Matrix, b: Vector) -> tuple[Vecto
         K[:n, :n], K[n:, :n], K[:n, n:] = P, A, A.T
     else:
         K = sp.csc_array(sp.block_array([[P, A.T], [A, None]] if m else [[P]], format="csc"))
+    # Plus for variables, minus for multipliers: quasidefinite, see below.
     shift = _REGULARIZATION * np.concatenate([np.ones(n), -np.ones(m)])
     right = np.concatenate([-q, b])
     if n + m <= _DENSE or isinstance(K, np.ndarray):

@@ -121,6 +121,7 @@ class ReducedRun(Run[SQPOptions]):
         if not self.point.differentiable:
             return Status.FAILED
         guess, y, z = self.point, self.y.copy(), self.z.copy()
+        # BFGS learns one dense matrix of the free variables, so its QPs are dense, too.
         dense = self.options.hessian == "bfgs"
         self._reduction = Reduction(self.program, guess.jacobian, self.determined, dense=dense)
         self._model = make_model(self.program, self.options, self._reduction)
@@ -130,6 +131,7 @@ class ReducedRun(Run[SQPOptions]):
                 self._reduction.load(guess)
             except np.linalg.LinAlgError:  # constraints do not determine their variables there
                 return Status.FAILED
+            # Once a solve: the filter compares violations of different iterates, which need the same weights.
             self._qp.weigh(guess, y, self.options.price)
             return self._attempts(guess, y, z)
         finally:
@@ -170,8 +172,10 @@ class ReducedRun(Run[SQPOptions]):
             if self.report.iterations > self.options.max_iterations:
                 return Status.ITERATION_LIMIT
             f, h = self.point.objective, self.point.violation
+            # In a restoration phase the objective is not aimed at, so it is no progress.
             lower = self._restoration is None and f < best - _LESS_OBJECTIVE * (1.0 + abs(best))
             if h < _LESS_VIOLATION * least or lower or not self._is_violated():
+                # At less violation the objective may have to rise: what it is there is the new reference.
                 best = f if h < _LESS_VIOLATION * least else min(best, f)
                 least, last_progress = min(least, h), self.report.iterations
             elif self.report.iterations > last_progress + _PATIENCE and not self._unlimited_patience:
@@ -201,6 +205,7 @@ class ReducedRun(Run[SQPOptions]):
             else:
                 self.y, self.z = qp_step.y.copy(), qp_step.z.copy()
                 self._complete_multipliers()
+                # With the QP's multipliers the iterate itself may be the solution, without another step.
                 if self._is_optimal(self.options.kkt_tolerance):
                     return Status.SOLVED
                 self._update_price(k, qp_step)
@@ -239,6 +244,8 @@ class ReducedRun(Run[SQPOptions]):
                 )
             if attempt == 0 and trial.finite and self.options.second_order_correction:
                 # a QP whose linearization has the trial point's values
+                # Nocedal and Wright 2006, section 15.6: J d + g = 0 with the curvature
+                # that the trial point shows.
                 g = trial.g - self.point.jacobian @ (trial.x - self.point.x)
                 corrected = self._solve(model, g)
                 if corrected is not None:
@@ -260,6 +267,7 @@ class ReducedRun(Run[SQPOptions]):
         for _ in range(_MAX_RETURNS):
             if not trial.finite or trial.violation < _ROUNDING:
                 break
+            # A chord iteration: the elimination of the iterate's Jacobian serves all trial points.
             other = self.program.point(self._clipped(trial.x + self._reduction.normal(trial.g)))
             if not other.violation < trial.violation:
                 break
@@ -278,6 +286,7 @@ class ReducedRun(Run[SQPOptions]):
         h, f, before = trial.violation, trial.objective, self.point
         if self._restoration is not None:
             predicted = before.violation - qp_step.linear_violation
+            # Armijo's condition for the violation, with the decrease that the QP predicts.
             enough = (
                 predicted > 1e-10 * before.violation and h <= before.violation - _ARMIJO * length * predicted
             )
@@ -311,12 +320,14 @@ class ReducedRun(Run[SQPOptions]):
         if self._restoration is None:  # the equalities' multipliers follow once the new Jacobian is loaded
             self.y, self.z = accepted.qp_step.y.copy(), accepted.qp_step.z.copy()
         else:
+            # The QP's multipliers are of the violation, not of the objective.
             self.y, self.z = np.zeros_like(self.y), np.zeros_like(self.z)
             acceptable = all(
                 h <= 0.999 * p.violation or accepted.point.objective <= p.objective for p in self._filter
             )
             if h <= max(_RESTORED * self._restoration, self.options.violation_tolerance) and acceptable:
                 self._end_restoration()
+            # Feasible, but a pair refuses it: the filter begins anew.
             elif accepted.point.max_violation <= self.options.violation_tolerance:
                 self._filter = []
                 self._end_restoration()
@@ -348,12 +359,14 @@ class ReducedRun(Run[SQPOptions]):
         if self._restoration is not None:  # a failed QP proves nothing
             return Status.INFEASIBLE if self._qp_solved else Status.FAILED
         self._restoration = self.point.violation
+        # So that the iterates do not return to where the search stalled (Waechter and Biegler, step A-9).
         self._filter.append(Pair(self.point.violation, self.point.objective))
         self._radius, self._price = self._widest, self.options.price
         return None
 
     def _end_restoration(self) -> None:
         self._restoration = None
+        # BFGS has learnt where the phase began, far from here.
         self._model.forget()
         self._radius = self._widest
 
@@ -383,6 +396,7 @@ class ReducedRun(Run[SQPOptions]):
     def _is_optimal(self, tolerance: float) -> bool:
         if self._is_violated() or self._restoration is not None or self._kkt() > tolerance:
             return False
+        # |multiplier| x distance of an equality is rounding, times a multiplier that may be large.
         y = self.y.copy()
         self._clear_equalities(y)
         gap = complementarity(self.program, self.point.x, self.point.g, y, self.z)

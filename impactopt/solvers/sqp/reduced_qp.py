@@ -25,7 +25,15 @@ import scipy.sparse as sp
 from impactopt.solvers.elimination.condense import Condenser, Elimination, find_eliminations
 from impactopt.solvers.elimination.kernels import kernels
 from impactopt.solvers.options import SQPOptions
-from impactopt.solvers.program import Determined, Matrix, Point, TimedProgram, Vector, constraint_violations
+from impactopt.solvers.program import (
+    Determined,
+    Matrix,
+    Point,
+    TimedProgram,
+    Vector,
+    constraint_violations,
+    row_norms,
+)
 from impactopt.solvers.qp.quadratic_program import QPSolution, QPSolver, QPStatus, QuadraticProgram
 
 Index = npt.NDArray[np.intp]
@@ -62,6 +70,7 @@ class Reduction:
         """jacobian : (m, n) csc, at any point.  dense : even if many variables are free."""
         equal = program.g_lower == program.g_upper
         self._equations, all_equal = np.flatnonzero(equal), np.ones(int(equal.sum()), dtype=bool)
+        # The condenser sees equalities only; the QP has the inequalities, and the Hessian is projected by T.
         equations = self._of_equations(jacobian.tocsr())
         self._empty = sp.csc_array((program.n, program.n))
         self._key = _key(equations, determined)
@@ -105,6 +114,7 @@ class Reduction:
         self._A = point.jacobian_csr[self.equalities]
         self._condenser.load(equations, self._empty)
         Z = np.zeros((self._n, self.free.size))
+        # The identity for free variables; the rows of the determined ones become -A_D^-1 A_F.
         Z[self.free, np.arange(self.free.size)] = 1.0
         self._condenser.expand_basis(Z)
         Z = self._Z = _without_zeros(Z) if self.sparse else Z
@@ -132,6 +142,7 @@ class Reduction:
         d = self._condenser.particular((g - self._level)[self._equations])
         if self.equalities.size:
             off = -(g[self.equalities] - self._level[self.equalities] + self._A @ d)
+            # R' has full column rank; dependent equalities are met as well as possible, by least squares.
             along = np.linalg.lstsq(self._R.T, off[self._order], rcond=None)[0]
             d = d + self._Z @ (self._Y @ along)
         return d
@@ -144,6 +155,7 @@ class Reduction:
         y = y.copy()
         if self.equalities.size:
             of_equalities = np.zeros(self.equalities.size)
+            # Stationarity along Y, the directions that the equalities fix: R y = -Y' Z' dual.
             target = -(self._Y.T @ (self._Z.T @ dual))
             of_equalities[self._order] = np.linalg.lstsq(self._R, target, rcond=None)[0]
             y[self.equalities] = of_equalities
@@ -165,7 +177,8 @@ class Reduction:
         """
         own = point.jacobian_csr[self.others]
         by_free = own @ self._Z
-        norms, whole = _norms(by_free), _norms(own)
+        norms, whole = row_norms(by_free), row_norms(own)
+        # A gradient that cancels along Z is rounding; over its own norm it would be a constraint of noise.
         norms = np.maximum(norms, _MIN_RELATIVE_NORM * whole)
         along = by_free if self._null_space is None else by_free @ self._null_space
         return along, np.where(norms > 1e-12, norms, 1.0)
@@ -183,11 +196,6 @@ def _key(equations: Matrix, determined: Sequence[Determined]) -> bytes:
     for array in (equations.indptr, equations.indices, *[variables for _, variables in determined]):
         digest.update(np.ascontiguousarray(array, dtype=np.int64).tobytes())
     return digest.digest()
-
-
-def _norms(rows: Any) -> Vector:
-    squares = rows.multiply(rows) if sp.issparse(rows) else rows**2
-    return np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
 
 
 def _without_zeros(Z: np.ndarray) -> Matrix:
@@ -268,6 +276,8 @@ class ExactModel:
         square, identity = active.T @ active, sp.eye_array(B.shape[0], format="csc")
         for weight in _ACTIVE_WEIGHTS[:2]:
             if _is_convex(weighted := B + weight * square):
+                # As in the interior-point method the last shift is where the next
+                # search begins, and it decays.
                 self._shift /= 3.0
                 return weighted
         self._shift = max(self._shift / 3.0, _MIN_SHIFT)
@@ -291,6 +301,7 @@ class BFGSModel:
         reduction = self._reduction
         if not objective:
             return _restoration_model(point, reduction.T)
+        # A point may be asked for again, with a smaller radius: then there is nothing to learn.
         if self._last is None or self._last[0] is not point:
             if self._last is not None:
                 self._update(point, y)
@@ -315,15 +326,18 @@ class BFGSModel:
         own_y[reduction.eliminated] = 0.0
         step = (point.x - before.x)[reduction.free]
         change = reduction.gradient(point.gradient + point.jacobian.T @ own_y)
+        # Each gradient is reduced with the basis of its own point.
         change = change - basis.T @ (before.gradient + before.jacobian.T @ own_y)
         Bs = self._B @ step
         sBs, sy = float(step @ Bs), float(step @ change)
+        # The free variables have not moved: nothing to learn.
         if sBs < 1e-16:
             return
         # procedure 18.2: a change of the gradient that shows too little curvature is mixed with Bs until
         # s'r is 0.2 s'Bs, so that B stays positive definite
         theta = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
         r = theta * change + (1.0 - theta) * Bs
+        # r'r / s'r is the curvature that the update would add along r.
         if float(r @ r) > _MAX_CURVATURE * float(step @ r):
             return
         self._B = self._B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(step @ r)
@@ -346,10 +360,12 @@ def _convex(B: np.ndarray, active: np.ndarray) -> np.ndarray:
             la.cholesky(weighted - least, check_finite=False)
             return np.asarray(weighted)
     values, vectors = la.eigh(B + _ACTIVE_WEIGHTS[1] * square, check_finite=False)
+    # Lifted to the least, not reflected: the radius bounds the long steps that follow.
     return np.asarray((vectors * np.maximum(values, _MIN_EIGENVALUE)) @ vectors.T)
 
 
 def _restoration_model(point: Point, T: Matrix) -> ReducedModel:
+    # Without curvature the QP may have many solutions; the dual method needs a positive definite P.
     B = _RESTORATION_CURVATURE * (
         sp.eye_array(T.shape[1], format="csc") if sp.issparse(T) else np.eye(T.shape[1])
     )
@@ -422,6 +438,7 @@ class ReducedQP:
         hold on to constraints that cease to be active.
         """
         every, which = self._gradients(point), np.flatnonzero(np.abs(self._unit) > _ACTIVE_MULTIPLIER)
+        # Rows of `every` have norm 1 by the free variables; times this, 1 by all variables.
         own = self._norms / point.row_norms[self._reduction.others]
         return sp.diags_array(np.append(own, np.ones(every.shape[0] - own.size))[which]) @ every[which]
 
@@ -436,6 +453,8 @@ class ReducedQP:
         self._program.weigh(point)
         weights, others = self._program.weights, self._reduction.others
         by_free = 1.0 / np.clip(self._norms, 1.0, 1e6)
+        # price x weight > |multiplier|, the condition for an exact penalty (Nocedal and
+        # Wright 2006, theorem 17.3).
         known = _PRICE_MARGIN * np.abs(y[others]) / price
         weights[others] = np.maximum(np.maximum(weights[others], by_free), known)
 
@@ -472,13 +491,16 @@ class ReducedQP:
         d0 = reduction.normal(g)
         shortened = self.careful or not model.has_objective
         longest = (_MAX_CAREFUL_NORMAL if shortened else _MAX_NORMAL) * radius
+        # A shortened normal step leaves a part of every equality's residual, the same fraction of all.
         d0 *= min(1.0, longest / max(float(np.abs(d0).max(initial=0.0)), 1e-300))
         # bounds of the normalized constraints on t, and the price of violating them
         after, scale = g + point.jacobian @ d0, self._norms
         x = point.x + d0
         lower = np.concatenate([(p.g_lower - after)[others] / scale, (p.x_lower - x)[bounded]])
         upper = np.concatenate([(p.g_upper - after)[others] / scale, (p.x_upper - x)[bounded]])
+        # Of the normalized constraints, whose unit of violation is `scale` units of the program's.
         prices = price * np.concatenate([p.weights[others] * scale, np.ones(bounded.size)])
+        # The largest change of a linear function in a box: radius times the 1-norm of its gradient.
         reach = radius * abs(every).sum(axis=1)
         off = np.maximum(lower, -upper)  # violation at t = 0; negative: distance to the bound
         given_up = (off > _ELASTIC_VIOLATION) & (
@@ -493,6 +515,7 @@ class ReducedQP:
         guess = np.zeros(T.shape[1])
         for _ in range(_MAX_ROUNDS):
             which, lost = np.flatnonzero(working & ~given_up), np.flatnonzero(given_up)
+            # A violated lower bound pulls up: its multiplier is negative, as `NonlinearProgram` has signs.
             lost_multipliers = np.where(lower > 0, -prices, prices)[lost]
             slope = slope0 + every[lost].T @ lost_multipliers
             qp = _elastic_qp(model.B, slope, every[which], lower[which], upper[which], radius, prices[which])
@@ -515,6 +538,7 @@ class ReducedQP:
             values = np.concatenate([(point.jacobian @ step)[others] / scale, step[bounded]])
             beyond = np.maximum(lower - values, values - upper)
             # a given-up constraint that is met strictly goes back into the working set
+            # Its price as a constant gradient would go on pushing it beyond its bound.
             met = given_up & (np.where(lower > 0, lower - values, values - upper) < -_MISSED_VIOLATION)
             missed = np.where(working | given_up, 0.0, beyond)
             if missed.max(initial=0.0) <= _MISSED_VIOLATION and not met.any():
@@ -525,6 +549,7 @@ class ReducedQP:
             working[worst[missed[worst] > 0]] = True
         self._unit = unit
         d, y, z = d0 + step, np.zeros(p.m), np.zeros(p.n)
+        # A normalized multiplier is of g / scale.
         y[others], z[bounded] = unit[: others.size] / scale, unit[others.size :]
         return QPStep(
             d,

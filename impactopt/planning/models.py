@@ -1,4 +1,4 @@
-"""Collision model and number of touches of a plan: the cheapest model that is accurate enough, and warm
+"""Collision model and order of contact events of a plan: the cheapest model that is accurate enough, and warm
 starts between models.
 
 A model's error is estimated without solving a program, by collisions of the compiled SDC from the plan's
@@ -28,10 +28,9 @@ from impactopt.problem.checks import met_once
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.contact_guess import (
-    can_meet,
+    contact_order,
     fastest_at_contact,
     mass_at_contact,
-    touches_needed,
 )
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.initial_guess import strike_rates
@@ -60,48 +59,47 @@ def carried_start(
     return with_factors_of(new, start.problem.robot, found) if now[-1] else found
 
 
-def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactProblem:
-    """Problem with the number of touches that point masses need, if it leaves that open; else itself.
+def with_order(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactProblem:
+    """Problem with the order of contact events that point masses have, if it leaves that open; else itself.
 
     Raises
     ------
-    InputError : point masses never meet as often as it says.
+    InputError : point masses never touch as often as it says.
     """
-    if met_once(problem) or problem.touches == 1 or (problem.scenarios and problem.touches is None):
+    touches = problem.touches
+    if met_once(problem) or isinstance(touches, tuple) or (problem.scenarios and touches is None):
         return problem
     mass, most = mass_at_contact(problem), fastest_at_contact(problem)
     if not np.isfinite(most):
         return problem
     event = problem.target.guards[-1]
-    if problem.touches is not None:
-        if can_meet(problem.law, problem.target, mass, most, problem.touches):
-            return problem
+    order = contact_order(problem.law, problem.target, mass, most, touches)
+    if order is None and touches not in (None, 1):
         raise InputError(
-            f"touches is {problem.touches}, but at no speed that the joints allow do point masses as heavy "
+            f"touches is {touches}, but at no speed that the joints allow do point masses as heavy "
             f"as striker and target meet so often until the target's {event!r}: leave it out"
         )
-    needed = touches_needed(problem.law, problem.target, mass, most)
-    if needed in (None, 1):
+    if not order:
         return problem
-    say(f"point masses part before the target's {event!r}: planned with {needed} touches")
-    return changed(problem, touches=needed)
+    say(f"point masses part before the target's {event!r}: the contact is planned as {', '.join(order)}")
+    return changed(problem, touches=order)
 
 
-def with_touches_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
-    """Problem with the number of touches of the solution that it starts from.
+def with_order_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
+    """Problem with the order of contact events of the solution that it starts from.
 
     Raises
     ------
-    InputError : the problem gives another number.
+    InputError : the problem gives another number of touches, or another order.
     """
-    own, of_start = problem.planned_touches, start.problem.planned_touches
-    if own == of_start:
+    order, touches = start.problem.order, start.problem.planned_touches
+    if problem.order == order:
         return problem
-    if problem.touches is None and not met_once(problem):
-        return changed(problem, touches=of_start)
+    if problem.touches in (None, touches) and not met_once(problem):
+        return changed(problem, touches=order)
     raise InputError(
-        f"start: the solution touches its target {of_start} times in the impact, and this problem's plan "
-        f"{own} times: leave start out"
+        f"start: the solution touches its target {touches} times in the impact ({', '.join(order)}), and "
+        f"this problem's plan {problem.planned_touches} times: leave start out"
     )
 
 

@@ -28,7 +28,7 @@ from impactopt.planning.lazy_constraints import (
     window_caution,
     with_lazy_constraints,
 )
-from impactopt.planning.models import carried_start, with_touches, with_touches_of
+from impactopt.planning.models import carried_start, with_order, with_order_of
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
@@ -193,7 +193,7 @@ def _program(
 ) -> tuple[Transcription, str | Array | SolverResult]:
     """Nonlinear program of a problem, on the mesh of a given solution, and the initial guess for it."""
     if not isinstance(start, Solution):
-        problem = with_touches(problem, budget.say)
+        problem = with_order(problem, budget.say)
         t = program_on(with_room_for_gains(problem), NO_MORE, (), (), budget.report)
         if isinstance(start, str):
             return with_first_scale(t), start
@@ -202,7 +202,7 @@ def _program(
     problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
     if problem.style == start.problem.style:
         problem = replace(problem, price_scale=start.problem.price_scale)
-    problem = with_touches_of(start, problem)
+    problem = with_order_of(start, problem)
     t = program_on(with_room_for_gains(problem), start.nodes, start.elements, start.shares, budget.report)
     apart = start.apart if same_bodies(problem, start.problem) else {}
     given = carried_start(t, partial(program_of, start), start, apart)

@@ -316,6 +316,15 @@ class PlannedCollision:
     acceleration: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     forces: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
+    @property
+    def last_touch(self) -> float:
+        """End of the last touch [s]; a board may swing on after it, and break."""
+        touching = np.flatnonzero(self.force > _NO_FORCE * self.force.max())
+        return float(self.time[min(touching[-1] + 1, len(self.time) - 1)]) if touching.size else 0.0
+
+
+_NO_FORCE = 1e-9  # of the largest force: rounding
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedScenario:

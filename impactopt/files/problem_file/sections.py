@@ -304,7 +304,9 @@ class CollisionSection(Section):
         "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    touches: Touches = optional("number of contacts with a board; left out: that of a point-mass model")
+    touches: Touches = optional(
+        "number of contacts with a board, or the ends of the contact's phases; left out: as of point masses"
+    )
     compression: Fractions = optional("lengths of its collocation elements")
     restitution: Fractions = optional("lengths of its collocation elements")
 

@@ -245,7 +245,7 @@ def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
 
 Positive = Annotated[float, Field(gt=0)]
 Freezes = Annotated[int, Field(ge=0, le=MOST_FREEZES)]
-Touches = Annotated[int, Field(ge=1, le=MOST_TOUCHES)]
+Touches = Annotated[int, Field(ge=1, le=MOST_TOUCHES)] | list[str]
 NotNegative = Annotated[float, Field(ge=0)]
 AtLeastOne = Annotated[float, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, le=1)]

@@ -263,7 +263,7 @@ def _nearest(
     """
     speed = max(speed, float(target.speed_before()) + MIN_APPROACH_SPEED)
     finer, touches = (STEPS_FOR_ORDERS, order.count(TOUCH) + 1) if order else (1, 0)
-    found, too_slow = _integrated(law, target, mass, speed, touches), 0.0
+    found, too_slow = _integrated(law, target, mass, speed, touches), -np.inf
     for k in range(2 * SPEED_STEPS * finer if target.guards else 1):
         # nearest speeds first, faster and slower in turn
         at = speed * SPEED_FACTOR ** ((k + 1) // 2 / finer * (1 if k % 2 else -1))

@@ -245,7 +245,18 @@ def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
 
 Positive = Annotated[float, Field(gt=0)]
 Freezes = Annotated[int, Field(ge=0, le=MOST_FREEZES)]
-Touches = Annotated[int, Field(ge=1, le=MOST_TOUCHES)] | list[str]
+
+
+def touches_or_order(value: Any) -> Any:
+    """A whole number from 1 to 4, or a list of names."""
+    if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
+        return tuple(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_TOUCHES:
+        raise ValueError(f"give a whole number from 1 to {MOST_TOUCHES}, or a list of names")
+    return value
+
+
+Touches = Annotated[Any, PlainValidator(touches_or_order)]
 NotNegative = Annotated[float, Field(ge=0)]
 AtLeastOne = Annotated[float, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, le=1)]

@@ -28,7 +28,7 @@ from impactopt.planning.lazy_constraints import (
     window_caution,
     with_lazy_constraints,
 )
-from impactopt.planning.models import carried_start, with_order, with_order_of
+from impactopt.planning.models import carried_start, overloaded, with_order, with_order_of
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
@@ -51,6 +51,7 @@ from impactopt.transcription.transcription import Transcription, statement_of
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
+_HOPELESS_ITERATIONS = 100  # of each solve of a problem that is unlikely to have a solution
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 
 
@@ -153,6 +154,9 @@ def _planned(
     began = time.perf_counter()
     t, given = _program(problem, start, budget)
     budget = budget.started()
+    heavy = overloaded(t.problem)
+    if heavy and budget.solver != "ipopt":
+        budget = replace(budget, options={"max_iterations": _HOPELESS_ITERATIONS, **(budget.options or {})})
     if isinstance(given, SolverResult) and Outcome.of(t, given).own_violation <= VIOLATED:
         budget = budget.near_by()  # a feasible warm start may be the optimum
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
@@ -166,7 +170,9 @@ def _planned(
     outcome = best_of(guesses, solver.from_guess, budget, len(which))
     if refined and margins is None:
         outcome = solver.on(outcome)
-    known = hopeless(t.problem) if ended_with_violations(outcome.program, outcome.result) else []
+    known: list[str] = []
+    if ended_with_violations(outcome.program, outcome.result):
+        known = hopeless(t.problem) or heavy
     causes: tuple[Cause, ...] = ()
     if not known:
         outcome, causes = _diagnosed(outcome, solver)

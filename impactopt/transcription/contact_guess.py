@@ -153,29 +153,56 @@ class Parting:
 
 
 def contact_order(
-    law: ContactLaw, target: Target, mass: float, fastest: float, touches: int | None = None
+    law: ContactLaw,
+    target: Target,
+    mass: float,
+    fastest: float,
+    touches: int | None = None,
+    most: float = np.inf,
 ) -> tuple[str, ...] | None:
     """Order in which a point mass [kg] brings about all events of a target, as ends of contact phases.
 
-    fastest : largest speed of the mass [m/s].  touches : number of touches; None: any.
+    fastest : largest speed of the mass [m/s].  touches : number of touches; None: any.  most : force [N] that
+        is not exceeded, if there is such an order.
 
     () if the target's own phases have the events at some speed; else the order that the widest range of
     speeds has; None if there is none.
     """
     speeds = (fastest * SPEED_FACTOR ** (1 - k) for k in range(2 * SPEED_STEPS))
-    if touches in (None, 1) and any(
-        _phases(_integrated(law, target, mass, v), target) is not None for v in speeds
-    ):
+    own = touches in (None, 1)
+    if own and any(_phases(_integrated(law, target, mass, v), target) is not None for v in speeds):
         return ()
     found = Counter[tuple[str, ...]]()
+    gentle = Counter[tuple[str, ...]]()
+    for _, order, peak in _orders(law, target, mass, fastest, touches or MOST_TOUCHES):
+        if touches in (None, order.count(TOUCH) + 1):
+            found[order] += 1
+            gentle[order] += peak <= most
+    counted = gentle if any(gentle.values()) else found
+    return max(counted, key=counted.__getitem__, default=None)
+
+
+def gentlest(law: ContactLaw, target: Target, mass: float, fastest: float) -> tuple[float, float] | None:
+    """Speed [m/s] of a point mass [kg] that brings about all events of a target with the least peak force,
+    and that force [N]; None if no speed does.
+    """
+    found = [(peak, speed) for speed, _, peak in _orders(law, target, mass, fastest, MOST_TOUCHES)]
+    return min(found)[::-1] if found else None
+
+
+def _orders(
+    law: ContactLaw, target: Target, mass: float, fastest: float, touches: int
+) -> Iterator[tuple[float, tuple[str, ...], float]]:
+    """Speeds [m/s], down from the largest, at which a point mass brings about all events of a target that is
+    met again in at most so many touches; with the order of events and the peak force [N].
+    """
     for k in range(2 * SPEED_STEPS * STEPS_FOR_ORDERS if target.met_again else 0):
         speed = fastest * SPEED_FACTOR ** (-k / STEPS_FOR_ORDERS)
-        history = _integrated(law, target, mass, speed, touches or MOST_TOUCHES)
+        history = _integrated(law, target, mass, speed, touches)
         if not set(target.guards) <= set(history.order):  # nor do all happen at lower speeds
             break
-        if history.complete and touches in (None, history.order.count(TOUCH) + 1):
-            found[history.order] += 1
-    return max(found, key=found.__getitem__, default=None)
+        if history.complete:
+            yield speed, history.order, float(history.values[-1].max())
 
 
 def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:

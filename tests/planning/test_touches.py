@@ -16,6 +16,7 @@ from impactopt.errors import InputError, NotSolvedWarning
 from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import load_problem
 from impactopt.files.replay import load_planned
+from impactopt.planning.models import largest_force
 from impactopt.problem.objectives import Penetration
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
@@ -25,9 +26,11 @@ from impactopt.simulation.pinocchio_engine import follow_contact
 from impactopt.solvers.program import Status
 from impactopt.transcription.contact_guess import (
     contact_order,
+    guessed_contact,
     mass_at_contact,
     natural_durations,
     parting,
+    speed_with_order,
 )
 
 BOARD = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
@@ -286,6 +289,46 @@ def test_touches_of_point_masses() -> None:
     first = natural_durations(undamped, BOARD, 2.5, after_two)[0]
     reduced = 1 / (1 / 2.5 + 1 / BOARD.mass)
     assert first == pytest.approx(np.pi * np.sqrt(reduced / 1e7), rel=0.02)
+
+
+def test_the_order_is_one_whose_force_is_borne() -> None:
+    hard = KelvinVoigt(stiffness=1e7, damping=50.0)
+    for most, touches in ((np.inf, 1), (4300.0, 2), (1.0, 1)):  # the last is not possible
+        order = contact_order(hard, BOARD, 0.9, 8.0, most=most)
+        assert order is not None
+        assert order.count(TOUCH) + 1 == touches
+
+
+def test_a_guess_has_the_speed_of_its_order() -> None:
+    """And of a ball that comes, faster than the hand that goes back, the contact itself."""
+    hard = KelvinVoigt(stiffness=1e7, damping=50.0)
+    for order in ((SEPARATION, "break"), (SEPARATION, TOUCH, SEPARATION, "break")):
+        speed = speed_with_order(hard, BOARD, 0.9, 1.0, order)
+        assert speed_with_order(hard, BOARD, 0.9, speed, order) == pytest.approx(speed)
+        assert contact_order(hard, BOARD, 0.9, speed, len(order) // 2) == order
+    ball, at = FreeMass(mass=0.5, initial_velocity=-3.0), np.arange(2)
+    found = guessed_contact(KelvinVoigt(stiffness=1e5, damping=100.0), ball, 2.0, -2.0, at, np.ones(2))
+    assert found.durations[1] < 0.95 * found.durations[0]  # the damper ends it early
+
+
+# ---- gears
+
+
+def test_gears_that_bear_no_impact_are_named_without_a_search() -> None:
+    problem = stiff(1e7, terms=load_problem("chop_arm").terms)
+    with pytest.warns(NotSolvedWarning):
+        solution = solve(problem)
+    assert solution.status is Status.INFEASIBLE
+    assert "gears. Point masses have the target's 'break' from" in solution.result.message
+    assert solution.result.iterations < 500
+
+
+def test_what_gears_bear_is_what_they_carry_at_that_force(swung: Solution) -> None:
+    force, joint = largest_force(stiff(terms=load_problem("chop_arm").terms))
+    loads = swung.loads
+    assert loads is not None
+    at_peak = loads.gear[loads.joints.index(joint)] / 2.0  # its limit
+    assert at_peak == pytest.approx(swung.plan.collision.force.max() / force, rel=0.1)
 
 
 # ---- refusals

@@ -50,7 +50,7 @@ class Target(Described, ABC):
         ones. If one more is left before the last, it ends with compression. The last ends at separation.
     at_once : the first guard may be zero at the first touch, so that the phase before it has no duration.
     stays : the target stays in place after the impact. The striker must then keep off it.
-    met_again : a plan may let the striker separate from it and touch it again before its first guard.
+    met_again : in a plan the striker may separate from it, and touch it again, before a guard and after it.
     """
 
     word: ClassVar[str] = ""

@@ -101,7 +101,8 @@ class ImpactProblem:
     normal (3,) : unit vector in the world frame, along which the target is pushed.
     friction : between the striking points and the target, which does not move sideways; None: no friction.
     second : another striker that hits the same target at the same time, at its own point.
-    law, target : contact law and target. In a plan a `Nail` moves once and stops before the striker leaves it.
+    law, target : contact law and target. In a plan a `Nail` moves once, and stops before the striker leaves
+        it.
     stance : fixed soles and supporting hands, which stay where they are in the start posture.
     stances : stance phases of the motion, each with the soles that stand in it; (): one stance throughout.
         With phases, `stance` is that of the phase with the impact.

@@ -149,6 +149,12 @@ def choose(condition: Any, yes: Any, no: Any) -> Any:
     return ca.if_else(condition, yes, no)
 
 
+def function(name: str, *values: Any) -> Any:
+    """Function of numpy's name, such as "exp", of floats, arrays or CasADi expressions."""
+    symbolic = any(isinstance(value, (ca.SX, ca.MX, ca.DM)) for value in values)
+    return getattr(ca if symbolic else np, name)(*values)
+
+
 def power(base: Any, exponent: Any) -> Any:
     """Power max(base, 0)^exponent for contact laws, of floats, arrays and CasADi expressions.
 

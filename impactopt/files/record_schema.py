@@ -176,7 +176,7 @@ _OTHERS: Mapping[str, _Kinds] = {
         _NUMBER,
     ),
     **dict.fromkeys(("freezes?", "price_scale?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),
-    "touches?": (int,),
+    "touches?": ([_TEXT],),
     "stances?": (
         [
             (

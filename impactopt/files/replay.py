@@ -221,7 +221,7 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """The problem as the record's plan has it: with its lazy constraints, number of touches, optimized gains
+    """The problem as the record's plan has it: with its lazy constraints, order of touches, optimized gains
     and prices of the style.
 
     given : the file is one given by the user, not the record's own text.
@@ -232,8 +232,8 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
         problem = with_chosen(problem, [each["factor"] for each in gains])
         if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
             problem = replace(problem, price_scale=scale)
-        if problem.touches is None and (touches := record.summary.get("touches")) is not None:
-            problem = replace(problem, touches=touches)
+        if order := record.summary.get("touches"):
+            problem = replace(problem, touches=tuple(order))
         return with_lazy_constraints(problem, record.summary.get("rows_on_demand", ()))
     except InputError as error:
         if given:

@@ -114,7 +114,7 @@ def _too_stiff(t: ContactProgram) -> str:
     """
     p = t.problem
     # With several touches planned, parting before the event is what is planned.
-    if not isinstance(t.expected, Collision) or not p.target.guards or p.planned_touches > 1:
+    if not isinstance(t.expected, Collision) or not p.target.guards or p.order:
         return ""
     limit = fastest_at_contact(p)
     found = parting(p.law, p.target, t.hit.mass, limit)
@@ -128,8 +128,8 @@ def _parting_message(found: Parting, limit: float, *, one_touch: bool) -> str:
         f"as heavy as striker and target separate {1e3 * found.time:.2g} ms after they touch, before the "
         f"target's {found.event!r}"
     )
-    if found.touches is not None and not one_touch:
-        message += f"; `[collision] touches = {found.touches}` plans them"
+    if found.order is not None and not one_touch:
+        message += f"; `[collision] touches = {list(found.order)}` plans them"
     if found.needed is not None:
         message += f"; {found.needed:.2g} m/s would be enough"
     if found.stiffness is not None:

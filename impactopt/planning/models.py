@@ -1,4 +1,4 @@
-"""Collision model and number of touches of a plan: the cheapest model that is accurate enough, and warm
+"""Collision model and order of contact events of a plan: the cheapest model that is accurate enough, and warm
 starts between models.
 
 A model's error is estimated without solving a program, by collisions of the compiled SDC from the plan's
@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.contact.laws import KelvinVoigt
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque
 from impactopt.planning.budget import Budget
@@ -26,12 +27,14 @@ from impactopt.planning.refinement import carried
 from impactopt.planning.solution import Solved
 from impactopt.problem.checks import met_once
 from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.loads import gear_torque
 from impactopt.solvers.program import SolverResult
+from impactopt.transcription.collision import jump_at_contact
 from impactopt.transcription.contact_guess import (
-    can_meet,
+    contact_order,
     fastest_at_contact,
+    gentlest,
     mass_at_contact,
-    touches_needed,
 )
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.initial_guess import strike_rates
@@ -41,6 +44,9 @@ AnySolution = TypeVar("AnySolution", bound=Solved)
 # Models that "auto" tries. Not the SDC with more freezes: in a program a freeze during contact costs as much
 # as full dynamics.
 _MODELS = ("sdc", "full")
+# Least force over what gears bear, from which on a problem is infeasible: both are of point masses, in the
+# posture of the initial guess.
+_FAR_BEYOND = 2.0
 # Speed at which the first model is tested: part of the fastest impact's; or [m/s] if that is unbounded.
 _TEST_FRACTION, _TEST_SPEED = 0.5, 1.0
 
@@ -61,49 +67,89 @@ def carried_start(
     return with_factors_of(new, start.problem.robot, found) if now[-1] else found
 
 
-def with_touches(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactProblem:
-    """Problem with the number of touches that point masses need, if it leaves that open; else itself.
+def with_order(problem: ImpactProblem, say: Callable[[str], None]) -> ImpactProblem:
+    """Problem with the order of contact events that point masses have, if it leaves that open; else itself.
 
     Raises
     ------
-    InputError : point masses never meet as often as it says.
+    InputError : point masses never touch as often as it says.
     """
-    if met_once(problem) or problem.touches == 1 or (problem.scenarios and problem.touches is None):
+    touches = problem.touches
+    if met_once(problem) or isinstance(touches, tuple) or (problem.scenarios and touches is None):
         return problem
     mass, most = mass_at_contact(problem), fastest_at_contact(problem)
     # Without limits of velocity point masses say nothing.
     if not np.isfinite(most):
         return problem
     event = problem.target.guards[-1]
-    if problem.touches is not None:
-        if can_meet(problem.law, problem.target, mass, most, problem.touches):
-            return problem
+    force = largest_force(problem)[0]
+    order = contact_order(problem.law, problem.target, mass, most, touches, force)
+    if order is None and touches not in (None, 1):
         raise InputError(
-            f"touches is {problem.touches}, but at no speed that the joints allow do point masses as heavy "
+            f"touches is {touches}, but at no speed that the joints allow do point masses as heavy "
             f"as striker and target meet so often until the target's {event!r}: leave it out"
         )
-    needed = touches_needed(problem.law, problem.target, mass, most)
-    if needed in (None, 1):
+    if not order:
         return problem
-    say(f"point masses part before the target's {event!r}: planned with {needed} touches")
-    return changed(problem, touches=needed)
+    say(f"point masses part before the target's {event!r}: the contact is planned as {', '.join(order)}")
+    return changed(problem, touches=order)
 
 
-def with_touches_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
-    """Problem with the number of touches of the solution that it starts from.
+def largest_force(problem: ImpactProblem) -> tuple[float, str]:
+    """Largest contact force [N] that the gears bear in the posture of the initial guess, and the name of the
+    joint whose gear bears least; inf without limits.
+    """
+    robot, c = problem.robot, problem.coordinates
+    if not problem.gear_load.active:
+        return np.inf, ""
+    y, legs = c.split(problem.contact_posture)
+    rates = strike_rates(c, problem.strikers, y, legs, problem.normal)
+    laws = [KelvinVoigt(stiffness=1.0, damping=damping) for damping in (0.0, 1.0)]
+    (_, _, _, before), (force, _, _, after) = (
+        jump_at_contact(problem, c, law, y, rates, legs) for law in laws
+    )
+    load = np.abs(gear_torque(robot, np.zeros(robot.n), after - before) / robot.torque_limit)
+    share = load / problem.gear_load.most(robot) / abs(force)
+    k = int(np.argmax(share))
+    return (1 / float(share[k]) if share[k] > 0 else np.inf), robot.joint_names[k]
+
+
+def overloaded(problem: ImpactProblem) -> list[str]:
+    """Message that gears bear far less than the least force with which point masses bring about all events of
+    a target; none if they may bear it, or nothing is known.
+    """
+    if met_once(problem) or not problem.order:
+        return []
+    mass, fastest = mass_at_contact(problem), fastest_at_contact(problem)
+    (most, joint), found = largest_force(problem), None
+    if np.isfinite(fastest) and np.isfinite(most):
+        found = gentlest(problem.law, problem.target, mass, fastest)
+    if found is None or found[1] <= _FAR_BEYOND * most:
+        return []
+    speed, force = found
+    limit = float(problem.gear_load.most(problem.robot)[problem.robot.joint_names.index(joint)])
+    return [
+        f"gears. Point masses have the target's {problem.target.guards[-1]!r} from {speed:.2g} m/s on, with "
+        f"{force:.2g} N, which load the gear of {joint} with {force / most * limit:.2g} times its torque "
+        f"limit, at most {limit:.3g} allowed ([terms.gear_load] limit); take a softer contact"
+    ]
+
+
+def with_order_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
+    """Problem with the order of contact events of the solution that it starts from.
 
     Raises
     ------
-    InputError : the problem gives another number.
+    InputError : the problem gives another number of touches, or another order.
     """
-    own, of_start = problem.planned_touches, start.problem.planned_touches
-    if own == of_start:
+    order, touches = start.problem.order, start.problem.planned_touches
+    if problem.order == order:
         return problem
-    if problem.touches is None and not met_once(problem):
-        return changed(problem, touches=of_start)
+    if problem.touches in (None, touches) and not met_once(problem):
+        return changed(problem, touches=order)
     raise InputError(
-        f"start: the solution touches its target {of_start} times in the impact, and this problem's plan "
-        f"{own} times: leave start out"
+        f"start: the solution touches its target {touches} times in the impact ({', '.join(order)}), and "
+        f"this problem's plan {problem.planned_touches} times: leave start out"
     )
 
 

@@ -107,7 +107,7 @@ class Solved:
             "starts": [attempt.summary() for attempt in self.attempts],
             "collision_model": self.problem.collision,
             "freezes": self.problem.freezes,
-            **({"touches": self.problem.touches} if self.problem.touches is not None else {}),
+            **({"touches": list(self.problem.order)} if self.problem.order else {}),
             "rows_on_demand": list(lazy_terms_of(self.problem)),
             "style": self.problem.style,
             "price_scale": self.problem.price_scale,
@@ -329,7 +329,7 @@ def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> di
         "impulse_Ns": hit.impulse,
         "target": collision.outcome,
         "peak_force_N": collision.peak_force if duration > 0 else None,
-        "contact_ms": 1e3 * duration,
+        "contact_ms": 1e3 * collision.last_touch if duration > 0 else 0.0,
         "hand_speed_m_s": hit.hand_speed,
     }
 

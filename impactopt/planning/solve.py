@@ -28,7 +28,7 @@ from impactopt.planning.lazy_constraints import (
     window_caution,
     with_lazy_constraints,
 )
-from impactopt.planning.models import carried_start, with_touches, with_touches_of
+from impactopt.planning.models import carried_start, overloaded, with_order, with_order_of
 from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
@@ -51,6 +51,7 @@ from impactopt.transcription.transcription import Transcription, statement_of
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
+_HOPELESS_ITERATIONS = 100  # of each solve of a problem that is unlikely to have a solution
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 
 
@@ -154,6 +155,9 @@ def _planned(
     t, given = _program(problem, start, budget)
     # From here on the time limit counts: a first run compiles for longer than it solves.
     budget = budget.started()
+    heavy = overloaded(t.problem)
+    if heavy and budget.solver != "ipopt":
+        budget = replace(budget, options={"max_iterations": _HOPELESS_ITERATIONS, **(budget.options or {})})
     if isinstance(given, SolverResult) and Outcome.of(t, given).own_violation <= VIOLATED:
         budget = budget.near_by()  # a feasible warm start may be the optimum
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
@@ -168,8 +172,9 @@ def _planned(
     outcome = best_of(guesses, solver.from_guess, budget, len(which))
     if refined and margins is None:
         outcome = solver.on(outcome)
-    # Reasons that need no search come first.
-    known = hopeless(t.problem) if ended_with_violations(outcome.program, outcome.result) else []
+    known: list[str] = []
+    if ended_with_violations(outcome.program, outcome.result):
+        known = hopeless(t.problem) or heavy  # reasons that need no search come first
     causes: tuple[Cause, ...] = ()
     if not known:
         outcome, causes = _diagnosed(outcome, solver)
@@ -198,7 +203,7 @@ def _program(
 ) -> tuple[Transcription, str | Array | SolverResult]:
     """Nonlinear program of a problem, on the mesh of a given solution, and the initial guess for it."""
     if not isinstance(start, Solution):
-        problem = with_touches(problem, budget.say)
+        problem = with_order(problem, budget.say)
         t = program_on(with_room_for_gains(problem), NO_MORE, (), (), budget.report)
         # The scale of prices is taken from the plain reach, so a vector of variables gets none.
         if isinstance(start, str):
@@ -208,7 +213,7 @@ def _program(
     problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
     if problem.style == start.problem.style:
         problem = replace(problem, price_scale=start.problem.price_scale)
-    problem = with_touches_of(start, problem)
+    problem = with_order_of(start, problem)
     t = program_on(with_room_for_gains(problem), start.nodes, start.elements, start.shares, budget.report)
     apart = start.apart if same_bodies(problem, start.problem) else {}
     given = carried_start(t, partial(program_of, start), start, apart)

@@ -17,7 +17,7 @@ from impactopt.planning.clearance_constraints import Margins, deepest_penetratio
 from impactopt.planning.diagnosis import with_reason
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
 from impactopt.planning.lazy_constraints import LazyTerms, gear_caution, lazy_terms_of, with_lazy_constraints
-from impactopt.planning.models import carried_start, with_touches, with_touches_of
+from impactopt.planning.models import carried_start, with_order, with_order_of
 from impactopt.planning.multistart import (
     Guesses,
     best_of,
@@ -136,9 +136,9 @@ def _optimized(
     began, problem = time.perf_counter(), with_room_for_gains(problem)
     if isinstance(start, StrikeSolution):
         problem = with_lazy_constraints(problem, lazy_terms_of(start.problem))
-        problem = with_touches_of(start, problem)
+        problem = with_order_of(start, problem)
     else:
-        problem = with_touches(problem, budget.say)
+        problem = with_order(problem, budget.say)
     mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()
     functions = block_functions(problem, problem.coordinates, budget.report, *mesh[:1])
     budget = budget.started()

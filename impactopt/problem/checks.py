@@ -18,6 +18,7 @@ from impactopt.bodies.world import Ground, Obstacle, TargetBody
 from impactopt.contact.friction import check_friction
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
+from impactopt.contact.targets.base import TOUCH, is_order
 from impactopt.errors import (
     MANY,
     MOST,
@@ -254,7 +255,7 @@ def check_collision(problem: Any) -> None:
     if not instant:
         target = problem.target
         target.smooth([0.0] * target.n_states, 0.0, 0)  # raises for switches without a `smooth` of their own
-        if not target.turns and law.formula()[0] != law.formula()[1]:
+        if not target.turns and law.switches:
             raise InputError(
                 f"a plan for a {type(target).__name__} needs a law that is the same in compression and "
                 f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
@@ -264,21 +265,27 @@ def check_collision(problem: Any) -> None:
 
 def check_touches(problem: Any) -> None:
     """InputError for touches that a plan cannot have."""
-    if problem.touches is None:
+    touches = problem.touches
+    if touches is None:
         return
-    touches = check_whole("touches", problem.touches, least=1, most=MOST_TOUCHES)
-    object.__setattr__(problem, "touches", touches)
-    if touches > 1 and (why := met_once(problem)):
+    order = tuple(touches) if isinstance(touches, (tuple, list)) else ()
+    number = order.count(TOUCH) + 1 if order else touches
+    number = check_whole("touches", number, least=1, most=MOST_TOUCHES)
+    object.__setattr__(problem, "touches", order or number)
+    if (order or number > 1) and (why := met_once(problem)):
         raise InputError(f"touches is {touches}, but {why}: leave it out")
+    if order and isinstance(problem.law, ContactLaw) and not is_order(problem.law, problem.target, order):
+        raise InputError(
+            f"touches: {list(order)} are no ends of a contact's phases, such as ['separation', "
+            f"{problem.target.guards[-1]!r}]: leave it out"
+        )
 
 
 def met_once(problem: Any) -> str:
     """Reason that a plan has a single touch; "" if it may have several."""
-    law, target = problem.law, problem.target
+    target = problem.target
     if not getattr(target, "met_again", False):  # not a target at all: `check_collision` refuses it
         return f"a {type(target).__name__} is met once in a plan"
-    if not isinstance(law, ContactLaw) or law.formula()[0] != law.formula()[1]:
-        return f"the law {type(law).__name__} is not the same in compression and restitution"
     if problem.collision != "full":
         return f"the model {problem.collision!r} of the collision has one contact"
     if problem.second is not None:

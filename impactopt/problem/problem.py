@@ -26,7 +26,7 @@ from impactopt.collision.settings import Effects
 from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.contact.targets.base import ContactPhase, contact_phases
+from impactopt.contact.targets.base import TOUCH, ContactPhase, contact_phases, order_of_touches
 from impactopt.errors import (
     FARTHEST,
     InputError,
@@ -102,8 +102,8 @@ class ImpactProblem:
     normal (3,) : unit vector in the world frame, along which the target is pushed.
     friction : between the striking points and the target, which does not move sideways; None: no friction.
     second : another striker that hits the same target at the same time, at its own point.
-    law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
-        once and stops before the striker leaves it.
+    law, target : contact law and target. In a plan a `Nail` moves once, and stops before the striker leaves
+        it.
     stance : fixed soles and supporting hands, which stay where they are in the start posture.
     stances : stance phases of the motion, each with the soles that stand in it; (): one stance throughout.
         With phases, `stance` is that of the phase with the impact.
@@ -117,8 +117,9 @@ class ImpactProblem:
         that sum to 1. With a `Nail` or a `Board` those of compression are used before and after the event,
         and every element is halved.
     collision_stages : Radau IIA stages of an element, 2 or 3 (order 3 or 5).
-    touches : number of contacts in the impact; more than one for a `Board` that breaks in the last one. None:
-        the number for point masses in place of robot and target.
+    touches : number of contacts with a `Board` in the impact; or what ends each phase of the contact, as
+        ("separation", "break") for a board that swings on and breaks after one touch. None: as for point
+        masses in place of robot and target.
     collision : model of the collision. "full": the equations of motion, at every instant. "sdc": H, J and
         bias are frozen at contact, and ``freezes`` times during it, as in :class:`impactopt.SDC`.
         "sdc-paper": the same with the effects of `SDC.paper`. "auto": "sdc", or "full" if full dynamics at
@@ -166,7 +167,7 @@ class ImpactProblem:
     contact_duration: tuple[float, float] = (0.0, 0.2)
     collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.8), (1.0,))
     collision_stages: int = 3
-    touches: int | None = None
+    touches: int | tuple[str, ...] | None = None
     collision: str = "full"
     freezes: int = 0
     auto_impulse_pct: float = 0.5
@@ -290,12 +291,19 @@ class ImpactProblem:
     @property
     def planned_touches(self) -> int:
         """Number of touches in a plan; 1 if it is left open."""
-        return self.touches or 1
+        return self.order.count(TOUCH) + 1
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Ends of the contact's phases in a plan; (): the phases are the target's own."""
+        if isinstance(self.touches, tuple):
+            return self.touches
+        return order_of_touches(self.law, self.target, self.touches or 1)
 
     @property
     def contact_phases(self) -> tuple[ContactPhase, ...]:
         """Phases of the contact in a plan."""
-        return contact_phases(self.target, self.planned_touches)
+        return contact_phases(self.target, self.order)
 
     @property
     def lasts(self) -> bool:

@@ -31,7 +31,6 @@ from impactopt.transcription.contact_state import (
     DrivePoint,
     joint_motion_slots,
     pulls_apart,
-    switches,
 )
 from impactopt.transcription.layout import (
     DIRECTIONS,
@@ -396,7 +395,7 @@ class Collision(ContactParameters, Collocated):
         self.update_parameters()
         self.torque_fraction = scenario.torque if scenario else limits.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else limits.cone.collision_margin
-        n, self._switches = len(stages), switches(p.law)
+        n = len(stages)
 
         def add(name: str, size: int, **options: Any) -> Group:
             """Add variables at every stage."""
@@ -597,6 +596,8 @@ class Collision(ContactParameters, Collocated):
             # a gap ends where the two meet; zero penetration alone would also hold where they part
             if phase.end == TOUCH:
                 self._bound_rate(last, start + last * size, receding=False)
+        if self.phases[-1].apart:  # or they would touch again
+            self._bound_rate(self.end[-1], start + self.end[-1] * size, receding=True)
 
     def _add_dynamics(self, i: int, place: Place, first: dict[str, int]) -> None:
         """Add the constraints of the robot at a stage, and those of the target.
@@ -638,7 +639,7 @@ class Collision(ContactParameters, Collocated):
         b.equal("target's motion", place, ["travel"], first + part["travel"], fast)
         b.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
         k, at_rest = phase.mode, [0.0] * target.n_states  # a state, to ask which expressions the target has
-        ends_by_guard, once = phase.end in target.guards, self._b.problem.planned_touches == 1
+        ends_by_guard, once = phase.end in target.guards, not self._b.problem.order
         if i in self.end and (ends_by_guard or once):
             # The constraint that ends the phase stands for rate and invariant there.
             if ends_by_guard and target.reserve(at_rest, 0.0, k):
@@ -651,9 +652,10 @@ class Collision(ContactParameters, Collocated):
                     measure=percent("short"),
                 )
             return
-        if self._switches and target.guards:
-            # The phase's branch of the law is right while bodies approach, or, in the last phase, recede.
-            self._bound_rate(i, first, receding=self.stages[i].phase == len(self.end) - 1)
+        turned = i in self.end and phase.end == TURN
+        if self._b.problem.law.switches and target.guards and not (phase.apart or turned):
+            # the phase's branch of the law is right while bodies approach, or recede
+            self._bound_rate(i, first, receding=phase.restituting)
         if target.invariant(at_rest, 0.0, k):
             b.constraints.add(
                 term=target.guards[min(k, len(target.guards) - 1)],
@@ -710,7 +712,7 @@ class Collision(ContactParameters, Collocated):
         place = np.array([s.place for s in self.stages])
         phase = np.array([s.phase for s in self.stages])
         mass, speed = effective_mass(c, p.strikers, p.normal, y, legs, rates)
-        found = guessed_contact(*self.per_striker(), mass, speed, phase, place, p.planned_touches)
+        found = guessed_contact(*self.per_striker(), mass, speed, phase, place, p.order)
         times = np.clip(found.durations, *np.transpose([layout.bounds(group) for group in self.T]))
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)

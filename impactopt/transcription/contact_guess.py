@@ -6,7 +6,8 @@ Contact law and target are those of the problem, with their switches and events.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from scipy.optimize import brentq, linprog
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Nail, Target
-from impactopt.contact.targets.base import contact_phases
+from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN, contact_phases
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import ConstrainedDynamics
@@ -34,8 +35,8 @@ MIN_PRESS_TIME = 1e-6
 # A search multiplies the approach speed by powers of this factor, so many times up and as many down. Boards
 # and nails may need a faster mass; stiff contacts a slower one, as mass and nail part before the nail stops.
 SPEED_FACTOR, SPEED_STEPS = 1.3, 12
-# Steps in place of one where the contact has several touches: few speeds have the number of touches wanted.
-STEPS_FOR_TOUCHES = 6
+# Steps in place of one where events have an order of their own: few speeds have the wanted one.
+STEPS_FOR_ORDERS = 6
 MIN_APPROACH_SPEED = 0.5  # [m/s] relative to a target that moves away
 MAX_SPEED_INCREASE = 10.0  # [m/s] over the given speed, in the search for a target's speed after contact
 MIN_STRIKER_SPEED = 0.1  # [m/s] a striker that is slower, in either direction, counts as this fast
@@ -142,54 +143,69 @@ class Parting:
 
     event : name of that event.
     time : of the separation [s].
-    touches : number of touches that bring the event about, at a speed the robot can have.
+    order : of the events, if they happen at a speed the robot can have (`contact_order`).
     needed : speed at which one touch does [m/s].
     stiffness : of the contact with which one touch does at the robot's speed, the nearest by factors of 10.
     """
 
     event: str
     time: float
-    touches: int | None
+    order: tuple[str, ...] | None
     needed: float | None
     stiffness: float | None
 
 
-def touches_needed(law: ContactLaw, target: Target, mass: float, fastest: float) -> int | None:
-    """Least number of touches in which a point mass [kg] brings about all events of a target.
+def contact_order(
+    law: ContactLaw,
+    target: Target,
+    mass: float,
+    fastest: float,
+    touches: int | None = None,
+    most: float = np.inf,
+) -> tuple[str, ...] | None:
+    """Order in which a point mass [kg] brings about all events of a target, as ends of contact phases.
 
-    fastest : largest speed of the mass [m/s].
+    fastest : largest speed of the mass [m/s].  touches : number of touches; None: any.  most : force [N] that
+        is not exceeded, if there is such an order.
 
-    None if no number of touches that a plan may have does.
+    () if the target's own phases have the events at some speed; else the order that the widest range of
+    speeds has; None if there is none.
     """
     speeds = (fastest * SPEED_FACTOR ** (1 - k) for k in range(2 * SPEED_STEPS))
-    if any(_phases(_integrated(law, target, mass, v), target) is not None for v in speeds):
-        return 1
-    if not target.met_again:
-        return None
-    least: int | None = None
-    for k in range(2 * SPEED_STEPS * STEPS_FOR_TOUCHES):
-        speed = fastest * SPEED_FACTOR ** (1 - k / STEPS_FOR_TOUCHES)
-        found = _integrated(law, target, mass, speed, least or MOST_TOUCHES)
-        if _phases(found, target) is not None:
-            least = min(found.touches, least or MOST_TOUCHES)
-        if least in (1, 2) or _first_event(found, target) is None:  # nor is there one at lower speeds
-            break
-    return least
+    own = touches in (None, 1)
+    if own and any(_phases(_integrated(law, target, mass, v), target) is not None for v in speeds):
+        return ()
+    found = Counter[tuple[str, ...]]()
+    gentle = Counter[tuple[str, ...]]()
+    for _, order, peak in _orders(law, target, mass, fastest, touches or MOST_TOUCHES):
+        if touches in (None, order.count(TOUCH) + 1):
+            found[order] += 1
+            gentle[order] += peak <= most
+    counted = gentle if any(gentle.values()) else found
+    return max(counted, key=counted.__getitem__, default=None)
 
 
-def can_meet(law: ContactLaw, target: Target, mass: float, fastest: float, touches: int) -> bool:
-    """True if a point mass [kg] brings about all events of a target in this number of touches.
-
-    fastest : largest speed of the mass [m/s].
+def gentlest(law: ContactLaw, target: Target, mass: float, fastest: float) -> tuple[float, float] | None:
+    """Speed [m/s] of a point mass [kg] that brings about all events of a target with the least peak force,
+    and that force [N]; None if no speed does.
     """
-    for k in range(2 * SPEED_STEPS * STEPS_FOR_TOUCHES):
-        speed = fastest * SPEED_FACTOR ** (-k / STEPS_FOR_TOUCHES)
-        found = _integrated(law, target, mass, speed, touches)
-        if found.touches == touches and _phases(found, target) is not None:
-            return True
-        if _first_event(found, target) is None:  # nor is there one at lower speeds
-            return False
-    return False
+    found = [(peak, speed) for speed, _, peak in _orders(law, target, mass, fastest, MOST_TOUCHES)]
+    return min(found)[::-1] if found else None
+
+
+def _orders(
+    law: ContactLaw, target: Target, mass: float, fastest: float, touches: int
+) -> Iterator[tuple[float, tuple[str, ...], float]]:
+    """Speeds [m/s], down from the largest, at which a point mass brings about all events of a target that is
+    met again in at most so many touches; with the order of events and the peak force [N].
+    """
+    for k in range(2 * SPEED_STEPS * STEPS_FOR_ORDERS if target.met_again else 0):
+        speed = fastest * SPEED_FACTOR ** (-k / STEPS_FOR_ORDERS)
+        history = _integrated(law, target, mass, speed, touches)
+        if not set(target.guards) <= set(history.order):  # nor do all happen at lower speeds
+            break
+        if history.complete:
+            yield speed, history.order, float(history.values[-1].max())
 
 
 def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
@@ -205,8 +221,8 @@ def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Par
 
     if not np.isfinite(fastest):
         return None
-    touches = touches_needed(law, target, mass, fastest)
-    if touches == 1:
+    order = contact_order(law, target, mass, fastest)
+    if order == ():
         return None
     time = _integrated(law, target, mass, fastest).time
     if time[-1] >= MAX_CONTACT_TIME:
@@ -218,7 +234,7 @@ def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Par
     return Parting(
         event=target.guards[-1],
         time=float(time[-1]),
-        touches=touches,
+        order=order,
         needed=next((v for v in faster if complete(law, v)), None),
         stiffness=next(
             (k for k in others if complete(type(law)(**{**parameters, "stiffness": k}), fastest)), None
@@ -233,27 +249,20 @@ def guessed_contact(
     speed: float,
     phase: NDArray[np.intp],
     place: Array,
-    touches: int,
+    order: tuple[str, ...] = (),
 ) -> GuessedContact:
     """Contact of a point mass [kg] with the target, sampled at collocation points.
 
     speed : of the mass at contact [m/s]. It is changed as little as a target with events needs for all of
-        them to happen in ``touches`` touches, and raised where the target moves away faster.
+        them to happen in their order, and raised where the target moves away faster.
+    order : ends of the phases, if they are not the target's own.
     phase (k,), place (k,) : of each collocation point, its contact phase and place in it, in [0, 1].
     """
-    speed = max(speed, float(target.speed_before()) + MIN_APPROACH_SPEED)
-    finer = 1 if touches == 1 else STEPS_FOR_TOUCHES
-    for k in range(2 * SPEED_STEPS * finer if target.guards else 1):
-        # nearest speeds first, faster and slower in turn
-        at = speed * SPEED_FACTOR ** ((k + 1) // 2 / finer * (1 if k % 2 else -1))
-        found = _integrated(law, target, mass, at, touches)
-        ends = _phases(found, target) if found.touches == touches else None
-        if ends is not None:
-            break
-    time, values, _ = found
+    found, ends = _nearest(law, target, mass, speed, order)
+    time, values = found.time, found.values
     if ends is None:  # no speed has the events: arbitrary phases, for the solver to correct
         ends = np.array([0.0, 0.4, 0.5, 1.0] if target.guards else [0.0, 0.5, 1.0])
-        ends = time[-1] * (ends if touches == 1 else np.linspace(0.0, 1.0, 2 * touches + 1))
+        ends = time[-1] * (np.linspace(0.0, 1.0, len(order) + 1) if order else ends)
     times = ends[phase] + place * np.diff(ends)[phase]
 
     def in_phase(quantity: Array) -> Array:
@@ -276,6 +285,37 @@ def guessed_contact(
         state=np.reshape(states, (target.n_states, len(times))).T,
         travel=in_phase(travel),
     )
+
+
+def _nearest(
+    law: ContactLaw, target: Target, mass: float, speed: float, order: tuple[str, ...]
+) -> tuple[_History, Array | None]:
+    """Contact of a point mass [kg] with all events in their order, at the speed [m/s] nearest to the given
+    one; and the instants of the phases, None if no speed has them.
+    """
+    speed = max(speed, float(target.speed_before()) + MIN_APPROACH_SPEED)
+    finer, touches = (STEPS_FOR_ORDERS, order.count(TOUCH) + 1) if order else (1, 0)
+    found, too_slow = _integrated(law, target, mass, speed, touches), -np.inf
+    for k in range(2 * SPEED_STEPS * finer if target.guards else 1):
+        # nearest speeds first, faster and slower in turn
+        at = speed * SPEED_FACTOR ** ((k + 1) // 2 / finer * (1 if k % 2 else -1))
+        if at <= too_slow:
+            continue
+        found = _integrated(law, target, mass, at, touches) if k else found
+        ends = _phases(found, target) if found.order == order else None
+        if ends is not None:
+            return found, ends
+        if order and not set(target.guards) <= set(found.order):
+            too_slow = max(too_slow, at)
+    return found, None
+
+
+def speed_with_order(
+    law: ContactLaw, target: Target, mass: float, speed: float, order: tuple[str, ...]
+) -> float:
+    """Approach speed [m/s] of a point mass [kg], nearest to the given one, with this order of events."""
+    found, ends = _nearest(law, target, mass, speed, order)
+    return speed if ends is None else float(found.values[1, 0])
 
 
 def speed_that_leaves(
@@ -301,22 +341,22 @@ def speed_that_leaves(
     return float(brentq(lambda v: target_speed(v) - wanted, low, high, xtol=1e-2)) if low < high else speed
 
 
-def natural_durations(law: ContactLaw, target: Target, mass: float, touches: int) -> Array:
+def natural_durations(law: ContactLaw, target: Target, mass: float, order: tuple[str, ...] = ()) -> Array:
     """Duration [s] of each contact phase of a point mass [kg] that hits at 1 m/s.
 
     Cached, as successive programs mostly have the same law, target and mass.
     """
     try:
-        return _natural_durations(law, target, mass, touches)
+        return _natural_durations(law, target, mass, order)
     except TypeError:  # a user's law or target without a hash
-        return _natural_durations.__wrapped__(law, target, mass, touches)
+        return _natural_durations.__wrapped__(law, target, mass, order)
 
 
 @lru_cache(maxsize=64)
-def _natural_durations(law: ContactLaw, target: Target, mass: float, touches: int) -> Array:
-    phases = len(contact_phases(target, touches))
+def _natural_durations(law: ContactLaw, target: Target, mass: float, order: tuple[str, ...]) -> Array:
+    phases = len(contact_phases(target, order))
     at = np.arange(phases, dtype=np.intp)
-    return guessed_contact(law, target, mass, 1.0, at, np.ones(phases), touches).durations
+    return guessed_contact(law, target, mass, 1.0, at, np.ones(phases), order).durations
 
 
 def _push(target: FreeMass, phase: NDArray[np.intp], place: Array) -> GuessedContact:
@@ -347,23 +387,23 @@ class _History(NamedTuple):
     time (k,) : [s].
     values (4 + n_states, k) : position [m] and speed [m/s] of the mass, travel [m] and state of the target,
         contact force [N].
-    switched : instants [s] of separation and of the next touch, in turn, before the last separation.
+    order, ends : ends of the contact's phases, and their instants [s]; () if they were not looked for.
+    complete : all events have happened, and striker and target part for good.
     """
 
     time: Array
     values: Array
-    switched: list[float]
-
-    @property
-    def touches(self) -> int:
-        return len(self.switched) // 2 + 1
+    order: tuple[str, ...] = ()
+    ends: tuple[float, ...] = ()
+    complete: bool = False
 
 
-def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touches: int = 1) -> _History:
-    """Contact of a point mass [kg] with a target, up to the separation after the target's first event, or
-    after this number of touches.
+def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touches: int = 0) -> _History:
+    """Contact of a point mass [kg] with a target.
+
+    touches : 0: up to the first separation. Else up to the last of the target's events and the separation
+        after it, or after this number of touches.
     """
-
     of_law, of_target = law.parameters, target.parameters
 
     # y = position and speed of the mass, travel and state of the target
@@ -371,53 +411,85 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
         return float(target.velocity(y[3:], of_target))
 
     def force(y: Array) -> float:
-        return float(law.force(float(y[0] - y[2]), float(y[1] - surface_speed(y)), of_law))
+        return float(law.force(float(y[0] - y[2]), rate(0.0, y), of_law))
 
     def derivative(_: float, y: Array) -> list[float]:
         f = force(y)
         return [y[1], -f / mass, surface_speed(y), *map(float, target.derivative(y[3:], f, of_target))]
 
+    def rate(_: float, y: Array) -> float:
+        return float(y[1] - surface_speed(y))
+
     def separation(_: float, y: Array) -> float:
-        rate = float(y[1] - surface_speed(y))
         # The law's `separation` is its restitution; while bodies approach, at first touch too, it says
         # nothing.
-        return 1.0 if rate > 0 else float(law.separation(float(y[0] - y[2]), rate, of_law))
+        return 1.0 if rate(0.0, y) > 0 else float(law.separation(float(y[0] - y[2]), rate(0.0, y), of_law))
 
     def touch(_: float, y: Array) -> float:
         return float(y[0] - y[2])
 
-    separation.terminal, separation.direction = True, -1.0  # type: ignore[attr-defined]
-    touch.terminal, touch.direction = True, 1.0  # type: ignore[attr-defined]
+    def passed(t: float, y: Array) -> float:
+        return float(target.guard(y[3:], force(y), t, guards, of_target))
+
     start = np.array([0.0, speed, 0.0, *np.zeros(target.n_states)])
     # An explicit method, because the switches of a nail make implicit ones stall.
     # Steps are bounded, as results are interpolated linearly and the deepest point is the deepest of the
     # steps.
     options = {"method": "RK23", "rtol": 1e-4, "atol": 1e-8, "max_step": MAX_CONTACT_TIME / 400}
-    times, values, switched = list[Array](), list[Array](), list[float]()
-    for k in range(2 * touches - 1):  # touches (even k) and gaps between them (odd k)
-        span = (switched[-1] if switched else 0.0, MAX_CONTACT_TIME)
-        found = solve_ivp(derivative, span, start, events=touch if k % 2 else separation, **options)
+    times, values, order, ends = list[Array](), list[Array](), list[str](), list[float]()
+    turns, apart, complete, guards, way = touches > 0 and law.switches, False, False, 0, -1.0
+    while not complete and order.count(TOUCH) < max(touches, 1):
+        possible = {TOUCH: _terminal(touch, 1.0)} if apart else {SEPARATION: _terminal(separation, -1.0)}
+        if turns and not apart:
+            possible[TURN] = _terminal(rate, way)
+        if touches and guards < len(target.guards):
+            possible[target.guards[guards]] = _terminal(passed, 1.0)
+        found = solve_ivp(
+            derivative,
+            (ends[-1] if ends else 0.0, MAX_CONTACT_TIME),
+            start,
+            events=[*possible.values()],
+            **options,
+        )
         times.append(found.t)
         values.append(found.y)
         if found.status != 1:  # no event until the end of the time
             break
         # the state goes on; only the event that is looked for changes
         start = found.y[:, -1]
-        if k % 2 == 0 and (k == 2 * touches - 2 or target.guard(start[3:], 0.0, found.t[-1], 0) >= 0):
-            break
-        switched.append(float(found.t[-1]))
+        end = next(name for name, at in zip(possible, found.t_events, strict=True) if at.size)
+        order.append(end)
+        ends.append(float(found.t[-1]))
+        guards += end in target.guards
+        if end in (SEPARATION, TOUCH):
+            apart = end == SEPARATION
+        if end not in target.guards:  # compression and restitution alternate
+            way = 1.0 if end == TURN and way < 0 else -1.0
+        over = apart and guards == len(target.guards)
+        complete = not touches or (over and (end == SEPARATION or rate(0.0, start) <= 0))
     y = np.hstack(values)
-    return _History(np.concatenate(times), np.vstack([y, [force(each) for each in y.T]]), switched)
+    history = _History(np.concatenate(times), np.vstack([y, [force(each) for each in y.T]]))
+    return history._replace(order=tuple(order), ends=tuple(ends), complete=complete) if touches else history
+
+
+_Event = Callable[[float, Array], float]
+
+
+def _terminal(event: _Event, direction: float) -> _Event:
+    """Event that ends an integration where it changes its sign in this direction."""
+
+    def terminal(t: float, y: Array) -> float:
+        return event(t, y)
+
+    terminal.terminal, terminal.direction = True, direction  # type: ignore[attr-defined]
+    return terminal
 
 
 def _phases(found: _History, target: Target) -> Array | None:
     """Start and ends (phases + 1,) of the contact phases [s]; None unless all events happen, in order."""
-    time, values, switched = found
-    if switched:  # several touches, and the event in the last of them
-        first = _first_event(found, target)
-        if len(switched) % 2 or first is None or not switched[-1] < time[first] < time[-1]:
-            return None
-        return np.array([0.0, *switched, time[first], time[-1]])
+    if found.order:
+        return np.array([0.0, *found.ends]) if found.complete else None
+    time, values = found.time, found.values
     deepest = int(np.argmax(values[0] - values[2]))
     ends = [0.0, time[deepest], time[-1]]  # compression and restitution
     if isinstance(target, Nail):  # pressed, driven, released
@@ -437,6 +509,6 @@ def _phases(found: _History, target: Target) -> Array | None:
 
 def _first_event(found: _History, target: Target) -> int | None:
     """Index of the first instant after a target's first event; None if it does not happen."""
-    time, values, _ = found
+    time, values = found.time, found.values
     guards = (float(target.guard(values[3:-1, k], values[-1, k], time[k], 0)) for k in range(len(time)))
     return next((k for k, guard in enumerate(guards) if guard >= 0), None)

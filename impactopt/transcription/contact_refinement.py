@@ -21,7 +21,7 @@ from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_set import ContactSet, approaches
-from impactopt.transcription.contact_state import Contact, ContactState, add_coasting, switches
+from impactopt.transcription.contact_state import Contact, ContactState, add_coasting
 from impactopt.transcription.layout import Affine, Array, Index
 from impactopt.transcription.mesh import GEAR, CollocationPoint, Elements, halved, lagrange
 from impactopt.transcription.plan import PlannedCollision, gear_share
@@ -141,9 +141,10 @@ class _FinerContact:
         )
         self.hit.add_constraints()
         # In a plan contact ends where the force is zero, without a constraint of the law. Here the last stage
-        # may be elsewhere, and has the law.
+        # may be elsewhere, and has the law, unless it is in a gap.
         last = len(self.hit.stages) - 1
-        for k in range(len(self.hit.collisions)):
+        self._apart = t.problem.contact_phases[-1].apart
+        for k in range(0 if self._apart else len(self.hit.collisions)):
             b.equal("contact law", "end", ["force"], self.hit.output(k, last, "law"))
             if t.problem.second is not None:
                 b.equal("contact law", "end", ["second force"], self.hit.output(k, last, "second law"))
@@ -178,7 +179,9 @@ class _FinerContact:
             # positions after contact follow from the solution, and a force that is zero by its bounds is not
             # determined
             fixed += [new.after.index(0)] if new.after.count else []
-            fixed += [new.f.index(int(i)) for i in np.flatnonzero(new.forceless[:-1])]
+            fixed += [
+                new.f.index(int(i)) for i in np.flatnonzero(new.forceless[: None if self._apart else -1])
+            ]
         ends = {phase.end for phase in self._builder.problem.contact_phases}
         # Inequalities do not matter here: the contact runs as it does, and `contact_error` looks at the
         # result.
@@ -204,7 +207,7 @@ class _FinerContact:
             free, constraints = system(free_durations=False)
             self._newton(z, free, constraints)
         by_phases = z.copy()
-        for _ in range(_MAX_BRANCH_CHANGES if switches(self._builder.problem.law) else 0):
+        for _ in range(_MAX_BRANCH_CHANGES if self._builder.problem.law.switches else 0):
             if not self._change_branches(z):
                 break
             self._newton(z, free, constraints)

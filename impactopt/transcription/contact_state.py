@@ -24,7 +24,7 @@ from impactopt.transcription.mesh import CollocationPoint
 # at first touch may last the second: short, as hardly anything happens in it, but not zero, as accelerations
 # are divided by its duration.
 EVENT_PHASE_FRACTION, IMMEDIATE_PHASE_FRACTION = 0.1, 0.05
-TOUCH_PHASE_FRACTION = 0.01  # of each phase where striker and target separate and meet again
+ORDER_PHASE_FRACTION = 0.01  # of each phase where events have an order of their own
 # Where no least duration is given, it is the least of a fraction of a point mass's restitution, a time [s],
 # and a fraction of the longest duration.
 # Measured: with fractions of 0.05 to 0.6 arm_planar and punch have the same optimum (33 to 76 and 57
@@ -71,7 +71,7 @@ class ContactParameters:
         if not anew and similar(parameters, self._parameters):
             return
         self._parameters = parameters
-        self.natural = float(natural_durations(*self.per_striker(), self.mass, p.planned_touches)[-1])
+        self.natural = float(natural_durations(*self.per_striker(), self.mass, p.order)[-1])
         self.shortest = shortest_phases(p, self.natural)
 
     def per_striker(self) -> tuple[Any, Any]:
@@ -97,7 +97,7 @@ class ContactParameters:
         common = [*self.law.values(), *self.target.values()]
         common += [] if p.second is None else [*p.second.point]
         return [
-            [*p.point, *p.normal, float(s.phase == len(self.end) - 1), *within[s.phase], *common]
+            [*p.point, *p.normal, float(p.contact_phases[s.phase].restituting), *within[s.phase], *common]
             for s in self.stages
         ]
 
@@ -112,8 +112,8 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
         shortest = min(NATURAL_FRACTION * natural, MAX_LEAST_DURATION, LONGEST_FRACTION * longest)
     before = EVENT_PHASE_FRACTION if target.guards else 1.0
     fractions = [before] * (len(problem.contact_phases) - 1) + [1.0]
-    if problem.planned_touches > 1:
-        fractions = [TOUCH_PHASE_FRACTION] * len(fractions)
+    if problem.order:
+        fractions = [ORDER_PHASE_FRACTION] * len(fractions)
     if target.at_once:
         fractions[0] = IMMEDIATE_PHASE_FRACTION
     return [fraction * shortest for fraction in fractions]
@@ -124,12 +124,6 @@ def similar(parameters: Array, others: Array) -> bool:
     # in this form, a parameter that is zero is similar to zero only
     sizes = np.sort(np.abs([parameters, others]), axis=0)
     return bool(np.all(sizes[1] <= SIMILAR_FACTOR * sizes[0]))
-
-
-def switches(law: ContactLaw) -> bool:
-    """True if compression and restitution are different branches of the law."""
-    compression, restitution, _ = law.formula()
-    return bool(compression != restitution)
 
 
 def pulls_apart(law: ContactLaw) -> bool:

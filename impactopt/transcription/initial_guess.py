@@ -18,7 +18,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import LegExtension, TargetSpeed
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves
+from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves, speed_with_order
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.contact_refinement import map_contact, same_places
 from impactopt.transcription.layout import Array, ConstraintOrigin, Group
@@ -44,10 +44,12 @@ def strike_rates(
     velocity: Array,
     *,
     base: float = 0.3,
+    limit: Array | None = None,
 ) -> Array:
     """Least rates ydot (ny,) that give all striking points ``velocity`` (3,) [m/s].
 
     base : scale of the base's rates against the joints'; 0: the base does not move.
+    limit (ny,) : largest rates [rad/s], within which the velocity is as near as possible; None: no limits.
     """
     model, data = c.model, c.model.createData()
     frames = [model.getFrameId(f"striker:{name}") for name in strikers]
@@ -63,7 +65,11 @@ def strike_rates(
     # 1 punch has the same optimum.
     weight = np.ones(c.ny)
     weight[: c.base] = base
-    return np.asarray(weight * np.linalg.lstsq(jac * weight, np.tile(velocity, len(frames)), rcond=None)[0])
+    wanted = np.tile(velocity, len(frames))
+    rates = np.asarray(weight * np.linalg.lstsq(jac * weight, wanted, rcond=None)[0])
+    if limit is None or (np.abs(rates) <= limit).all():
+        return rates
+    return np.asarray(lsq_linear(jac, wanted, bounds=(-limit, limit)).x)
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,8 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     """State at contact by inverse kinematics.
 
     speed : of the striking points [m/s]; less if joints are not that fast. If the target's speed after the
-        impact is bounded, the nearest speed with which a point mass meets the bounds.
+        impact is bounded, or the contact's events have an order of their own, the nearest speed with which a
+        point mass meets the bounds, or has the order.
     noise, seed : standard deviation [rad] and seed of a perturbation of the joints, for several guesses.
     """
     p, c = t.problem, t.coordinates
@@ -89,13 +96,17 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)
     bounds = p.extra(TargetSpeed)
-    if bounds is not None:
-        mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]
+    mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]
+    if p.order:
+        speed = speed_with_order(p.law, p.target, mass, speed, p.order)
+    elif bounds is not None:
         speed = speed_that_leaves(p.law, p.target, mass, speed, bounds.least, bounds.most)
-    options = {"base": 0.0} if c.drifts else {}  # momentum determines the rates of a floating base
-    # one factor for all rates below, so that the striking point still moves along the normal
-    rates = strike_rates(c, p.strikers, y, legs, speed * p.normal, **options)
-    return ReachedState(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
+    base = 0.0 if c.drifts else 0.3  # momentum determines the rates of a floating base
+    limit = 0.8 * limits.rate_limit[c.independent]
+    most = np.concatenate([np.full(c.base, np.inf), limit]) if p.order else None
+    rates = strike_rates(c, p.strikers, y, legs, speed * p.normal, base=base, limit=most)
+    # one factor for all rates, so that the striking point still moves along the normal
+    return ReachedState(y, rates * _within(rates[c.base :], limit), legs)
 
 
 def _within(rates: Array, limit: Array) -> float:

@@ -210,21 +210,22 @@ _GAP_ELEMENTS = (0.5, 0.5)  # of a phase in which striker and target are apart, 
 def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
     """Collocation elements of each phase of a problem's contact.
 
-    They are halved if the target has events, and once more if it is met several times, as the force then
-    rises and falls in one phase. If an event may come at once, the phase before it is one element. If the
-    model is frozen again during contact, each segment between freezes begins with an element.
+    They are halved if the target has events, and once more if these have an order of their own, as the force
+    then rises and falls in one phase. If an event may come at once, the phase before it is one element. If
+    the model is frozen again during contact, each segment between freezes begins with an element.
 
     shares : of the phases; by default those of a point mass.
     """
     target, (first, last) = problem.target, problem.collision_elements
     if target.guards:
         first, last = halved((first, last))
-    if problem.planned_touches > 1:
+    if problem.order:
         first, last = halved((first, last))
-    before = [_GAP_ELEMENTS if phase.apart else first for phase in problem.contact_phases[:-1]]
+    phases = problem.contact_phases
+    before = [_GAP_ELEMENTS if phase.apart else first for phase in phases[:-1]]
     if target.at_once:
         before[0] = (1.0,)
-    own = (*before, last)
+    own = (*before, _GAP_ELEMENTS if phases[-1].apart else last)
     if problem.freezes < 2:
         return own
     shares = shares or guessed_shares(problem)
@@ -238,7 +239,7 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
 
 def guessed_shares(problem: ImpactProblem) -> Shares:
     """Fraction of the contact's time that each phase lasts when a point mass hits the target."""
-    durations = natural_durations(problem.law, problem.target, mass_at_contact(problem), 1)
+    durations = natural_durations(problem.law, problem.target, mass_at_contact(problem))
     return tuple(float(share) for share in durations / durations.sum())
 
 

@@ -322,6 +322,15 @@ class PlannedCollision:
         """Largest contact force [N]; infinite for an impact without duration."""
         return float(self.force.max()) if self.time[-1] > 0 else np.inf
 
+    @property
+    def last_touch(self) -> float:
+        """End of the last touch [s]; a board may swing on after it, and break."""
+        touching = np.flatnonzero(self.force > _NO_FORCE * self.force.max())
+        return float(self.time[min(touching[-1] + 1, len(self.time) - 1)]) if touching.size else 0.0
+
+
+_NO_FORCE = 1e-9  # of the largest force: rounding
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedScenario:

@@ -445,11 +445,37 @@ def test_a_board_breaks_exactly_when_it_should():
 def test_a_broken_board_is_a_free_mass_and_stays_broken():
     board, mass = TARGETS["board"], FreeMass(mass=0.5)
     w = 1.0001 * 400.0 / 2e4
-    assert board.result([1.0, w]) == [1.0] and board.result([1.0, 0.9999 * 0.02]) == [0.0]
+    assert board.result([1.0, w]) == [1.0] and board.result([-1.0, 0.9999 * 0.02]) == [0.0]
     assert board.derivative([1.0, w], 30.0)[0] == mass.derivative([1.0], 30.0)[0]
     assert board.energy([1.0, w]) == pytest.approx(mass.energy([1.0]) + 0.5 * 400.0**2 / 2e4)
     # no state beyond the break that can be reached goes back
     assert all(rate >= 0 for rate in board.derivative([0.0, w], 0.0))
+
+
+@pytest.mark.parametrize("damping", [0.0, 30.0, 199.0, 200.0, 201.0, 900.0])
+def test_a_board_that_swings_on_is_broken_where_its_oscillation_turns_beyond_the_break(damping):
+    rng = np.random.default_rng(0)
+    for v, w in rng.uniform([0.1, 0.0], [12.0, 6e-3], size=(10, 2)):
+
+        def turn(_, y):
+            return y[0]
+
+        turn.terminal, turn.direction = True, -1.0
+        found = solve_ivp(
+            lambda _, y: [-(1e5 * y[1] + damping * y[0]) / 0.1, y[0]],
+            (0.0, 1.0),
+            [v, w],
+            method="LSODA",
+            events=turn,
+            rtol=1e-10,
+            atol=1e-13,
+        )
+        largest = found.y[1].max()
+        for factor, broken in ((1 - 1e-6, 1.0), (1 + 1e-6, 0.0)):
+            if largest > w:
+                board = Board(mass=0.1, stiffness=1e5, breaking_force=factor * 1e5 * largest, damping=damping)
+                assert board.result([v, w]) == [broken]
+                assert board.result([-v, w]) == board.result([1e-3, -w]) == [0.0]
 
 
 # ------------------------------------------------------------ derivatives of the whole collision

@@ -57,33 +57,43 @@ def stages_of(elements: Sequence[Sequence[float]], stages: int) -> list[Stage]:
 
 
 class Spell(NamedTuple):
-    """A phase: its name, the target's phase in it, what ends it, and whether striker and target are apart."""
+    """A phase: its name, the target's phase in it, what ends it, whether striker and target are apart, and
+    whether they recede under a law that has a branch for that.
+    """
 
     name: str
     mode: int
     end: str
-    apart: bool
+    apart: bool = False
+    recede: bool = False
 
 
 def spells_of(problem: ImpactProblem) -> list[Spell]:
-    """All phases: the target's; or each touch and each gap, the last touch with the target's events."""
-    target, more = problem.target, (problem.touches or 1) - 1
-    guards = list(target.guards)
-    if not more:
+    """All phases: the target's; or each touch and each gap, as the problem lists what ends them."""
+    target = problem.target
+    guards, listed = list(target.guards), problem.touches
+    if listed is None or listed == 1:
         turn = ["end of compression"] if len(target.phases) > len(guards) + 1 else []
         ends = [*guards, *turn, "separation"]
-        return [Spell(name, k, ends[k], False) for k, name in enumerate(target.phases)]
-    out = []
-    for k in range(more):
-        out += [
-            Spell(f"touch {k + 1}", 0, "separation", False),
-            Spell(f"apart after touch {k + 1}", 0, "touch", True),
-        ]
-    out.append(Spell(f"touch {more + 1}", 0, guards[0], False))
-    for k, guard in enumerate(guards):
-        out.append(
-            Spell(f"touch {more + 1}, after the {guard}", k + 1, [*guards, "separation"][k + 1], False)
-        )
+        last = len(target.phases) - 1
+        return [Spell(name, k, ends[k], recede=k == last) for k, name in enumerate(target.phases)]
+    if isinstance(listed, int):
+        once = ["end of compression", "separation"] if _switches(problem.law) else ["separation"]
+        listed = (*[*once, "touch"] * (listed - 1), *guards, *once)
+    out = list[Spell]()
+    for k, end in enumerate(listed):
+        since = listed[:k]
+        touch, mode = since.count("touch") + 1, sum(since.count(guard) for guard in guards)
+        here = [each for each in since if each not in guards]
+        apart = bool(here) and here[-1] == "separation"
+        turns = 0
+        for each in here:
+            turns = turns + 1 if each == "end of compression" else 0
+        name = f"{'apart after ' if apart else ''}touch {touch}"
+        name += f", after the {guards[mode - 1]}" if mode else ""
+        if turns:
+            name += f", {['compression', 'restitution'][turns % 2]} {turns // 2 + 1}"
+        out.append(Spell(name, mode, end, apart, bool(turns % 2)))
     return out
 
 
@@ -306,12 +316,13 @@ class Blow:
         target, law, place = self.problem.target, self.problem.law, self.place(i)
         number = self.stages[i].phase
         spell, n = self.spells[number], target.n_states
-        phase, inner, one = spell.mode, i not in self.end, not any(each.apart for each in self.spells)
+        phase, inner, one = spell.mode, i not in self.end, self.problem.touches in (None, 1)
         to_event = spell.end in target.guards
         guarded = (inner or not (one or to_event)) and bool(target.invariant([0.0] * n, 0.0, phase))
         reserved = not inner and to_event and bool(target.reserve([0.0] * n, 0.0, phase))
-        signed = inner and bool(target.guards) and _switches(law)
-        releases = number == self.phases - 1
+        turned = not inner and (one or to_event or spell.end == "end of compression")
+        signed = not (turned or spell.apart) and bool(target.guards) and _switches(law)
+        releases = spell.recede
 
         def value(v: Variables) -> Array:
             _, rate, f, T, now = self.contact(v, i)
@@ -372,13 +383,14 @@ class Blow:
             each = {"separation": "force", "touch": "penetration", "end of compression": "approach speed"}
             names = [f"{one}{each[spell.end]}" for one in self._each] if spell.end in each else ["target"]
             out.append(Piece.of(ended, [(spell.end, where, names, 0.0, 0.0)]))
-            if spell.apart:
+            meets, parts = spell.end == "touch", spell.apart and number == self.phases - 1
+            if meets or parts:
 
                 def comes(v: Variables, i: int = i) -> Array:
                     return np.array([self.contact(v, i)[1]])
 
-                row = ("approach speed", self.place(i), ["striker and target"], 0.0, np.inf)
-                out.append(Piece.of(comes, [row]))
+                way = (0.0, np.inf) if meets else (-np.inf, 0.0)
+                out.append(Piece.of(comes, [("approach speed", self.place(i), ["striker and target"], *way)]))
         return [*out, *(self._joined(where, k) for k in range(1, self.phases - 1))]
 
     def _joined(self, where: str, k: int) -> Piece:

@@ -268,11 +268,12 @@ def _quadrature(time: Array, force: Array, stages: int) -> tuple[float, float]:
 def _summary(p: Program, v: Variables, summary: Mapping[str, Any]) -> Iterator[Off]:
     blow = p.blows[0]
     contact = sum(v.one(name) for name in blow.durations)
+    swings_on = v.one(blow.durations[-1]) if blow.spells[-1].apart else 0.0
     y, u = p.state_at_contact(v)
     moving = sum(v.one(way.T) for course in p.courses[:2] for way in course.values())
     wanted = {
         "impulse_Ns": float(blow.get(v, "impulse so far", blow.end[-1])[0]),
-        "contact_ms": 1e3 * contact,
+        "contact_ms": 1e3 * (contact - swings_on),
         "hand_speed_m_s": float(p.robot.normal @ p.robot.striking(y, u)[1]),
         "duration_s": contact + moving,
     }

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.small_plans import Planned, arm_problem, biped_problem, changed, transcribed
 
-from impactopt.contact import Board, ContactFriction, FreeMass, KelvinVoigt
+from impactopt.contact import Board, ContactFriction, FreeMass, KelvinVoigt, SpringDamper
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.clearance_constraints import Margins, Watch
 from impactopt.problem.objectives import Effort
@@ -131,11 +131,21 @@ def test_of_a_ball_that_comes_and_is_caught() -> None:
     check_rows(transcribed(dataclasses.replace(p, target=ball, terms=(*p.terms, still))))
 
 
-@pytest.mark.parametrize("touches", [2, 3])
-def test_of_a_board_that_is_met_several_times(touches: int) -> None:
+ENDS = {"C": "end of compression", "S": "separation", "T": "touch", "B": "break"}
+
+
+@pytest.mark.parametrize(
+    ("law", "touches"),
+    [
+        *((KelvinVoigt, each) for each in (2, 3, "SB", "BS", "STSB", "SBTS")),
+        *((SpringDamper, each) for each in (2, "CSB", "BCS", "CBCCSTCS")),
+    ],
+)
+def test_of_a_board_whose_events_have_an_order(law: Any, touches: int | str) -> None:
     board = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
-    law = KelvinVoigt(stiffness=1e6, damping=50.0)
-    check_rows(transcribed(dataclasses.replace(arm_problem(), target=board, law=law, touches=touches)))
+    order = touches if isinstance(touches, int) else tuple(ENDS[letter] for letter in touches)
+    stiff = law(stiffness=1e6, damping=50.0)
+    check_rows(transcribed(dataclasses.replace(arm_problem(), target=board, law=stiff, touches=order)))
 
 
 def test_of_a_slide_that_is_bounded() -> None:

@@ -75,6 +75,12 @@ class ContactLaw(Described, ABC):
         """
         return numbers_of(self)
 
+    @property
+    def switches(self) -> bool:
+        """True if compression and restitution are different branches."""
+        compression, restitution, _ = self.formula()
+        return compression != restitution
+
     @abstractmethod
     def branch(
         self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -21,6 +22,8 @@ __all__ = [
     "ContactPhase",
     "Target",
     "contact_phases",
+    "is_order",
+    "order_of_touches",
     "scaled_numbers",
 ]
 
@@ -47,7 +50,7 @@ class Target(Described, ABC):
         ones. If one more is left before the last, it ends with compression. The last ends at separation.
     at_once : the first guard may be zero at the first touch, so that the phase before it has no duration.
     stays : the target stays in place after the impact. The striker must then keep off it.
-    met_again : a plan may let the striker separate from it and touch it again before its first guard.
+    met_again : in a plan the striker may separate from it, and touch it again, before a guard and after it.
     """
 
     word: ClassVar[str] = ""
@@ -231,28 +234,65 @@ class ContactPhase:
     mode : phase of the target's motion in it (`impactopt.contact.targets.Target.smooth`).
     end : one of the target's guards, `TURN`, `SEPARATION` or `TOUCH`.
     apart : striker and target do not touch in it.
+    restituting : the contact law has its branch of restitution in it.
     """
 
     name: str
     mode: int
     end: str
     apart: bool = False
+    restituting: bool = False
 
 
-def contact_phases(target: Target, touches: int = 1) -> tuple[ContactPhase, ...]:
-    """Phases of a contact in which the striker touches the target ``touches`` times.
+def contact_phases(target: Target, order: Sequence[str] = ()) -> tuple[ContactPhase, ...]:
+    """Phases of a contact.
 
-    With one touch they are the target's. With more, the target's guards are in the last touch, and
-    compression and restitution are not distinguished.
+    order : their ends. (): those of the target's own phases, in one touch.
     """
-    if touches == 1:
+    out = list[ContactPhase]()
+    if not order:
         last = len(target.phases) - 1
         ends = [*target.guards, *[TURN] * (last - len(target.guards)), SEPARATION]
-        return tuple(ContactPhase(*each) for each in zip(target.phases, range(last + 1), ends, strict=True))
-    out = []
-    for k in range(1, touches):
-        out.append(ContactPhase(f"touch {k}", 0, SEPARATION))
-        out.append(ContactPhase(f"apart after touch {k}", 0, TOUCH, apart=True))
-    names = [f"touch {touches}", *(f"touch {touches}, after the {guard}" for guard in target.guards)]
-    ends = [*target.guards, SEPARATION]
-    return (*out, *(ContactPhase(*each) for each in zip(names, range(len(names)), ends, strict=True)))
+        for k, (name, end) in enumerate(zip(target.phases, ends, strict=True)):
+            out.append(ContactPhase(name, k, end, restituting=k == last))
+        return tuple(out)
+    touch, mode, apart, turns = 1, 0, False, 0
+    for end in order:
+        name = f"apart after touch {touch}" if apart else f"touch {touch}"
+        name += f", after the {target.guards[mode - 1]}" if mode else ""
+        if turns:
+            name += f", {'restitution' if turns % 2 else 'compression'} {turns // 2 + 1}"
+        out.append(ContactPhase(name, mode, end, apart, restituting=turns % 2 == 1))
+        mode += end in target.guards
+        touch += end == TOUCH
+        if end in (SEPARATION, TOUCH):
+            apart = end == SEPARATION
+        if end not in target.guards:
+            turns = turns + 1 if end == TURN else 0
+    return tuple(out)
+
+
+def order_of_touches(law: ContactLaw, target: Target, touches: int) -> tuple[str, ...]:
+    """Ends of the phases of a contact with several touches; () for one touch.
+
+    All guards are passed in the last touch. Compression and restitution are phases of their own if they are
+    different branches of the law.
+    """
+    if touches == 1:
+        return ()
+    touch = (TURN, SEPARATION) if law.switches else (SEPARATION,)
+    return (*((*touch, TOUCH) * (touches - 1)), *target.guards, *touch)
+
+
+def is_order(law: ContactLaw, target: Target, order: Sequence[str]) -> bool:
+    """True if these can be the ends of a contact's phases.
+
+    Striker and target touch, part and touch again, and pass the guards in turn. The last end is the last
+    guard in a gap, or a separation after it. With a law that switches, compression and restitution alternate
+    in a touch, with a `TURN` between them.
+    """
+    guards = [end for end in order if end in target.guards]
+    letters = {TURN: "C", SEPARATION: "S", TOUCH: "T"} | dict.fromkeys(target.guards, "G")
+    touch = "G*C(G*CG*C)*G*S" if law.switches else "G*S"
+    text = "".join(letters.get(end, "?") for end in order)
+    return guards == list(target.guards) and bool(re.fullmatch(f"({touch}G*T)*{touch}G*", text))

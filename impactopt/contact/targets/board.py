@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from impactopt.contact.fields import Parameters, about, choose
+from impactopt.contact.fields import Parameters, about, choose, function
 from impactopt.contact.targets.base import Target
 
 __all__ = ["Board"]
 
 MARGIN = 0.1  # relative to the breaking force, at the touch; zero at the break
 RESERVE = 0.02  # relative to the deflection at the break
+ROUNDED = 1e-12  # added to |1 - damping ratio^2|, by which is divided
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +23,7 @@ class Board(Target):
     two halves are a free mass. As f >= 0, and v > 0 at the break, the deflection never comes back: a broken
     board stays broken. The state is (v, w). A board that is swung at the striker moves with its holders at
     the initial velocity, and v and w are against them. Its result is `broken`: 1 if the board broke before
-    separation, else 0. A board that swings on and breaks after separation counts as not broken.
+    separation, or swings on until it breaks, else 0.
 
     Source: lowest mode of a brittle beam, as in Walker, "Karate strikes", Am. J. Phys. 43 (1975) 845-849.
     """
@@ -114,5 +115,26 @@ class Board(Target):
 
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
         p = self.parameters if parameters is None else parameters
-        beyond = self._beyond(state, p)
-        return [choose(beyond > 0, 1.0 + 0.0 * beyond, 0.0 * beyond)]
+        highest = self._swing(state, p) - p["breaking_force"] / p["stiffness"]
+        return [choose(highest > 0, 1.0 + 0.0 * highest, 0.0 * highest)]
+
+    def _swing(self, state: Any, p: Parameters) -> Any:
+        """Deflection [m] at which an unbroken board turns, without a force; now, if it does not bend on.
+
+        A damped oscillation with rate O and damping ratio z, from (v, w), turns at the phase a with
+        tan a = s v / (O w + z v), s = sqrt(1 - z^2), where it is exp(-a z / s) sqrt(w^2 + 2 z w v / O +
+        (v / O)^2). For z > 1 tan is tanh, and s = sqrt(z^2 - 1); without an a it only creeps back.
+        """
+        v, w, rate = state[0], state[1], (p["stiffness"] / p["mass"]) ** 0.5
+        z = p["damping"] / (2.0 * rate * p["mass"])
+        apart = 1.0 - z**2
+        slow = apart < 0
+        s = (choose(slow, -apart, apart) + ROUNDED) ** 0.5
+        up, along = choose(v > 0, v, 0.0 * v) + 0.0, rate * w + z * v  # + 0.0: no minus zero
+        turns = along > s * up
+        ratio = choose(turns, s * up, 0.0 * up) / choose(turns, along, 1.0 + 0.0 * along)
+        phase = choose(slow, function("arctanh", ratio), function("arctan2", s * up, along))
+        square = w**2 + 2.0 * z * w * up / rate + (up / rate) ** 2
+        size = choose(slow, choose(turns, square, w**2), square) ** 0.5
+        on = choose(slow, choose(turns, size, w), size)
+        return choose(v > 0, function("exp", -phase * z / s) * on, w)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Annotated, Any, Literal, get_type_hints
 
-from pydantic import BaseModel, Field, create_model
+from pydantic import BaseModel, Field, PlainValidator, create_model
 
 from impactopt.bodies.world import Ground, Obstacle
 from impactopt.contact.fields import snake_case
@@ -164,6 +164,18 @@ class FollowSection(PhaseSection):
     """Follow-through, from the state after the impact to rest."""
 
 
+def touches_or_order(value: Any) -> Any:
+    """A whole number from 1 to 4, or a list of names."""
+    if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
+        return tuple(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_TOUCHES:
+        raise ValueError(f"give a whole number from 1 to {MOST_TOUCHES}, or a list of names")
+    return value
+
+
+Touches = Annotated[Any, PlainValidator(touches_or_order)]
+
+
 class CollisionSection(Section):
     """Model and discretization of the collision."""
 
@@ -181,8 +193,8 @@ class CollisionSection(Section):
         "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
-    touches: Annotated[int, Field(ge=1, le=MOST_TOUCHES)] = optional(
-        "number of contacts with a board; left out: that of a point-mass model"
+    touches: Touches = optional(
+        "number of contacts with a board, or the ends of the contact's phases; left out: as of point masses"
     )
     compression: Fractions = optional("lengths of its collocation elements")
     restitution: Fractions = optional("lengths of its collocation elements")

@@ -24,7 +24,7 @@ from impactopt.files.draft.limbs import Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
-from impactopt.files.draft.strikers import find_edge, find_striker
+from impactopt.files.draft.strikers import find_edge, find_striker, find_toe
 from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest, touches
 from impactopt.files.draft.target_placement import WAYS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
@@ -64,7 +64,6 @@ PEGGED = (
     f"a peg of {100 * PEG:g} cm is drafted on the striking link, as the links before it would touch the "
     "target first: mount one, or give your own tool in [[robot.tools]]"
 )
-TOE = 0.02  # [m] height of a toe's striking point above the sole
 BALL = 0.22  # [m] largest diameter
 KICKS = (0.3, 0.2, 0.4)  # distances of the ball ahead over the hip's height, in the order tried
 
@@ -352,10 +351,7 @@ def _kick(
         )
     lifted = max(range(len(soles)), key=lambda k: soles[k].name == "right")
     foot, stands = soles[lifted], soles[1 - lifted]
-    place, corners = foot.placement, foot.polygon
-    point = place.act(np.array([corners[:, 0].max(), corners[:, 1].mean(), TOE]))
-    assert foot.parent is not None  # as for every drafted sole
-    toe = Striker(name=f"{foot.name}_toe", frame=foot.parent, point=np.round(point, 4) + 0.0)
+    toe = find_toe(drafted.robot.model, drafted.legs[lifted].tip, foot, drafted.pieces)
     strikers = [*strikers, toe]
     robot, legs, q = _standing(drafted, soles, strikers, forward)
     at = striking_point(robot, toe.name, q)

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -197,15 +198,17 @@ def _bolted(
         strong, hit, edgewise, _ = _hardest(other, with_peg, q, targets)
         robot, arms = (other, [with_peg, *arms[1:]]) if strong else (robot, arms)
     if strong:
-        tries = [
-            _strike_data(drafted, robot, strikers, arms[0], strike, hit, edgewise, folder)
-            for strike in strong
-        ]
-        taken = _first_planned(tries, folder, say) if planned else 0
+        striking, count = arms[0], len(strong)
+
+        @cache
+        def data_of(k: int) -> dict[str, Any]:
+            return _strike_data(drafted, robot, strikers, striking, strong[k], hit, edgewise, folder)
+
+        taken = _first_planned(data_of, count, folder, say) if planned else 0
+        data = data_of(taken or 0)
         if taken is None:
-            tries = [_slower(data) for data in tries]
-            taken = _first_planned(tries, folder, say)
-        data = tries[taken or 0]
+            taken = _first_planned(lambda k: _slower(data_of(k)), count, folder, say)
+            data = _slower(data_of(taken or 0))
         result = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
         messages = [result, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
     else:
@@ -370,17 +373,19 @@ def _kick(
     return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
 
 
-def _first_planned(tries: Sequence[dict[str, Any]], folder: Path, say: Callable[[str], None]) -> int | None:
-    """Index of the first data for which a whole motion is solved; None if there is none.
+def _first_planned(
+    data_of: Callable[[int], dict[str, Any]], count: int, folder: Path, say: Callable[[str], None]
+) -> int | None:
+    """Index of the first of so many data for which a whole motion is solved; None if there is none.
 
     A solved strike may have no motion, as links may be beyond the target's plane just before it.
     """
-    for k, data in enumerate(tries):
-        say(f"planning the motion to strike {k + 1} of {len(tries)}")
+    for k in range(count):
+        say(f"planning the motion to strike {k + 1} of {count}")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a failed trial is no result
             with contextlib.suppress(InputError):
-                problem = _built(data, folder)
+                problem = _built(data_of(k), folder)
                 solution = solve(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
                 if solution.status.usable:
                     return k

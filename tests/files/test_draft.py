@@ -34,7 +34,7 @@ from impactopt.problem.feasibility import hopeless, sticks_out, too_weak
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import best_share
-from impactopt.problem.terms import TorqueLimit
+from impactopt.problem.terms import Slide, TorqueLimit
 from impactopt.robots.urdf import read_urdf
 
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
@@ -87,6 +87,10 @@ def test_a_foot_that_is_longer_than_its_sole_kicks_with_its_toe(tmp_path: Path) 
     share = 0.9 * weight * aside / robot.torque_limit.max()  # of the limit, 0.9 of what the roll joint needs
     others = (term for term in problem.terms if not isinstance(term, TorqueLimit))
     assert too_weak(dataclasses.replace(problem, terms=(*others, TorqueLimit(fraction=share)))) == ""
+
+
+def test_a_punch_on_legs_may_not_slide_off_the_target_from_the_start(tmp_path: Path) -> None:
+    assert _problem(tmp_path, urdfs.biped()).extra(Slide) == Slide()
 
 
 def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:

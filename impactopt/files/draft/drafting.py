@@ -39,6 +39,7 @@ from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import shape_doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import DOWN
+from impactopt.problem.terms import Slide
 from impactopt.robots.attachments import Sole, Striker, Tool
 from impactopt.robots.build import default_kd, default_kp
 from impactopt.robots.checks import REPAIRED
@@ -165,6 +166,8 @@ def _punch(
     arms = _renumbered(arms, drafted, robot)
     q, way = ready(robot, arms, q, ways=WAYS[:1])
     data = _data(drafted, robot, soles, strikers, q, folder)
+    # from the start: a push that slides off the target is refused for its replay before its slide is bounded
+    data["terms"]["slide"] = {"most_m": Slide().most}
     data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
     return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
 

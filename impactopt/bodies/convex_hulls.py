@@ -77,7 +77,7 @@ def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
     """Hull as a coal.Convex."""
     points, facets = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     points.extend(list(vertices))
-    facets.extend([coal.Triangle(*(int(i) for i in t)) for t in triangles])
+    facets.extend([coal.Triangle(*t) for t in triangles.tolist()])
     return coal.Convex(points, facets)
 
 

@@ -217,9 +217,10 @@ def _leading(points: Array, normal: Array) -> Array:
     directions = height[:, None] * normal + wide[:, None] * (
         np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]
     )
-    farthest, chosen = set((points @ directions.T).argmax(axis=0).tolist()), list[Array]()
+    left, chosen = points[np.unique((points @ directions.T).argmax(axis=0))], list[Array]()
     # The foremost first, so that it stays of near duplicates.
-    for index in np.argsort(-(points @ normal)):
-        if index in farthest and all(np.linalg.norm(points[index] - c) > MERGED for c in chosen):
-            chosen.append(points[index])
+    left = left[np.argsort(-(left @ normal))]
+    while len(left):
+        chosen.append(left[0])
+        left = left[np.linalg.norm(left - left[0], axis=1) > MERGED]
     return np.array(chosen)

@@ -56,8 +56,8 @@ def too_weak(problem: ImpactProblem) -> str:
     """Message if no wrenches on the constrained frames let the torques hold the robot at rest in its start
     posture; else "". A motion that falls from there at once may be feasible all the same.
     """
-    robot, c, limit = problem.robot, problem.coordinates, problem.term(TorqueLimit).fraction
-    q = problem.start_posture
+    robot, limit = problem.robot, problem.term(TorqueLimit).fraction
+    c, q = problem.stance_coordinates[0], problem.start_posture
     weight = robot.generalized_gravity(robot.model.createData(), q)
     # torques are weight - fixed @ wrenches
     fixed = c.sole_jacobians(q)[0].T if c.legs else np.zeros((robot.nv, 0))

@@ -30,10 +30,11 @@ from impactopt.files.draft.strikers import find_striker
 from impactopt.files.problem_file import load_problem
 from impactopt.files.toml import read_toml
 from impactopt.kinematics.operational_space import striking_point
-from impactopt.problem.feasibility import hopeless
+from impactopt.problem.feasibility import hopeless, sticks_out, too_weak
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import best_share
+from impactopt.problem.terms import Slide, TorqueLimit
 from impactopt.robots.urdf import read_urdf
 
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
@@ -64,6 +65,32 @@ def test_a_biped_kicks_where_it_has_no_arms_or_is_told_to(tmp_path: Path, arms: 
     assert np.abs([foot[2] for foot in feet]).max() < 1e-6
     assert abs(centre[0] - np.mean(feet, axis=0)[0]) < 0.05 and abs(centre[1]) < 0.01
     assert toe[0] < problem.point[0] - 0.05 and toe[1] == pytest.approx(problem.point[1], abs=1e-3)
+
+
+def test_a_foot_that_is_longer_than_its_sole_kicks_with_its_toe(tmp_path: Path) -> None:
+    """And stands on both feet before that, with ankles too weak for one of them at the start."""
+    low, high, ahead = 0.03, 0.06, 0.04
+    at = (0.04 + ahead, 0.0, -urdfs.ANKLE + (low + high) / 2)
+    shape = f'<geometry><box size="{urdfs.SOLE[0]} {urdfs.SOLE[1]} {high - low}"/></geometry>'
+    cap = f'<collision><origin xyz="{" ".join(map(str, at))}"/>{shape}</collision>'
+    name = '<link name="right_ankle_roll_link">'
+    text = urdfs.biped(arms=False).replace(name, name + cap)
+    problem = _problem(tmp_path, text)
+    robot, data = problem.robot, problem.robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, problem.start_posture)
+    toe, sole = (data.oMf[robot.model.getFrameId(f)] for f in ("striker:right_toe", "right_sole"))
+    forward = problem.soles[-1].polygon[:, 0].max() + ahead
+    assert sole.actInv(toe.translation) == pytest.approx([forward, 0.0, low], abs=1e-4)
+    assert sticks_out(problem) == []
+    weight = 9.81 * sum(body.mass for body in robot.model.inertias)
+    aside = abs(data.oMi[robot.model.getJointId("left_ankle_roll")].translation[1])
+    share = 0.9 * weight * aside / robot.torque_limit.max()  # of the limit, 0.9 of what the roll joint needs
+    others = (term for term in problem.terms if not isinstance(term, TorqueLimit))
+    assert too_weak(dataclasses.replace(problem, terms=(*others, TorqueLimit(fraction=share)))) == ""
+
+
+def test_a_punch_on_legs_may_not_slide_off_the_target_from_the_start(tmp_path: Path) -> None:
+    assert _problem(tmp_path, urdfs.biped()).extra(Slide) == Slide()
 
 
 def test_who_cannot_kick_or_punch_is_told(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from impactopt.files.draft.limbs import Limb, renumbered
 from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
-from impactopt.files.draft.strikers import find_edge, find_striker
+from impactopt.files.draft.strikers import find_edge, find_striker, find_toe
 from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest, touches
 from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
@@ -38,6 +39,7 @@ from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import shape_doubts
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import DOWN
+from impactopt.problem.terms import Slide
 from impactopt.robots.attachments import Sole, Striker, Tool
 from impactopt.robots.build import default_kd, default_kp
 from impactopt.robots.checks import REPAIRED
@@ -64,7 +66,6 @@ PEGGED = (
     f"a peg of {100 * PEG:g} cm is drafted on the striking link, as the links before it would touch the "
     "target first: mount one, or give your own tool in [[robot.tools]]"
 )
-TOE = 0.02  # [m] height of a toe's striking point above the sole
 BALL = 0.22  # [m] largest diameter
 KICKS = (0.3, 0.2, 0.4)  # distances of the ball ahead over the hip's height, in the order tried
 
@@ -165,6 +166,8 @@ def _punch(
     arms = _renumbered(arms, drafted, robot)
     q, way = ready(robot, arms, q, directions=STRIKE_DIRECTIONS[:1])
     data = _data(drafted, robot, soles, strikers, q, folder)
+    # from the start: a push that slides off the target is refused for its replay before its slide is bounded
+    data["terms"]["slide"] = {"most_m": Slide().most}
     data = _aimed(data, arms[0].name, aims(robot, arms[0], q, way), way, folder)
     return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
 
@@ -198,15 +201,17 @@ def _bolted(
         strong, hit, edgewise, _ = _hardest(other, with_peg, q, targets)
         robot, arms = (other, [with_peg, *arms[1:]]) if strong else (robot, arms)
     if strong:
-        tries = [
-            _strike_data(drafted, robot, strikers, arms[0], strike, hit, edgewise, folder)
-            for strike in strong
-        ]
-        taken = _first_planned(tries, folder, say) if planned else 0
+        striking, count = arms[0], len(strong)
+
+        @cache
+        def data_of(k: int) -> dict[str, Any]:
+            return _strike_data(drafted, robot, strikers, striking, strong[k], hit, edgewise, folder)
+
+        taken = _first_planned(data_of, count, folder, say) if planned else 0
+        data = data_of(taken or 0)
         if taken is None:
-            tries = [_slower(data) for data in tries]
-            taken = _first_planned(tries, folder, say)
-        data = tries[taken or 0]
+            taken = _first_planned(lambda k: _slower(data_of(k)), count, folder, say)
+            data = _slower(data_of(taken or 0))
         result = _strike_message(strong[taken or 0], found=taken is not None, tried=planned)
         messages = [result, *([EDGEWISE] if edgewise else []), *([PEGGED] if pegged else [])]
     else:
@@ -354,10 +359,7 @@ def _kick(
         )
     lifted = max(range(len(soles)), key=lambda k: soles[k].name == "right")
     foot, stands = soles[lifted], soles[1 - lifted]
-    place, corners = foot.placement, foot.polygon
-    point = place.act(np.array([corners[:, 0].max(), corners[:, 1].mean(), TOE]))
-    assert foot.parent is not None  # as for every drafted sole
-    toe = Striker(name=f"{foot.name}_toe", frame=foot.parent, point=np.round(point, 4) + 0.0)
+    toe = find_toe(drafted.robot.model, drafted.legs[lifted].tip, foot, drafted.pieces)
     strikers = [*strikers, toe]
     robot, legs, q = _standing(drafted, soles, strikers, forward)
     at = striking_point(robot, toe.name, q)
@@ -376,17 +378,19 @@ def _kick(
     return Draft(text=_text(data, drafted, robot), said=tuple(_messages(data, drafted, robot)))
 
 
-def _first_planned(tries: Sequence[dict[str, Any]], folder: Path, say: Callable[[str], None]) -> int | None:
-    """Index of the first data for which a whole motion is solved; None if there is none.
+def _first_planned(
+    data_of: Callable[[int], dict[str, Any]], count: int, folder: Path, say: Callable[[str], None]
+) -> int | None:
+    """Index of the first of so many data for which a whole motion is solved; None if there is none.
 
     A solved strike may have no motion, as links may be beyond the target's plane just before it.
     """
-    for k, data in enumerate(tries):
-        say(f"planning the motion to strike {k + 1} of {len(tries)}")
+    for k in range(count):
+        say(f"planning the motion to strike {k + 1} of {count}")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a failed trial is no result
             with contextlib.suppress(InputError):
-                problem = _built(data, folder)
+                problem = _built(data_of(k), folder)
                 solution = solve(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
                 if solution.status.usable:
                     return k

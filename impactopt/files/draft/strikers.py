@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from impactopt.bodies.convex_hulls import Piece, inertia_box, is_far
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb
-from impactopt.robots.attachments import Striker
+from impactopt.robots.attachments import Sole, Striker
 from impactopt.robots.couplings import axis_of
 
-__all__ = ["find_edge", "find_striker", "first_link"]
+__all__ = ["find_edge", "find_striker", "find_toe", "first_link"]
 
 Array = NDArray[np.float64]
 # names of tool frames by ROS-Industrial (tool0), manufacturers and MuJoCo Menagerie (sites), the most
@@ -31,7 +31,10 @@ _TOOLS = tuple(
 )
 APART = 0.01  # [m] least distance of two points that defines a direction
 SHORT = 0.06  # [m]: a link so short, such as a flange, does not fold back over the link before it
-EDGE = 5e-3  # [m]: the part of a hand so near to its lowest plane is its edge
+EDGE = (
+    5e-3  # [m]: the part of a hand so near to its lowest plane is its edge; of a foot to its front, its toe
+)
+TOE = 0.02  # [m] height of a toe's striking point above the sole, if the toe has such a point
 LONG = 0.12  # [m] least length of a hand from a tool's frame
 # least cosines of angles between
 ROLLS = np.cos(np.radians(25))  # a joint's axis and a link that rolls about it
@@ -98,6 +101,20 @@ def find_edge(
     edge += (deep.max() - edge @ below) * below
     parent, above = first_link(model, limb.tip)
     return Striker(name=name, frame=parent, point=np.round(above.actInv(edge), 4) + 0.0), below
+
+
+def find_toe(model: pin.Model, joint: int, sole: Sole, pieces: Mapping[int, tuple[Piece, ...]]) -> Striker:
+    """Striker at the front of a foot, which may be ahead of its sole.
+
+    joint : that moves the foot, whose first link is the sole's parent.
+    """
+    parent, above = first_link(model, joint)
+    place = above * sole.placement
+    points = np.concatenate([p.vertices for p in pieces[joint]])
+    points = (points - place.translation) @ place.rotation
+    x, y, z = points[points[:, 0] > points[:, 0].max() - EDGE].T
+    front = np.array([x.max(), (y.min() + y.max()) / 2, np.clip(TOE, z.min(), z.max())])
+    return Striker(name=f"{sole.name}_toe", frame=parent, point=np.round(sole.placement.act(front), 4) + 0.0)
 
 
 def first_link(model: pin.Model, joint: int) -> tuple[str, pin.SE3]:

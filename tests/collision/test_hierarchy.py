@@ -27,7 +27,6 @@ from impactopt.robots.rigid_body import RigidBody
 from impactopt.simulation.reference import FullDynamics
 
 
-
 def models(robot, **options):
     given = {"robot": robot, "striker": "right_hand", "normal": X, "law": LAW, "target": TARGET, **options}
     steps = {"tolerance": 1e-10, "step": 2.5e-4}

@@ -67,6 +67,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     path = tmp_path / "cache"
     monkeypatch.setenv("IMPACTOPT_CACHE", str(path))
     private_files.temporary_private_directory.cache_clear()
+    gc.freeze()  # the tests' own objects are collected, not all that other tests have left
     yield path
     gc.collect()  # unload the libraries: a later test may put others at the same paths
 

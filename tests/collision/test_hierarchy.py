@@ -26,13 +26,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.simulation.reference import FullDynamics
 
-pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
-
-
-@pytest.fixture(autouse=True)
-def _virtual_machine(monkeypatch):
-    monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
-
 
 def models(robot, **options):
     given = {"robot": robot, "striker": "right_hand", "normal": X, "law": LAW, "target": TARGET, **options}

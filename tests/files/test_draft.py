@@ -40,9 +40,17 @@ from impactopt.robots.urdf import read_urdf
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
 
 
+_drafts: dict[Any, Draft] = {}
+
+
 def _drafted(folder: Path, text: str, **options: Any) -> Draft:
+    """A description's draft, made once: it is the same in every folder."""
     (folder / "robot.urdf").write_text(text)
-    return draft_problem(folder / "robot.urdf", folder=folder, **{"planned": False, **options})
+    key = text, *sorted(options.items())
+    if key not in _drafts:
+        given = {"planned": False, **options}
+        _drafts[key] = draft_problem(folder / "robot.urdf", folder=folder, **given)
+    return _drafts[key]
 
 
 def _problem(folder: Path, text: str, **options: Any) -> ImpactProblem:

@@ -31,7 +31,7 @@ class Verdict:
     """What was found.
 
     ok : nothing is violated, the KKT conditions hold, and all that the problem states was computed.
-    max_violation : of all rows and of what the record says.  kkt : residual; None with a `reason`.
+    max_violation : of all rows and of what the record says.  kkt : residual; None with another `reason`.
     objective : what is minimized [N s], computed here; None where it is not known.
     rows : by name, worst violation and where.
     reason : why it is not ok, or what could not be computed; "".
@@ -135,14 +135,14 @@ class _Checked:
         for told in off_in_record(self.program, self.v, self.arrays, self.summary):
             self.note(*told)
         left: Residual | None = None
-        if not self.reasons:
+        worst = max((by for by, _ in self.found.values()), default=0.0)
+        if not self.reasons and worst <= VIOLATION:  # a violation is reason enough
             left = self._residual(weights, values, bounds)
             if left.kkt > KKT:
                 name = self._variable(left.variable)
                 self.reasons.append(f"the KKT residual is {left.kkt:.2g}, more than {KKT:g}; worst: {name}")
             if left.doubt > KKT:
                 self.reasons.append(f"the KKT residual is known to {left.doubt:.2g} only")
-        worst = max((by for by, _ in self.found.values()), default=0.0)
         off_by = sorted(self.found.items(), key=lambda item: -item[1][0])[:TOLD]
         self.reasons[:0] = [
             f"{name}, {where}: off by {by:.3g}, more than {VIOLATION:g}"

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
+from support.causes import searched
 from support.derivative_checks import check_derivatives
 from support.small_plans import BODILESS, biped_problem, transcribed
 from support.small_robots import arm, biped
 
-from impactopt import NotSolvedWarning, solve
 from impactopt.errors import InputError
 from impactopt.files.export.motion import motion_at
 from impactopt.files.output import Record
@@ -19,6 +19,7 @@ from impactopt.files.problem_file import load_problem, problem_data, problem_fro
 from impactopt.files.verify import motion_of_record
 from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.bounds import bounds_of
+from impactopt.planning.diagnosis import with_reason
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.stances import StancePhase
@@ -97,9 +98,10 @@ def test_a_step_without_the_time_for_it_names_its_phase() -> None:
     """The search has to lengthen stance phases, too: with 0.2 s the foot does not come 6 cm ahead."""
     step = StancePhase(soles=("left",), phase=Phase(duration=0.2, intervals=6, grading=1.0))
     landed = StancePhase(soles=("left", "right"), steps=AHEAD)
-    with pytest.warns(NotSolvedWarning, match="Infeasible: time. stance phase 2: "):
-        solution = solve(stepping(stances=(BOTH, step, landed), scenarios=()))
-    longer = solution.causes[0].problem
+    t, result, found = searched(stepping(stances=(BOTH, step, landed), scenarios=()))
+    message = with_reason(t, result, found.causes).message
+    assert message.startswith("Infeasible: time. stance phase 2: ")
+    longer = found.causes[0].problem
     assert longer is not None and longer.stances[0] == BOTH and longer.stances[2] == landed
     assert longer.stances[1].phase is not None and longer.stances[1].phase.duration[0] > 0.2
 

@@ -55,9 +55,8 @@ def test_a_seed_makes_the_draws_and_fewer_are_the_first_of_more() -> None:
 
 
 def test_parameters_are_drawn_independently() -> None:
-    table = np.array(
-        [[getattr(d, n) for n in PerturbationRanges().bounds()] for d in draw_perturbations(2000)]
-    )
+    names = PerturbationRanges().bounds()
+    table = np.array([[getattr(d, n) for n in names] for d in draw_perturbations(2000)])
     correlation = np.corrcoef(table.T) - np.eye(table.shape[1])
     assert np.abs(correlation).max() < 5 / np.sqrt(len(table))
 
@@ -179,8 +178,9 @@ def rows_of(result: Robustness) -> list[tuple[Any, ...]]:
 
 def test_one_worker_and_two_give_the_same_numbers(still: tuple[Any, Any]) -> None:
     told: list[tuple[int, int]] = []
-    one = robustness(*still, 1.0, draws=3, workers=1)
-    two = robustness(*still, 1.0, draws=3, workers=2, progress=lambda done, of: told.append((done, of)))
+    given: dict[str, Any] = {"draws": 3, "step": STEP / 2}
+    one = robustness(*still, 1.0, **given, workers=1)
+    two = robustness(*still, 1.0, **given, workers=2, progress=lambda done, of: told.append((done, of)))
     assert np.isfinite(one.impulse).all()
     assert rows_of(one) == rows_of(two)
     assert one.perturbations == two.perturbations == tuple(draw_perturbations(3))

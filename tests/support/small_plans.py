@@ -1,13 +1,8 @@
-"""Programs and plans of the small robots, for all tests that need one.
-
-Their functions run in CasADi's virtual machine: building them for the small biped takes some ten seconds, and
-compiling them would take longer.
-"""
+"""Programs and plans of the small robots, for all tests that need one."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,20 +10,18 @@ from numpy.typing import NDArray
 
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stance import FixedBase
-from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.terms import KeepOut, SelfCollision, Term
 from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.blocks import BlockExpression, builders, extra_blocks, own_blocks, stance_blocks
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.structured import derivative_functions
-from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.transcription import Transcription, block_functions
 from support.small_robots import arm, biped, striking_point
 
 Array = NDArray[np.float64]
@@ -73,44 +66,21 @@ def arm_problem() -> ImpactProblem:
 
 
 def transcribed(problem: ImpactProblem) -> Transcription:
-    """The problem's program; all blocks are built, those of every model of the collision."""
-    c = problem.coordinates
-    edges = len(support_polygon(problem.robot, c))
-    found: dict[str, Callable[[], BlockExpression]] = {}
-    if problem.frozen is not None:
-        return Transcription(
-            problem, c, _functions(found | own_blocks(problem, c, edges)) | _extra_functions(problem)
-        )
-    for instant in (False, True):
-        given = c, problem.striker, problem.law, problem.target, edges
-        found |= builders(*given, instant=instant, first=True, friction=problem.friction is not None)
-    found |= {name: build for name, (_, build) in stance_blocks(problem).items()}
-    return Transcription(problem, c, _functions(found) | _extra_functions(problem))
+    return Transcription(problem, *_shared(problem))
 
 
 def struck(problem: ImpactProblem) -> StrikeTranscription:
-    """The problem's strike; only the blocks of its own model of the collision are built."""
-    c = problem.coordinates
-    own = own_blocks(problem, c, len(support_polygon(problem.robot, c)))
-    return StrikeTranscription(problem, c, _functions(own) | _extra_functions(problem))
+    """The problem's strike."""
+    return StrikeTranscription(problem, *_shared(problem))
 
 
-def _functions(builders: Mapping[str, Callable[[], BlockExpression]]) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for name, build in builders.items():
-        block = build()
-        out |= {f.name(): f for f in derivative_functions(name, block.z, block.p, block.out, block.through)}
-    return out
-
-
-def _extra_functions(problem: ImpactProblem) -> dict[str, Any]:
-    return _functions({name: b.build for name, b in extra_blocks(problem, problem.coordinates).items()})
+def _shared(problem: ImpactProblem) -> tuple[StanceCoordinates, dict[str, Any]]:
+    return problem.coordinates, block_functions(problem, problem.coordinates)
 
 
 def changed(transcription: Transcription, **changes: Any) -> Transcription:
-    """The program of the same problem with changes, on the same functions but for the extra ones."""
-    problem = dataclasses.replace(transcription.problem, **changes)
-    return Transcription(problem, problem.coordinates, transcription.functions | _extra_functions(problem))
+    """The program of the same problem with changes."""
+    return transcribed(dataclasses.replace(transcription.problem, **changes))
 
 
 @dataclasses.dataclass

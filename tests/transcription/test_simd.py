@@ -33,6 +33,7 @@ needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compil
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("IMPACTOPT_CACHE", str(tmp_path / "cache"))
+    gc.freeze()  # as in test_codegen.py
     yield tmp_path / "cache"
     gc.collect()
 
@@ -234,10 +235,12 @@ def test_without_a_compiler_an_instance_a_call(cache: Path, monkeypatch: pytest.
 
 
 @needs_compiler
-def test_a_program_in_lanes_is_the_program(cache: Path) -> None:
+def test_a_program_in_lanes_is_the_program(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All blocks of a small robot's motion."""
     problem = arm_problem()
-    plain = transcribed(problem)
+    with monkeypatch.context() as without:
+        without.setenv("IMPACTOPT_NO_COMPILER", "1")
+        plain = transcribed(problem)
     fast = Transcription(problem, problem.coordinates, compiled(*plain.functions.values()))
     rng = np.random.default_rng(1)
     x = first_iterate(plain) + 0.01 * rng.standard_normal(plain.program.n)

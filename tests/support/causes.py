@@ -1,0 +1,20 @@
+"""Search for the cause of infeasibility after a few iterations, not after solvers have given up."""
+
+from __future__ import annotations
+
+from impactopt.planning.budget import Budget
+from impactopt.planning.causes import Search, search
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import SolverResult
+from impactopt.transcription.initial_guess import first_iterate
+from impactopt.transcription.transcription import Transcription, block_functions
+
+ITERATIONS = 20  # the search needs a point with violations, not the least ones
+
+
+def searched(problem: ImpactProblem) -> tuple[Transcription, SolverResult, Search]:
+    """Program of a problem, the result of a short solve of it, and the causes found from there."""
+    t = Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
+    budget = Budget(solver="ipm", options={"max_iterations": ITERATIONS}, time_limit=None, callback=None)
+    result = budget.run(t.program, first_iterate(t))
+    return t, result, search(t, result, budget)

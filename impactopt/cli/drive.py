@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, ProblemPath, Quiet, Settings, Verbose, check_loudness, print_json
+from impactopt.cli.options import AsJson, ProblemPath, Quiet, Settings, Verbose, print_json
 from impactopt.report.plain_errors import plain_errors
 
 NOT_IN = 1  # exit code
@@ -36,7 +36,6 @@ def drive(
         from impactopt.planning.nail_driving import drive_nail
         from impactopt.report.console import SolveConsole, nail_driving_table, output
 
-        check_loudness(quiet, verbose)
         read = read_problem_file(problem, parse_settings(settings or ()))
         directory = None if out is None else make_directory(out)
         with SolveConsole(console, quiet=quiet) as progress:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import enum
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -16,14 +15,7 @@ if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
     from impactopt.robots.robot import Robot
 
-
-class Motion(str, enum.Enum):
-    punch = "punch"
-    kick = "kick"
-    chop = "chop"
-    nail = "nail"
-
-
+Motion = Literal["punch", "kick", "chop", "nail"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -208,7 +200,7 @@ def _draft(
             folder=folder,
             mjcf=mjcf,
             bolted=bolted,
-            motion=None if motion is None else motion.value,
+            motion=motion,
             report=progress.say,
         )
     _give(draft.text, out, as_json)

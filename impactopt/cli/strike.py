@@ -19,8 +19,6 @@ from impactopt.cli.options import (
     TimeLimit,
     Verbose,
     Workers,
-    check_loudness,
-    check_time_limit,
     command_line,
     print_json,
 )
@@ -34,9 +32,6 @@ def strike(
         Path | None,
         typer.Option("--out", "-o", metavar="DIR", help="Directory for the numbers."),
     ] = None,
-    method: Annotated[
-        str, typer.Option(metavar="METHOD", hidden=True, help="Of the contact: collocation.")
-    ] = "collocation",
     starts: Starts = 4,
     workers: Workers = 1,
     seed: Seed = 0,
@@ -59,10 +54,8 @@ def strike(
         from impactopt.planning.strike import optimize_strike
         from impactopt.report.console import SolveConsole
 
-        check_time_limit(time_limit)
-        check_loudness(quiet, verbose)
         read = read_problem_file(file, parse_settings(settings or ()))
-        chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
+        chosen = read.solver.arguments(solver, time_limit)
         with SolveConsole(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
@@ -70,7 +63,6 @@ def strike(
             progress.say("building the nonlinear program (compiles for some ten seconds the first time)")
             solution = optimize_strike(
                 problem,
-                method=method,
                 starts=starts,
                 workers=workers,
                 seed=seed,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, check_loudness, complete_sweep, print_json
+from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, complete_sweep, print_json
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
@@ -67,7 +67,6 @@ def sweep(
         from impactopt.sweeps import sweep as run
         from impactopt.sweeps.progress import SweepConsole
 
-        check_loudness(quiet, verbose)
         chosen = read_sweep_file(file, parse_settings(settings or ()))
         with SweepConsole(console, quiet=quiet, verbose=verbose) as shown:
             callbacks: dict[str, Any] = {"report": shown.say, "progress": shown.progress}

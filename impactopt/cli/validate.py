@@ -2,45 +2,26 @@
 
 from __future__ import annotations
 
-import enum
 import json
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, Quiet, Settings, Verbose, check_loudness, print_json
+from impactopt.cli.options import AsJson, OtherProblem, Quiet, ResultPath, Settings, Verbose, print_json
 from impactopt.report.plain_errors import plain_errors
-
-
-class Controller(str, enum.Enum):
-    servo = "servo"
-    wbc = "wbc"
-
-
-class Contact(str, enum.Enum):
-    point = "point"
-    link = "link"
-
 
 FELL = 1  # exit code
 
 
-class Engine(str, enum.Enum):
-    mujoco = "mujoco"
-    pinocchio = "pinocchio"
-
-
 def validate(
-    result: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."
-        ),
-    ],
+    context: typer.Context,
+    result: ResultPath,
     engine: Annotated[
-        Engine, typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: fixed soles.")
-    ] = Engine.mujoco,
+        Literal["mujoco", "pinocchio"],
+        typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: fixed soles."),
+    ] = "mujoco",
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="DIR", help="Write replay.json and replay.png there."),
@@ -49,17 +30,17 @@ def validate(
         Path | None, typer.Option(metavar="FILE.gif", help="Draw the robot's motion, slow around contact.")
     ] = None,
     controller: Annotated[
-        Controller,
+        Literal["servo", "wbc"],
         typer.Option(
             help="servo: PD control of the joints; wbc: whole-body controller, set up by the problem file."
         ),
-    ] = Controller.servo,
+    ] = "servo",
     contact: Annotated[
-        Contact,
+        Literal["point", "link"],
         typer.Option(
             help="link: the striking link's hull meets the target's body; point: its striking point."
         ),
-    ] = Contact.point,
+    ] = "point",
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -110,27 +91,8 @@ def validate(
         from impactopt.report.console import SolveConsole
         from impactopt.simulation import Perturbation
 
-        check_loudness(quiet, verbose)
-
-        world = Perturbation(
-            mass=mass,
-            stiffness=stiffness,
-            damping=damping,
-            distance=distance,
-            missing=missing,
-            payload=payload,
-            friction=friction,
-            floor_time=floor_time,
-            kp=kp,
-            kd=kd,
-            torque_limit=torque_limit,
-            period=period,
-            delay=delay,
-            push=push,
-            push_start=push_start,
-            push_time=push_time,
-            push_way=push_way,
-        )
+        # an option for each of its fields
+        world = Perturbation(**{field.name: context.params[field.name] for field in fields(Perturbation)})
         directory = None if out is None else make_directory(out)
         if animation is not None:
             make_directory(animation.parent)
@@ -138,13 +100,13 @@ def validate(
         changes, written = parse_settings(settings or ()), []
         with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
             planned = load_planned(result, problem_file=problem, settings=changes)
-            progress.say(f"{result} is read; replaying it in {engine.value}")
+            progress.say(f"{result} is read; replaying it in {engine}")
             done = replay(
                 planned,
-                engine=engine.value,
+                engine=engine,
                 perturbation=world,
-                controller=controller.value,
-                contact=contact.value,
+                controller=controller,
+                contact=contact,
                 **options,
             )
             ok = done.report["standing"] is not False

@@ -225,15 +225,14 @@ def _show(record: Record, as_json: bool, ok: bool) -> None:
     if as_json:
         print_json(record.summary, ok)
         return
-    from impactopt.errors import printable
     from impactopt.report.console import (
-        multistart_table,
         output,
         reason_message,
         result_table,
+        say,
+        say_details,
         switched_off_message,
         touches_message,
-        violation_table,
     )
 
     console, summary = output(), record.summary
@@ -241,25 +240,20 @@ def _show(record: Record, as_json: bool, ok: bool) -> None:
         console.print(result_table(summary))
     reach = summary.get("baseline", {})
     if "impulse_Ns" in reach:
-        console.print(
+        say(
+            console,
             f"hardest minimum-jerk reach: {reach['impulse_Ns']:.2f} N s at "
             f"{reach['hand_speed_m_s']:.2f} m/s (simulated)",
-            highlight=False,
         )
     error = summary.get("simulated", {}).get("error")
     beyond = summary.get("gear_caution")
     cautions = (summary.get("caution"), touches_message(summary), beyond, switched_off_message(summary))
-    for text in (reason_message(summary), summary.get("note"), error, reach.get("error"), *cautions):
-        if text:
-            console.print(printable(str(text)), markup=False, highlight=False)
-    if len(summary["starts"]) > 1:
-        console.print(multistart_table(summary["starts"]))
-    if summary["violations"]:
-        console.print(violation_table(summary["violations"]))
-    console.print(
+    say(console, reason_message(summary), summary.get("note"), error, reach.get("error"), *cautions)
+    say_details(console, summary)
+    say(
+        console,
         f"{summary['solver']}: {summary['status']} after {summary['iterations']} iterations, "
         f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
-        highlight=False,
     )
 
 

@@ -32,7 +32,6 @@ def compare(
     Exit code: 0 compared, 2 bad input.
     """
     with plain_errors("interrupted before the results were compared"):
-        from impactopt.errors import printable
         from impactopt.files.output import load_record, make_directory, write_file
         from impactopt.report.comparison import compare as comparison_of
 
@@ -51,13 +50,12 @@ def compare(
         if as_json:
             print_json(found.describe(), True)
             return
-        from impactopt.report.console import comparison_tables, output
+        from impactopt.report.console import comparison_tables, output, say
 
         console = output()
         for table in comparison_tables(found):
             console.print(table)
-        for path in written:
-            console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
+        say(console, *written)
 
 
 def _names(results: Sequence[Path]) -> list[str]:

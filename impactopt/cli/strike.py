@@ -48,7 +48,6 @@ def strike(
     there is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
-        from impactopt.errors import printable
         from impactopt.files.output import keep_record, make_directory, record_of_strike, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.planning.strike import optimize_strike
@@ -80,25 +79,18 @@ def strike(
             print_json(record.summary, solution.status.usable)
         else:
             from impactopt.report.console import (
-                multistart_table,
                 output,
                 reason_message,
+                say,
+                say_details,
                 strike_table,
                 switched_off_message,
-                violation_table,
             )
 
-            shown = output()
-            shown.print(strike_table(record.summary))
-            s = record.summary
-            for text in filter(None, (reason_message(s), s.get("gear_caution"), switched_off_message(s))):
-                shown.print(printable(str(text)), highlight=False, markup=False)
-            shown.print(multistart_table(record.summary["starts"]))
-            if record.summary["violations"]:
-                shown.print(violation_table(record.summary["violations"]))
-            for path in written:
-                shown.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
-            if aside := set_aside(record.summary):
-                shown.print(aside, highlight=False, markup=False, soft_wrap=True)
+            shown, s = output(), record.summary
+            shown.print(strike_table(s))
+            say(shown, reason_message(s), s.get("gear_caution"), switched_off_message(s))
+            say_details(shown, s)
+            say(shown, *written, set_aside(s))
         if not solution.status.usable:
             raise typer.Exit(NOT_SOLVED)

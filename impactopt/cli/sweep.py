@@ -78,18 +78,18 @@ def sweep(
         if result.failed == result.done:
             raise typer.Exit(NOT_SOLVED)
         if chosen.figure is not None:
+            from impactopt.report.console import say
             from impactopt.report.pictures.sweep import save_sweep_picture
 
             picture = save_sweep_picture(chosen, result.table)
             if not (as_json or quiet):
-                console.print(str(picture), markup=False, highlight=False, soft_wrap=True)
+                say(console, picture)
 
 
 def _show(result: SweepResult) -> None:
     from rich.table import Table
 
-    from impactopt.errors import printable
-    from impactopt.report.console import output
+    from impactopt.report.console import output, say
     from impactopt.sweeps.progress import words_for_time
 
     table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
@@ -108,6 +108,4 @@ def _show(result: SweepResult) -> None:
         table.add_row(name, value)
     console = output()
     console.print(table)
-    for reason, count in result.reasons.items():
-        console.print(printable(f"{count} x {reason}"), markup=False, highlight=False)
-    console.print(str(result.table), markup=False, highlight=False, soft_wrap=True)
+    say(console, *(f"{count} x {reason}" for reason, count in result.reasons.items()), result.table)

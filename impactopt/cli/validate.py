@@ -84,7 +84,6 @@ def validate(
     Exit code: 0 stands (or the engine fixes the soles), 1 fell, 2 bad input.
     """
     with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
-        from impactopt.errors import printable
         from impactopt.files.output import make_directory, remove_file, write_file
         from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned, replay
@@ -126,15 +125,10 @@ def validate(
         if as_json:
             print_json(done.report, ok)
         else:
-            from impactopt.report.console import output, replay_table, touch_message
+            from impactopt.report.console import output, replay_table, say, touch_message
 
             console = output()
             console.print(replay_table(done.report, planned.record.summary))
-            if beyond := done.record.summary.get("gear_caution"):
-                console.print(printable(str(beyond)), markup=False, highlight=False)
-            if message := touch_message(done.report):
-                console.print(message, highlight=False, markup=False)
-            for path in written:
-                console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
+            say(console, done.record.summary.get("gear_caution"), touch_message(done.report), *written)
         if not ok:
             raise typer.Exit(FELL)

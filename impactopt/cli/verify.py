@@ -32,12 +32,10 @@ def verify(
         if as_json:
             print_json(plain(verdict.describe()), verdict.ok)
         else:
-            from impactopt.errors import printable
-            from impactopt.report.console import output
+            from impactopt.report.console import output, say
 
             console = output()
             console.print(verdict_table(verdict.describe()))
-            if verdict.reason:
-                console.print(printable(verdict.reason), markup=False, highlight=False)
+            say(console, verdict.reason)
         if not verdict.ok:
             raise typer.Exit(NOT_OK)

@@ -16,7 +16,7 @@ from impactopt.report.histories import footprints
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.robots.robot import Robot
 
-__all__ = ["bodies_drawn", "pack_robot", "pack_solid", "pack_track", "pack_world", "stage_of"]
+__all__ = ["bodies_drawn", "middle", "pack_robot", "pack_solid", "pack_track", "pack_world", "stage_of"]
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
@@ -41,7 +41,7 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
         "soles": [f"ground_{name}" for name in soles if name != "polygon"],
         "normal": problem.normal,
         "point": problem.point,
-        "side": _middle(arrays["track0_places"]),
+        "side": middle(arrays["track0_places"]),
         "weight": 9.81 * float(sum(i.mass for i in problem.robot.model.inertias)),
         "around": AROUND,
         "far": FAR,
@@ -73,7 +73,7 @@ def pack_world(world: tuple[WorldBody, ...], arrays: Arrays) -> list[dict[str, A
     ]
 
 
-def _middle(places: Array) -> float:
+def middle(places: Array) -> float:
     """Mean y [m] of the robot's joints at the start, by which the view's side is chosen."""
     return float(places[0, 1:, 1].mean())
 

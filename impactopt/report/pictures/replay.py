@@ -16,14 +16,11 @@ from impactopt.report.pictures.style import (
     BLUE,
     GREEN,
     ORANGE,
-    PAGE,
     PHASES,
     RIGHT,
     VERMILION,
     Array,
-    Picture,
-    styled,
-    title,
+    picture,
 )
 from impactopt.robots.loads import MIN_LOAD_FRACTION
 
@@ -31,19 +28,14 @@ SOLE_COLOURS = (BLUE, VERMILION)
 PHASE_COLOURS = (ORANGE, BLACK, GREEN)
 
 
-@styled
-def replay(record: Record) -> Picture | None:
-    """Centres of pressure on the soles, normal forces, slip and lift; None without a replay on soles."""
-    a = record.arrays
-    if not record.replayed or not len(a["replayed_soles"]):
-        return None
-    figure = Picture(PAGE, 4.2)
-    draw_replay(figure, record)
-    return figure
-
-
-def draw_replay(figure: FigureBase, record: Record) -> None:
-    """Draws the picture into a figure, or a part of one."""
+@picture(
+    height=4.2,
+    title=lambda record: f"soles in the replay ({_stands(record)})",
+    exists=lambda record: record.replayed and len(record.arrays["replayed_soles"]) > 0,
+    lacking="it needs replay=solution.validate(engine='mujoco') of a robot on soles",
+)
+def replay(figure: FigureBase, record: Record) -> None:
+    """Centres of pressure on the soles, normal forces, slip and lift."""
     a = record.arrays
     places: Any = figure.subplot_mosaic([["cop", "force"], ["cop", "move"]], width_ratios=[2, 3])
     _centres(figure, places["cop"], record)
@@ -65,7 +57,6 @@ def draw_replay(figure: FigureBase, record: Record) -> None:
     places["force"].tick_params(labelbottom=False)
     places["force"].set(ylabel="normal force [N]", title="force on each sole; grey: contact")
     places["move"].set(xlabel="time [s]", ylabel="slip, lift [mm]", title="the corner that moved most")
-    figure.suptitle(title(record, f"soles in the replay ({_stands(record)})"))
 
 
 def _stands(record: Record) -> str:

@@ -20,26 +20,23 @@ from impactopt.report.histories import footprints
 from impactopt.report.pictures.style import (
     BLACK,
     OVER,
-    PAGE,
     PHASES,
     RIGHT,
     Array,
-    Picture,
+    picture,
     simulated_phases,
-    styled,
-    title,
 )
 
 
-@styled
-def zero_moment_point(record: Record) -> Picture | None:
-    """Path of the ZMP in the support polygon, seen from above; None without soles."""
-    if not len(record.arrays["polygon"]):
-        return None
-    figure = Picture(PAGE, 3.1)
+@picture(
+    height=3.1,
+    title="zero-moment point, from above",
+    exists=lambda record: len(record.arrays["polygon"]) > 0,
+    lacking="the robot stands on no soles",
+)
+def zero_moment_point(figure: FigureBase, record: Record) -> None:
+    """Path of the ZMP in the support polygon, seen from above."""
     draw_zmp(figure, record)
-    figure.suptitle(title(record, "zero-moment point, from above"))
-    return figure
 
 
 def draw_zmp(figure: FigureBase, record: Record, phases: Sequence[int] = (0, 1, 2)) -> None:

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field
 from impactopt.files.problem_file.diagnostics import Mistake
 from impactopt.files.problem_file.values import Positive, Section, optional, required
 
-__all__ = ["CaseKind", "Figure", "SpanSection", "SweepFile", "flat", "of_other_kinds", "put"]
+__all__ = ["Figure", "SpanSection", "SweepFile", "SweepSection", "flat", "of_other_kinds", "put"]
 
 
 def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -95,7 +95,6 @@ class Figure(Section):
         return self.model_copy(update=new)
 
 
-CaseKind = Literal["solve", "strike", "collision"]
 AtLeastOne = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0)]
 
@@ -105,7 +104,7 @@ class SweepSection(Section):
 
     problem: str = required("a problem's name, or a file beside this one")
     name: str = Field(default="", description="what reports call the sweep")
-    case_kind: CaseKind = Field(
+    case_kind: Literal["solve", "strike", "collision"] = Field(
         default="solve", description="a whole motion, the strike alone, or one collision"
     )
     seed: Seed = Field(default=0, description="seed of what is drawn, and of solves from several starts")

@@ -34,6 +34,7 @@ from impactopt.cli.options import (
     Verbose,
     Workers,
     command_line,
+    out_option,
     print_json,
 )
 from impactopt.cli.show import show
@@ -79,10 +80,7 @@ def _root(
 def solve(
     context: typer.Context,
     file: ProblemPath,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
-    ] = None,
+    out: Annotated[Path | None, out_option("Where results go (default: results/NAME).")] = None,
     solver: SolverName = None,
     start: Annotated[
         Literal["reach", "strike"],

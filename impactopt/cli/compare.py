@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, print_json
+from impactopt.cli.options import AsJson, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 FILES = ("compare.json", "compare.png", "compare.html")
@@ -21,10 +21,7 @@ def compare(
         list[Path],
         typer.Argument(metavar="A B [C...]", help="Directories that `impactopt solve` wrote; two to five."),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help=f"Write {', '.join(FILES)} there."),
-    ] = None,
+    out: Annotated[Path | None, out_option(f"Write {', '.join(FILES)} there.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare results: numbers, differences of problems and versions, force, ZMP and torque.

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, ResultPath, print_json
+from impactopt.cli.options import AsJson, OtherProblem, ResultPath, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 # commands that use the files, printed after writing them
@@ -29,10 +29,7 @@ def export(
             "play it; mjlab: a motion for policies to track."
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Where the files go (default: RESULT_FORMAT)."),
-    ] = None,
+    out: Annotated[Path | None, out_option("Where the files go (default: RESULT_FORMAT).")] = None,
     rate: Annotated[
         float | None, typer.Option(metavar="HZ", help="Rows a second (default: 1000; mjlab: 50).")
     ] = None,

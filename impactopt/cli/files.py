@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem, print_json
+from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem, out_option, print_json
 from impactopt.report.plain_errors import BAD_INPUT, plain_errors
 
 if TYPE_CHECKING:
@@ -132,9 +132,7 @@ def new(
     mjcf: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draft it for the robot of this MJCF.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write it there, and do not print it.")
-    ] = None,
+    out: Annotated[Path | None, out_option("Write it there, and do not print it.", "FILE")] = None,
     reference: Annotated[
         bool, typer.Option("--reference", help="Print all sections and keys instead, as Markdown.")
     ] = False,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, Verbose, complete_problem, print_json
+from impactopt.cli.options import AsJson, Verbose, complete_problem, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 
@@ -41,12 +41,7 @@ def identify(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE",
-            help="Write the law that fits best there, as a section for a problem file.",
-        ),
+        out_option("Write the law that fits best there, as a section for a problem file.", "FILE"),
     ] = None,
     as_json: AsJson = False,
     verbose: Verbose = False,

@@ -99,6 +99,13 @@ ResultPath = Annotated[
     Path,
     typer.Argument(metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."),
 ]
+
+
+def out_option(help_text: str, metavar: str = "DIR") -> Any:
+    """Option for the place of the results."""
+    return typer.Option("--out", "-o", metavar=metavar, help=help_text)
+
+
 OtherProblem = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
 ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impactopt.cli.options import OtherProblem
+from impactopt.cli.options import OtherProblem, out_option
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
@@ -31,13 +31,7 @@ def show(
         ),
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE.html",
-            help=f"The page (default: RESULT/{PAGE}, or {BODIES}/ROBOT.html).",
-        ),
+        Path | None, out_option(f"The page (default: RESULT/{PAGE}, or {BODIES}/ROBOT.html).", "FILE.html")
     ] = None,
     open_: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
     sheet: Annotated[

@@ -20,6 +20,7 @@ from impactopt.cli.options import (
     Verbose,
     Workers,
     command_line,
+    out_option,
     print_json,
 )
 from impactopt.report.plain_errors import plain_errors
@@ -28,10 +29,7 @@ from impactopt.report.plain_errors import plain_errors
 def strike(
     context: typer.Context,
     file: ProblemPath,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Directory for the numbers."),
-    ] = None,
+    out: Annotated[Path | None, out_option("Directory for the numbers.")] = None,
     starts: Starts = 4,
     workers: Workers = 1,
     seed: Seed = 0,

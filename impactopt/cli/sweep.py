@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, complete_sweep, print_json
+from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, complete_sweep, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
@@ -23,10 +23,7 @@ def sweep(
             autocompletion=complete_sweep,
         ),
     ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", metavar="DIR", help="Directory of the results; give it again to resume."),
-    ],
+    out: Annotated[Path, out_option("Directory of the results; give it again to resume.")],
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes on this machine (default: one a core).")
     ] = None,

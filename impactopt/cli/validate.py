@@ -9,7 +9,16 @@ from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, Quiet, ResultPath, Settings, Verbose, print_json
+from impactopt.cli.options import (
+    AsJson,
+    OtherProblem,
+    Quiet,
+    ResultPath,
+    Settings,
+    Verbose,
+    out_option,
+    print_json,
+)
 from impactopt.report.plain_errors import plain_errors
 
 FELL = 1  # exit code
@@ -22,10 +31,7 @@ def validate(
         Literal["mujoco", "pinocchio"],
         typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: fixed soles."),
     ] = "mujoco",
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Write replay.json and replay.png there."),
-    ] = None,
+    out: Annotated[Path | None, out_option("Write replay.json and replay.png there.")] = None,
     animation: Annotated[
         Path | None, typer.Option(metavar="FILE.gif", help="Draw the robot's motion, slow around contact.")
     ] = None,

@@ -17,7 +17,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.page import Page, html_table, report_html
 from impactopt.report.result_rows import Cell, Row
 from impactopt.report.stage import Arrays, middle, pack_robot, pack_solid, pack_track, pack_world
-from impactopt.report.tracks import Track
+from impactopt.report.tracks import Track, places_of
 from impactopt.robots.robot import Robot
 
 __all__ = ["bodies_page", "bodies_page_of_problem"]
@@ -96,17 +96,15 @@ def _pack_hulls(links: RobotBodies, arrays: Arrays) -> list[dict[str, Any]]:
 
 def _still(robot: Robot, q: Array, label: str) -> Track:
     """Track of a single instant without contact."""
-    model, data = robot.model, robot.model.createData()
-    pin.framesForwardKinematics(model, data, q)
     zero, unknown = np.zeros(1), np.full((1, 3), np.nan)
-    strikers = [data.oMf[model.getFrameId(s.model_frame)].translation for s in robot.strikers.values()]
-    com = np.array(pin.centerOfMass(model, data, q))
+    frames = [striker.model_frame for striker in robot.strikers.values()]
+    places, hand, mass = places_of(robot, frames[0] if frames else "universe", q[None])
     return Track(
         name=label,
         time=zero,
-        places=np.array([[pin.SE3ToXYZQUAT(place) for place in data.oMi]]),
-        hand=np.array([strikers[0] if strikers else com]),
-        mass=com[None],
+        places=places,
+        hand=hand if frames else mass,
+        mass=mass,
         force=zero,
         travel=zero,
         zmp=unknown[:, :2],

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.solids import Solid, joined, simplified
-from impactopt.bodies.visuals import Visual, surroundings_of, visuals_of
+from impactopt.bodies.solids import Solid, simplified
+from impactopt.bodies.visuals import Visual, joined_visuals, surroundings_of
 from impactopt.bodies.world import WorldBody
 from impactopt.files.output import Record
 from impactopt.problem.problem import ImpactProblem
@@ -80,10 +80,7 @@ def middle(places: Array) -> float:
 
 def bodies_drawn(robot: Robot) -> list[Visual]:
     """Solids of a robot, one for each joint and colour, with few enough triangles in all."""
-    groups: dict[tuple[int, tuple[float, float, float]], list[Solid]] = {}
-    for visual in visuals_of(robot):
-        groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)
-    whole = {key: joined(solids) for key, solids in groups.items()}
+    whole = joined_visuals(robot)
     if sum(len(solid.triangles) for solid in whole.values()) > MAX_TRIANGLES:
         whole = _few(whole)
     return [

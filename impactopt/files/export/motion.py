@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BPoly, PchipInterpolator
+from scipy.spatial.transform import Rotation
 
 from impactopt.kinematics.support import zmp
 from impactopt.robots.robot import Robot
@@ -256,6 +257,4 @@ def _product(quaternion: Array, vector: Array) -> Array:
 
 def _turned(quaternion: Array, vector: Array) -> Array:
     """Vectors (k, 3) rotated by unit quaternions (k, 4)."""
-    w, u = quaternion[:, :1], quaternion[:, 1:]
-    twice = 2 * np.cross(u, vector)
-    return np.asarray(vector + w * twice + np.cross(u, twice))
+    return np.asarray(Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).apply(vector))

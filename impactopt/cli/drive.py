@@ -38,11 +38,7 @@ def drive(
         directory = None if out is None else make_directory(out)
         with SolveConsole(console, quiet=quiet) as progress:
             series = drive_nail(
-                read.build(),
-                depth=depth,
-                most=most,
-                report=progress.say,
-                **read.solver.arguments(),
+                read.build(), depth=depth, most=most, report=progress.say, **read.solver.arguments()
             )
         done = plain(series.describe())
         if directory is not None:

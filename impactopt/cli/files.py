@@ -194,12 +194,7 @@ def _draft(
     folder = Path() if out is None else out.parent
     with SolveConsole(Console(stderr=True)) as progress:
         draft = draft_problem(
-            path,
-            folder=folder,
-            mjcf=mjcf,
-            bolted=bolted,
-            motion=motion,
-            report=progress.say,
+            path, folder=folder, mjcf=mjcf, bolted=bolted, motion=motion, report=progress.say
         )
     _give(draft.text, out, as_json)
     for line in draft.said:

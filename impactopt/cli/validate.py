@@ -107,12 +107,7 @@ def validate(
             planned = load_planned(result, problem_file=problem, settings=changes)
             progress.say(f"{result} is read; replaying it in {engine}")
             done = replay(
-                planned,
-                engine=engine,
-                perturbation=world,
-                controller=controller,
-                contact=contact,
-                **options,
+                planned, engine=engine, perturbation=world, controller=controller, contact=contact, **options
             )
             ok = done.report["standing"] is not False
             if directory is not None:

@@ -15,15 +15,7 @@ from impactopt.files.problem_file.toml import TOMLError, read_toml
 from impactopt.report.charts import chart, series_of
 from impactopt.report.histories import at_contact, ground_wrenches, planned_torque, thinned, zmp_margins
 from impactopt.report.page import Page, html_table, report_html
-from impactopt.report.result_rows import (
-    Cell,
-    Row,
-    contact_rows,
-    number_row,
-    phase_rows,
-    standing,
-    word_row,
-)
+from impactopt.report.result_rows import Cell, Row, contact_rows, number_row, phase_rows, standing, word_row
 
 __all__ = ["MOST", "Comparison", "Difference", "compare", "histories_of"]
 
@@ -72,11 +64,7 @@ class Comparison:
         def by_key(differences: Sequence[Difference]) -> dict[str, dict[str, str]]:
             return {d.key: dict(zip(self.records, d.values, strict=True)) for d in differences}
 
-        return {
-            "results": plain(results),
-            "problem": by_key(self.problem),
-            "versions": by_key(self.versions),
-        }
+        return {"results": plain(results), "problem": by_key(self.problem), "versions": by_key(self.versions)}
 
     def page(self) -> Page:
         """HTML page of the comparison, with histories over the time since each result's contact."""

@@ -212,9 +212,7 @@ def _empty(title: str, *columns: str, left: Collection[str] = ("",), fold: bool 
     table = Table(title=_plain(title), title_justify="left")
     for name in columns:
         table.add_column(
-            _plain(name),
-            justify="left" if name in left else "right",
-            overflow="fold" if fold else "ellipsis",
+            _plain(name), justify="left" if name in left else "right", overflow="fold" if fold else "ellipsis"
         )
     return table
 

@@ -241,10 +241,7 @@ def _base(whole: Mapping[str, Any]) -> Base:
     spin = 2 * spin / size**2
     quaternion = quaternion / size
     return Base(
-        position=position[:, :3],
-        quaternion=quaternion,
-        linear=rate[:, :3],
-        angular=_turned(quaternion, spin),
+        position=position[:, :3], quaternion=quaternion, linear=rate[:, :3], angular=_turned(quaternion, spin)
     )
 
 

@@ -162,9 +162,5 @@ def _at(time: Array, nodes: Array, q: Array, v: Array, a: Array) -> Array:
     k = np.clip(np.searchsorted(nodes, time, side="right") - 1, 0, len(nodes) - 2)
     t, jerk = time - nodes[k], np.diff(a)[k] / (nodes[1] - nodes[0])
     return np.array(
-        [
-            q[k] + t * (v[k] + t * (a[k] / 2 + t * jerk / 6)),
-            v[k] + t * (a[k] + t * jerk / 2),
-            a[k] + t * jerk,
-        ]
+        [q[k] + t * (v[k] + t * (a[k] / 2 + t * jerk / 6)), v[k] + t * (a[k] + t * jerk / 2), a[k] + t * jerk]
     )

@@ -91,11 +91,7 @@ def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
             points: Array = zmp(a["replayed_sole_ground"][keep, k])
             axes.plot(-points[:, 1], points[:, 0], ".", color=colour, markersize=2.5, zorder=3 + (which == 1))
     axes.set_aspect("equal")
-    axes.set(
-        xlabel=RIGHT,
-        ylabel="x, forward [m]",
-        title="centre of pressure\n",
-    )
+    axes.set(xlabel=RIGHT, ylabel="x, forward [m]", title="centre of pressure\n")
     axes.grid(False)
     key = [
         Line2D([], [], linestyle="", marker="o", color=colour, label=name)

@@ -26,8 +26,7 @@ def strobe_height(record: Record) -> float:
 
 
 @picture(
-    height=lambda record: strobe_height(record) + 0.2,
-    title=lambda record: f"seen from {_view(record)[1]}",
+    height=lambda record: strobe_height(record) + 0.2, title=lambda record: f"seen from {_view(record)[1]}"
 )
 def strobe(figure: FigureBase, record: Record) -> None:
     """Robot as sticks at a few instants, and path of its striking point."""

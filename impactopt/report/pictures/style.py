@@ -142,9 +142,7 @@ class RecordPicture:
         return figure
 
 
-def picture(
-    **settings: Any,
-) -> Callable[[Callable[[FigureBase, Record], None]], RecordPicture]:
+def picture(**settings: Any) -> Callable[[Callable[[FigureBase, Record], None]], RecordPicture]:
     """Decorator of a function that draws a picture; settings : of a `RecordPicture`."""
     return lambda draw: RecordPicture(draw=draw, **settings)
 

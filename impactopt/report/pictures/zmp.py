@@ -17,15 +17,7 @@ from numpy.typing import NDArray
 from impactopt.files.output import Record
 from impactopt.kinematics.support import zmp
 from impactopt.report.histories import footprints
-from impactopt.report.pictures.style import (
-    BLACK,
-    OVER,
-    PHASES,
-    RIGHT,
-    Array,
-    picture,
-    simulated_phases,
-)
+from impactopt.report.pictures.style import BLACK, OVER, PHASES, RIGHT, Array, picture, simulated_phases
 
 
 @picture(

@@ -47,8 +47,6 @@ from impactopt.report.plain_errors import plain_errors
 if TYPE_CHECKING:
     from impactopt.files.output import Record
 
-__all__ = ["app", "main"]
-
 app = typer.Typer(
     name="impactopt",
     cls=PlainGroup,

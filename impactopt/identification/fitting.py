@@ -21,8 +21,6 @@ from impactopt.identification.log import MeasuredImpact, noise_of
 from impactopt.identification.result import Estimate, LawFit
 from impactopt.robots.robot import Robot, Striker
 
-__all__ = ["MAX_HAND_MASS", "ContactHistory", "TwoMassModel", "fit_law"]
-
 Array = NDArray[np.float64]
 _HEAVY = 1e6  # [kg] of the mass that hardly moves
 MAX_HAND_MASS = 1e5  # [kg]

@@ -22,8 +22,6 @@ from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.tracks import places_of
 
-__all__ = ["CollisionPage", "ShownCollision"]
-
 Array = NDArray[np.float64]
 _MIN_SPEED, _FIRST_SPEED, _MAX_SPEED = 0.05, 1.0, 4.0  # [m/s]
 _SLIDER_STEPS = 200

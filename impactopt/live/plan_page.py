@@ -18,8 +18,6 @@ from impactopt.planning.solution import Solution
 from impactopt.report.stage import middle
 from impactopt.report.tracks import Track
 
-__all__ = ["PlanPage", "failure_message", "plan_message"]
-
 FRAME = 1 / 30  # [s] between frames
 SPEEDS = {"1": 1.0, "1/4": 0.25, "1/20": 0.05}  # of the motion over the real one
 

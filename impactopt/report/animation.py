@@ -13,8 +13,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.page import Page, html_page
 from impactopt.report.stage import stage_of
 
-__all__ = ["Animation", "animate", "animation_of"]
-
 BODY = '<main><div id="trouble"></div><div id="animation"></div></main>'
 HEIGHT = 660  # pixels, in a notebook
 

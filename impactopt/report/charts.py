@@ -23,8 +23,6 @@ from impactopt.report.histories import (
 from impactopt.report.tracks import planned_hand_speed
 from impactopt.simulation.result import centre_of_pressure
 
-__all__ = ["chart", "charts_of", "series_of"]
-
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
 NEAR = (0.01, 0.03)  # [s] before and after contact, shown of the force at first

@@ -17,8 +17,6 @@ from impactopt.report.histories import at_contact, ground_wrenches, planned_torq
 from impactopt.report.page import Page, html_table, report_html
 from impactopt.report.result_rows import Cell, Row, contact_rows, number_row, phase_rows, standing, word_row
 
-__all__ = ["MOST", "Comparison", "Difference", "compare", "histories_of"]
-
 Array = NDArray[np.float64]
 MOST = 5  # results: the page has as many line styles
 STYLES = ("planned", "simulated", "free", "one", "two")

@@ -30,26 +30,6 @@ from impactopt.solvers.program import IterationRecord, without_violations
 if TYPE_CHECKING:
     from impactopt.report.comparison import Comparison
 
-__all__ = [
-    "SolveConsole",
-    "collision_table",
-    "comparison_tables",
-    "identified_table",
-    "multistart_table",
-    "nail_driving_table",
-    "output",
-    "reason_message",
-    "replay_table",
-    "result_table",
-    "say",
-    "say_details",
-    "strike_table",
-    "switched_off_message",
-    "torques_table",
-    "touches_message",
-    "violation_table",
-]
-
 PHASES_OF_STRIKE = ("contact", "collision")
 PIPE_WIDTH = 500  # columns of output that does not go to a terminal
 MIN_INTERVAL = 1.0  # [s] between lines about iterations where a line cannot be rewritten

@@ -13,16 +13,6 @@ from impactopt.files.output import Record
 from impactopt.kinematics.support import convex_polygon, margin
 from impactopt.simulation.result import centre_of_pressure
 
-__all__ = [
-    "BUCKETS",
-    "at_contact",
-    "ground_wrenches",
-    "planned_torque",
-    "soles_standing",
-    "thinned",
-    "zmp_margins",
-]
-
 Array = NDArray[np.float64]
 BUCKETS = 400  # of a thinned history
 

@@ -22,8 +22,6 @@ from impactopt.errors import InputError
 from impactopt.files.output import plain, write_file
 from impactopt.report.result_rows import Row
 
-__all__ = ["Page", "html_page", "html_table", "pack", "report_html", "unpack"]
-
 KINDS = {"<f4": np.float32, "<u2": np.uint16, "<u4": np.uint32, "|u1": np.uint8}  # JavaScript's typed arrays
 
 

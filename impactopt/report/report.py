@@ -15,8 +15,6 @@ from impactopt.report.result_rows import Cell, Row, result_columns, result_rows,
 from impactopt.report.stage import stage_of
 from impactopt.robots.loads import shortfalls
 
-__all__ = ["report_of", "report_page"]
-
 COLUMN_NOTES = {
     "simulated": "Simulated: replayed in Pinocchio's full dynamics, any soles fixed.",
     "fixed soles": "Fixed soles: replayed in Pinocchio's full dynamics, with the soles fixed.",

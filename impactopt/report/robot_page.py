@@ -20,8 +20,6 @@ from impactopt.report.stage import Arrays, middle, pack_robot, pack_solid, pack_
 from impactopt.report.tracks import Track, places_of
 from impactopt.robots.robot import Robot
 
-__all__ = ["bodies_page", "bodies_page_of_problem"]
-
 Array = NDArray[np.float64]
 DEFAULT_POSTURE = "half_sitting"  # of a robot without a problem, if the robot has it
 

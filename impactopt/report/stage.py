@@ -16,8 +16,6 @@ from impactopt.report.histories import footprints
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.robots.robot import Robot
 
-__all__ = ["bodies_drawn", "middle", "pack_robot", "pack_solid", "pack_track", "pack_world", "stage_of"]
-
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
 MAX_TRIANGLES = 120_000  # of a robot

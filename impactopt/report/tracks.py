@@ -17,8 +17,6 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.result import centre_of_pressure, travelled
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["AROUND", "FAR", "Track", "places_of", "planned_hand_speed", "planned_track", "tracks_of"]
-
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
 FRAME, FINE = 1 / 30, 1 / 500  # [s] between instants, and around contact

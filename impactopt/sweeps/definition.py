@@ -32,8 +32,6 @@ from impactopt.sweeps.collisions import Collisions, sweep_place
 from impactopt.sweeps.design import Axis, Column, Design, Draws, Span, column
 from impactopt.sweeps.sections import Figure, SpanSection, SweepFile, SweepSection, flat, of_other_kinds, put
 
-__all__ = ["Sweep", "VariedKeys", "parse_sweep", "read_sweep_file", "sweep_from_data"]
-
 
 class VariedKeys:
     """Reader of the varied keys, which adds what is wrong with them to a list of mistakes.

@@ -20,21 +20,6 @@ from impactopt import __version__
 from impactopt.files.output import Record
 from impactopt.sweeps.sections import SweepSection
 
-__all__ = [
-    "GRACE",
-    "Axis",
-    "Column",
-    "Columns",
-    "Design",
-    "Draws",
-    "Found",
-    "Span",
-    "Unit",
-    "Work",
-    "column",
-    "failed_columns",
-]
-
 Array = NDArray[np.float64]
 Column = Sequence[Any] | NDArray[Any]
 

@@ -29,8 +29,6 @@ from impactopt.sweeps.design import Columns, Found, Unit, Work, failed_columns
 from impactopt.sweeps.progress import START
 from impactopt.sweeps.table import UNITS
 
-__all__ = ["CASE_KINDS", "ENDED_BY_WATCHDOG", "TRIES", "Watchdog", "evaluate", "on_processes"]
-
 ENDED_BY_WATCHDOG = -int(signal.SIGALRM)  # exit code of a process that the watchdog has ended
 MAX_BUILD_STEP = 900.0  # [s] for one step of building functions
 

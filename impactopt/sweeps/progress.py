@@ -18,8 +18,6 @@ from impactopt.errors import printable
 from impactopt.sweeps.design import Columns
 from impactopt.sweeps.table import merge_kinds
 
-__all__ = ["START", "ProgressCounter", "SweepConsole", "SweepProgress", "receivers", "words_for_time"]
-
 BEST = "impulse_Ns"
 START = "started_from"  # column with the solved case that a solve started from; "": none
 RATE_WINDOW = 30.0  # [s] over which the present rate is measured

@@ -22,8 +22,6 @@ from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
 from impactopt.transcription.transcription import block_functions
 
-__all__ = ["SweepResult", "sweep"]
-
 RETRIED = {"crashed", "error", "time_limit"}  # statuses of cases that may succeed in another run
 Engine = Generator[tuple[Unit, Found], None, None]
 MAX_UNIT = {"collision": 16384}  # cases in a unit by kind; 1 for other kinds

@@ -10,8 +10,6 @@ from pydantic import BeforeValidator, Field
 from impactopt.files.problem_file.diagnostics import Mistake
 from impactopt.files.problem_file.values import Positive, Section, optional, required
 
-__all__ = ["Figure", "SpanSection", "SweepFile", "SweepSection", "flat", "of_other_kinds", "put"]
-
 
 def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
     """Key paths and their values; TOML reads dots in keys as nested tables."""

@@ -34,8 +34,6 @@ from impactopt.planning.solution import versions
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.design import Columns, Found
 
-__all__ = ["Entry", "Journal", "Store"]
-
 MAGIC = b"SQLite format 3\x00"  # first bytes of an SQLite file
 APPLICATION = 0x696D7061  # SQLite's application_id of these files: "impa"
 FIX = "put back a copy of it, or give another --out"

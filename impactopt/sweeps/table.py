@@ -14,8 +14,6 @@ from impactopt.errors import InputError, check_choice, missing_package
 from impactopt.files.output import write_file
 from impactopt.sweeps.design import Columns
 
-__all__ = ["UNITS", "merge_kinds", "pyarrow", "read_columns", "unit_of", "without_unit", "write_table"]
-
 Part = tuple[int, Columns]  # number of the first case, and columns of consecutive cases from it on
 
 MIN_GROUP = 1 << 16  # rows in one of the file's row groups, but for the last; small units are joined

@@ -16,8 +16,6 @@ from impactopt.kinematics.support import zmp
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["JUMP", "Base", "Motion", "motion_at", "with_passive_at_rest"]
-
 Array = NDArray[np.float64]
 JUMP = 1e-6  # [s] between the two samples at a jump, so that time is strictly ascending
 CONTACT = 1  # phase

@@ -32,8 +32,6 @@ from impactopt.simulation.mujoco_world import (
 )
 from impactopt.simulation.perturbation import Perturbation
 
-__all__ = ["PLAYER", "write"]
-
 Array = NDArray[np.float64]
 SCENE, REFERENCE, PLAYER, MESHES = "scene.xml", "reference.npz", "play.py", "meshes"
 MAX_STEP = 2e-4  # [s]

@@ -13,8 +13,6 @@ from impactopt.errors import InputError, check_number
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription.plan import Trajectory, complete_reference
 
-__all__ = ["Smoothness", "smoothed"]
-
 Array = NDArray[np.float64]
 MIN_STEP, MAX_STEPS = 2e-3, 3000  # [s] of constant jerk, and their number
 EXTRA_TIME = 0.1  # [s] that the smoothed motion is longer

@@ -9,8 +9,6 @@ from impactopt.files.output import Record
 from impactopt.report.comparison import histories_of
 from impactopt.report.pictures.style import PAGE, Picture, impulse_text, styled
 
-__all__ = ["comparison_picture"]
-
 AROUND = 0.25  # time shown before and after contact, over its duration
 # name of each history, its label, its limit, and whether it is shown near contact only
 PANELS = (

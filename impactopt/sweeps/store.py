@@ -33,6 +33,7 @@ from impactopt.files.output import make_directory, save_record, write_file
 from impactopt.planning.solution import versions
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.design import Columns, Found
+from impactopt.sweeps.sections import flat
 
 MAGIC = b"SQLite format 3\x00"  # first bytes of an SQLite file
 APPLICATION = 0x696D7061  # SQLite's application_id of these files: "impa"
@@ -274,7 +275,7 @@ def _lock(path: Path) -> int:
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Message with the settings that differ between two sweep.json, or that only one of them has."""
     old, new = (
-        {**_flat(data.get("sweep", {})), **_flat(data.get("problem", {}), "problem file: ")}
+        {**dict(flat(data.get("sweep", {}))), **dict(flat(data.get("problem", {}), "problem file: "))}
         for data in (before, now)
     )
     none = "not given"
@@ -287,11 +288,3 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         return ""
     more = f", and {len(changed) - MAX_NAMED} more" if len(changed) > MAX_NAMED else ""
     return ": " + "; ".join(changed[:MAX_NAMED]) + more
-
-
-def _flat(data: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Values by key path."""
-    out: dict[str, Any] = {}
-    for key, value in data.items():
-        out |= _flat(value, f"{above}{key}.") if isinstance(value, Mapping) else {f"{above}{key}": value}
-    return out

@@ -10,18 +10,17 @@ from matplotlib.lines import Line2D
 
 from impactopt.files.output import Record
 from impactopt.kinematics.support import zmp
-from impactopt.report.histories import footprints
 from impactopt.report.pictures.style import (
     BLACK,
     BLUE,
     GREEN,
     ORANGE,
     PHASES,
-    RIGHT,
     VERMILION,
     Array,
     picture,
 )
+from impactopt.report.pictures.zmp import draw_soles
 from impactopt.robots.loads import MIN_LOAD_FRACTION
 
 SOLE_COLOURS = (BLUE, VERMILION)
@@ -71,17 +70,7 @@ def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
     a = record.arrays
     time, start, end = a["replayed_time"], a["replayed_contact_start"], a["replayed_contact_end"]
     phase = (time >= start).astype(int) + (time >= end).astype(int)  # nan compares false
-    for name, corners in footprints(record).items():
-        axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
-        axes.annotate(
-            name.removeprefix("sole_").partition(",")[0].replace("_", " "),
-            (-corners[:, 1].mean(), corners[:, 0].max()),
-            (0, 2),
-            textcoords="offset points",
-            color="#666666",
-            ha="center",
-            fontsize=6.5,
-        )
+    draw_soles(axes, record, toes=True)
     normal = a["replayed_sole_ground"][:, :, 2]
     for k in range(normal.shape[1]):
         # the median is the weight, because most of the motion is slow
@@ -90,9 +79,7 @@ def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
             keep = loaded & (phase == which)
             points: Array = zmp(a["replayed_sole_ground"][keep, k])
             axes.plot(-points[:, 1], points[:, 0], ".", color=colour, markersize=2.5, zorder=3 + (which == 1))
-    axes.set_aspect("equal")
-    axes.set(xlabel=RIGHT, ylabel="x, forward [m]", title="centre of pressure\n")
-    axes.grid(False)
+    axes.set(ylabel="x, forward [m]", title="centre of pressure\n")
     key = [
         Line2D([], [], linestyle="", marker="o", color=colour, label=name)
         for name, colour in zip(PHASES, PHASE_COLOURS, strict=True)

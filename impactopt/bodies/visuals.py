@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from impactopt.bodies.convex_hulls import ROD, bare_joints, inertia_box, is_too_large, tool_solids
 from impactopt.bodies.file_shapes import geoms_of, numbers, shapes_of, urdf_elements
-from impactopt.bodies.solids import Solid, box, cylinder, sphere
+from impactopt.bodies.solids import Solid, box, cylinder, joined, sphere
 from impactopt.bodies.world import WorldBody
 from impactopt.robots.attachments import Tool
 from impactopt.robots.robot import Robot, Striker
 
-__all__ = ["Hinge", "Part", "Visual", "surroundings_of", "visuals_of"]
+__all__ = ["Hinge", "Part", "Visual", "joined_visuals", "surroundings_of", "visuals_of"]
 
 Array = NDArray[np.float64]
 GREY = (0.72, 0.74, 0.77)  # default colour
@@ -50,6 +50,14 @@ def visuals_of(robot: Robot) -> list[Visual]:
     bare = bare_joints(robot, known) | (known - {visual.joint for visual in found})
     found += [visual for visual in _from_inertia(robot) if visual.joint in bare] if bare else []
     return [*found, *(visual for tool in robot.tools for visual in _of_tool(robot, tool))]
+
+
+def joined_visuals(robot: Robot) -> dict[tuple[int, tuple[float, float, float]], Solid]:
+    """Visual shapes of the robot, joined to one solid for each joint and colour."""
+    groups: dict[tuple[int, tuple[float, float, float]], list[Solid]] = {}
+    for visual in visuals_of(robot):
+        groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)
+    return {key: joined(solids) for key, solids in groups.items()}
 
 
 def _from_urdf(robot: Robot) -> list[Visual]:

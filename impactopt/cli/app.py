@@ -7,10 +7,9 @@ input; 70 a fault of ours; 130 Ctrl-C.
 
 from __future__ import annotations
 
-import enum
 import inspect
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -34,23 +33,19 @@ from impactopt.cli.options import (
     TimeLimit,
     Verbose,
     Workers,
-    check_loudness,
-    check_time_limit,
     command_line,
-    examples,
+    out_option,
     print_json,
 )
 from impactopt.cli.show import show
 from impactopt.cli.strike import strike
 from impactopt.cli.sweep import sweep
 from impactopt.cli.validate import validate
-from impactopt.cli.verify import EXAMPLES, verify
+from impactopt.cli.verify import verify
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
     from impactopt.files.output import Record
-
-__all__ = ["app", "main"]
 
 app = typer.Typer(
     name="impactopt",
@@ -64,20 +59,13 @@ app = typer.Typer(
 )
 
 
-class Start(str, enum.Enum):
-    reach = "reach"
-    strike = "strike"
-
-
 def main() -> None:
     """Entry point of the command `impactopt`."""
     app()
 
 
 @app.callback(invoke_without_command=True)
-def _root(
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-) -> None:
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     if version:
         from impactopt import __version__
 
@@ -85,24 +73,15 @@ def _root(
         raise typer.Exit
 
 
-@app.command(
-    epilog=examples(
-        "impactopt solve punch --out results/punch",
-        "impactopt solve my.toml --set target.mass=8 --set swing.duration=[0.6,0.9]",
-        "impactopt solve punch --start strike --starts 4 --json --quiet",
-    )
-)
 def solve(
     context: typer.Context,
     file: ProblemPath,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
-    ] = None,
+    out: Annotated[Path | None, out_option("Where results go (default: results/NAME).")] = None,
     solver: SolverName = None,
     start: Annotated[
-        Start, typer.Option(help="Initial guess: a plain reach, or the hardest strike near it.")
-    ] = Start.reach,
+        Literal["reach", "strike"],
+        typer.Option(help="Initial guess: a plain reach, or the hardest strike near it."),
+    ] = "reach",
     starts: Starts = 1,
     workers: Workers = 1,
     seed: Seed = 0,
@@ -141,17 +120,15 @@ def solve(
         from impactopt.planning.solve import solve as plan
         from impactopt.report.console import SolveConsole
 
-        check_time_limit(time_limit)
-        check_loudness(quiet, verbose)
         read = read_problem_file(file, parse_settings(settings or ()))
-        chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
+        chosen = read.solver.arguments(solver, time_limit)
         with SolveConsole(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
             progress.say("building the nonlinear program (compiles for some ten seconds the first time)")
             processes = workers if starts > 1 else 1
-            chosen |= {"start": start.value, "starts": starts, "workers": processes, "seed": seed}
+            chosen |= {"start": start, "starts": starts, "workers": processes, "seed": seed}
             chosen |= {"report": progress.say, "callback": progress.iteration if processes == 1 else None}
             if store is None:
                 solution = plan(problem, **chosen)
@@ -183,86 +160,73 @@ def solve(
             raise typer.Exit(NOT_SOLVED)
 
 
-app.command(
-    epilog=examples("impactopt strike punch --starts 8", "impactopt strike my.toml --json --out results/s")
-)(strike)
-app.command(
-    epilog=examples(
-        "impactopt collide punch --speed 0.5",
-        "impactopt collide punch --speed 0.5 --set target.mass=20 --model full --json",
-        "impactopt collide results/punch",
-    )
-)(collide)
-app.command(
-    epilog=examples(
-        "impactopt validate results/punch",
-        "impactopt validate results/punch --missing --json",
-        "impactopt validate results/punch --animation punch.gif",
-    )
-)(validate)
-app.command(epilog=EXAMPLES)(verify)
-app.command(
-    epilog=examples(
-        "impactopt show results/punch --open",
-        "impactopt show talos --open",
-        "impactopt show results/punch --live --port 8080",
-        "impactopt show my.toml --live",
-    )
-)(show)
-app.command(
-    epilog=examples(
-        "impactopt compare results/punch results/punch_robust",
-        "impactopt compare results/a results/b results/c --out results/compared --json",
-    )
-)(compare)
-app.command(
-    epilog=examples(
-        "impactopt export results/punch --to csv",
-        "impactopt export results/punch --to ros2 --rate 200 --out goals",
-        "impactopt export results/punch --to mujoco",
-    )
-)(export)
-app.command(
-    epilog=examples(
-        "impactopt identify blow.csv",
-        "impactopt identify blows.npz --target-mass 2 --out contact.toml",
-        "impactopt identify joints.csv --problem arm7 --law Hunt-Crossley --json",
-    )
-)(identify)
-app.command(epilog=examples("impactopt drive arm7 --depth 0.05"))(drive)
-app.command(
-    epilog=examples(
-        "impactopt sweep my.toml --out results/s", "impactopt sweep collision_target --out results/t"
-    )
-)(sweep)
-app.command(epilog=examples("impactopt new", "impactopt new punch > my.toml", "impactopt new --reference"))(
-    new
+# in the order of the help
+COMMANDS = (
+    *(solve, strike, collide, validate, verify, show, compare, export, identify, drive, sweep, new, check),
+    *(problems, robots),
 )
-app.command(epilog=examples("impactopt check my.toml", "impactopt check punch --set problem.point.0=0.7"))(
-    check
-)
-app.command(epilog=examples("impactopt problems --json"))(problems)
-app.command(epilog=examples("impactopt robots --json"))(robots)
-for _registered in app.registered_commands:
-    _registered.cls = PlainCommand
+# for the end of the help of the command that each line names
+EXAMPLES = """
+impactopt solve punch --out results/punch
+impactopt solve my.toml --set target.mass=8 --set swing.duration=[0.6,0.9]
+impactopt solve punch --start strike --starts 4 --json --quiet
+impactopt strike punch --starts 8
+impactopt strike my.toml --json --out results/s
+impactopt collide punch --speed 0.5
+impactopt collide punch --speed 0.5 --set target.mass=20 --model full --json
+impactopt collide results/punch
+impactopt validate results/punch
+impactopt validate results/punch --missing --json
+impactopt validate results/punch --animation punch.gif
+impactopt verify results/punch
+impactopt verify results/punch --json
+impactopt show results/punch --open
+impactopt show talos --open
+impactopt show results/punch --live --port 8080
+impactopt show my.toml --live
+impactopt compare results/punch results/punch_robust
+impactopt compare results/a results/b results/c --out results/compared --json
+impactopt export results/punch --to csv
+impactopt export results/punch --to ros2 --rate 200 --out goals
+impactopt export results/punch --to mujoco
+impactopt identify blow.csv
+impactopt identify blows.npz --target-mass 2 --out contact.toml
+impactopt identify joints.csv --problem arm7 --law Hunt-Crossley --json
+impactopt drive arm7 --depth 0.05
+impactopt sweep my.toml --out results/s
+impactopt sweep collision_target --out results/t
+impactopt new
+impactopt new punch > my.toml
+impactopt new --reference
+impactopt check my.toml
+impactopt check punch --set problem.point.0=0.7
+impactopt problems --json
+impactopt robots --json
+""".strip().splitlines()
+
+for _command in COMMANDS:
     # typer keeps the line breaks of a docstring beside those that fit the terminal
-    _paragraphs = inspect.cleandoc(str(_registered.callback.__doc__)).split("\n\n")
-    _registered.help = "\n\n".join(text.replace("\n", " ") for text in _paragraphs)
+    _paragraphs = inspect.cleandoc(str(_command.__doc__)).split("\n\n")
+    _examples = [f"  {line}" for line in EXAMPLES if line.split()[1] == _command.__name__]
+    app.command(
+        cls=PlainCommand,
+        help="\n\n".join(text.replace("\n", " ") for text in _paragraphs),
+        epilog="\n\n".join(["Examples:", *_examples]),
+    )(_command)
 
 
 def _show(record: Record, as_json: bool, ok: bool) -> None:
     if as_json:
         print_json(record.summary, ok)
         return
-    from impactopt.errors import printable
     from impactopt.report.console import (
-        multistart_table,
         output,
         reason_message,
         result_table,
+        say,
+        say_details,
         switched_off_message,
         touches_message,
-        violation_table,
     )
 
     console, summary = output(), record.summary
@@ -270,25 +234,20 @@ def _show(record: Record, as_json: bool, ok: bool) -> None:
         console.print(result_table(summary))
     reach = summary.get("baseline", {})
     if "impulse_Ns" in reach:
-        console.print(
+        say(
+            console,
             f"hardest minimum-jerk reach: {reach['impulse_Ns']:.2f} N s at "
             f"{reach['hand_speed_m_s']:.2f} m/s (simulated)",
-            highlight=False,
         )
     error = summary.get("simulated", {}).get("error")
     beyond = summary.get("gear_caution")
     cautions = (summary.get("caution"), touches_message(summary), beyond, switched_off_message(summary))
-    for text in (reason_message(summary), summary.get("note"), error, reach.get("error"), *cautions):
-        if text:
-            console.print(printable(str(text)), markup=False, highlight=False)
-    if len(summary["starts"]) > 1:
-        console.print(multistart_table(summary["starts"]))
-    if summary["violations"]:
-        console.print(violation_table(summary["violations"]))
-    console.print(
+    say(console, reason_message(summary), summary.get("note"), error, reach.get("error"), *cautions)
+    say_details(console, summary)
+    say(
+        console,
         f"{summary['solver']}: {summary['status']} after {summary['iterations']} iterations, "
         f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
-        highlight=False,
     )
 
 

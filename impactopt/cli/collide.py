@@ -2,35 +2,19 @@
 
 from __future__ import annotations
 
-import enum
 import math
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import (
-    AsJson,
-    Quiet,
-    Settings,
-    Verbose,
-    check_loudness,
-    complete_problem,
-    print_json,
-)
+from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, complete_problem, print_json
 from impactopt.report.plain_errors import plain_errors
 
 NO_COLLISION = 1  # exit code
 RESULT_FREEZES = 16  # default for a saved result, as the contacts of plans are long
-
-
-class Model(str, enum.Enum):
-    sdc = "sdc"
-    paper = "sdc-paper"
-    virtual_mass = "virtual-mass"
-    rigid = "rigid"
-    full = "full"
+Model = Literal["sdc", "sdc-paper", "virtual-mass", "rigid", "full"]
 
 
 def collide(
@@ -54,7 +38,7 @@ def collide(
             metavar="NAME", help="A posture of the robot by name; left out: a reach to the problem's point."
         ),
     ] = None,
-    model: Annotated[Model, typer.Option(help="Model of the collision.")] = Model.sdc,
+    model: Annotated[Model, typer.Option(help="Model of the collision.")] = "sdc",
     freezes: Annotated[
         int | None,
         typer.Option(
@@ -90,7 +74,6 @@ def collide(
         from impactopt.files.sections.reading import CollisionFile, parse_settings
         from impactopt.report.console import SolveConsole
 
-        check_loudness(quiet, verbose)
         if not 0 < accuracy < math.inf:
             raise typer.BadParameter(f"{accuracy:g}; give a number > 0", param_hint="--accuracy")
         saved = os.path.isdir(what)  # False also for names that are too long
@@ -100,9 +83,9 @@ def collide(
             raise typer.BadParameter("a result has its own; leave it out", param_hint="--posture")
         changes = parse_settings(settings or ())
         read = problem_of_result(what).changed(changes) if saved else CollisionFile.read(what, changes)
-        if freezes is None and saved and model is Model.sdc:
+        if freezes is None and saved and model == "sdc":
             freezes = RESULT_FREEZES
-        given = {"model": model.value, "freezes": freezes, "posture": posture, "speed_m_s": speed}
+        given = {"model": model, "freezes": freezes, "posture": posture, "speed_m_s": speed}
         given["result"] = str(what.resolve()) if saved else None
         at_contact = {key: value for key, value in given.items() if value is not None}
         with SolveConsole(console, quiet=quiet) as progress:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, print_json
+from impactopt.cli.options import AsJson, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 FILES = ("compare.json", "compare.png", "compare.html")
@@ -21,10 +21,7 @@ def compare(
         list[Path],
         typer.Argument(metavar="A B [C...]", help="Directories that `impactopt solve` wrote; two to five."),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help=f"Write {', '.join(FILES)} there."),
-    ] = None,
+    out: Annotated[Path | None, out_option(f"Write {', '.join(FILES)} there.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare results: numbers, differences of problems and versions, force, ZMP and torque.
@@ -32,7 +29,6 @@ def compare(
     Exit code: 0 compared, 2 bad input.
     """
     with plain_errors("interrupted before the results were compared"):
-        from impactopt.errors import printable
         from impactopt.files.output import load_record, make_directory, write_file
         from impactopt.report.comparison import compare as comparison_of
 
@@ -51,13 +47,12 @@ def compare(
         if as_json:
             print_json(found.describe(), True)
             return
-        from impactopt.report.console import comparison_tables, output
+        from impactopt.report.console import comparison_tables, output, say
 
         console = output()
         for table in comparison_tables(found):
             console.print(table)
-        for path in written:
-            console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
+        say(console, *written)
 
 
 def _names(results: Sequence[Path]) -> list[str]:

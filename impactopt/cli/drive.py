@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, ProblemPath, Quiet, Settings, Verbose, check_loudness, print_json
+from impactopt.cli.options import AsJson, ProblemPath, Quiet, Settings, Verbose, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 NOT_IN = 1  # exit code
@@ -17,9 +17,7 @@ def drive(
     problem: ProblemPath,
     depth: Annotated[float, typer.Option(metavar="M", help="Depth to which the nail is driven.")] = 0.05,
     most: Annotated[int, typer.Option(metavar="N", help="Largest number of blows.", min=1)] = 20,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write blows.json there.")
-    ] = None,
+    out: Annotated[Path | None, out_option("Write blows.json there.")] = None,
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -36,16 +34,11 @@ def drive(
         from impactopt.planning.nail_driving import drive_nail
         from impactopt.report.console import SolveConsole, nail_driving_table, output
 
-        check_loudness(quiet, verbose)
         read = read_problem_file(problem, parse_settings(settings or ()))
         directory = None if out is None else make_directory(out)
         with SolveConsole(console, quiet=quiet) as progress:
             series = drive_nail(
-                read.build(),
-                depth=depth,
-                most=most,
-                report=progress.say,
-                **read.solver.arguments(),
+                read.build(), depth=depth, most=most, report=progress.say, **read.solver.arguments()
             )
         done = plain(series.describe())
         if directory is not None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import enum
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, print_json
+from impactopt.cli.options import AsJson, OtherProblem, ResultPath, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 # commands that use the files, printed after writing them
@@ -18,23 +17,11 @@ NEXT = {
     "control_msgs/action/FollowJointTrajectory < {directory}/motion.yaml",
     "mujoco": "python {directory}/play.py",
 }
-
-
-class Target(str, enum.Enum):
-    csv = "csv"
-    ros2 = "ros2"
-    mcap = "mcap"
-    mujoco = "mujoco"
-    mjlab = "mjlab"
+Target = Literal["csv", "ros2", "mcap", "mujoco", "mjlab"]
 
 
 def export(
-    result: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."
-        ),
-    ],
+    result: ResultPath,
     to: Annotated[
         Target,
         typer.Option(
@@ -42,10 +29,7 @@ def export(
             "play it; mjlab: a motion for policies to track."
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Where the files go (default: RESULT_FORMAT)."),
-    ] = None,
+    out: Annotated[Path | None, out_option("Where the files go (default: RESULT_FORMAT).")] = None,
     rate: Annotated[
         float | None, typer.Option(metavar="HZ", help="Rows a second (default: 1000; mjlab: 50).")
     ] = None,
@@ -88,15 +72,15 @@ def export(
         planned = load_planned(result, problem_file=problem)
         folder = result if result.is_dir() else result.parent
         parent = folder.parent if folder.name.strip(".") else folder.resolve().parent  # also for "." and ".."
-        directory = out if out is not None else parent / f"{folder.resolve().name}_{to.value}"
+        directory = out if out is not None else parent / f"{folder.resolve().name}_{to}"
         names = None if joints is None else [name.strip() for name in joints.split(",")]
         limits = None if smooth is None else _limits(smooth)
         written = export_planned(
-            planned, to.value, directory, rate=rate, joints=names, gravity=gravity, smooth=limits
+            planned, to, directory, rate=rate, joints=names, gravity=gravity, smooth=limits
         )
         cost = None if limits is None else json.loads(written[0].read_text(encoding="utf-8"))["smooth"]
         if as_json:
-            summary = {"to": to.value, "directory": str(directory), "files": [str(path) for path in written]}
+            summary = {"to": to, "directory": str(directory), "files": [str(path) for path in written]}
             print_json(summary | ({} if cost is None else {"smooth": cost}), True)
             return
         for path in written:
@@ -107,10 +91,10 @@ def export(
                 f"smoothed: {cost['impulse_Ns']:.3g} N s in our replay, of {cost['planned_impulse_Ns']:.3g} "
                 f"planned{meets}"
             )
-        if to is Target.mujoco:
+        if to == "mujoco":
             typer.echo(f"\n{(directory / 'play.py').read_text(encoding='utf-8')}")
-        if to.value in NEXT:
-            typer.echo(printable(NEXT[to.value].format(directory=directory)))
+        if to in NEXT:
+            typer.echo(printable(NEXT[to].format(directory=directory)))
 
 
 def _limits(given: str) -> tuple[float, float]:

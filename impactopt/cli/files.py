@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import enum
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem, print_json
+from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem, out_option, print_json
 from impactopt.report.plain_errors import BAD_INPUT, plain_errors
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
     from impactopt.robots.robot import Robot
 
-
-class Motion(str, enum.Enum):
-    punch = "punch"
-    kick = "kick"
-    chop = "chop"
-    nail = "nail"
-
-
+Motion = Literal["punch", "kick", "chop", "nail"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -140,9 +132,7 @@ def new(
     mjcf: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draft it for the robot of this MJCF.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write it there, and do not print it.")
-    ] = None,
+    out: Annotated[Path | None, out_option("Write it there, and do not print it.", "FILE")] = None,
     reference: Annotated[
         bool, typer.Option("--reference", help="Print all sections and keys instead, as Markdown.")
     ] = False,
@@ -204,12 +194,7 @@ def _draft(
     folder = Path() if out is None else out.parent
     with SolveConsole(Console(stderr=True)) as progress:
         draft = draft_problem(
-            path,
-            folder=folder,
-            mjcf=mjcf,
-            bolted=bolted,
-            motion=None if motion is None else motion.value,
-            report=progress.say,
+            path, folder=folder, mjcf=mjcf, bolted=bolted, motion=motion, report=progress.say
         )
     _give(draft.text, out, as_json)
     for line in draft.said:

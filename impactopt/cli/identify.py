@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, Verbose, complete_problem, print_json
+from impactopt.cli.options import AsJson, Verbose, complete_problem, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 
@@ -41,12 +41,7 @@ def identify(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE",
-            help="Write the law that fits best there, as a section for a problem file.",
-        ),
+        out_option("Write the law that fits best there, as a section for a problem file.", "FILE"),
     ] = None,
     as_json: AsJson = False,
     verbose: Verbose = False,
@@ -60,7 +55,7 @@ def identify(
         import numpy as np
 
         from impactopt.contact.laws import LAWS
-        from impactopt.errors import InputError, printable
+        from impactopt.errors import InputError
         from impactopt.files.output import write_file
         from impactopt.files.problem_file import load_problem
         from impactopt.identification import identify as fit
@@ -83,11 +78,8 @@ def identify(
         if as_json:
             print_json(found.describe(), True)
             return
-        from impactopt.report.console import identified_table, output
+        from impactopt.report.console import identified_table, output, say
 
         console = output()
         console.print(identified_table(found.describe()))
-        for caution in found.cautions:
-            console.print(printable(f"caution: {caution}"), markup=False, highlight=False, soft_wrap=True)
-        if out is not None:
-            console.print(printable(str(out)), markup=False, highlight=False, soft_wrap=True)
+        say(console, *(f"caution: {caution}" for caution in found.cautions), out)

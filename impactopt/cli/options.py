@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import enum
 import hashlib
 import json
 import shlex
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -96,24 +95,37 @@ Settings = Annotated[
     ),
 ]
 
+ResultPath = Annotated[
+    Path,
+    typer.Argument(metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."),
+]
+
+
+def out_option(help_text: str, metavar: str = "DIR") -> Any:
+    """Option for the place of the results."""
+    return typer.Option("--out", "-o", metavar=metavar, help=help_text)
+
 
 OtherProblem = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
 ]
-
-
-class SolverChoice(str, enum.Enum):
-    ipm = "ipm"
-    sqp = "sqp"
-    ipopt = "ipopt"
-
-
 SolverName = Annotated[
-    SolverChoice | None, typer.Option(help="Solver, instead of the one that the file names.")
+    Literal["ipm", "sqp", "ipopt"] | None,
+    typer.Option(help="Solver, instead of the one that the file names."),
 ]
+
+
+def _positive(seconds: float | None) -> float | None:
+    if seconds is not None and not seconds > 0:
+        raise typer.BadParameter(f"{seconds:g}; give seconds > 0", param_hint="--time-limit")
+    return seconds
+
+
 TimeLimit = Annotated[
     float | None,
-    typer.Option(metavar="SECONDS", help="Time limit of the solver, whose best iterate is kept."),
+    typer.Option(
+        metavar="SECONDS", help="Time limit of the solver, whose best iterate is kept.", callback=_positive
+    ),
 ]
 Starts = Annotated[
     int, typer.Option(min=1, help="Multistart: number of initial guesses; all but the first are random.")
@@ -145,28 +157,16 @@ class _Plain:
 
 
 class PlainCommand(_Plain, TyperCommand):
-    """Command whose help shows flags without a type."""
+    """Command whose help shows flags without a type; it is quiet or verbose, not both."""
+
+    def invoke(self, context: Any) -> Any:
+        if context.params.get("quiet") and context.params.get("verbose"):
+            raise typer.BadParameter("give one of them", context, param_hint="--quiet, --verbose")
+        return super().invoke(context)
 
 
 class PlainGroup(_Plain, TyperGroup):
     """Group of commands whose help shows flags without a type."""
-
-
-def check_loudness(quiet: bool, verbose: bool) -> None:
-    """BadParameter if both are given."""
-    if quiet and verbose:
-        raise typer.BadParameter("give one of them", param_hint="--quiet, --verbose")
-
-
-def examples(*lines: str) -> str:
-    """Examples for the end of a command's help."""
-    return "\n\n".join(["Examples:", *(f"  {line}" for line in lines)])
-
-
-def check_time_limit(seconds: float | None) -> None:
-    """BadParameter unless it is positive."""
-    if seconds is not None and not seconds > 0:
-        raise typer.BadParameter(f"{seconds:g}; give seconds > 0", param_hint="--time-limit")
 
 
 def command_line(context: typer.Context) -> str:
@@ -182,5 +182,5 @@ def command_line(context: typer.Context) -> str:
             continue
         option = max(parameter.opts, key=len)
         words += [option] if option.startswith("-") else []
-        words.append(str(value.value if isinstance(value, enum.Enum) else value))
+        words.append(str(value))
     return shlex.join(words)

@@ -17,8 +17,6 @@ from impactopt.report.console import SolveConsole
 from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.solvers.program import Status
 
-__all__ = ["compared_record"]
-
 BASELINE = "baseline"
 METHOD = "minimum jerk"
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impactopt.cli.options import OtherProblem
+from impactopt.cli.options import OtherProblem, out_option
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
     from impactopt.live.collision_page import CollisionPage
     from impactopt.live.plan_page import PlanPage
-    from impactopt.report.report import Report
+    from impactopt.report.page import Page
 
 PAGE = "report.html"
 BODIES = "results"  # default directory of a robot's page
@@ -31,13 +31,7 @@ def show(
         ),
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE.html",
-            help=f"The page (default: RESULT/{PAGE}, or {BODIES}/ROBOT.html).",
-        ),
+        Path | None, out_option(f"The page (default: RESULT/{PAGE}, or {BODIES}/ROBOT.html).", "FILE.html")
     ] = None,
     open_: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
     sheet: Annotated[
@@ -143,7 +137,7 @@ def _is_robot(what: Path) -> bool:
     return what.suffix == ".toml" or (str(what) in robot_names() and not os.path.exists(what))
 
 
-def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
+def _result(result: Path, problem: Path | None) -> tuple[Page, Path]:
     """Page of a result, and its default path."""
     from impactopt.errors import InputError, did_you_mean
     from impactopt.files.output import load_record
@@ -162,7 +156,7 @@ def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
     return report_of(record, about), (result if os.path.isdir(result) else result.parent) / PAGE
 
 
-def _bodies(what: Path, problem: Path | None) -> tuple[Report, Path]:
+def _bodies(what: Path, problem: Path | None) -> tuple[Page, Path]:
     """Page of a robot's bodies, and its default path."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file

@@ -19,9 +19,8 @@ from impactopt.cli.options import (
     TimeLimit,
     Verbose,
     Workers,
-    check_loudness,
-    check_time_limit,
     command_line,
+    out_option,
     print_json,
 )
 from impactopt.report.plain_errors import plain_errors
@@ -30,13 +29,7 @@ from impactopt.report.plain_errors import plain_errors
 def strike(
     context: typer.Context,
     file: ProblemPath,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Directory for the numbers."),
-    ] = None,
-    method: Annotated[
-        str, typer.Option(metavar="METHOD", hidden=True, help="Of the contact: collocation.")
-    ] = "collocation",
+    out: Annotated[Path | None, out_option("Directory for the numbers.")] = None,
     starts: Starts = 4,
     workers: Workers = 1,
     seed: Seed = 0,
@@ -53,16 +46,13 @@ def strike(
     there is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
-        from impactopt.errors import printable
         from impactopt.files.output import keep_record, make_directory, record_of_strike, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.planning.strike import optimize_strike
         from impactopt.report.console import SolveConsole
 
-        check_time_limit(time_limit)
-        check_loudness(quiet, verbose)
         read = read_problem_file(file, parse_settings(settings or ()))
-        chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
+        chosen = read.solver.arguments(solver, time_limit)
         with SolveConsole(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
@@ -70,7 +60,6 @@ def strike(
             progress.say("building the nonlinear program (compiles for some ten seconds the first time)")
             solution = optimize_strike(
                 problem,
-                method=method,
                 starts=starts,
                 workers=workers,
                 seed=seed,
@@ -88,25 +77,18 @@ def strike(
             print_json(record.summary, solution.status.usable)
         else:
             from impactopt.report.console import (
-                multistart_table,
                 output,
                 reason_message,
+                say,
+                say_details,
                 strike_table,
                 switched_off_message,
-                violation_table,
             )
 
-            shown = output()
-            shown.print(strike_table(record.summary))
-            s = record.summary
-            for text in filter(None, (reason_message(s), s.get("gear_caution"), switched_off_message(s))):
-                shown.print(printable(str(text)), highlight=False, markup=False)
-            shown.print(multistart_table(record.summary["starts"]))
-            if record.summary["violations"]:
-                shown.print(violation_table(record.summary["violations"]))
-            for path in written:
-                shown.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
-            if aside := set_aside(record.summary):
-                shown.print(aside, highlight=False, markup=False, soft_wrap=True)
+            shown, s = output(), record.summary
+            shown.print(strike_table(s))
+            say(shown, reason_message(s), s.get("gear_caution"), switched_off_message(s))
+            say_details(shown, s)
+            say(shown, *written, set_aside(s))
         if not solution.status.usable:
             raise typer.Exit(NOT_SOLVED)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, check_loudness, complete_sweep, print_json
+from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, complete_sweep, out_option, print_json
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
@@ -23,10 +23,7 @@ def sweep(
             autocompletion=complete_sweep,
         ),
     ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", metavar="DIR", help="Directory of the results; give it again to resume."),
-    ],
+    out: Annotated[Path, out_option("Directory of the results; give it again to resume.")],
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes on this machine (default: one a core).")
     ] = None,
@@ -67,7 +64,6 @@ def sweep(
         from impactopt.sweeps import sweep as run
         from impactopt.sweeps.progress import SweepConsole
 
-        check_loudness(quiet, verbose)
         chosen = read_sweep_file(file, parse_settings(settings or ()))
         with SweepConsole(console, quiet=quiet, verbose=verbose) as shown:
             callbacks: dict[str, Any] = {"report": shown.say, "progress": shown.progress}
@@ -79,18 +75,18 @@ def sweep(
         if result.failed == result.done:
             raise typer.Exit(NOT_SOLVED)
         if chosen.figure is not None:
+            from impactopt.report.console import say
             from impactopt.report.pictures.sweep import save_sweep_picture
 
             picture = save_sweep_picture(chosen, result.table)
             if not (as_json or quiet):
-                console.print(str(picture), markup=False, highlight=False, soft_wrap=True)
+                say(console, picture)
 
 
 def _show(result: SweepResult) -> None:
     from rich.table import Table
 
-    from impactopt.errors import printable
-    from impactopt.report.console import output
+    from impactopt.report.console import output, say
     from impactopt.sweeps.progress import words_for_time
 
     table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
@@ -109,6 +105,4 @@ def _show(result: SweepResult) -> None:
         table.add_row(name, value)
     console = output()
     console.print(table)
-    for reason, count in result.reasons.items():
-        console.print(printable(f"{count} x {reason}"), markup=False, highlight=False)
-    console.print(str(result.table), markup=False, highlight=False, soft_wrap=True)
+    say(console, *(f"{count} x {reason}" for reason, count in result.reasons.items()), result.table)

@@ -2,64 +2,51 @@
 
 from __future__ import annotations
 
-import enum
 import json
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, Quiet, Settings, Verbose, check_loudness, print_json
+from impactopt.cli.options import (
+    AsJson,
+    OtherProblem,
+    Quiet,
+    ResultPath,
+    Settings,
+    Verbose,
+    out_option,
+    print_json,
+)
 from impactopt.report.plain_errors import plain_errors
-
-
-class Controller(str, enum.Enum):
-    servo = "servo"
-    wbc = "wbc"
-
-
-class Contact(str, enum.Enum):
-    point = "point"
-    link = "link"
-
 
 FELL = 1  # exit code
 
 
-class Engine(str, enum.Enum):
-    mujoco = "mujoco"
-    pinocchio = "pinocchio"
-
-
 def validate(
-    result: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."
-        ),
-    ],
+    context: typer.Context,
+    result: ResultPath,
     engine: Annotated[
-        Engine, typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: fixed soles.")
-    ] = Engine.mujoco,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Write replay.json and replay.png there."),
-    ] = None,
+        Literal["mujoco", "pinocchio"],
+        typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: fixed soles."),
+    ] = "mujoco",
+    out: Annotated[Path | None, out_option("Write replay.json and replay.png there.")] = None,
     animation: Annotated[
         Path | None, typer.Option(metavar="FILE.gif", help="Draw the robot's motion, slow around contact.")
     ] = None,
     controller: Annotated[
-        Controller,
+        Literal["servo", "wbc"],
         typer.Option(
             help="servo: PD control of the joints; wbc: whole-body controller, set up by the problem file."
         ),
-    ] = Controller.servo,
+    ] = "servo",
     contact: Annotated[
-        Contact,
+        Literal["point", "link"],
         typer.Option(
             help="link: the striking link's hull meets the target's body; point: its striking point."
         ),
-    ] = Contact.point,
+    ] = "point",
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -103,34 +90,14 @@ def validate(
     Exit code: 0 stands (or the engine fixes the soles), 1 fell, 2 bad input.
     """
     with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
-        from impactopt.errors import printable
         from impactopt.files.output import make_directory, remove_file, write_file
         from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned, replay
         from impactopt.report.console import SolveConsole
         from impactopt.simulation import Perturbation
 
-        check_loudness(quiet, verbose)
-
-        world = Perturbation(
-            mass=mass,
-            stiffness=stiffness,
-            damping=damping,
-            distance=distance,
-            missing=missing,
-            payload=payload,
-            friction=friction,
-            floor_time=floor_time,
-            kp=kp,
-            kd=kd,
-            torque_limit=torque_limit,
-            period=period,
-            delay=delay,
-            push=push,
-            push_start=push_start,
-            push_time=push_time,
-            push_way=push_way,
-        )
+        # an option for each of its fields
+        world = Perturbation(**{field.name: context.params[field.name] for field in fields(Perturbation)})
         directory = None if out is None else make_directory(out)
         if animation is not None:
             make_directory(animation.parent)
@@ -138,14 +105,9 @@ def validate(
         changes, written = parse_settings(settings or ()), []
         with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
             planned = load_planned(result, problem_file=problem, settings=changes)
-            progress.say(f"{result} is read; replaying it in {engine.value}")
+            progress.say(f"{result} is read; replaying it in {engine}")
             done = replay(
-                planned,
-                engine=engine.value,
-                perturbation=world,
-                controller=controller.value,
-                contact=contact.value,
-                **options,
+                planned, engine=engine, perturbation=world, controller=controller, contact=contact, **options
             )
             ok = done.report["standing"] is not False
             if directory is not None:
@@ -164,15 +126,10 @@ def validate(
         if as_json:
             print_json(done.report, ok)
         else:
-            from impactopt.report.console import output, replay_table, touch_message
+            from impactopt.report.console import output, replay_table, say, touch_message
 
             console = output()
             console.print(replay_table(done.report, planned.record.summary))
-            if beyond := done.record.summary.get("gear_caution"):
-                console.print(printable(str(beyond)), markup=False, highlight=False)
-            if message := touch_message(done.report):
-                console.print(message, highlight=False, markup=False)
-            for path in written:
-                console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
+            say(console, done.record.summary.get("gear_caution"), touch_message(done.report), *written)
         if not ok:
             raise typer.Exit(FELL)

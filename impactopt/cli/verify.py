@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
-from impactopt.cli.options import AsJson, Quiet, Verbose, check_loudness, examples, print_json
+from impactopt.cli.options import AsJson, OtherProblem, Quiet, ResultPath, Verbose, print_json
 from impactopt.report.plain_errors import plain_errors
 
 NOT_OK = 1  # exit code
-EXAMPLES = examples("impactopt verify results/punch", "impactopt verify results/punch --json")
 
 
 def verify(
-    result: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."
-        ),
-    ],
-    problem: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
-    ] = None,
+    result: ResultPath,
+    problem: OtherProblem = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -37,19 +26,16 @@ def verify(
         from impactopt.files.verify import verify as verified
         from impactopt.report.console import SolveConsole, verdict_table
 
-        check_loudness(quiet, verbose)
         with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{result}: evaluating its program again")
             verdict = verified(result, problem_file=problem)
         if as_json:
             print_json(plain(verdict.describe()), verdict.ok)
         else:
-            from impactopt.errors import printable
-            from impactopt.report.console import output
+            from impactopt.report.console import output, say
 
             console = output()
             console.print(verdict_table(verdict.describe()))
-            if verdict.reason:
-                console.print(printable(verdict.reason), markup=False, highlight=False)
+            say(console, verdict.reason)
         if not verdict.ok:
             raise typer.Exit(NOT_OK)

@@ -63,8 +63,6 @@ from impactopt.codegen.files import (
 )
 from impactopt.errors import NoCompilerWarning
 
-__all__ = ["FunctionGroup", "cached", "cached_groups", "canonical", "library_path", "model_hash"]
-
 
 def model_hash(model: pin.Model, springs: Mapping[str, tuple[float, float]] | None = None) -> str:
     """Hexadecimal hash of all in a `pin.Model` that shapes its dynamics, the same in every process.

@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -23,25 +23,6 @@ import numpy.typing as npt
 
 from impactopt.codegen.files import UnsafePath, check_private_file, locked, put, slug, usable_directory
 from impactopt.errors import InputError, NoCompilerWarning
-
-__all__ = [
-    "MAX_OPTIMIZED",
-    "Buildable",
-    "CompileError",
-    "Compiler",
-    "NativeCode",
-    "SharedCode",
-    "Source",
-    "address",
-    "find_compiler",
-    "library_of",
-    "longest_body",
-    "name_of",
-    "native_library",
-    "quick_to_compile",
-    "source_of",
-    "why_no_compiler",
-]
 
 _FLAGS = ("-march=native", "-fPIC", "-shared", "-w")
 # what a compiler has to make a library of before it is taken for one
@@ -90,20 +71,15 @@ def find_compiler() -> Compiler | None:
     """
     if _forbidden():
         return None
-    for command in _candidates():
-        version = _version(command)
-        if version and not _trouble(Compiler(command=command, version=version)):
-            return Compiler(command=command, version=version)
-    return None
+    return next((compiler for compiler, trouble in _tried() if not trouble), None)
 
 
 def why_no_compiler() -> str:
     """Reason why `find_compiler` has found none, in a few words."""
     if _forbidden():
         return "IMPACTOPT_NO_COMPILER is set" if os.name == "posix" else "there is none for this system"
-    for command in _candidates():
-        version = _version(command)
-        if version and (trouble := _trouble(Compiler(command=command, version=version))):
+    for _, trouble in _tried():
+        if trouble:
             return f"{trouble}; fix it, or what CC names"
     return "install gcc or clang, or name one in the environment variable CC"
 
@@ -129,6 +105,14 @@ def _candidates() -> list[tuple[str, ...]]:
     names = [wanted] if wanted else [["cc"], ["gcc"], ["clang"]]
     found = [(shutil.which(words[0]), words[1:]) for words in names]
     return [(program, *rest) for program, rest in found if program]
+
+
+def _tried() -> Iterator[tuple[Compiler, str]]:
+    """Compilers that answer, each with the reason why it cannot be used, or ""."""
+    for command in _candidates():
+        if version := _version(command):
+            compiler = Compiler(command=command, version=version)
+            yield compiler, _trouble(compiler)
 
 
 @functools.cache

@@ -23,27 +23,6 @@ from typing import IO, Any
 
 from impactopt.errors import CacheWarning, InputError
 
-__all__ = [
-    "UnsafePath",
-    "allows_code",
-    "cache_directory",
-    "check_private_file",
-    "is_plain_file",
-    "kept",
-    "locked",
-    "open_own",
-    "private_directory",
-    "put",
-    "read_archive",
-    "read_plain",
-    "slug",
-    "sweep_away",
-    "temporary_private_directory",
-    "usable_directory",
-    "warn",
-    "write_atomically",
-]
-
 _NONBLOCK = getattr(os, "O_NONBLOCK", 0)  # a pipe without a writer, or a reader, would wait for one
 
 

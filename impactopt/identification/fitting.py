@@ -16,17 +16,10 @@ from scipy.special import stdtrit
 from impactopt.collision.sdc import VirtualMass
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass
-from impactopt.identification.free_parameters import (
-    MASS,
-    FreeParameter,
-    free_parameters,
-    initial_guesses,
-)
+from impactopt.identification.free_parameters import MASS, FreeParameter, free_parameters, initial_guesses
 from impactopt.identification.log import MeasuredImpact, noise_of
 from impactopt.identification.result import Estimate, LawFit
 from impactopt.robots.robot import Robot, Striker
-
-__all__ = ["MAX_HAND_MASS", "ContactHistory", "TwoMassModel", "fit_law"]
 
 Array = NDArray[np.float64]
 _HEAVY = 1e6  # [kg] of the mass that hardly moves

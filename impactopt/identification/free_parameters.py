@@ -14,8 +14,6 @@ from impactopt.contact.laws import ContactLaw, CustomLaw
 from impactopt.errors import InputError
 from impactopt.identification.log import MeasuredImpact
 
-__all__ = ["MASS", "FreeParameter", "free_parameters", "initial_guesses", "sample_law"]
-
 Array = NDArray[np.float64]
 MASS = "effective_mass"
 _MAX_LOG = 14.0  # bound of z of a logarithmic parameter: a factor of a million from the estimate

@@ -16,8 +16,6 @@ from impactopt.identification.log import ImpactLog, find_impacts, read_log
 from impactopt.identification.result import Identification
 from impactopt.robots.robot import Robot
 
-__all__ = ["identify"]
-
 
 def identify(
     log: ImpactLog | str | os.PathLike[str],

@@ -20,8 +20,6 @@ from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.robots.couplings import axis_of
 from impactopt.robots.robot import Robot
 
-__all__ = ["FORCE", "SPEED", "TIME", "ImpactLog", "MeasuredImpact", "find_impacts", "noise_of", "read_log"]
-
 Array = NDArray[np.float64]
 TIME, FORCE, SPEED = "time_s", "force_N", "hand_speed_m_s"
 # bytes and arrays of an npz file: an hour of 15 columns at 1 kHz has 430 MB

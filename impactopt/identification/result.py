@@ -14,8 +14,6 @@ from impactopt.errors import InputError
 from impactopt.files.toml import write_toml
 from impactopt.identification.free_parameters import MASS
 
-__all__ = ["Estimate", "Identification", "LawFit"]
-
 _MAX_WIDTH = 1.0  # of the interval of a determined parameter, over its value
 _DIGITS = 5  # of parameters in a file
 _MAX_CORRELATION = 4.0  # of white noise, in standard deviations

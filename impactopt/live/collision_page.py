@@ -20,8 +20,7 @@ from impactopt.live.drawing import Drawing, Moment
 from impactopt.live.requests import LatestRequest
 from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.problem.problem import ImpactProblem
-
-__all__ = ["CollisionPage", "ShownCollision"]
+from impactopt.report.tracks import places_of
 
 Array = NDArray[np.float64]
 _MIN_SPEED, _FIRST_SPEED, _MAX_SPEED = 0.05, 1.0, 4.0  # [m/s]
@@ -140,9 +139,8 @@ class CollisionPage(LivePage):
     def _draw(self, shown: ShownCollision) -> None:
         assert shown.q is not None
         robot, collision = self.problem.robot, shown.collision
-        model, data = robot.model, robot.model.createData()
-        pin.framesForwardKinematics(model, data, shown.q)
-        placements = np.array([pin.SE3ToXYZQUAT(placement) for placement in data.oMi])
+        striker = robot.striker(self.problem.striker)
+        places, hand, mass = places_of(robot, striker.model_frame, shown.q[None])
         zmp = np.full(2, np.nan)
         if collision is not None and collision.zmp is not None and len(self._polygon):
             # drawn where its margin is least
@@ -150,16 +148,15 @@ class CollisionPage(LivePage):
             zmp = collision.zmp[int(np.argmin(np.where(np.isfinite(inside), inside, np.inf)))]
             path = np.column_stack([collision.zmp, np.zeros(len(collision.zmp))])
             self._drawing.path("/path of the ZMP", path)
-        frame = model.getFrameId(robot.striker(self.problem.striker).model_frame)
         force = 0.0 if collision is None else collision.peak_force
         self._drawing.largest = max(self._drawing.largest, force)
         self._drawing.draw(
             Moment(
                 time=0.0,
-                place=placements[:, :3],
-                turn=placements[:, [6, 3, 4, 5]],  # Pinocchio has w last, viser first
-                hand=np.array(data.oMf[frame].translation),
-                mass=np.array(pin.centerOfMass(model, data, shown.q)),
+                place=places[0, :, :3],
+                turn=places[0][:, [6, 3, 4, 5]],  # Pinocchio has w last, viser first
+                hand=hand[0],
+                mass=mass[0],
                 force=force,
                 travel=0.0,
                 zmp=zmp,

@@ -17,8 +17,6 @@ from impactopt.report.stage import bodies_drawn
 from impactopt.report.tracks import Track
 from impactopt.robots.robot import Robot
 
-__all__ = ["Drawing", "Moment", "moment_of"]
-
 Array = NDArray[np.float64]
 
 

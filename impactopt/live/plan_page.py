@@ -15,9 +15,8 @@ from impactopt.live.replanning import MAX_VIOLATIONS, Answer, Replanning
 from impactopt.live.requests import LatestRequest, PlanRequest, request_of, slider_parameters
 from impactopt.live.server import LOCAL, LivePage, served
 from impactopt.planning.solution import Solution
+from impactopt.report.stage import middle
 from impactopt.report.tracks import Track
-
-__all__ = ["PlanPage", "failure_message", "plan_message"]
 
 FRAME = 1 / 30  # [s] between frames
 SPEEDS = {"1": 1.0, "1/4": 0.25, "1/20": 0.05}  # of the motion over the real one
@@ -53,8 +52,7 @@ class PlanPage(LivePage):
         self._drawing = Drawing(self._server, first.problem.robot, first.problem.ground_height)
         self._add_controls()
         track, problem = self._track, first.problem
-        middle = float(track.places[0, 1:, 1].mean())
-        self._drawing.aim_camera(track.mass[0], problem.point, problem.normal, middle)
+        self._drawing.aim_camera(track.mass[0], problem.point, problem.normal, middle(track.places))
         self._show_plan(self.answer)
         self._latest = LatestRequest(replanning, self._show)
 

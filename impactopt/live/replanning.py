@@ -20,8 +20,6 @@ from impactopt.report.tracks import Track, planned_track
 from impactopt.solvers.program import IterationRecord, Status
 from impactopt.transcription.plan import Plan, Trajectory
 
-__all__ = ["Answer", "Replanning"]
-
 TIME_LIMIT = 20.0  # [s] of each of the two solves
 _STEP_RANGE = 3e-3, 1e-2  # [s] between the instants of the motion that is drawn
 _CONTACT_SAMPLES = 6  # instants of the contact, within that range

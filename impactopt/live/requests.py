@@ -13,8 +13,6 @@ import numpy as np
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone
 
-__all__ = ["LatestRequest", "PlanRequest", "SliderParameter", "request_of", "slider_parameters"]
-
 Request = TypeVar("Request")
 Outcome = TypeVar("Outcome")
 

@@ -16,8 +16,6 @@ from urllib.parse import urlsplit
 from impactopt.errors import InputError, missing_package
 from impactopt.live.requests import LatestRequest
 
-__all__ = ["LOCAL", "LivePage", "served"]
-
 LOCAL = "127.0.0.1"
 
 

@@ -2,43 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from html import escape
-from pathlib import Path
 from typing import Any
 
 from impactopt.errors import InputError
-from impactopt.files.output import Record, record_of, write_file
+from impactopt.files.output import Record, record_of
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.report.page import html_page
+from impactopt.report.page import Page, html_page
 from impactopt.report.stage import stage_of
-
-__all__ = ["Animation", "animate", "animation_of"]
 
 BODY = '<main><div id="trouble"></div><div id="animation"></div></main>'
 HEIGHT = 660  # pixels, in a notebook
-
-
-@dataclass(frozen=True)
-class Page:
-    """A page that needs no network.  html : its text."""
-
-    html: str
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Writes the page as one HTML file, into an existing folder.
-
-        Raises
-        ------
-        InputError : the file cannot be written, or its name does not end with .html.
-        """
-        path = Path(path)
-        if path.suffix.lower() not in (".html", ".htm"):
-            raise InputError(f"a page is HTML: give {path.name!r} the ending .html")
-        write_file(path, lambda file: file.write(self.html.encode()))
-        return path
 
 
 @dataclass(frozen=True)

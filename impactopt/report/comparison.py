@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -13,20 +12,10 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.files.output import Record, plain
 from impactopt.files.toml import TOMLError, read_toml
+from impactopt.report.charts import chart, series_of
 from impactopt.report.histories import at_contact, ground_wrenches, planned_torque, thinned, zmp_margins
-from impactopt.report.page import html_page
-from impactopt.report.report import Report
-from impactopt.report.result_rows import (
-    Cell,
-    Row,
-    contact_rows,
-    number_row,
-    phase_rows,
-    standing,
-    word_row,
-)
-
-__all__ = ["MOST", "Comparison", "Difference", "compare", "histories_of"]
+from impactopt.report.page import Page, html_table, report_html
+from impactopt.report.result_rows import Cell, Row, contact_rows, number_row, phase_rows, standing, word_row
 
 Array = NDArray[np.float64]
 MOST = 5  # results: the page has as many line styles
@@ -73,21 +62,22 @@ class Comparison:
         def by_key(differences: Sequence[Difference]) -> dict[str, dict[str, str]]:
             return {d.key: dict(zip(self.records, d.values, strict=True)) for d in differences}
 
-        return {
-            "results": plain(results),
-            "problem": by_key(self.problem),
-            "versions": by_key(self.versions),
-        }
+        return {"results": plain(results), "problem": by_key(self.problem), "versions": by_key(self.versions)}
 
-    def page(self) -> Report:
+    def page(self) -> Page:
         """HTML page of the comparison, with histories over the time since each result's contact."""
         arrays: dict[str, Any] = {}
         charts = list(_charts(self.records, arrays))
         title = " and ".join(self.records)
-        body = "\n".join(_body(self, title))
-        return Report(
-            html_page(title=title, kind="report", body=body, header={"charts": charts}, arrays=arrays)
+        html = report_html(
+            title=title,
+            heading=title,
+            about="compared",
+            parts=_parts(self),
+            header={"charts": charts},
+            arrays=arrays,
         )
+        return Page(html)
 
 
 def compare(records: Mapping[str, Record]) -> Comparison:
@@ -196,62 +186,34 @@ def _charts(records: Mapping[str, Record], arrays: dict[str, Any]) -> Iterator[d
     """Descriptions of the page's charts; their data are added to `arrays`."""
     known = [histories_of(record) for record in records.values()]
     longest = max((float(r.summary.get("contact_ms") or 0.0) for r in records.values()), default=0.0)
+    limit = {"limits": [{"y": 1.0, "text": "limit"}], "include": [0.0, 1.0]}
     for which, title, unit, more in (
         ("force", "Force on the target", "force [N]", {"view": [-0.2e-3 * longest, 1.2e-3 * longest]}),
         ("margin", "ZMP margin", "margin [mm]", {"limits": [{"y": 0.0, "text": "edge"}]}),
-        (
-            "ratio",
-            "Torque demand over limit",
-            "torque / limit",
-            {"limits": [{"y": 1.0, "text": "limit"}], "include": [0.0, 1.0]},
-        ),
+        ("ratio", "Torque demand over limit", "torque / limit", limit),
     ):
         series = []
         for k, (name, histories) in enumerate(zip(records, known, strict=True)):
             if which in histories:
                 x, y = thinned(*histories[which], whole=[-0.01, 2e-3 * longest])
-                arrays |= {f"{which}{k}_x": x, f"{which}{k}_y": y}
-                series.append({"label": name, "style": STYLES[k], "x": f"{which}{k}_x", "y": f"{which}{k}_y"})
+                series.append(series_of(arrays, f"{which}{k}", name, STYLES[k], x, y))
         if series:
-            yield {
-                "kind": "lines",
-                "title": title,
-                "x": "time since contact [s]",
-                "y": unit,
-                "series": series,
-                "include": [0.0],
-                **more,
-            }
+            yield chart(title, unit, series, **{"x": "time since contact [s]", "include": [0.0], **more})
 
 
-def _body(comparison: Comparison, title: str) -> Iterator[str]:
-    names = list(comparison.records)
-    yield f'<header><h1>{escape(title)}</h1><span class="sub">compared</span>'
-    yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
-    yield '<div id="trouble"></div>'
-    rows = [(row.label, [(cell.text, cell.good) for cell in row.cells]) for row in comparison.rows]
-    yield _table(names, rows)
+def _parts(comparison: Comparison) -> Iterator[str]:
+    yield _table(comparison, comparison.rows)
     yield '<h2>Planned histories</h2><div id="charts"></div>'
     for heading, differences in (
         ("Differences of the problems", comparison.problem),
         ("Differences of the versions", comparison.versions),
     ):
-        rows = [(d.key, [(value, True) for value in d.values]) for d in differences]
+        rows = [Row(d.key, tuple(map(Cell, d.values))) for d in differences]
         yield f"<h2>{heading}</h2>"
-        yield _table(names, rows) if rows else "<p>None.</p>"
-    yield "</main><footer><main>Made by impactopt. This file holds all that it shows and needs no network."
-    yield "</main></footer>"
+        yield _table(comparison, rows) if rows else "<p>None.</p>"
 
 
-def _table(names: Sequence[str], rows: Sequence[tuple[str, list[tuple[str, bool]]]]) -> str:
-    """HTML table with a column for each result; a cell is its text, and whether it is good."""
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
-    lines = []
-    for label, cells in rows:
-        values = "".join(
-            f"<td>{escape(text)}</td>" if good else f'<td class="bad">! {escape(text)}</td>'
-            for text, good in cells
-        )
-        lines.append(f'<tr><th scope="row">{escape(label)}</th>{values}</tr>')
-    table = f"<table><thead><tr><td></td>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
+    """HTML table with a column for each result."""
+    table = html_table(rows, ["", *comparison.records])
     return f'<section class="card"><div class="scroll" tabindex="0">{table}</div></section>'

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -28,24 +29,6 @@ from impactopt.solvers.program import IterationRecord, without_violations
 
 if TYPE_CHECKING:
     from impactopt.report.comparison import Comparison
-
-__all__ = [
-    "SolveConsole",
-    "collision_table",
-    "comparison_tables",
-    "identified_table",
-    "multistart_table",
-    "nail_driving_table",
-    "output",
-    "reason_message",
-    "replay_table",
-    "result_table",
-    "strike_table",
-    "switched_off_message",
-    "torques_table",
-    "touches_message",
-    "violation_table",
-]
 
 PHASES_OF_STRIKE = ("contact", "collision")
 PIPE_WIDTH = 500  # columns of output that does not go to a terminal
@@ -111,6 +94,22 @@ class SolveConsole:
             self._console.print(f"          {text}", highlight=False, soft_wrap=True)
 
 
+def say(console: Console, *texts: Any) -> None:
+    """Prints texts and paths as they are, each on a line; empty ones are left out."""
+    for text in filter(None, texts):
+        # a path is not broken
+        whole = isinstance(text, Path)
+        console.print(printable(str(text)), markup=False, highlight=False, soft_wrap=whole)
+
+
+def say_details(console: Console, summary: Mapping[str, Any]) -> None:
+    """Prints the starts of a plan or a strike, if there are several, and its violations."""
+    if len(summary["starts"]) > 1:
+        console.print(multistart_table(summary["starts"]))
+    if summary["violations"]:
+        console.print(violation_table(summary["violations"]))
+
+
 def result_table(summary: Mapping[str, Any]) -> Table:
     """Table of plan, simulation and replay on free soles; values outside their limits are marked."""
     return _table(summary, result_columns(summary))
@@ -139,9 +138,8 @@ def _early(ms: float) -> str:
 def verdict_table(verdict: Mapping[str, Any]) -> Table:
     """Table of a verification, worst constraint first; `verdict` as in `impactopt verify --json`."""
     kkt = "not computed" if verdict["kkt"] is None else f"KKT residual {verdict['kkt']:.2g}"
-    table = Table(title=_plain(f"{'ok' if verdict['ok'] else 'not ok'}; {kkt}"), title_justify="left")
-    for name in ("constraint", "violation", "where"):
-        table.add_column(name, justify="right" if name == "violation" else "left")
+    title, left = f"{'ok' if verdict['ok'] else 'not ok'}; {kkt}", ("constraint", "where")
+    table = _empty(title, "constraint", "violation", "where", left=left)
     for name, worst in sorted(verdict["rows"].items(), key=lambda item: -item[1]["violation"]):
         table.add_row(_plain(name), f"{worst['violation']:.2g}", _plain(worst["where"]))
     return table
@@ -160,15 +158,12 @@ def strike_table(summary: Mapping[str, Any]) -> Table:
 def collision_table(found: Mapping[str, Any]) -> Table:
     """Table of one collision and those of a saved result; `found` as in `impactopt collide --json`."""
     model = f"{found['model']}, freezes = {found['freezes']}" if found.get("freezes") else found["model"]
-    table = Table(title=_plain(f"{found['problem']}: {model}"), title_justify="left")
+    table = _empty(f"{found['problem']}: {model}", "", "collision", *(found.get("saved") or {}))
     notes = [f"caution: {found['caution']}"] if found.get("caution") else []
     notes += [f"{found['model']}: {found['believe']}"] if "believe" in found else []
     notes += ["no peak force: the impact takes no time"] if found["model"] == "rigid" else []
     if notes:
         table.caption, table.caption_justify = _plain("\n".join(notes)), "left"
-    table.add_column("")
-    for name in ("collision", *(found.get("saved") or {})):
-        table.add_column(name, justify="right")
     for row in collision_rows(found):
         _add(table, row)
     return table
@@ -176,33 +171,36 @@ def collision_table(found: Mapping[str, Any]) -> Table:
 
 def comparison_tables(found: Comparison) -> list[Table]:
     """Tables of results side by side: their values, and the keys in which problems and versions differ."""
-    values = _empty_comparison("values", found.records)
+    values = _empty("values", "", *found.records, fold=True)
     for row in found.rows:
         _add(values, row)
     tables = [values]
     for what, differences in (("problems", found.problem), ("versions", found.versions)):
         if differences:
-            table = _empty_comparison(f"{what}: differences", found.records)
+            table = _empty(f"{what}: differences", "", *found.records, fold=True)
             for difference in differences:
                 table.add_row(_plain(difference.key), *map(_plain, difference.values))
             tables.append(table)
     return tables
 
 
-def _empty_comparison(title: str, names: Iterable[str]) -> Table:
-    """Table without rows, with a column for each result."""
-    table = Table(title=title, title_justify="left")
-    table.add_column("", overflow="fold")
-    for name in names:
-        table.add_column(_plain(name), justify="right", overflow="fold")
+def _empty(title: str, *columns: str, left: Collection[str] = ("",), fold: bool = False) -> Table:
+    """Table without rows; `left` : columns of text, the others are aligned to the right.
+
+    fold : break long words, and not shorten them.
+    """
+    table = Table(title=_plain(title), title_justify="left")
+    for name in columns:
+        table.add_column(
+            _plain(name), justify="left" if name in left else "right", overflow="fold" if fold else "ellipsis"
+        )
     return table
 
 
 def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
     """Table of the largest torque demands; `joints` as in `impactopt collide --json`."""
-    table = Table(title="largest torque demands", title_justify="left")
-    for name in ("joint", "torque [N m]", "limit [N m]", "ratio"):
-        table.add_column(name, justify="left" if name == "joint" else "right")
+    columns = ("joint", "torque [N m]", "limit [N m]", "ratio")
+    table = _empty("largest torque demands", *columns, left=("joint",))
     for joint in joints[:most]:
         numbers = (f"{joint['torque_Nm']:.1f}", f"{joint['limit_Nm']:.1f}", f"{joint['ratio']:.2f}")
         table.add_row(_plain(str(joint["joint"])), *numbers)
@@ -212,9 +210,7 @@ def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
 def identified_table(found: Mapping[str, Any]) -> Table:
     """Table of contact laws and their parameters, best law first; `found` as in `identify --json`."""
     impacts = "one impact" if found["blows"] == 1 else f"{found['blows']} impacts"
-    table = Table(title=_plain(f"{found['log']}: {impacts}"), title_justify="left")
-    for name in ("", "value", f"{100 * found['level']:g} % interval"):
-        table.add_column(name, justify="right" if name else "left")
+    table = _empty(f"{found['log']}: {impacts}", "", "value", f"{100 * found['level']:g} % interval")
     for law in found["laws"]:
         more = law["aic"] - found["laws"][0]["aic"]
         fit = f"residual {law['force_left_pct']:.2g} % of the peak force, AIC {more:+.0f}"
@@ -230,9 +226,8 @@ def identified_table(found: Mapping[str, Any]) -> Table:
 
 def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
     """Table of the results from several initial guesses; `starts` as in a summary."""
-    table = Table(title="starts", title_justify="left")
-    for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
-        table.add_column(_plain(name), justify="left" if name in ("start", "status") else "right")
+    columns = ("start", "status", "impulse [N s]", "iterations", "time [s]")
+    table = _empty("starts", *columns, left=("start", "status"))
     for start in starts:
         name, numbers = str(start["start"]), (start["impulse_Ns"], start["iterations"], start["seconds"])
         cells = (f"{number:.{digits}f}" for number, digits in zip(numbers, (2, 0, 1), strict=True))
@@ -246,10 +241,7 @@ def _table(
     summary: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]], phases: Sequence[str] = PHASES
 ) -> Table:
     """Table titled with the problem's name, with the rows of `result_rows`."""
-    table = Table(title=_plain(str(summary.get("problem", {}).get("name", "result"))), title_justify="left")
-    table.add_column("")
-    for name in columns:
-        table.add_column(name, justify="right")
+    table = _empty(str(summary.get("problem", {}).get("name", "result")), "", *columns)
     for row in result_rows(columns, phases):
         _add(table, row)
     return table
@@ -291,9 +283,8 @@ def switched_off_message(summary: Mapping[str, Any]) -> str:
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     """Table of violated constraints, worst first, one of each term."""
-    table = Table(title="violations, worst first", title_justify="left")
-    table.add_column("constraint", overflow="fold")
-    table.add_column("violation", overflow="fold")
+    columns = ("constraint", "violation")
+    table = _empty("violations, worst first", *columns, left=columns, fold=True)
     for constraint, amount in worst_constraints(violations):
         table.add_row(_plain(constraint), _plain(amount))
     return table
@@ -301,7 +292,6 @@ def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
 
 def nail_driving_table(series: Mapping[str, Any]) -> Table:
     """Table of the blows on a nail; `series` as in `impactopt drive --json`."""
-    table = Table(title="blows on the nail", title_justify="left")
     columns = (
         ("driven [mm]", "driven_m", 1e3, 1),
         ("depth [mm]", "depth_m", 1e3, 1),
@@ -310,8 +300,7 @@ def nail_driving_table(series: Mapping[str, Any]) -> Table:
         ("speed [m/s]", "hand_speed_m_s", 1.0, 2),
         ("solved in [s]", "solve_seconds", 1.0, 1),
     )
-    for name in ("blow", *(label for label, *_ in columns)):
-        table.add_column(_plain(name), justify="right")
+    table = _empty("blows on the nail", "blow", *(label for label, *_ in columns))
     for k, blow in enumerate(series["blows"], start=1):
         table.add_row(str(k), *(f"{scale * blow[key]:.{n}f}" for _, key, scale, n in columns))
     return table

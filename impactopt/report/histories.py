@@ -13,16 +13,6 @@ from impactopt.files.output import Record
 from impactopt.kinematics.support import convex_polygon, margin
 from impactopt.simulation.result import centre_of_pressure
 
-__all__ = [
-    "BUCKETS",
-    "at_contact",
-    "ground_wrenches",
-    "planned_torque",
-    "soles_standing",
-    "thinned",
-    "zmp_margins",
-]
-
 Array = NDArray[np.float64]
 BUCKETS = 400  # of a thinned history
 
@@ -68,11 +58,16 @@ def ground_wrenches(record: Record, prefix: str) -> tuple[Array, Array]:
     keep, ground = a["reference_phase"] != 1, a["collision_ground"]
     if not len(ground):
         return time[keep], a["reference_ground"][keep]
-    inside = float(a["reference_contact_start"]) + a["collision_time"][-len(ground) :]
-    order = np.argsort(np.concatenate([time[keep], inside]), kind="stable")
-    return np.concatenate([time[keep], inside])[order], np.concatenate([a["reference_ground"][keep], ground])[
-        order
-    ]
+    return _spliced(record, a["reference_ground"][keep], a["collision_time"][-len(ground) :], ground)
+
+
+def _spliced(record: Record, outside: Array, hit: Array, inside: Array) -> tuple[Array, Array]:
+    """Time [s] and values of the plan outside of contact, and at times `hit` [s] since contact in it."""
+    a = record.arrays
+    start = float(a["reference_contact_start"])
+    time = np.concatenate([a["reference_time"][a["reference_phase"] != 1], start + hit])
+    order = np.argsort(time, kind="stable")
+    return time[order], np.concatenate([outside, inside])[order]
 
 
 def soles_standing(record: Record, time: Array) -> dict[str, NDArray[np.bool_]]:
@@ -127,11 +122,7 @@ def _footprint(record: Record, phase: Mapping[str, Any], name: str) -> Array:
 def planned_torque(record: Record) -> tuple[Array, Array]:
     """Time (k,) [s] and the plan's torques (k, n) [N m]."""
     a = record.arrays
-    time, torque, phase = a["reference_time"], a["reference_torque"], a["reference_phase"]
-    hit = a["collision_torque"]
+    torque, hit = a["reference_torque"], a["collision_torque"]
     if len(hit) != len(a["collision_time"]) or not len(a["collision_ground"]):
-        return time, torque
-    keep = phase != 1
-    inside = float(a["reference_contact_start"]) + a["collision_time"]
-    order = np.argsort(np.concatenate([time[keep], inside]), kind="stable")
-    return np.concatenate([time[keep], inside])[order], np.concatenate([torque[keep], hit])[order]
+        return a["reference_time"], torque
+    return _spliced(record, torque[a["reference_phase"] != 1], a["collision_time"], hit)

@@ -4,22 +4,45 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.files.output import plain
-
-__all__ = ["html_page", "pack", "unpack"]
+from impactopt.errors import InputError
+from impactopt.files.output import plain, write_file
+from impactopt.report.result_rows import Row
 
 KINDS = {"<f4": np.float32, "<u2": np.uint16, "<u4": np.uint32, "|u1": np.uint8}  # JavaScript's typed arrays
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page that needs no network.  html : its text."""
+
+    html: str
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Writes the page as one HTML file, into an existing folder.
+
+        Raises
+        ------
+        InputError : the file cannot be written, or its name does not end with .html.
+        """
+        path = Path(path)
+        if path.suffix.lower() not in (".html", ".htm"):
+            raise InputError(f"a page is HTML: give {path.name!r} the ending .html")
+        write_file(path, lambda file: file.write(self.html.encode()))
+        return path
 
 
 def pack(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -77,6 +100,48 @@ def html_page(
     page = _asset("page.html")
     # in a single pass, because the inserted texts may contain such marks
     return re.sub(r"\{\{(\w+)\}\}", lambda mark: given[mark.group(1)], page)
+
+
+def report_html(
+    *,
+    title: str,
+    heading: str,
+    about: str,
+    parts: Iterable[str],
+    header: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
+) -> str:
+    """HTML of a report's page: heading and a text about it, parts as HTML, and the footer."""
+    body = [
+        f'<header><h1>{escape(heading)}</h1><span class="sub">{escape(about)}</span>',
+        '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>',
+        '<div id="trouble"></div>',
+        *filter(None, parts),
+        "</main><footer><main>Made by impactopt. This file holds all that it shows and needs no network.",
+        "</main></footer>",
+    ]
+    return html_page(title=title, kind="report", body="\n".join(body), header=header, arrays=arrays)
+
+
+def html_table(
+    rows: Sequence[Row], head: Sequence[str] = (), *, kind: str = "", row_attributes: Sequence[str] = ()
+) -> str:
+    """HTML table; values outside their limits are marked.
+
+    head : titles of all columns, that of the labels first.  kind : CSS class.  row_attributes : of each row.
+    """
+    titles = "".join(f'<th scope="col">{escape(name)}</th>' if name else "<td></td>" for name in head)
+    lines = []
+    for k, row in enumerate(rows):
+        cells = "".join(
+            f"<td>{escape(cell.text)}</td>" if cell.good else f'<td class="bad">! {escape(cell.text)}</td>'
+            for cell in row.cells
+        )
+        attributes = f" {row_attributes[k]}" if row_attributes else ""
+        lines.append(f'<tr{attributes}><th scope="row">{escape(row.label)}</th>{cells}</tr>')
+    above = f"<thead><tr>{titles}</tr></thead>" if head else ""
+    style = f' class="{kind}"' if kind else ""
+    return f"<table{style}>{above}<tbody>{''.join(lines)}</tbody></table>"
 
 
 def _asset(name: str) -> str:

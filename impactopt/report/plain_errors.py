@@ -15,8 +15,6 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["BAD_INPUT", "BUG", "INTERRUPTED", "plain_errors"]
-
 BAD_INPUT, BUG, INTERRUPTED = 2, 70, 130  # exit codes
 
 

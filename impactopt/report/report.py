@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 from impactopt.files.output import Record, record_of
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.report.animation import Page
 from impactopt.report.charts import charts_of
-from impactopt.report.page import html_page
-from impactopt.report.result_rows import result_columns, result_rows, worst_constraints
+from impactopt.report.page import Page, html_table, report_html
+from impactopt.report.result_rows import Cell, Row, result_columns, result_rows, worst_constraints
 from impactopt.report.stage import stage_of
 from impactopt.robots.loads import shortfalls
-
-__all__ = ["Report", "report_of", "report_page"]
 
 COLUMN_NOTES = {
     "simulated": "Simulated: replayed in Pinocchio's full dynamics, any soles fixed.",
@@ -31,12 +27,7 @@ BAD_NOTE = (
 NARROW = "\u202f"  # narrow no-break space, between a number and its unit
 
 
-@dataclass(frozen=True)
-class Report(Page):
-    """A page that needs no network; `save` writes it.  html : its text."""
-
-
-def report_of(record: Record, problem: ImpactProblem | None = None) -> Report:
+def report_of(record: Record, problem: ImpactProblem | None = None) -> Page:
     """Page of a record; with the animation, if the problem is given and there is a motion."""
     charts, arrays = charts_of(record, problem)
     header: dict[str, Any] = {}
@@ -44,27 +35,26 @@ def report_of(record: Record, problem: ImpactProblem | None = None) -> Report:
         header, solids = stage_of(record, problem)
         arrays |= solids
     title = str(record.summary.get("problem", {}).get("name", "")) or "result"
-    body = "\n".join(part for part in _body(record, title, animated=bool(header)) if part)
-    page = html_page(
-        title=title, kind="report", body=body, header={**header, "charts": charts}, arrays=arrays
+    known = record.summary.get("problem", {})
+    html = report_html(
+        title=title,
+        heading=title,
+        about=" · ".join(str(known[key]) for key in ("robot", "striker") if known.get(key)),
+        parts=_parts(record, animated=bool(header)),
+        header={**header, "charts": charts},
+        arrays=arrays,
     )
-    return Report(page)
+    return Page(html)
 
 
-def report_page(solution: Solution, *, simulation: Any | None = None, replay: Any | None = None) -> Report:
+def report_page(solution: Solution, *, simulation: Any | None = None, replay: Any | None = None) -> Page:
     """Page as of `impactopt show`; simulation, replay : as in :func:`impactopt.animate`."""
     record = record_of(solution, simulation=simulation, replay=replay)
     return report_of(record, solution.problem)
 
 
-def _body(record: Record, title: str, *, animated: bool) -> Iterator[str]:
+def _parts(record: Record, *, animated: bool) -> Iterator[str]:
     s = record.summary
-    about = " · ".join(
-        str(s["problem"][key]) for key in ("robot", "striker") if s.get("problem", {}).get(key)
-    )
-    yield f'<header><h1>{escape(title)}</h1><span class="sub">{escape(about)}</span>'
-    yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
-    yield '<div id="trouble"></div>'
     errors = (s.get(name, {}).get("error") for name in ("simulated", "baseline"))
     notes = (s.get("note"), s.get("caution"), s.get("gear_caution"), *errors)
     for note in filter(None, notes):
@@ -90,9 +80,7 @@ def _body(record: Record, title: str, *, animated: bool) -> Iterator[str]:
     yield f'<section class="card"><h3>The solve</h3>{_pairs(_solve(s))}</section>'
     yield f'<section class="card"><h3>The model</h3>{_pairs(s.get("problem", {}))}</section>'
     yield f'<section class="card"><h3>Versions</h3>{_pairs(s.get("versions", {}))}</section>'
-    yield "</div></div></main>"
-    yield "<footer><main>Made by impactopt. This file holds all that it shows and needs no network."
-    yield "</main></footer>"
+    yield "</div></div>"
 
 
 def _cards(s: Mapping[str, Any]) -> str:
@@ -131,31 +119,19 @@ def _cards(s: Mapping[str, Any]) -> str:
 
 def _table(s: Mapping[str, Any]) -> str:
     columns = result_columns(s)
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in columns)
-    rows = []
-    for row in result_rows(columns):
-        cells = "".join(
-            f"<td>{escape(cell.text)}</td>" if cell.good else f'<td class="bad">! {escape(cell.text)}</td>'
-            for cell in row.cells
-        )
-        rows.append(f'<tr><th scope="row">{escape(row.label)}</th>{cells}</tr>')
-    table = f"<thead><tr><td></td>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
+    rows = result_rows(columns)
     notes = " ".join(text for name, text in COLUMN_NOTES.items() if name in columns)
-    if any(not cell.good for row in result_rows(columns) for cell in row.cells):
+    if any(not cell.good for row in rows for cell in row.cells):
         notes = f"{notes} {BAD_NOTE}"
     about = f'<p class="about">{escape(notes.strip())}</p>' if notes.strip() else ""
-    return f'<div class="scroll" tabindex="0"><table>{table}</table>{about}</div>'
+    return f'<div class="scroll" tabindex="0">{html_table(rows, ["", *columns])}{about}</div>'
 
 
 def _violations(s: Mapping[str, Any]) -> str:
     if not s.get("violations"):
         return ""
-    rows = "".join(
-        f'<tr><th scope="row">{escape(constraint)}</th><td>{escape(amount)}</td></tr>'
-        for constraint, amount in worst_constraints(s["violations"])
-    )
-    table = f'<div class="card scroll"><table><tbody>{rows}</tbody></table></div>'
-    return f"<h2>Violated constraints, worst first</h2>{table}"
+    rows = [Row(constraint, (Cell(amount),)) for constraint, amount in worst_constraints(s["violations"])]
+    return f'<h2>Violated constraints, worst first</h2><div class="card scroll">{html_table(rows)}</div>'
 
 
 def _solve(s: Mapping[str, Any]) -> dict[str, Any]:
@@ -181,9 +157,6 @@ def _pairs(pairs: Mapping[str, Any]) -> str:
     def shown(value: Any) -> str:
         return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
 
-    rows = "".join(
-        f'<tr><th scope="row">{escape(str(name))}</th><td>{escape(shown(value))}</td></tr>'
-        for name, value in pairs.items()
-        if value not in (None, [], "")
-    )
-    return f'<div class="scroll"><table class="pairs"><tbody>{rows}</tbody></table></div>'
+    known = {str(name): value for name, value in pairs.items() if value not in (None, [], "")}
+    rows = [Row(name, (Cell(shown(value)),)) for name, value in known.items()]
+    return f'<div class="scroll">{html_table(rows, kind="pairs")}</div>'

@@ -13,22 +13,6 @@ from impactopt.files.record import replay_name
 from impactopt.robots.loads import SHARE, margin_between_nodes
 from impactopt.solvers.program import MINOR
 
-__all__ = [
-    "Cell",
-    "Row",
-    "collision_rows",
-    "contact_rows",
-    "number_row",
-    "phase_rows",
-    "replay_columns",
-    "result_columns",
-    "result_rows",
-    "standing",
-    "target_rows",
-    "word_row",
-    "worst_constraints",
-]
-
 PHASES = ("swing", "collision", "follow", "missed")
 MAX_SLIP = 5.0  # [mm] on free soles: a plan within its friction slips less
 TOLERANCE = 0.1  # [mm, N] of sole margins: a sole that tips on its edge may seem to be slightly outside

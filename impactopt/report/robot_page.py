@@ -15,25 +15,23 @@ from impactopt.bodies.solids import Solid
 from impactopt.bodies.world import WorldBody
 from impactopt.kinematics.stance import USUAL_POSTURE
 from impactopt.problem.problem import ImpactProblem
-from impactopt.report.page import html_page
-from impactopt.report.report import Report
-from impactopt.report.stage import Arrays, pack_robot, pack_solid, pack_track, pack_world
-from impactopt.report.tracks import Track
+from impactopt.report.page import Page, html_table, report_html
+from impactopt.report.result_rows import Cell, Row
+from impactopt.report.stage import Arrays, middle, pack_robot, pack_solid, pack_track, pack_world
+from impactopt.report.tracks import Track, places_of
 from impactopt.robots.robot import Robot
-
-__all__ = ["bodies_page", "bodies_page_of_problem"]
 
 Array = NDArray[np.float64]
 
 
-def bodies_page(robot: Robot) -> Report:
+def bodies_page(robot: Robot) -> Page:
     """Page of a robot's bodies in `USUAL_POSTURE`, else in its first posture, or else in the neutral."""
     names = sorted(robot.postures, key=lambda name: name != USUAL_POSTURE)
     posture = robot.posture(names[0]) if names else pin.neutral(robot.model)
     return _page(robot, posture, names[0] if names else "neutral", robot.name)
 
 
-def bodies_page_of_problem(problem: ImpactProblem) -> Report:
+def bodies_page_of_problem(problem: ImpactProblem) -> Page:
     """Page of the bodies of a problem's world, and of its robot in the initial posture."""
     posture = problem.start if isinstance(problem.start, str) else "start"
     title = problem.name or problem.robot.name
@@ -57,7 +55,7 @@ def _page(
     world: tuple[WorldBody, ...] = (),
     normal: Array | None = None,
     floor: float | None = 0.0,
-) -> Report:
+) -> Page:
     links, arrays = bodies_of(robot), dict[str, Any]()
     header = {
         "bodies": pack_robot(robot, arrays),
@@ -67,7 +65,7 @@ def _page(
         "soles": [],
         "normal": np.array([1.0, 0.0, 0.0]) if normal is None else normal,
         "point": arrays["track0_hand"][0],
-        "side": float(arrays["track0_places"][0, 1:, 1].mean()),
+        "side": middle(arrays["track0_places"]),
         "weight": 1.0,
         "around": 0.0,
         "far": 1.0,
@@ -75,8 +73,15 @@ def _page(
         "legged": False,
         "charts": [],
     }
-    body = "\n".join(_body(links, q, posture, title, world))
-    return Report(html_page(title=f"{title}: bodies", kind="report", body=body, header=header, arrays=arrays))
+    html = report_html(
+        title=f"{title}: bodies",
+        heading=title,
+        about=f"{robot.name}: collision bodies",
+        parts=_parts(links, q, posture, world),
+        header=header,
+        arrays=arrays,
+    )
+    return Page(html)
 
 
 def _pack_hulls(links: RobotBodies, arrays: Arrays) -> list[dict[str, Any]]:
@@ -89,17 +94,15 @@ def _pack_hulls(links: RobotBodies, arrays: Arrays) -> list[dict[str, Any]]:
 
 def _still(robot: Robot, q: Array, label: str) -> Track:
     """Track of a single instant without contact."""
-    model, data = robot.model, robot.model.createData()
-    pin.framesForwardKinematics(model, data, q)
     zero, unknown = np.zeros(1), np.full((1, 3), np.nan)
-    strikers = [data.oMf[model.getFrameId(s.model_frame)].translation for s in robot.strikers.values()]
-    com = np.array(pin.centerOfMass(model, data, q))
+    frames = [striker.model_frame for striker in robot.strikers.values()]
+    places, hand, mass = places_of(robot, frames[0] if frames else "universe", q[None])
     return Track(
         name=label,
         time=zero,
-        places=np.array([[pin.SE3ToXYZQUAT(place) for place in data.oMi]]),
-        hand=np.array([strikers[0] if strikers else com]),
-        mass=com[None],
+        places=places,
+        hand=hand if frames else mass,
+        mass=mass,
         force=zero,
         travel=zero,
         zmp=unknown[:, :2],
@@ -109,13 +112,7 @@ def _still(robot: Robot, q: Array, label: str) -> Track:
     )
 
 
-def _body(
-    links: RobotBodies, q: Array, posture: str, title: str, world: Sequence[WorldBody]
-) -> Iterator[str]:
-    yield f'<header><h1>{escape(title)}</h1><span class="sub">'
-    yield f"{escape(links.robot.name)}: collision bodies</span>"
-    yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
-    yield '<div id="trouble"></div>'
+def _parts(links: RobotBodies, q: Array, posture: str, world: Sequence[WorldBody]) -> Iterator[str]:
     yield f'<p id="source">Bodies are convex hulls of the {escape(links.source)}. Point at a row to see its '
     yield "link.</p>"
     yield '<div class="top"><section class="card stays" id="animation" aria-label="bodies"></section>'
@@ -125,11 +122,8 @@ def _body(
         yield f'<h2>The world</h2><section class="card" id="world">{_world(world)}</section>'
     yield "<h2>Pairs that may touch</h2>"
     for number, (why, pairs) in enumerate(_excluded_pairs(links, q, posture)):
-        rows = [(one, other) for one, other in pairs] or [("none", "")]
         yield f'<section class="card left-out" id="why{number}"><h3>{escape(why)}</h3>'
-        yield f"{_table(('link', 'and link'), rows)}</section>"
-    yield "</main><footer><main>Made by impactopt. This file holds all that it shows and needs no network."
-    yield "</main></footer>"
+        yield f"{_table(('link', 'and link'), pairs or [('none', '')])}</section>"
 
 
 def _fit(links: RobotBodies) -> str:
@@ -175,12 +169,8 @@ def _sorted(pairs: Iterable[frozenset[str]]) -> list[tuple[str, str]]:
     return sorted({(min(pair), max(pair)) for pair in pairs})
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], joints: Sequence[int] | None = None) -> str:
-    top = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
-    lines = []
-    for k, (first, *cells) in enumerate(rows):
-        joint = f' data-joint="{joints[k]}" tabindex="0"' if joints is not None else ""
-        inner = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
-        lines.append(f'<tr{joint}><th scope="row">{escape(first)}</th>{inner}</tr>')
-    table = f"<thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody>"
-    return f'<div class="scroll"><table>{table}</table></div>'
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], joints: Sequence[int] = ()) -> str:
+    """Table with a label first in each row, which stands for a joint of the robot if these are given."""
+    found = [Row(first, tuple(map(Cell, cells))) for first, *cells in rows]
+    attributes = [f'data-joint="{joint}" tabindex="0"' for joint in joints]
+    return f'<div class="scroll">{html_table(found, head, row_attributes=attributes)}</div>'

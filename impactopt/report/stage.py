@@ -7,16 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.solids import Solid, joined, simplified
-from impactopt.bodies.visuals import Visual, surroundings_of, visuals_of
+from impactopt.bodies.solids import Solid, simplified
+from impactopt.bodies.visuals import Visual, joined_visuals, surroundings_of
 from impactopt.bodies.world import WorldBody
 from impactopt.files.output import Record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import footprints
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.robots.robot import Robot
-
-__all__ = ["bodies_drawn", "pack_robot", "pack_solid", "pack_track", "pack_world", "stage_of"]
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
@@ -41,7 +39,7 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
         "soles": [f"ground_{name}" for name in soles if name != "polygon"],
         "normal": problem.normal,
         "point": problem.point,
-        "side": _middle(arrays["track0_places"]),
+        "side": middle(arrays["track0_places"]),
         "weight": 9.81 * float(sum(i.mass for i in problem.robot.model.inertias)),
         "around": AROUND,
         "far": FAR,
@@ -73,17 +71,14 @@ def pack_world(world: tuple[WorldBody, ...], arrays: Arrays) -> list[dict[str, A
     ]
 
 
-def _middle(places: Array) -> float:
+def middle(places: Array) -> float:
     """Mean y [m] of the robot's joints at the start, by which the view's side is chosen."""
     return float(places[0, 1:, 1].mean())
 
 
 def bodies_drawn(robot: Robot) -> list[Visual]:
     """Solids of a robot, one for each joint and colour, with few enough triangles in all."""
-    groups: dict[tuple[int, tuple[float, float, float]], list[Solid]] = {}
-    for visual in visuals_of(robot):
-        groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)
-    whole = {key: joined(solids) for key, solids in groups.items()}
+    whole = joined_visuals(robot)
     if sum(len(solid.triangles) for solid in whole.values()) > MAX_TRIANGLES:
         whole = _few(whole)
     return [

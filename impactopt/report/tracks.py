@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from impactopt.files.output import Record, replay_name
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.robot import Robot
 from impactopt.simulation.result import centre_of_pressure, travelled
 from impactopt.transcription.plan import Trajectory
-
-__all__ = ["AROUND", "FAR", "Track", "planned_hand_speed", "planned_track", "tracks_of"]
 
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
@@ -111,21 +110,14 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     if prefix == "reference" and record.summary.get("target", {}).get("broken", 1.0) < 0.5:
         travel[time > end] = 0.0  # an unbroken board springs back
     travel = travel[chosen]
-    model = robot.model
-    data, striker = model.createData(), model.getFrameId(robot.striker(problem.striker).model_frame)
-    places, hand, mass = np.zeros((len(shown), model.njoints, 7)), [], []
-    for k, posture in enumerate(q):
-        pin.framesForwardKinematics(model, data, posture)
-        places[k] = [pin.SE3ToXYZQUAT(place) for place in data.oMi]
-        hand.append(np.array(data.oMf[striker].translation))
-        mass.append(np.array(pin.centerOfMass(model, data, posture)))
+    places, hand, mass = places_of(robot, robot.striker(problem.striker).model_frame, q)
     legged = len(a["polygon"]) > 0
     return Track(
         name=name,
         time=shown,
         places=places,
-        hand=np.array(hand),
-        mass=np.array(mass),
+        hand=hand,
+        mass=mass,
         force=force,
         travel=np.clip(travel, -FAR, FAR),
         zmp=centre_of_pressure(wrench) if legged else np.full((len(shown), 2), np.nan),
@@ -134,6 +126,19 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
         contact_end=end,
         missing=prefix == MISSED,
     )
+
+
+def places_of(robot: Robot, frame: str, postures: Array) -> tuple[Array, Array, Array]:
+    """Fields `places`, `hand` and `mass` of a `Track` for postures (k, nq); frame : of the striking point."""
+    model, data = robot.model, robot.model.createData()
+    striker = model.getFrameId(frame)
+    places, hand, mass = [], [], []
+    for q in postures:
+        pin.framesForwardKinematics(model, data, q)
+        places.append([pin.SE3ToXYZQUAT(place) for place in data.oMi])
+        hand.append(np.array(data.oMf[striker].translation))
+        mass.append(np.array(pin.centerOfMass(model, data, q)))
+    return np.array(places), np.array(hand), np.array(mass)
 
 
 def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.intp]:

@@ -15,8 +15,6 @@ from impactopt.errors import InputError, missing_package
 from impactopt.sweeps.design import Found, Unit, Work, failed_columns
 from impactopt.sweeps.evaluate import evaluate
 
-__all__ = ["connected", "on_cluster"]
-
 UNITS_PER_THREAD = 3  # that the scheduler has at once, for each thread of its workers
 COUNT_INTERVAL = 5.0  # [s] between counts of the workers' threads
 CONNECT_TIMEOUT = 10.0  # [s]

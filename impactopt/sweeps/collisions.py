@@ -36,17 +36,6 @@ from impactopt.errors import InputError, did_you_mean, raw_array
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file
 from impactopt.files.toml import Place, plain_value
 
-__all__ = [
-    "SERVO",
-    "CollisionBatch",
-    "Collisions",
-    "Role",
-    "collide_many",
-    "role_of",
-    "setting_of",
-    "sweep_place",
-]
-
 # Role of a key: "number", an input of the compiled functions; "point", which changes the posture;
 # "structure", which changes the robot or the model.
 Role = Literal["number", "point", "structure"]

@@ -30,9 +30,7 @@ from impactopt.files.toml import (
 )
 from impactopt.sweeps.collisions import Collisions, sweep_place
 from impactopt.sweeps.design import Axis, Column, Design, Draws, Span, column
-from impactopt.sweeps.sections import CaseKind, Figure, SpanSection, SweepFile, flat, of_other_kinds, put
-
-__all__ = ["Sweep", "VariedKeys", "parse_sweep", "read_sweep_file", "sweep_from_data"]
+from impactopt.sweeps.sections import Figure, SpanSection, SweepFile, SweepSection, flat, of_other_kinds, put
 
 
 class VariedKeys:
@@ -206,11 +204,8 @@ class Sweep:
 
     path, text : of the file.  content : its data but for [figure], which no result depends on.
     problem : the problem file with the sweep's [set]; every case changes it.
-    design : the values of the cases.  name : for reports.
-    case_kind : kind of case: "solve" (a whole motion), "strike" or "collision".
-    seed, start, starts : of a case's solves, as of :func:`impactopt.solve`.
-    time_limit [s] : of a case; None: no limit.  trajectories : whether each case's full result is kept.
-    at_contact, outputs : of collisions, as of :func:`impactopt.collide_many`.
+    design : the values of the cases.  settings : of all cases, the section [sweep].
+    at_contact : of collisions, as of :func:`impactopt.collide_many`.
     figure : of the table, with full names of the keys; None: no figure.
     """
 
@@ -219,16 +214,14 @@ class Sweep:
     content: Mapping[str, Any] = field(repr=False)
     problem: ProblemFile = field(repr=False)
     design: Design = field(repr=False)
-    name: str
-    case_kind: CaseKind
-    seed: int
-    start: str
-    starts: int
-    time_limit: float | None
-    trajectories: bool
+    settings: SweepSection
     at_contact: Mapping[str, Any]
-    outputs: tuple[str, ...]
     figure: Figure | None
+
+    @property
+    def name(self) -> str:
+        """Name for reports."""
+        return self.settings.name or self.path.stem
 
     @property
     def hash(self) -> str:
@@ -350,15 +343,8 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
         content={name: dict(flat(table)) for name, table in data.items() if name != "figure"},
         problem=base,
         design=design,
-        name=given.name or path.stem,
-        case_kind=given.case_kind,
-        seed=given.seed,
-        start=given.start,
-        starts=given.starts,
-        time_limit=given.time_limit,
-        trajectories=given.trajectories,
+        settings=given,
         at_contact=content.at_contact,
-        outputs=given.outputs,
         figure=None if content.figure is None else content.figure.renamed(reader.full_name),
     )
 

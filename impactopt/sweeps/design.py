@@ -18,21 +18,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.files.output import Record
-
-__all__ = [
-    "GRACE",
-    "Axis",
-    "Column",
-    "Columns",
-    "Design",
-    "Draws",
-    "Found",
-    "Span",
-    "Unit",
-    "Work",
-    "column",
-    "failed_columns",
-]
+from impactopt.sweeps.sections import SweepSection
 
 Array = NDArray[np.float64]
 Column = Sequence[Any] | NDArray[Any]
@@ -175,7 +161,7 @@ class Work:
     """Data that all units of a sweep share.
 
     data, path : of the problem file with the sweep's [set].  folder : of the sweep file.
-    case_kind, seed, start, starts, time_limit [s], trajectories, at_contact, outputs : as of `Sweep`.
+    settings, at_contact : as of `Sweep`.
     grace [s] : time after the time limit until the worker is killed.
     solved : folder of the solved cases that others start from; None: cases do not start from others.
     version : of impactopt, which the workers must have.
@@ -183,14 +169,8 @@ class Work:
 
     data: Mapping[str, Any]
     path: Path
-    case_kind: str
-    seed: int = 0
-    start: str = "reach"
-    starts: int = 1
-    time_limit: float | None = None
-    trajectories: bool = False
+    settings: SweepSection
     at_contact: Mapping[str, Any] = field(default_factory=dict)
-    outputs: tuple[str, ...] = ()
     folder: Path = Path()
     solved: Path | None = None
     grace: float = GRACE

@@ -27,8 +27,7 @@ from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Columns, Found, Unit, Work, failed_columns
 from impactopt.sweeps.progress import START
-
-__all__ = ["CASE_KINDS", "ENDED_BY_WATCHDOG", "TRIES", "Watchdog", "evaluate", "on_processes"]
+from impactopt.sweeps.table import UNITS
 
 ENDED_BY_WATCHDOG = -int(signal.SIGALRM)  # exit code of a process that the watchdog has ended
 MAX_BUILD_STEP = 900.0  # [s] for one step of building functions
@@ -79,7 +78,6 @@ _COPIED = (
     "solve_seconds",
     "build_seconds",
 )
-_UNITS = {"N s": "_Ns", "N": "_N", "J": "_J", "m": "_m", "s": "_s", "(N m s)^2": "_N2m2s2"}
 
 
 def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
@@ -88,15 +86,15 @@ def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
     file = problem_file_from_data(work.data, where=work.path).changed(settings)
     problem = file.build()
     options = {
-        "starts": work.starts,
-        "seed": work.seed,
+        "starts": work.settings.starts,
+        "seed": work.settings.seed,
         "report": watchdog.building,
         "callback": watchdog.iteration,
         **_arguments(file, work),
     }
     solution: Solution | StrikeSolution
     started: dict[str, str] = {}  # the column of the case that this one starts from
-    if work.case_kind == "strike":
+    if work.settings.case_kind == "strike":
         solution = optimize_strike(problem, **options)
     elif work.solved is not None:
         folder = SolvedFolder(work.solved)
@@ -104,8 +102,8 @@ def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
         folder.keep(solution, file, f"{unit.first:06d}")
         started = {START: near.path.name if near is not None else ""}
     else:
-        solution = solve(problem, start=work.start, **options)
-    if not work.trajectories:
+        solution = solve(problem, start=work.settings.start, **options)
+    if not work.settings.trajectories:
         return _columns({**summary_of(solution), **started}, problem), {}
     from_file: Any = {"problem": file.text, "problem_path": file.path}
     if isinstance(solution, StrikeSolution):
@@ -121,7 +119,7 @@ def _collide(work: Work, unit: Unit, watchdog: Watchdog) -> Evaluated:
     if _kept is None or _kept[0] != work:
         file = problem_file_from_data(work.data, where=work.path)
         keys, folder = tuple(unit.columns), work.folder
-        _kept = work, Collisions(file, work.at_contact, work.outputs, keys=keys, folder=folder)
+        _kept = work, Collisions(file, work.at_contact, work.settings.outputs, keys=keys, folder=folder)
     columns = _kept[1](unit.columns, threads=1)
     return {"reason": columns.pop("reason").tolist(), **columns}, {}
 
@@ -138,7 +136,7 @@ CASE_KINDS: dict[str, Callable[[Work, Unit, Watchdog], Evaluated]] = {
 def _arguments(file: ProblemFile, work: Work) -> dict[str, Any]:
     """Arguments of `solve` in the problem file, with the shorter time limit of file and sweep."""
     own = file.solver.time_limit
-    limits = [seconds for seconds in (own, work.time_limit) if seconds is not None]
+    limits = [seconds for seconds in (own, work.settings.time_limit) if seconds is not None]
     return file.solver.arguments(time_limit=min(limits, default=None))
 
 
@@ -153,7 +151,8 @@ def _columns(summary: Mapping[str, Any], problem: ImpactProblem) -> Columns:
     row |= {f"target_{name}": value for name, value in (summary.get("target") or {}).items()}
     row |= {f"torque_ratio_{phase}": x for phase, x in summary.get("torque_ratio", {}).items()}
     row |= {f"zmp_margin_{phase}_m": x for phase, x in summary.get("zmp_margin_m", {}).items()}
-    units = {objective.name: _UNITS.get(objective.unit, "") for objective in problem.objectives}
+    endings = {unit: end for end, unit in UNITS.items()}
+    units = {objective.name: endings.get(objective.unit, "") for objective in problem.objectives}
     for name, value in summary.get("objectives", {}).items():
         row[f"objective_{name.replace(' ', '_')}{units[name]}"] = value
     for scenario in summary.get("scenarios", ()):
@@ -182,10 +181,10 @@ def evaluate(work: Work, unit: Unit) -> Found:
 
 
 def _evaluate(work: Work, unit: Unit) -> Found:
-    began, watchdog = time.perf_counter(), Watchdog(work.time_limit, work.grace)
+    began, watchdog = time.perf_counter(), Watchdog(work.settings.time_limit, work.grace)
     records: Mapping[int, Record] = {}
     try:
-        columns, records = CASE_KINDS[work.case_kind](work, unit, watchdog)
+        columns, records = CASE_KINDS[work.settings.case_kind](work, unit, watchdog)
     except InputError as error:
         columns = failed_columns(unit.count, "refused", str(error))
     except Exception as error:  # the other units go on
@@ -193,7 +192,7 @@ def _evaluate(work: Work, unit: Unit) -> Found:
     finally:
         watchdog.off()
         gc.collect()  # solves leave reference cycles, with which the worker's memory would grow
-    if work.case_kind != "collision":
+    if work.settings.case_kind != "collision":
         columns = {**columns, "seconds": [time.perf_counter() - began]}
     return Found(columns=columns, records=records, peak_mb=_peak_memory())
 
@@ -240,9 +239,8 @@ def on_processes(
 def _lost(work: Work, unit: Unit, died: Died) -> Found:
     """Result of a unit whose process died: its rows have the reason."""
     if died.code == ENDED_BY_WATCHDOG:
-        columns = failed_columns(
-            unit.count, "time_limit", f"it took longer than {work.time_limit:g} s and did not stop by itself"
-        )
+        reason = f"it took longer than {work.settings.time_limit:g} s and did not stop by itself"
+        columns = failed_columns(unit.count, "time_limit", reason)
     else:
         how = f"exit code {died.code}" if died.code >= 0 else f"killed by {_signal(-died.code)}"
         columns = failed_columns(unit.count, "crashed", f"its process died {died.tries} times ({how})")

@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from impactopt.errors import printable
 from impactopt.sweeps.design import Columns
 from impactopt.sweeps.table import merge_kinds
-
-__all__ = ["START", "ProgressCounter", "SweepConsole", "SweepProgress", "receivers", "words_for_time"]
 
 BEST = "impulse_Ns"
 START = "started_from"  # column with the solved case that a solve started from; "": none
@@ -105,6 +103,12 @@ class ProgressCounter:
         """
         return {name: float(np.mean(found)) for name, found in sorted(self._iterations.items())}
 
+    @property
+    def counts(self) -> dict[str, Any]:
+        """Fields that a progress and a result have in common."""
+        names = ("cases", "done", "failed", "resumed", "best", "best_case")
+        return {name: getattr(self, name) for name in names}
+
     def progress(self) -> SweepProgress:
         """Present progress."""
         now = time.perf_counter()
@@ -114,15 +118,10 @@ class ProgressCounter:
         self._recent.append((now, self.done))
         rate = (self.done - before) / (now - since) if now > since else 0.0
         return SweepProgress(
-            cases=self.cases,
-            done=self.done,
-            failed=self.failed,
-            resumed=self.resumed,
+            **self.counts,
             seconds=now - self._began,
             rate=rate,
             remaining=(self.cases - self.done) / rate if rate > 0 else float("nan"),
-            best=self.best,
-            best_case=self.best_case,
         )
 
 

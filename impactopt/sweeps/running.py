@@ -22,8 +22,6 @@ from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
 from impactopt.transcription.transcription import block_functions
 
-__all__ = ["SweepResult", "sweep"]
-
 RETRIED = {"crashed", "error", "time_limit"}  # statuses of cases that may succeed in another run
 Engine = Generator[tuple[Unit, Found], None, None]
 MAX_UNIT = {"collision": 16384}  # cases in a unit by kind; 1 for other kinds
@@ -133,7 +131,7 @@ def _run(
 ) -> SweepResult:
     journal = store.journal
     # the same in every run, as units are numbered
-    unit_size = min(MAX_UNIT.get(chosen.case_kind, 1), -(-chosen.design.cases // MIN_UNITS))
+    unit_size = min(MAX_UNIT.get(chosen.settings.case_kind, 1), -(-chosen.design.cases // MIN_UNITS))
     if journal.damaged:
         say(f"{journal.damaged} units in {journal.path} are damaged, and evaluated again")
     counter, finished = ProgressCounter(chosen.design.cases), set[int]()
@@ -162,16 +160,11 @@ def _run(
     _write(chosen, problem, store, unit_size, counter)
     seconds = counter.seconds
     return SweepResult(
-        cases=counter.cases,
-        done=counter.done,
-        failed=counter.failed,
-        resumed=counter.resumed,
+        **counter.counts,
         seconds=seconds,
         rate_per_second=(counter.done - counter.resumed) / seconds,
         peak_worker_mb=counter.peak_mb,
         table=store.table,
-        best=counter.best,
-        best_case=counter.best_case,
         reasons=dict(counter.reasons.most_common()),
         iterations=counter.iterations,
     )
@@ -185,7 +178,7 @@ def _read(source: Sweep | Mapping[str, Any] | str | os.PathLike[str]) -> Sweep:
 
 def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, say: Callable[[str], None]) -> None:
     """Compile functions once, in this process; workers load them from disk."""
-    if chosen.case_kind == "collision":
+    if chosen.settings.case_kind == "collision":
         say("building the collision (compiles the first time)")
         evaluate(work, Unit(index=0, first=0, count=1, columns=chosen.design.columns(0, 1)))
     else:
@@ -196,16 +189,10 @@ def _work(chosen: Sweep, store: Store) -> Work:
     return Work(
         data=chosen.problem.data,
         path=chosen.problem.path.resolve(),
-        case_kind=chosen.case_kind,
-        seed=chosen.seed,
-        start=chosen.start,
-        starts=chosen.starts,
-        time_limit=chosen.time_limit,
-        trajectories=chosen.trajectories,
+        settings=chosen.settings,
         at_contact=chosen.at_contact,
-        outputs=chosen.outputs,
         folder=chosen.path.parent.resolve(),
-        solved=store.solved.resolve() if chosen.start == "neighbour" else None,
+        solved=store.solved.resolve() if chosen.settings.start == "neighbour" else None,
     )
 
 
@@ -235,7 +222,7 @@ def _write(
         merge_kinds(kinds, {axis.key: axis.values})
     metadata = {
         "name": chosen.name,
-        "case_kind": chosen.case_kind,
+        "case_kind": chosen.settings.case_kind,
         "cases": str(counter.cases),
         "done": str(counter.done),
         "sweep_hash": chosen.hash,

@@ -10,8 +10,6 @@ from pydantic import BeforeValidator, Field
 from impactopt.files.sections.diagnostics import Mistake
 from impactopt.files.sections.values import Positive, Section, optional, required
 
-__all__ = ["CaseKind", "Figure", "SpanSection", "SweepFile", "flat", "of_other_kinds", "put"]
-
 
 def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
     """Key paths and their values; TOML reads dots in keys as nested tables."""
@@ -95,7 +93,6 @@ class Figure(Section):
         return self.model_copy(update=new)
 
 
-CaseKind = Literal["solve", "strike", "collision"]
 AtLeastOne = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0)]
 
@@ -105,7 +102,7 @@ class SweepSection(Section):
 
     problem: str = required("a problem's name, or a file beside this one")
     name: str = Field(default="", description="what reports call the sweep")
-    case_kind: CaseKind = Field(
+    case_kind: Literal["solve", "strike", "collision"] = Field(
         default="solve", description="a whole motion, the strike alone, or one collision"
     )
     seed: Seed = Field(default=0, description="seed of what is drawn, and of solves from several starts")

@@ -33,8 +33,7 @@ from impactopt.files.output import make_directory, save_record, write_file
 from impactopt.planning.solution import versions
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.design import Columns, Found
-
-__all__ = ["Entry", "Journal", "Store"]
+from impactopt.sweeps.sections import flat
 
 MAGIC = b"SQLite format 3\x00"  # first bytes of an SQLite file
 APPLICATION = 0x696D7061  # SQLite's application_id of these files: "impa"
@@ -77,7 +76,7 @@ class Journal:
         try:
             self._claim()
             for unit, crc, content in self._records():
-                if isinstance(content, bytes) and zlib.crc32(content) == crc and _unit(content) == unit:
+                if isinstance(content, bytes) and zlib.crc32(content) == crc:
                     self.units.add(unit)
                 else:
                     self.damaged += 1
@@ -152,34 +151,16 @@ def _pack(entry: Entry) -> bytes:
     return b"".join([json.dumps(line).encode(), b"\n", *(x.tobytes() for x in arrays.values())])
 
 
-def _unit(content: bytes) -> int | None:
-    """Unit number of a record; None if `_pack` cannot have written it."""
-    try:
-        return _unpack(content).unit
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return None
-
-
 def _unpack(content: bytes) -> Entry:
+    """Unit of a record that `_pack` has written, as its checksum tells."""
     line, _, numbers = content.partition(b"\n")
     given: Mapping[str, Any] = json.loads(line)
-    unit, peak = given["unit"], float(given["peak_mb"])
-    columns: dict[str, Any] = dict(given["lists"])
-    at = 0
+    columns, at = dict[str, Any](given["lists"]), 0
     for name, (kind, count) in given["arrays"].items():
-        dtype = np.dtype(str(kind))
-        if dtype.kind not in "biuf" or not isinstance(count, int) or count < 0:
-            raise ValueError(f"{name} is no column of numbers")
-        x: NDArray[Any] = np.frombuffer(numbers, dtype=dtype, count=count, offset=at)
+        x: NDArray[Any] = np.frombuffer(numbers, dtype=kind, count=count, offset=at)
         columns[name], at = x, at + x.nbytes
-    ordered = {str(name): columns[name] for name in given["order"]}
-    lengths = {len(x) for x in ordered.values()}
-    cells = (cell for x in ordered.values() if isinstance(x, list) for cell in x)
-    if isinstance(unit, bool) or not isinstance(unit, int) or unit < 0 or at != len(numbers):
-        raise ValueError("not a unit's number, or more numbers than columns")
-    if len(ordered) != len(columns) or len(lengths) > 1 or any(isinstance(c, (list, dict)) for c in cells):
-        raise ValueError("columns of different lengths, or of no numbers and texts")
-    return Entry(unit=unit, peak_mb=peak, columns=ordered)
+    ordered = {name: columns[name] for name in given["order"]}
+    return Entry(unit=given["unit"], peak_mb=given["peak_mb"], columns=ordered)
 
 
 FORMAT = 2  # of sweep.json and the journal
@@ -294,7 +275,7 @@ def _lock(path: Path) -> int:
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Message with the settings that differ between two sweep.json, or that only one of them has."""
     old, new = (
-        {**_flat(data.get("sweep", {})), **_flat(data.get("problem", {}), "problem file: ")}
+        {**dict(flat(data.get("sweep", {}))), **dict(flat(data.get("problem", {}), "problem file: "))}
         for data in (before, now)
     )
     none = "not given"
@@ -307,11 +288,3 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         return ""
     more = f", and {len(changed) - MAX_NAMED} more" if len(changed) > MAX_NAMED else ""
     return ": " + "; ".join(changed[:MAX_NAMED]) + more
-
-
-def _flat(data: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Values by key path."""
-    out: dict[str, Any] = {}
-    for key, value in data.items():
-        out |= _flat(value, f"{above}{key}.") if isinstance(value, Mapping) else {f"{above}{key}": value}
-    return out

@@ -14,13 +14,11 @@ from impactopt.errors import InputError, check_choice, missing_package
 from impactopt.files.output import write_file
 from impactopt.sweeps.design import Columns
 
-__all__ = ["merge_kinds", "pyarrow", "read_columns", "unit_of", "without_unit", "write_table"]
-
 Part = tuple[int, Columns]  # number of the first case, and columns of consecutive cases from it on
 
 MIN_GROUP = 1 << 16  # rows in one of the file's row groups, but for the last; small units are joined
 # Units by the endings of columns' names. `_N_m` is N/m for stiffness and hardening (`unit_of`).
-_UNITS = {
+UNITS = {
     "_N_m_rad": "N m/rad",
     "_N_m_s_rad": "N m s/rad",
     "_N_s_m": "N s/m",
@@ -63,24 +61,27 @@ def unit_of(name: str) -> str:
     """Unit in a column's name, "" for none: impulse_Ns is in N s."""
     if name.endswith("seconds"):
         return "s"
-    # the last part of the key path with a unit: those after it name a joint, or an index of a list
-    for part in reversed(name.split(".")):
-        ends = [end for end in _UNITS if part.endswith(end)]
-        if ends:
-            end = max(ends, key=len)
-            return "N/m" if end == "_N_m" and part.startswith(("stiffness", "hardening")) else _UNITS[end]
-    return ""
+    k, end = _ending(name)
+    stiff = end == "_N_m" and name.split(".")[k].startswith(("stiffness", "hardening"))
+    return "N/m" if stiff else UNITS.get(end, "")
 
 
 def without_unit(name: str) -> str:
     """Name of a column without its unit: target.mass for target.mass_kg."""
+    parts, (k, end) = name.split("."), _ending(name)
+    parts[k] = parts[k].removesuffix(end)
+    return ".".join(parts)
+
+
+def _ending(name: str) -> tuple[int, str]:
+    """Index of the last part of a key path with a unit, as later ones name a joint, or an index of a list;
+    and the part's ending, one of `UNITS`, or "".
+    """
     parts = name.split(".")
     for k in reversed(range(len(parts))):
-        ends = [end for end in _UNITS if parts[k].endswith(end)]
-        if ends:
-            parts[k] = parts[k].removesuffix(max(ends, key=len))
-            break
-    return ".".join(parts)
+        if ends := [end for end in UNITS if parts[k].endswith(end)]:
+            return k, max(ends, key=len)
+    return 0, ""
 
 
 def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:

@@ -99,7 +99,9 @@ def test_cases_of_a_sweep_start_from_each_other(tmp_path: Path) -> None:
             "grid": {"target.mass": [0.05, 0.055]},
         }
     )
-    work = Work(data=chosen.problem.data, path=chosen.problem.path, case_kind="solve", solved=tmp_path / "s")
+    work = Work(
+        data=chosen.problem.data, path=chosen.problem.path, settings=chosen.settings, solved=tmp_path / "s"
+    )
     counter, rows = ProgressCounter(2), list[Any]()
     for case, mass in enumerate((0.05, 0.055)):
         unit = Unit(index=case, first=case, count=1, columns={"target.mass_kg": [mass]})

@@ -26,8 +26,10 @@ from impactopt.errors import InputError
 from impactopt.files.named_problems import problem_file
 from impactopt.files.output import Record, record_of, save_record
 from impactopt.problem.problem import ImpactProblem
-from impactopt.report import animation_of, bodies_page, report_of
+from impactopt.report.animation import animation_of
 from impactopt.report.page import unpack
+from impactopt.report.report import report_of
+from impactopt.report.robot_page import bodies_page
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
 from impactopt.robots.presets import load_robot

@@ -37,11 +37,12 @@ def pools(_: None, number: int) -> int:
 
     from impactopt.sweeps import evaluate
     from impactopt.sweeps.design import Unit, Work
+    from impactopt.sweeps.sections import SweepSection
 
     def count(*_: Any) -> Any:
         return {"reason": [""], "threads": [max(pool["num_threads"] for pool in threadpool_info())]}, {}
 
     evaluate.CASE_KINDS["solve"] = count
     unit = Unit(index=number, first=0, count=1, columns={})
-    found = evaluate.evaluate(Work(data={}, path=Path("p"), case_kind="solve"), unit)
+    found = evaluate.evaluate(Work(data={}, path=Path("p"), settings=SweepSection(problem="p")), unit)
     return int(found.columns["threads"][0])

@@ -21,6 +21,7 @@ from impactopt.sweeps import SweepProgress, sweep, sweep_from_data
 from impactopt.sweeps.cluster import on_cluster
 from impactopt.sweeps.design import Unit, Work
 from impactopt.sweeps.evaluate import evaluate
+from impactopt.sweeps.sections import SweepSection
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")
 RESISTANCES = [500.0, 650.0, 9e3, 600.0, 800.0]
@@ -44,7 +45,7 @@ def client() -> Iterator[Any]:
 
 def test_a_worker_of_the_cluster_that_is_killed_costs_nothing(tmp_path: Path, client: Any) -> None:
     chosen = sweep_from_data(SWEEP)
-    work = Work(data=chosen.problem.data, path=chosen.problem.path, case_kind="strike")
+    work = Work(data=chosen.problem.data, path=chosen.problem.path, settings=chosen.settings)
     told: list[SweepProgress] = []
 
     def kill_one(now: SweepProgress) -> None:
@@ -92,7 +93,7 @@ def lethal(folder: Path, unit: Unit) -> Any:
 
 
 def test_workers_of_another_version_are_refused(client: Any) -> None:
-    work = Work(data={}, path=Path("p"), case_kind="solve", version="0.0.0")
+    work = Work(data={}, path=Path("p"), settings=SweepSection(problem="p"), version="0.0.0")
     with pytest.raises(InputError, match=r"a worker has impactopt .*, the sweep 0\.0\.0"):
         list(on_cluster(work, [Unit(index=0, first=0, count=1, columns={})], client, print))
 

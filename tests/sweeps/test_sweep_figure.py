@@ -206,4 +206,4 @@ def test_the_command_draws(tmp_path: Path) -> None:
 @pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)
 def test_studies_are_sound(file: Path) -> None:
     study = read_sweep_file(file)
-    assert study.case_kind == "collision" and study.figure is not None
+    assert study.settings.case_kind == "collision" and study.figure is not None

@@ -123,7 +123,7 @@ def message(path: Path) -> str:
 
 def test_a_file_names_its_problem_relative_to_itself(tmp_path: Path) -> None:
     found = read_sweep_file(written(tmp_path))
-    assert (found.name, found.case_kind, found.seed) == ("sweep", "strike", 3)
+    assert (found.name, found.settings.case_kind, found.settings.seed) == ("sweep", "strike", 3)
     assert cases(found) == [(0.05, 100.0), (0.1, 100.0)]
     assert found.problem.path == tmp_path / "arm.toml"
 

@@ -29,6 +29,7 @@ from impactopt.sweeps.collisions import collide_many
 from impactopt.sweeps.design import Found, Unit, Work
 from impactopt.sweeps.evaluate import ENDED_BY_WATCHDOG, evaluate, on_processes
 from impactopt.sweeps.running import MAX_UNIT
+from impactopt.sweeps.sections import SweepSection
 from impactopt.sweeps.store import Entry, Journal
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")  # which no two runs share
@@ -52,7 +53,7 @@ def failures(found: list[dict[str, Any]]) -> int:
 def undisturbed() -> list[dict[str, Any]]:
     """The rows, one after the other in this process."""
     chosen = sweep_from_data(SWEEP)
-    work = Work(data=chosen.problem.data, path=chosen.problem.path, case_kind="strike")
+    work = Work(data=chosen.problem.data, path=chosen.problem.path, settings=chosen.settings)
     out = []
     for case, value in enumerate(RESISTANCES):
         unit = Unit(index=case, first=case, count=1, columns={"target.resistance_N": [value]})
@@ -179,7 +180,7 @@ def test_a_case_that_does_not_stop_is_ended(monkeypatch: pytest.MonkeyPatch) -> 
     began = time.perf_counter()
     assert dict(each_on_workers(slow, 0.3, [(0, 0)], workers=1)) == {0: Died(code=ENDED_BY_WATCHDOG, tries=1)}
     assert time.perf_counter() - began > 3 * 0.8 * 0.3
-    work = Work(data={}, path=Path("p"), case_kind="solve", time_limit=0.5)
+    work = Work(data={}, path=Path("p"), settings=SweepSection(problem="p", time_limit_s=0.5))
     units = [Unit(index=k, first=k, count=1, columns={}) for k in range(2)]
     ends = [Died(code=ENDED_BY_WATCHDOG, tries=1), Died(code=-signal.SIGSEGV, tries=3)]
     monkeypatch.setattr(
@@ -196,7 +197,7 @@ def test_workers_have_one_blas_thread() -> None:
 
 
 def test_a_worker_of_another_version_is_refused() -> None:
-    work = Work(data={}, path=Path("p"), case_kind="solve", version="0.0.0")
+    work = Work(data={}, path=Path("p"), settings=SweepSection(problem="p"), version="0.0.0")
     with pytest.raises(InputError, match=r"the sweep 0\.0\.0; install the same"):
         evaluate(work, Unit(index=0, first=0, count=1, columns={}))
 

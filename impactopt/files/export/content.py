@@ -34,8 +34,6 @@ from impactopt.simulation.result import parts_from
 from impactopt.solvers.program import Status
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["META", "Export", "body_name", "check_export", "export_of", "joint_order", "write_directory"]
-
 META = "meta.json"
 MADE_BY = "impactopt export"
 LARGEST = 1 << 24  # bytes of a meta.json

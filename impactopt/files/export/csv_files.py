@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from impactopt.files.export.content import Export
 from impactopt.files.export.motion import Motion
 
-__all__ = ["write"]
-
 Array = NDArray[np.float64]
 
 

@@ -17,8 +17,6 @@ from impactopt.files.export.content import Export
 from impactopt.files.export.motion import Motion
 from impactopt.files.export.ros2 import stamp
 
-__all__ = ["write"]
-
 WORLD = "world"  # frame_id of all messages
 _RULE = "=" * 80  # between message definitions
 # definitions of ROS 2's own packages, without their comments

@@ -16,8 +16,6 @@ from impactopt.errors import InputError
 from impactopt.files.export.content import Export, body_name
 from impactopt.files.export.motion import Motion, motion_at
 
-__all__ = ["write"]
-
 Array = NDArray[np.float64]
 
 

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BPoly, PchipInterpolator
+from scipy.spatial.transform import Rotation
 
 from impactopt.kinematics.support import zmp
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
-
-__all__ = ["JUMP", "Base", "Motion", "motion_at", "with_passive_at_rest"]
 
 Array = NDArray[np.float64]
 JUMP = 1e-6  # [s] between the two samples at a jump, so that time is strictly ascending
@@ -240,10 +239,7 @@ def _base(whole: Mapping[str, Any]) -> Base:
     spin = 2 * spin / size**2
     quaternion = quaternion / size
     return Base(
-        position=position[:, :3],
-        quaternion=quaternion,
-        linear=rate[:, :3],
-        angular=_turned(quaternion, spin),
+        position=position[:, :3], quaternion=quaternion, linear=rate[:, :3], angular=_turned(quaternion, spin)
     )
 
 
@@ -256,6 +252,4 @@ def _product(quaternion: Array, vector: Array) -> Array:
 
 def _turned(quaternion: Array, vector: Array) -> Array:
     """Vectors (k, 3) rotated by unit quaternions (k, 4)."""
-    w, u = quaternion[:, :1], quaternion[:, 1:]
-    twice = 2 * np.cross(u, vector)
-    return np.asarray(vector + w * twice + np.cross(u, twice))
+    return np.asarray(Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).apply(vector))

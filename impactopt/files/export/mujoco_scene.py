@@ -12,8 +12,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from impactopt.bodies.solids import Solid, joined, simplified
-from impactopt.bodies.visuals import visuals_of
+from impactopt.bodies.solids import Solid, simplified
+from impactopt.bodies.visuals import joined_visuals
 from impactopt.bodies.world import face_axes
 from impactopt.contact.targets import Board, FreeMass, Nail, RigidWall
 from impactopt.errors import InputError
@@ -31,8 +31,6 @@ from impactopt.simulation.mujoco_world import (
     robot_on_floor,
 )
 from impactopt.simulation.perturbation import Perturbation
-
-__all__ = ["PLAYER", "write"]
 
 Array = NDArray[np.float64]
 SCENE, REFERENCE, PLAYER, MESHES = "scene.xml", "reference.npz", "play.py", "meshes"
@@ -120,12 +118,8 @@ def _step(export: Export) -> float:
 
 def _draw_robot(mujoco: Any, spec: Any, bodies: list[Any], export: Export, meshes: Path) -> None:
     """Add the robot's visual shapes, one mesh for each joint and colour, without contacts and mass."""
-    groups: dict[tuple[int, tuple[float, float, float]], list[Solid]] = {}
-    for visual in visuals_of(export.robot):
-        groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)
     meshes.mkdir()
-    for k, ((joint, colour), solids) in enumerate(groups.items()):
-        solid = joined(solids)
+    for k, ((joint, colour), solid) in enumerate(joined_visuals(export.robot).items()):
         if len(solid.triangles) > MAX_TRIANGLES:
             solid = simplified(solid, CELL)
         name = f"{k:02d}"

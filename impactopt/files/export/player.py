@@ -8,8 +8,6 @@ from impactopt.contact.laws import ContactLaw, HertzDamped, HuntCrossley, Kelvin
 from impactopt.contact.targets import Board, Nail
 from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["LAWS", "player"]
-
 # contact force [N] at a penetration x [m] and its rate [m/s]; negative values are replaced by zero
 LAWS: Mapping[type[ContactLaw], str] = {
     SpringDamper: "stiffness * x + damping * rate * (rate > 0)",

@@ -12,8 +12,6 @@ import numpy as np
 from impactopt.files.export.content import Export
 from impactopt.files.export.motion import Motion
 
-__all__ = ["stamp", "write"]
-
 
 def write(export: Export, directory: Path) -> None:
     """`motion.yaml`, and `missed.yaml` of a plan with an abort motion."""

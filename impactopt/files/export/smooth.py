@@ -13,8 +13,6 @@ from impactopt.errors import InputError, check_number
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription.plan import Trajectory, complete_reference
 
-__all__ = ["Smoothness", "smoothed"]
-
 Array = NDArray[np.float64]
 MIN_STEP, MAX_STEPS = 2e-3, 3000  # [s] of constant jerk, and their number
 EXTRA_TIME = 0.1  # [s] that the smoothed motion is longer
@@ -162,9 +160,5 @@ def _at(time: Array, nodes: Array, q: Array, v: Array, a: Array) -> Array:
     k = np.clip(np.searchsorted(nodes, time, side="right") - 1, 0, len(nodes) - 2)
     t, jerk = time - nodes[k], np.diff(a)[k] / (nodes[1] - nodes[0])
     return np.array(
-        [
-            q[k] + t * (v[k] + t * (a[k] / 2 + t * jerk / 6)),
-            v[k] + t * (a[k] + t * jerk / 2),
-            a[k] + t * jerk,
-        ]
+        [q[k] + t * (v[k] + t * (a[k] / 2 + t * jerk / 6)), v[k] + t * (a[k] + t * jerk / 2), a[k] + t * jerk]
     )

@@ -6,7 +6,7 @@ collisions, records or cases.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,17 @@ from matplotlib.figure import FigureBase
 from impactopt.errors import InputError, check_choice
 from impactopt.files.output import Record, record_of, write_file
 from impactopt.planning.solution import Solution
-from impactopt.report.pictures.ellipsoid import draw_ellipsoid, ellipsoid
+from impactopt.report.pictures.ellipsoid import ellipsoid
 from impactopt.report.pictures.force import draw_force, force
 from impactopt.report.pictures.hierarchy import hierarchy
-from impactopt.report.pictures.iterations import draw_iterations, iterations
-from impactopt.report.pictures.motion import draw_motion, motion
-from impactopt.report.pictures.overview import draw_overview, overview
-from impactopt.report.pictures.replay import draw_replay
+from impactopt.report.pictures.iterations import iterations
+from impactopt.report.pictures.motion import motion
+from impactopt.report.pictures.overview import overview
 from impactopt.report.pictures.replay import replay as _replay
-from impactopt.report.pictures.strobe import draw_strobe, strobe
-from impactopt.report.pictures.style import Picture, styled
-from impactopt.report.pictures.torque import draw_torque_and_gears, torque
-from impactopt.report.pictures.zmp import draw_zmp, zero_moment_point
+from impactopt.report.pictures.strobe import strobe
+from impactopt.report.pictures.style import Picture, RecordPicture, styled
+from impactopt.report.pictures.torque import torque
+from impactopt.report.pictures.zmp import zero_moment_point
 
 __all__ = [
     "PICTURES",
@@ -45,8 +44,8 @@ __all__ = [
     "zero_moment_point",
 ]
 
-# functions that draw a picture, by its file name without .png; they return None if there is nothing to draw
-PICTURES: Mapping[str, Callable[[Record], Picture | None]] = {
+# by file name without .png
+PICTURES: Mapping[str, RecordPicture] = {
     "force": force,
     "zmp": zero_moment_point,
     "torque": torque,
@@ -55,24 +54,6 @@ PICTURES: Mapping[str, Callable[[Record], Picture | None]] = {
     "ellipsoid": ellipsoid,
     "iterations": iterations,
     "replay": _replay,
-}
-# functions that draw the same into a figure or a part of one
-DRAWN: Mapping[str, Callable[[Any, Record], None]] = {
-    "overview": draw_overview,
-    "force": draw_force,
-    "zmp": draw_zmp,
-    "torque": draw_torque_and_gears,
-    "strobe": draw_strobe,
-    "motion": draw_motion,
-    "ellipsoid": draw_ellipsoid,
-    "iterations": draw_iterations,
-    "replay": draw_replay,
-}
-# reasons why a picture may be None
-_WHY = {
-    "zmp": "the robot stands on no soles",
-    "iterations": "the solver kept no history",
-    "replay": "it needs replay=solution.validate(engine='mujoco') of a robot on soles",
 }
 
 
@@ -102,24 +83,24 @@ def plot(
     record = record_of(solution, simulation=simulation, replay=replay)
     if not record.completed:
         raise InputError(f"there is no motion to draw: {record.summary['note']}")
-    picture = draws[what](record)
-    if picture is None:
-        raise InputError(f"of this solution there is nothing to draw as {what!r}: {_WHY[what]}")
-    return picture if ax is None else _drawn_in(ax, what, record)
+    drawn = draws[what](record)
+    if drawn is None:
+        raise InputError(f"of this solution there is nothing to draw as {what!r}: {draws[what].lacking}")
+    return drawn if ax is None else _drawn_in(ax, draws[what], record)
 
 
 @styled
-def _drawn_in(ax: Axes, what: str, record: Record) -> Axes | list[Axes]:
+def _drawn_in(ax: Axes, picture: RecordPicture, record: Record) -> Axes | list[Axes]:
     """Draws a picture in the place of axes; returns its axes."""
-    if what == "force":
+    if picture is force:
         draw_force(ax, record)
         return ax
     grid, figure = ax.get_subplotspec(), ax.figure
     if grid is None:
-        raise InputError(f"ax is no part of a grid, which {what!r} needs: make it with plt.subplots()")
+        raise InputError("ax is no part of a grid, which this picture needs: make it with plt.subplots()")
     ax.remove()
     part = figure.add_subfigure(grid)
-    DRAWN[what](part, record)
+    picture.draw(part, record)
     panels = _panels(part)
     return panels[0] if len(panels) == 1 else panels
 

@@ -27,8 +27,6 @@ from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
 from impactopt.simulation import scene_of
 from impactopt.simulation.result import centre_of_pressure
 
-__all__ = ["save_animation", "shown_times"]
-
 FPS, SLOW = 20, 10  # frames a second; factor by which time is slower around contact
 AROUND = 0.05  # [s] before and after contact that are slow too
 AFTER = 0.6  # [s] shown beyond the end of the reference's motion

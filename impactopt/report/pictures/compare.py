@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from impactopt.errors import InputError
 from impactopt.files.output import Record
 from impactopt.report.comparison import histories_of
-from impactopt.report.pictures.style import PAGE, Picture, styled
-
-__all__ = ["comparison_picture"]
+from impactopt.report.pictures.style import PAGE, Picture, impulse_text, styled
 
 AROUND = 0.25  # time shown before and after contact, over its duration
 # name of each history, its label, its limit, and whether it is shown near contact only
@@ -39,7 +37,11 @@ def comparison_picture(records: Mapping[str, Record]) -> Picture:
         for k, (name, histories) in enumerate(known.items()):
             if which in histories:
                 time, values = histories[which]
-                style = {"color": f"C{k}", "linewidth": 1.3, "label": f"{name}: {_impulse(records[name])}"}
+                style = {
+                    "color": f"C{k}",
+                    "linewidth": 1.3,
+                    "label": f"{name}: {impulse_text(records[name].summary)}",
+                }
                 ax.plot(1e3 * time if near else time, values, **style)
         if limit is not None:
             ax.axhline(limit, color="#666666", linewidth=0.8, linestyle="--")
@@ -54,8 +56,3 @@ def comparison_picture(records: Mapping[str, Record]) -> Picture:
         handles, labels, title="planned impulse", loc="outside lower center", ncols=min(3, len(labels))
     )
     return figure
-
-
-def _impulse(record: Record) -> str:
-    value = record.summary.get("impulse_Ns")
-    return "unknown" if value is None else f"{value:.2f} N s"

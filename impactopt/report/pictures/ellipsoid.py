@@ -9,18 +9,7 @@ from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from impactopt.files.output import Record
-from impactopt.report.pictures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    PAGE,
-    RIGHT,
-    VERMILION,
-    Array,
-    Picture,
-    styled,
-    title,
-)
+from impactopt.report.pictures.style import BLACK, BLUE, GREEN, RIGHT, VERMILION, Array, picture, title
 
 # of each view: axes across and up, their labels, and its name
 VIEWS = (
@@ -33,21 +22,14 @@ ANGLES = 181
 GREY = "#bbbbbb"
 
 
-@styled
-def ellipsoid(record: Record) -> Picture:
+@picture(height=2.8)
+def ellipsoid(figure: FigureBase, record: Record) -> None:
     """Robot at contact with its fist's effective mass, from two sides, and as a plot over the direction.
 
     The curve's distance from the fist is the effective mass along that direction, 1 / (n' J P J' n), with
     soles fixed and joints free. (An ellipsoid proper has its square root for a radius; a mass is easier to
     read.) The curve is open where the mass exceeds the scale, as across an arm that moves in a plane.
     """
-    figure = Picture(PAGE, 2.8)
-    draw_ellipsoid(figure, record)
-    return figure
-
-
-def draw_ellipsoid(figure: FigureBase, record: Record) -> None:
-    """Draws the picture into a figure, or a part of one."""
     a = record.arrays
     inverse, normal = a["pose_inverse_mass"], a["pose_normal"]
     mass = float(effective_masses(inverse, normal[None])[0])

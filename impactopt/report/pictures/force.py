@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,23 +9,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from impactopt.files.output import Record
-from impactopt.report.pictures.style import COLUMN, PLANNED, SIMULATED, Picture, styled, title
+from impactopt.report.pictures.style import COLUMN, PLANNED, SIMULATED, impulse_text, picture, title
 
 
-@styled
-def force(record: Record) -> Picture:
+@picture(width=COLUMN, height=2.6)
+def force(figure: FigureBase, record: Record) -> None:
     """Contact force over the time since contact."""
-    figure = Picture(COLUMN, 2.6)
     draw_force(figure, record)
-    figure.axes[0].set_title(title(record, "contact force"))
-    return figure
+    whole: Any = figure  # of which matplotlib has wrong types
+    whole.axes[0].set_title(title(record, "contact force"))
 
 
 def draw_force(place: FigureBase | Axes, record: Record) -> None:
     """Draws the picture into a figure, a part of one, or axes."""
     a, summary = record.arrays, record.summary
     axes: Any = place if isinstance(place, Axes) else place.subplots()
-    label = f"planned: {_impulse(summary)}"
+    label = f"planned: {impulse_text(summary)}"
     style: Any = {"color": PLANNED, "markersize": 4, "label": label, "zorder": 3}
     axes.plot(1e3 * a["collision_time"], a["collision_force"], "o", **style)
     end = 1e3 * float(a["collision_time"][-1])
@@ -36,7 +34,7 @@ def draw_force(place: FigureBase | Axes, record: Record) -> None:
     if record.simulated and np.isfinite(a["simulated_contact_start"]):
         time = 1e3 * (a["simulated_time"] - a["simulated_contact_start"])
         keep = (time >= 0) & (time < 1.08 * end)
-        label = f"simulated: {_impulse(summary.get('simulated', {}))}"
+        label = f"simulated: {impulse_text(summary.get('simulated', {}))}"
         # before contact there is no force, however coarsely the simulation was recorded
         shown = np.concatenate([[-0.05 * end, 0.0], time[keep]])
         value = np.concatenate([[0.0, 0.0], a["simulated_force"][keep]])
@@ -48,8 +46,3 @@ def draw_force(place: FigureBase | Axes, record: Record) -> None:
         return
     # below the axes: no corner is free of curves for every contact
     place.legend(title="impulse", loc="outside lower center", ncols=2)
-
-
-def _impulse(summary: Mapping[str, Any]) -> str:
-    value = summary.get("impulse_Ns")
-    return "unknown" if value is None else f"{value:.2f} N s"

@@ -6,27 +6,20 @@ import numpy as np
 from matplotlib.figure import FigureBase
 
 from impactopt.files.output import Record
-from impactopt.report.pictures.style import BLUE, COLUMN, GREEN, VERMILION, Array, Picture, styled, title
+from impactopt.report.pictures.style import BLUE, COLUMN, GREEN, VERMILION, Array, picture
 
 MIN_VALUE = 1e-12  # smaller values are drawn there
 
 
-@styled
-def iterations(record: Record) -> Picture | None:
-    """Objective (the impulse, minus small penalties) above, violation and stationarity below.
-
-    None without a history.
-    """
-    if "history_iteration" not in record.arrays:
-        return None
-    figure = Picture(COLUMN, 3.6)
-    draw_iterations(figure, record)
-    figure.suptitle(title(record, "the solver's iterations"))
-    return figure
-
-
-def draw_iterations(figure: FigureBase, record: Record) -> None:
-    """Draws the picture into a figure, or a part of one."""
+@picture(
+    width=COLUMN,
+    height=3.6,
+    title="the solver's iterations",
+    exists=lambda record: "history_iteration" in record.arrays,
+    lacking="the solver kept no history",
+)
+def iterations(figure: FigureBase, record: Record) -> None:
+    """Objective (the impulse, minus small penalties) above, violation and stationarity below."""
     a = record.arrays
     count = a["history_iteration"]
     top, bottom = figure.subplots(2, 1, sharex=True)

@@ -12,29 +12,20 @@ from impactopt.report.pictures.style import (
     BLUE,
     GREEN,
     ORANGE,
-    PAGE,
     PURPLE,
     SKY,
     VERMILION,
-    Picture,
     joint_label,
-    styled,
+    picture,
     title,
 )
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 
 
-@styled
-def motion(record: Record) -> Picture:
+@picture(height=4.6)
+def motion(figure: FigureBase, record: Record) -> None:
     """Angles and velocities of the joints that move most."""
-    figure = Picture(PAGE, 4.6)
-    draw_motion(figure, record)
-    return figure
-
-
-def draw_motion(figure: FigureBase, record: Record) -> None:
-    """Draws the picture into a figure, or a part of one."""
     a = record.arrays
     names, time, angle = a["joints"], a["reference_time"], a["reference_angle"]
     until = float(a["reference_end"])

@@ -10,40 +10,31 @@ from matplotlib.lines import Line2D
 
 from impactopt.files.output import Record
 from impactopt.kinematics.support import zmp
-from impactopt.report.histories import footprints
 from impactopt.report.pictures.style import (
     BLACK,
     BLUE,
     GREEN,
     ORANGE,
-    PAGE,
     PHASES,
-    RIGHT,
     VERMILION,
     Array,
-    Picture,
-    styled,
-    title,
+    picture,
 )
+from impactopt.report.pictures.zmp import draw_soles
 from impactopt.robots.loads import MIN_LOAD_FRACTION
 
 SOLE_COLOURS = (BLUE, VERMILION)
 PHASE_COLOURS = (ORANGE, BLACK, GREEN)
 
 
-@styled
-def replay(record: Record) -> Picture | None:
-    """Centres of pressure on the soles, normal forces, slip and lift; None without a replay on soles."""
-    a = record.arrays
-    if not record.replayed or not len(a["replayed_soles"]):
-        return None
-    figure = Picture(PAGE, 4.2)
-    draw_replay(figure, record)
-    return figure
-
-
-def draw_replay(figure: FigureBase, record: Record) -> None:
-    """Draws the picture into a figure, or a part of one."""
+@picture(
+    height=4.2,
+    title=lambda record: f"soles in the replay ({_stands(record)})",
+    exists=lambda record: record.replayed and len(record.arrays["replayed_soles"]) > 0,
+    lacking="it needs replay=solution.validate(engine='mujoco') of a robot on soles",
+)
+def replay(figure: FigureBase, record: Record) -> None:
+    """Centres of pressure on the soles, normal forces, slip and lift."""
     a = record.arrays
     places: Any = figure.subplot_mosaic([["cop", "force"], ["cop", "move"]], width_ratios=[2, 3])
     _centres(figure, places["cop"], record)
@@ -65,7 +56,6 @@ def draw_replay(figure: FigureBase, record: Record) -> None:
     places["force"].tick_params(labelbottom=False)
     places["force"].set(ylabel="normal force [N]", title="force on each sole; grey: contact")
     places["move"].set(xlabel="time [s]", ylabel="slip, lift [mm]", title="the corner that moved most")
-    figure.suptitle(title(record, f"soles in the replay ({_stands(record)})"))
 
 
 def _stands(record: Record) -> str:
@@ -80,17 +70,7 @@ def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
     a = record.arrays
     time, start, end = a["replayed_time"], a["replayed_contact_start"], a["replayed_contact_end"]
     phase = (time >= start).astype(int) + (time >= end).astype(int)  # nan compares false
-    for name, corners in footprints(record).items():
-        axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
-        axes.annotate(
-            name.removeprefix("sole_").partition(",")[0].replace("_", " "),
-            (-corners[:, 1].mean(), corners[:, 0].max()),
-            (0, 2),
-            textcoords="offset points",
-            color="#666666",
-            ha="center",
-            fontsize=6.5,
-        )
+    draw_soles(axes, record, toes=True)
     normal = a["replayed_sole_ground"][:, :, 2]
     for k in range(normal.shape[1]):
         # the median is the weight, because most of the motion is slow
@@ -99,13 +79,7 @@ def _centres(figure: FigureBase, axes: Any, record: Record) -> None:
             keep = loaded & (phase == which)
             points: Array = zmp(a["replayed_sole_ground"][keep, k])
             axes.plot(-points[:, 1], points[:, 0], ".", color=colour, markersize=2.5, zorder=3 + (which == 1))
-    axes.set_aspect("equal")
-    axes.set(
-        xlabel=RIGHT,
-        ylabel="x, forward [m]",
-        title="centre of pressure\n",
-    )
-    axes.grid(False)
+    axes.set(ylabel="x, forward [m]", title="centre of pressure\n")
     key = [
         Line2D([], [], linestyle="", marker="o", color=colour, label=name)
         for name, colour in zip(PHASES, PHASE_COLOURS, strict=True)

@@ -15,8 +15,6 @@ from impactopt.report.pictures.style import BLUE, ORANGE, VERMILION, Array, Pict
 from impactopt.report.stage import bodies_drawn
 from impactopt.report.tracks import Track, tracks_of
 
-__all__ = ["sheet"]
-
 CELL = 0.015  # [m] of the simplified meshes: a limb is 40 pixels wide
 WIDTH = 11.0  # [in]
 MAX_TRAVEL = 0.6  # [m] beyond which a target is not shown

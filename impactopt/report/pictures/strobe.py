@@ -11,20 +11,11 @@ from matplotlib.patches import Patch
 from scipy.spatial import ConvexHull
 
 from impactopt.files.output import Record
-from impactopt.report.pictures.style import BLACK, BLUE, PAGE, VERMILION, Array, Picture, styled, title
+from impactopt.report.pictures.style import BLACK, BLUE, PAGE, VERMILION, Array, picture
 
 GAP = 0.12  # [m] between poses
 GREY = "#999999"
 WORLD = {"target": ("#dddddd", "target when contact begins"), "obstacles": ("#f2f2f2", "obstacle")}
-
-
-@styled
-def strobe(record: Record) -> Picture:
-    """Robot as sticks at a few instants, and path of its striking point."""
-    figure = Picture(PAGE, strobe_height(record) + 0.2)
-    draw_strobe(figure, record)
-    figure.suptitle(title(record, f"seen from {_view(record)[1]}"))
-    return figure
 
 
 def strobe_height(record: Record) -> float:
@@ -34,8 +25,11 @@ def strobe_height(record: Record) -> float:
     return min(float((high - low) * scale) + 0.75, PAGE)
 
 
-def draw_strobe(figure: FigureBase, record: Record) -> None:
-    """Draws the picture into a figure, or a part of one."""
+@picture(
+    height=lambda record: strobe_height(record) + 0.2, title=lambda record: f"seen from {_view(record)[1]}"
+)
+def strobe(figure: FigureBase, record: Record) -> None:
+    """Robot as sticks at a few instants, and path of its striking point."""
     a = record.arrays
     view, _ = _view(record)
     low, high, width = _extent(record)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import wraps
 from typing import IO, Any, ParamSpec, TypeVar
 
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.rcsetup import cycler
 from numpy.typing import NDArray
 
@@ -111,6 +112,45 @@ def styled(draw: Callable[Given, Drawn]) -> Callable[Given, Drawn]:
             return draw(*args, **options)
 
     return in_style
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordPicture:
+    """Picture of a record; used as a decorator of the function that draws it.
+
+    draw : draws it into a figure, or a part of one.  width, height [in] : as a figure of its own.
+    title : of the same, after the problem's name.
+    exists : False for records of which there is nothing to draw.  lacking : what they lack.
+    """
+
+    draw: Callable[[FigureBase, Record], None]
+    width: float = PAGE
+    height: float | Callable[[Record], float]
+    title: str | Callable[[Record], str] = ""
+    exists: Callable[[Record], bool] = lambda record: True
+    lacking: str = ""
+
+    def __call__(self, record: Record) -> Picture | None:
+        """The picture as a figure of its own; None if there is nothing to draw."""
+        if not self.exists(record):
+            return None
+        with matplotlib.rc_context(STYLE):
+            figure = Picture(self.width, self.height(record) if callable(self.height) else self.height)
+            self.draw(figure, record)
+            if self.title:
+                figure.suptitle(title(record, self.title(record) if callable(self.title) else self.title))
+        return figure
+
+
+def picture(**settings: Any) -> Callable[[Callable[[FigureBase, Record], None]], RecordPicture]:
+    """Decorator of a function that draws a picture; settings : of a `RecordPicture`."""
+    return lambda draw: RecordPicture(draw=draw, **settings)
+
+
+def impulse_text(summary: Mapping[str, Any]) -> str:
+    """Impulse with its unit."""
+    value = summary.get("impulse_Ns")
+    return "unknown" if value is None else f"{value:.2f} N s"
 
 
 def title(record: Record, what: str) -> str:

@@ -40,8 +40,6 @@ from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.sections import Figure as Section
 from impactopt.sweeps.table import read_columns
 
-__all__ = ["drawn_table", "save_sweep_picture", "sweep_picture"]
-
 Array = NDArray[np.float64]
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)

@@ -14,8 +14,6 @@ from impactopt.report.pictures.style import joint_label
 from impactopt.sweeps.sections import Figure as Section
 from impactopt.sweeps.table import unit_of, without_unit
 
-__all__ = ["Columns", "SweepColumns", "combined", "errors_against", "name_of_error"]
-
 Array = NDArray[np.float64]
 Columns = Mapping[str, Sequence[Any] | NDArray[Any]]
 

@@ -13,33 +13,28 @@ from impactopt.report.pictures.style import (
     BLUE,
     GREEN,
     OVER,
-    PAGE,
     PHASES,
     VERMILION,
     Array,
-    Picture,
     joint_label,
+    picture,
     simulated_phases,
-    styled,
-    title,
 )
 
 JOINT_HEIGHT = 0.13  # [in]
 GEARS_HEIGHT = 2.0  # [in] of the panel of gears
 
 
-@styled
-def torque(record: Record) -> Picture:
+def _title(record: Record) -> str:
+    return f"torque over limit ({'simulated, before saturation' if record.simulated else 'planned'})"
+
+
+@picture(
+    height=lambda record: torque_height(record) + 0.2 + (GEARS_HEIGHT if _gears(record) else 0.0),
+    title=_title,
+)
+def torque(figure: FigureBase, record: Record) -> None:
     """Torque demand over limit, joints by time; contact has a panel of its own, at a larger scale."""
-    figure = Picture(PAGE, torque_height(record) + 0.2 + (GEARS_HEIGHT if _gears(record) else 0.0))
-    kind = "simulated, before saturation" if record.simulated else "planned"
-    figure.suptitle(title(record, f"torque over limit ({kind})"))
-    draw_torque_and_gears(figure, record)
-    return figure
-
-
-def draw_torque_and_gears(figure: FigureBase, record: Record) -> None:
-    """Draws the picture into a figure, or a part of one."""
     gears = _gears(record)
     if not gears:
         draw_torque(figure, record)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
@@ -17,29 +17,18 @@ from numpy.typing import NDArray
 from impactopt.files.output import Record
 from impactopt.kinematics.support import zmp
 from impactopt.report.histories import footprints
-from impactopt.report.pictures.style import (
-    BLACK,
-    OVER,
-    PAGE,
-    PHASES,
-    RIGHT,
-    Array,
-    Picture,
-    simulated_phases,
-    styled,
-    title,
+from impactopt.report.pictures.style import BLACK, OVER, PHASES, RIGHT, Array, picture, simulated_phases
+
+
+@picture(
+    height=3.1,
+    title="zero-moment point, from above",
+    exists=lambda record: len(record.arrays["polygon"]) > 0,
+    lacking="the robot stands on no soles",
 )
-
-
-@styled
-def zero_moment_point(record: Record) -> Picture | None:
-    """Path of the ZMP in the support polygon, seen from above; None without soles."""
-    if not len(record.arrays["polygon"]):
-        return None
-    figure = Picture(PAGE, 3.1)
+def zero_moment_point(figure: FigureBase, record: Record) -> None:
+    """Path of the ZMP in the support polygon, seen from above."""
     draw_zmp(figure, record)
-    figure.suptitle(title(record, "zero-moment point, from above"))
-    return figure
 
 
 def draw_zmp(figure: FigureBase, record: Record, phases: Sequence[int] = (0, 1, 2)) -> None:
@@ -48,7 +37,9 @@ def draw_zmp(figure: FigureBase, record: Record, phases: Sequence[int] = (0, 1, 
     paths = _zmp_paths(record)
     panels: Any = figure.subplots(1, len(phases), sharex=True, sharey=True, squeeze=False)[0]
     for axes, k in zip(panels, phases, strict=True):
-        _ground(axes, footprints(record), a["polygon"])
+        draw_soles(axes, record)
+        closed = np.vstack([a["polygon"], a["polygon"][:1]])
+        axes.plot(-closed[:, 1], closed[:, 0], "--", color=BLACK, linewidth=1.0)
         norm = None
         for kind in ("simulated", "planned"):
             if (kind, k) not in paths:
@@ -120,23 +111,20 @@ def _stations(time: Array, count: int) -> NDArray[np.intp]:
     return np.searchsorted(time, np.linspace(time[0], time[-1], count)).clip(0, len(time) - 1)
 
 
-def _ground(axes: Any, soles: Mapping[str, Array], polygon: Array) -> None:
-    """Draws soles and support polygon from above; forward is up."""
-    for name, corners in soles.items():
+def draw_soles(axes: Any, record: Record, *, toes: bool = False) -> None:
+    """Draws soles from above, forward up; their names are at their heels, or above their toes."""
+    for name, corners in footprints(record).items():
         axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
-        middle = corners.mean(axis=0)
         axes.annotate(
-            name.removeprefix("sole_").partition(",")[0],
-            (-middle[1], corners[:, 0].min()),
-            (0, 3),
+            name.removeprefix("sole_").partition(",")[0].replace("_", " "),
+            (-corners[:, 1].mean(), corners[:, 0].max() if toes else corners[:, 0].min()),
+            (0, 2 if toes else 3),
             textcoords="offset points",
             ha="center",
-            va="bottom",
+            va="baseline" if toes else "bottom",
             color="#666666",
             fontsize=6.5,
         )
-    closed = np.vstack([polygon, polygon[:1]])
-    axes.plot(-closed[:, 1], closed[:, 0], "--", color=BLACK, linewidth=1.0)
     axes.set_aspect("equal")
     axes.set_xlabel(RIGHT)
     axes.grid(False)

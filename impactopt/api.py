@@ -22,8 +22,6 @@ from impactopt.planning import solve as planning
 from impactopt.planning.replanning import Sensitivity, sensitivity_of
 from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["Solution", "drive_nail", "moved_solution", "optimize_strike", "solve"]
-
 R = TypeVar("R")
 GROUND = ("fx", "fy", "fz", "mx", "my", "mz")  # components of the ground's wrench
 

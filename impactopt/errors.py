@@ -14,23 +14,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "FARTHEST",
-    "MANY",
-    "MOST",
-    "CacheWarning",
-    "InputError",
-    "Mistakes",
-    "NoCompilerWarning",
-    "NotSolvedWarning",
-    "check_array",
-    "check_choice",
-    "check_positive",
-    "did_you_mean",
-    "missing_package",
-    "printable",
-]
-
 FARTHEST = 1e3  # [m] from the origin of a frame or the world; micrometres are still resolved there
 # largest magnitude of other inputs, in SI units: products of a few of them are still finite
 MOST = 1e15

@@ -19,8 +19,6 @@ from impactopt.errors import InputError
 from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 
-__all__ = ["SLACK", "Bodies", "Places", "Survey", "Touch"]
-
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 MISSED = 3  # phase without a target

@@ -19,22 +19,6 @@ from impactopt.bodies.solids import Solid, cached_arrays, cylinder, rounded_box
 from impactopt.robots.robot import Robot, Tool
 from impactopt.robots.tools import without
 
-__all__ = [
-    "ROD",
-    "Piece",
-    "bare_joints",
-    "convex",
-    "distance_to_link",
-    "file_pieces",
-    "inertia_box",
-    "is_far",
-    "is_too_large",
-    "pieces_of",
-    "seen_pieces",
-    "size_of",
-    "tool_solids",
-]
-
 Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
 _SHORTEST_SIDE = 0.02  # [m] of a box of inertia

@@ -18,8 +18,6 @@ from impactopt.bodies.solids import Solid, box, capsule, cylinder, find_mesh, la
 from impactopt.errors import FARTHEST
 from impactopt.robots.mjcf import compile_mjcf
 
-__all__ = ["Geom", "LinkShape", "geoms_of", "lost_meshes", "numbers", "shapes_of", "urdf_elements"]
-
 Array = NDArray[np.float64]
 
 

@@ -18,17 +18,6 @@ from impactopt.bodies.convex_hulls import Piece, file_pieces, pieces_of
 from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "Pair",
-    "RobotBodies",
-    "StrikerFace",
-    "bodies_of",
-    "bounding_ball",
-    "distance",
-    "striker_face",
-    "transform",
-]
-
 Array = NDArray[np.float64]
 Pair = tuple[int, int]
 

@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ROUNDING", "look", "may_meet", "write"]
-
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 ROUNDING = 1e-3  # [m] e of the smoothed support functions, see separation.py

@@ -19,21 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.files import kept
 
-__all__ = [
-    "Solid",
-    "box",
-    "cached_arrays",
-    "capsule",
-    "cylinder",
-    "find_mesh",
-    "joined",
-    "lack_of",
-    "read_mesh",
-    "rounded_box",
-    "simplified",
-    "sphere",
-]
-
 Array = NDArray[np.float64]
 SELF_CONTAINED = (
     ".dae",

@@ -19,8 +19,6 @@ from impactopt.bodies.world import WorldBody
 from impactopt.robots.attachments import Tool
 from impactopt.robots.robot import Robot, Striker
 
-__all__ = ["Hinge", "Part", "Visual", "joined_visuals", "surroundings_of", "visuals_of"]
-
 Array = NDArray[np.float64]
 GREY = (0.72, 0.74, 0.77)  # default colour
 JOINT, BONE = (0.35, 0.37, 0.40), (0.55, 0.57, 0.60)

@@ -18,21 +18,6 @@ from impactopt.contact.fields import Described, about
 from impactopt.contact.targets import Board, Nail, RigidWall, Target
 from impactopt.errors import FARTHEST, InputError, check_array, check_choice, check_name
 
-__all__ = [
-    "BEHIND",
-    "Ground",
-    "Obstacle",
-    "TargetBody",
-    "Vector",
-    "WorldBody",
-    "body_message",
-    "face_axes",
-    "ground_body",
-    "obstacle_bodies",
-    "target_bodies",
-    "vector",
-]
-
 Vector = tuple[float, float, float]
 
 

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BatchedFunction", "pattern"]
-
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 # For functions of one instance a call. Functions in SIMD lanes are done before a thread has started.

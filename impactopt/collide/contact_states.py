@@ -31,8 +31,6 @@ from impactopt.kinematics.support import support_polygon
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 
-__all__ = ["ContactStates", "Posture", "States", "striking_functions"]
-
 # [m/s], [rad/s] In the place of velocity limits of the base, which has none. It is so large that base
 # velocities cost next to nothing: they follow from the constraints of the legs.
 _BASE_VELOCITY_SCALE = 100.0

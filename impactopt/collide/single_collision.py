@@ -28,21 +28,6 @@ from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import margin, zmp
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "MEASURES",
-    "NOT_ENDED",
-    "AtContact",
-    "CollisionResults",
-    "Measure",
-    "check_at_contact",
-    "chosen",
-    "collide_once",
-    "collision_model",
-    "full_names",
-    "planned_numbers",
-    "problem_of_result",
-]
-
 NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
 _FULL_DYNAMICS_STEP = 1e-4  # [s] between instants of its histories
 _IMPULSE_TOLERANCE = 1e-4  # relative, of the full dynamics

@@ -35,8 +35,6 @@ from impactopt.collision.settings import NO_LIMIT
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array, raw_array
 
-__all__ = ["Batch"]
-
 Array = NDArray[np.float64]
 _ALIGNED = 8  # doubles that a work array is longer, as the C code aligns it
 _CHECKED_TOGETHER = 256  # cases whose step lengths are checked in one call

@@ -24,24 +24,6 @@ from impactopt.collision.stepped import SteppedModel
 from impactopt.contact import Board
 from impactopt.errors import InputError
 
-__all__ = [
-    "ACCURACY",
-    "FREEZE_ERROR",
-    "LEAST_PIVOT",
-    "Stability",
-    "breaks",
-    "caution",
-    "check_finite",
-    "check_frozen",
-    "check_steps",
-    "freeze_error",
-    "ill_conditioned_cases",
-    "left_out_by_breaking",
-    "more_often",
-    "too_large",
-    "without_contact",
-]
-
 Array = NDArray[np.float64]
 
 # name of the output of a batch

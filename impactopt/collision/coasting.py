@@ -9,8 +9,6 @@ from impactopt.collision.settings import REFERENCE_ORDER, constant_reference
 from impactopt.errors import InputError, check_positive
 from impactopt.kinematics.coordinates import StanceCoordinates, independent_rates
 
-__all__ = ["coasting_reference"]
-
 Array = NDArray[np.float64]
 _NODES = 3 * REFERENCE_ORDER  # of the fit
 _MIN_TIME = 1e-3  # [s] below which legs that do not reach are an error

@@ -35,16 +35,6 @@ from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
 from impactopt.robots.rigid_body import RigidBody
 
-__all__ = [
-    "CollisionFunction",
-    "Part",
-    "differentiable",
-    "export",
-    "in_order",
-    "native_part",
-    "with_jacobian",
-]
-
 Array = NDArray[np.float64]
 Compile = Callable[[str, tuple[Any, ...], Callable[[], Any]], Any]
 

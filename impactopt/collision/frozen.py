@@ -41,8 +41,6 @@ from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 
-__all__ = ["FrozenDynamics", "effective_mass"]
-
 
 class FrozenDynamics:
     """Frozen quantities as MX expressions of q, v, the normal and `target_start`, built on first access.

@@ -20,20 +20,6 @@ from impactopt.collision.stepped import SteppedModel, number_of_steps
 from impactopt.contact import Target
 from impactopt.robots.rigid_body import RigidBody
 
-__all__ = [
-    "MOST_STEPS",
-    "Description",
-    "collision_graph",
-    "columns_of",
-    "describe",
-    "frozen_dynamics",
-    "gradient_graph",
-    "independent_joints",
-    "instructions",
-    "joint_space_model",
-    "target_start",
-]
-
 # largest number of implicit steps, which choose their own length
 MOST_STEPS = 5000
 

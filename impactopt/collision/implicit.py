@@ -43,22 +43,6 @@ from scipy.special import roots_laguerre
 from impactopt.collision.stepped import contact_functions, law_is_linear, target_is_linear
 from impactopt.contact import ContactLaw, Target
 
-__all__ = [
-    "NODES",
-    "STAGES",
-    "Contact",
-    "Law",
-    "StateMaps",
-    "Step",
-    "bernstein_matrix",
-    "first_negative",
-    "gamma",
-    "largest",
-    "node_tables",
-    "polynomials",
-    "tables",
-]
-
 Array = NDArray[np.float64]
 
 # subintervals of [0, 1] shorter than this are not subdivided further

@@ -20,8 +20,6 @@ from scipy.optimize import brentq
 from impactopt.collision.implicit import STAGES, Contact, StateMaps, Step, first_negative, largest, tables
 from impactopt.collision.model import JointSpaceModel
 
-__all__ = ["ImplicitLoop"]
-
 Array = NDArray[np.float64]
 
 _TERMS = STAGES + 1

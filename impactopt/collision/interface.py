@@ -15,8 +15,6 @@ from impactopt.errors import InputError, check_direction, check_positive
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.robot import Robot
 
-__all__ = ["Collision", "CollisionModel"]
-
 Array = NDArray[np.float64]
 
 

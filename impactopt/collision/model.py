@@ -31,17 +31,6 @@ from impactopt.collision.settings import Effects, Settings
 from impactopt.contact import ContactLaw, Target
 from impactopt.contact.friction import pushed_way
 
-__all__ = [
-    "GIVES_WAY",
-    "JointSpaceModel",
-    "Loop",
-    "Segment",
-    "SegmentedCollision",
-    "cuts",
-    "relative_to",
-    "shape_of",
-]
-
 _DIFFERENCE_STEP = 1e-9  # [s] for the target's acceleration, by a difference of velocities
 
 

@@ -10,18 +10,6 @@ import casadi as ca
 from impactopt.collision.model import JointSpaceModel, Segment
 from impactopt.errors import InputError, check_choice
 
-__all__ = [
-    "HISTORIES",
-    "OF_SERVO",
-    "OF_SOLES",
-    "OUTPUTS",
-    "SCALARS",
-    "Outputs",
-    "check_jacobian",
-    "check_outputs",
-    "frozen_for",
-]
-
 # description of each output
 OUTPUTS = {
     "impulse": "[N s] delivered to the target",

@@ -13,8 +13,6 @@ from impactopt.contact import FreeMass, RigidWall
 from impactopt.errors import InputError, check_array, check_choice, check_number
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 
-__all__ = ["RigidImpact"]
-
 Array = NDArray[np.float64]
 
 

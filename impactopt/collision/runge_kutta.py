@@ -13,8 +13,6 @@ import casadi as ca
 
 from impactopt.collision.model import JointSpaceModel
 
-__all__ = ["BLOCK", "LEFT_OUT_BY_RK4", "rate_of_change", "rk4_step", "run"]
-
 # steps in a block; a block is skipped if the contact is over before it begins
 BLOCK = 16
 

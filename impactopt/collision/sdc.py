@@ -17,8 +17,6 @@ from impactopt.errors import InputError, check_array, check_choice
 from impactopt.kinematics.stance import BothSoles, FixedBase, Stance
 from impactopt.robots.robot import Robot
 
-__all__ = ["FROZEN", "SDC", "VirtualMass", "frozen_model"]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VirtualMass(SymbolicModel):

@@ -21,16 +21,6 @@ from impactopt.errors import (
 )
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "NO_LIMIT",
-    "REFERENCE_ORDER",
-    "Effects",
-    "JointFriction",
-    "Settings",
-    "constant_reference",
-    "servo_settings",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:

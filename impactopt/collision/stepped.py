@@ -20,8 +20,6 @@ from impactopt.contact import ContactFriction, ContactLaw, Target
 from impactopt.contact.friction import check_friction
 from impactopt.errors import InputError, check_array, check_choice, check_positive
 
-__all__ = ["SteppedModel", "contact_functions", "law_is_linear", "number_of_steps", "target_is_linear"]
-
 
 def law_is_linear(law: ContactLaw) -> bool:
     """True if both branches are linear for all values of the law's parameters; a kink counts as nonlinear."""

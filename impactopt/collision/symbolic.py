@@ -31,8 +31,6 @@ from impactopt.collision.outputs import OF_SERVO, SCALARS, check_jacobian, check
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array
 
-__all__ = ["SymbolicModel"]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SymbolicModel(SteppedModel):

@@ -19,21 +19,6 @@ import numpy as np
 
 from impactopt.errors import MOST, InputError, check_number
 
-__all__ = [
-    "About",
-    "Described",
-    "Parameters",
-    "about",
-    "abouts",
-    "check_numbers",
-    "choose",
-    "numbers_of",
-    "power",
-    "snake_case",
-    "text_of",
-]
-
-
 _METADATA = "about"
 
 

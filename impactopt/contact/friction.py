@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from impactopt.contact.fields import Described, about, check_numbers
 from impactopt.errors import InputError
 
-__all__ = ["ContactFriction", "check_friction", "pushed_way"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ContactFriction(Described):

@@ -12,17 +12,6 @@ from pathlib import Path
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
 
-__all__ = [
-    "FOLDERS",
-    "SWEEPS",
-    "named_files",
-    "problem_file",
-    "problem_names",
-    "problem_summary",
-    "sweep_file",
-    "sweep_names",
-]
-
 SWEEPS = "sweeps"  # subfolder of the problems
 _PACKAGE = Path(__file__).resolve().parents[1]
 FOLDERS = (_PACKAGE / "_problems", _PACKAGE.parent / "problems")

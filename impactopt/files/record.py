@@ -20,18 +20,6 @@ from impactopt.codegen.files import read_archive, read_plain
 from impactopt.errors import InputError
 from impactopt.files.record_schema import check_arrays, check_summary
 
-__all__ = [
-    "FORMAT",
-    "LARGEST",
-    "NUMBERS",
-    "SUMMARY",
-    "Record",
-    "load_record",
-    "plain",
-    "read_json",
-    "replay_name",
-]
-
 FORMAT = 1  # of solution.npz; increased by a change that an older reader would misread
 LARGEST, MOST_ARRAYS = 1 << 29, 1000  # bytes and arrays of solution.npz; ours have some MB, and a hundred
 NUMBERS, SUMMARY = "solution.npz", "summary.json"

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from impactopt.errors import has_control
 
-__all__ = ["check_arrays", "check_summary"]
-
 # Shapes of arrays. Letters are sizes: n, nq and nv are the robot's, the same in all arrays; others are the
 # same in all arrays of one prefix. "?" at the beginning: the array may be missing, as in records of older
 # versions, or empty.

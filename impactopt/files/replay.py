@@ -31,18 +31,6 @@ from impactopt.transcription.mesh import Elements, MoreNodes
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.transcription import Transcription
 
-__all__ = [
-    "Planned",
-    "Replay",
-    "has_mujoco",
-    "load_planned",
-    "problem_of",
-    "program_of_record",
-    "replay",
-    "resumed",
-    "solution_of_record",
-]
-
 # Tolerance of the recorded violation of constraints. A program that differs from the record's, as of another
 # version, has a larger violation at its variables.
 _SAME = 1e-6

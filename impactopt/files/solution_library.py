@@ -23,8 +23,6 @@ from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status
 
-__all__ = ["Neighbour", "SolvedFolder"]
-
 MAX_DISTANCE = 2.0  # of neighbours
 # Change of a number in a list, such as [m] of a point, of distance 1; of other numbers it is a factor of 2.
 _UNIT_CHANGE = 0.1

@@ -14,16 +14,6 @@ import numpy as np
 
 from impactopt.errors import has_control
 
-__all__ = [
-    "LONGEST_TEXT",
-    "TOMLError",
-    "check_plain",
-    "plain_value",
-    "read_toml",
-    "text_with_control",
-    "write_toml",
-]
-
 _tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 TOMLError: type[ValueError] = _tomllib.TOMLDecodeError
 _BARE = re.compile(r"[A-Za-z0-9_-]+")

@@ -34,8 +34,6 @@ from impactopt.solvers.program import (
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.transcription import Transcription, statement_of
 
-__all__ = ["KKT", "VIOLATION", "Verdict", "motion_of_record", "verify", "verify_record"]
-
 Array = NDArray[np.float64]
 VIOLATION = 1e-5  # of constraints, which are of order one, and of recorded numbers
 KKT = 1e-4  # as of solvers that call a point acceptable

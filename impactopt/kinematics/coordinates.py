@@ -33,20 +33,6 @@ from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.tools import check_held
 
-__all__ = [
-    "Index",
-    "LegClosure",
-    "Limb",
-    "StanceCoordinates",
-    "base_motion",
-    "base_rates",
-    "elimination_order",
-    "independent_rates",
-    "solve_in_order",
-    "solved",
-    "striker_kinematics",
-]
-
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 # Newton's method for a leg's inverse kinematics

@@ -17,8 +17,6 @@ from impactopt.kinematics.support import inward_edges, margin
 from impactopt.robots.robot import Robot
 from impactopt.robots.tools import inside
 
-__all__ = ["Reach", "inverse_kinematics", "reach"]
-
 Array = NDArray[np.float64]
 UNBOUNDED = 50.0  # [rad, m] stands for an infinite bound
 

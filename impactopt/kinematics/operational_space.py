@@ -20,15 +20,6 @@ from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "ConstrainedDynamics",
-    "across",
-    "holding_torque",
-    "static_wrenches",
-    "striking_point",
-    "striking_velocity",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -14,8 +14,6 @@ import casadi as ca
 
 from impactopt.kinematics.coordinates import Index, StanceCoordinates, solve_in_order
 
-__all__ = ["Stage", "motion_in_stages", "velocity_in_stages"]
-
 
 @dataclass(frozen=True, eq=False)
 class Stage:

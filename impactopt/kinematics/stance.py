@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, check_array
 from impactopt.robots.robot import Robot, Sole, Striker
 
-__all__ = ["USUAL_POSTURE", "BothSoles", "FixedBase", "Free", "OneSole", "Stance", "usual_stance"]
-
 USUAL_POSTURE = "half_sitting"  # name of the start posture where none is given
 
 

@@ -18,8 +18,6 @@ from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import Elements, contact_elements, nodes_to_add
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["BetweenNodes"]
-
 # First barriers of a warm start that violates constraints of the new program: new clearance constraints; a
 # finer contact that differs from the coarse one by more than a solved plan may.
 _BARRIER_CLEARANCE, _BARRIER_CONTACT = 1e-4, 1e-3

@@ -36,17 +36,6 @@ from impactopt.solvers.relaxed import Relaxation
 from impactopt.transcription.layout import ConstraintOrigin
 from impactopt.transcription.transcription import Transcription
 
-__all__ = [
-    "FEASIBLE",
-    "TYPICAL_DURATION",
-    "Bound",
-    "Cause",
-    "bounds_of",
-    "changed_or_none",
-    "motion_phases",
-    "phase_changes",
-]
-
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Selector = Callable[[ConstraintOrigin], bool]

@@ -36,17 +36,6 @@ from impactopt.transcription.mesh import MoreNodes
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
 
-__all__ = [
-    "ClearanceViolations",
-    "Margins",
-    "Watch",
-    "clearance_violations",
-    "deepest_penetration",
-    "node_placements",
-    "same_bodies",
-    "solve_with_clearance",
-]
-
 Array = NDArray[np.float64]
 Constraints = dict[ClearanceKey, SeparatingDirection]
 IN_CONTACT, AFTER_CONTACT = 1, 2  # phases, as of `Places.phase`

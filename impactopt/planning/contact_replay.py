@@ -29,17 +29,6 @@ from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.contact_program import ContactProgram
 from impactopt.transcription.plan import Plan, PlannedStrike, Trajectory
 
-__all__ = [
-    "SOLVED_WITHIN",
-    "ContactReplay",
-    "ModelError",
-    "PlannedContact",
-    "checked",
-    "collision_error",
-    "model_error",
-    "planned_contact",
-]
-
 Array = NDArray[np.float64]
 # [%] Largest differences between planned and replayed impulse of a solved, and of an acceptable plan.
 SOLVED_WITHIN, ACCEPTABLE_WITHIN = 1.0, 5.0

@@ -19,15 +19,6 @@ from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.contact_program import ContactProgram
 
-__all__ = [
-    "ChosenGains",
-    "chosen_gains",
-    "with_chosen",
-    "with_factors_of",
-    "with_gains_fixed",
-    "with_room_for_gains",
-]
-
 Array = NDArray[np.float64]
 _BARRIER = 1e-7  # first one of the program with fixed gains, whose initial guess is a solution
 _AT_BOUND = 1e-3  # largest distance of a factor's logarithm from its bound's that counts as at it

@@ -26,20 +26,6 @@ from impactopt.transcription.mesh import GEAR
 from impactopt.transcription.plan import Plan, PlannedCollision, PlannedStrike, plan_loads, strike_loads
 from impactopt.transcription.transcription import Transcription
 
-__all__ = [
-    "FAR",
-    "LazyTerms",
-    "gear_caution",
-    "gears_beyond",
-    "lazy_terms_of",
-    "reference_beyond",
-    "slide",
-    "slide_caution",
-    "slides_beyond",
-    "window_caution",
-    "with_lazy_constraints",
-]
-
 # Tolerances beyond a limit. In replays of a plan that keeps its gear limits, loads stay within the first one
 # (of the limit). The others are what a plan with constraints exceeds between its nodes.
 REPLAY_GEAR_TOLERANCE = 0.1

@@ -12,8 +12,6 @@ from impactopt.problem.motion_style import MotionPrices
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["MotionPrice", "unpriced", "with_first_scale"]
-
 # [N s] Objective of the initial guess of the problem `punch`, for which the prices were chosen.
 _REFERENCE_OBJECTIVE = 4.0
 _MIN_SCALE = 0.02  # of the prices, if the objective of the initial guess is nearly zero

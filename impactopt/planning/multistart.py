@@ -25,8 +25,6 @@ from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.solvers.program import Status
 from impactopt.transcription.transcription import block_functions
 
-__all__ = ["best_of", "best_of_starts", "check_starts", "drawn_guesses"]
-
 AnySolution = TypeVar("AnySolution", bound=Solved)
 # problem, start, budget, numbers of the starts, and the number that further starts end before -> best
 # solution

@@ -13,8 +13,6 @@ from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["Blow", "Series", "drive_nail"]
-
 MIN_ADVANCE = 1e-4  # [m] a blow that drives the nail less is the last
 
 

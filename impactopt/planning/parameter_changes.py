@@ -16,8 +16,6 @@ from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
 
-__all__ = ["MOVABLE", "Parameter", "changed", "moved_problem", "parameter_of", "with_term"]
-
 # Cached properties of a problem that stay valid with the same robot, stance and start; and those that also
 # need the same terms, or other ones that do not switch the bodies of the world on or off.
 _CACHED = ("stance_coordinates", "start_posture")

@@ -27,8 +27,6 @@ from impactopt.transcription.mesh import Elements, MoreNodes, Shares
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 
-__all__ = ["Additions", "Attempt", "Evaluation", "Guess", "Oracle", "Outcome", "program_for", "refine"]
-
 Array = NDArray[np.float64]
 Program = TypeVar("Program", Transcription, StrikeTranscription)
 MAX_VIOLATIONS = 20  # that an outcome lists

@@ -29,15 +29,6 @@ from impactopt.solvers.predictor import ActiveSystem, Change, Offset, Prediction
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.transcription import Transcription, statement_of
 
-__all__ = [
-    "Binding",
-    "ParametricProgram",
-    "Sensitivity",
-    "moved_solution",
-    "parametric_program",
-    "sensitivity_of",
-]
-
 # changes that show whether a program follows its problem: factor of the parameters of law and target, and
 # shift of the point [m]
 _TRIAL_FACTOR, _TRIAL_SHIFT = 1.01, 1e-3

@@ -13,8 +13,6 @@ import casadi as ca
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.stages import Stage
 
-__all__ = ["LANES", "BlockExpression", "BlockRecipe", "JointMotion", "joint_motion", "make_block"]
-
 # Instances that a compiled block evaluates at once (SIMD). On CPUs with narrower vectors the compiler uses
 # several vectors. Blocks of few instances have fewer lanes, a power of two, as idle lanes cost as much as the
 # others, above all in memory traffic.

@@ -40,24 +40,6 @@ from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.gains import GainFactor, scaled_gains
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "COLLISIONS",
-    "INSTANT",
-    "check_apart",
-    "check_at_rest",
-    "check_collision",
-    "check_elements",
-    "check_gains",
-    "check_hands",
-    "check_moves",
-    "check_names",
-    "check_prices",
-    "check_stance",
-    "check_strikers",
-    "check_touches",
-    "check_world",
-]
-
 INSTANT = ("rigid", "virtual-mass")  # collision models without duration
 # collision models, the cheapest first; "auto" is the cheapest that is accurate enough
 COLLISIONS = (*INSTANT, "sdc-paper", "sdc", "full", "auto")

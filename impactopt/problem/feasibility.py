@@ -19,8 +19,6 @@ from impactopt.problem.terms.first_touch import face_of
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["hopeless", "sticks_out", "too_weak"]
-
 Array = NDArray[np.float64]
 # [m] Distance outside the support polygon to which a motion may take the centre of mass for a short time.
 MAX_LEAN = 0.05

@@ -14,8 +14,6 @@ from impactopt.contact.laws import CustomLaw
 from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS
 from impactopt.robots.robot import Robot
 
-__all__ = ["problem_hash"]
-
 # Fields that are not hashed: the name, and the factor by which the planner has reduced the prices.
 _NOT_HASHED = ("name", "price_scale")
 DIGITS = 16  # 64 bits: the probability that two of a million problems share a hash is 1 in 40 million

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
 
-__all__ = ["STYLES", "MotionPrices", "idle_joints", "joints_to"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class MotionPrices:

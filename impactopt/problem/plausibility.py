@@ -12,8 +12,6 @@ from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.robots.gains import HEAVIEST_ROTOR, LIGHTEST_ROTOR
 from impactopt.robots.robot import Robot
 
-__all__ = ["doubts", "giant_soles", "shape_doubts"]
-
 GIANT = 3.0  # length of a sole over that of its leg: no sole is so long
 ALIKE = 0.2  # relative difference of left and right soles in length or width that is no doubt
 

@@ -24,8 +24,6 @@ from impactopt.errors import (
 from impactopt.problem.objectives import PeakForce, Penetration
 from impactopt.problem.terms import HitCone, HitRegion, Slide
 
-__all__ = ["FINEST", "LONGEST", "SHORTEST", "STEEPEST", "Phase", "Scenario", "SecondStriker", "check_second"]
-
 Array = NDArray[np.float64]
 
 

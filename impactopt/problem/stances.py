@@ -18,8 +18,6 @@ from impactopt.kinematics.support import corners_at, overlap
 from impactopt.problem.scenario import Phase
 from impactopt.robots.robot import Robot
 
-__all__ = ["StancePhase", "check_stances", "names_of", "places_of_soles", "stepped_posture"]
-
 _DESCENTS = np.arange(0.0, 0.21, 0.02)  # [m] of the base that are tried, in turn, for legs that do not reach
 _MAX_STEP = 2.0  # [m]: a longer step is a mistake of units
 

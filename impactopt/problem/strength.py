@@ -23,8 +23,6 @@ from impactopt.robots.robot import Robot
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["EstimatedImpact", "Strength", "best_share", "drawn_impacts"]
-
 Array = NDArray[np.float64]
 MAX_SWING = 1.2  # [rad], [m] travel of a joint from rest to contact
 LIMIT_MARGIN = 0.05  # of a joint's range, between a posture at contact and the joint's limits

@@ -15,8 +15,6 @@ from impactopt.contact.fields import Described, about, abouts
 from impactopt.errors import FARTHEST, InputError, check_choice
 from impactopt.robots.checks import HEAVIEST, STRONGEST
 
-__all__ = ["MOMENTARY_PEAK", "Actuator", "fitting", "known", "numbers_of", "with_classes"]
-
 # Momentary peak torque of a gear over the joint's torque limit, if its data sheet is not known: our choice
 # after Harmonic Drive's CSF-17-50, 34 N m repeated and 70 N m momentary peak (docs/howto/gears.md).
 MOMENTARY_PEAK = 2.0

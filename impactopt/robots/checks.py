@@ -13,24 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import FARTHEST, InputError, Mistakes, check_array, did_you_mean
 from impactopt.robots.mass_matrix import mass_matrix
 
-__all__ = [
-    "GIVEN",
-    "HEAVIEST",
-    "INERTIAS",
-    "LEG",
-    "REPAIRED",
-    "STRONGEST",
-    "check_arms",
-    "check_configuration",
-    "check_frame",
-    "check_inertias",
-    "check_legs",
-    "columns_above",
-    "reduced",
-    "repair_inertias",
-    "tell_apart",
-]
-
 _MARK = "\x00"  # no name in a file contains it
 
 

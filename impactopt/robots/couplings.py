@@ -23,19 +23,6 @@ from impactopt.robots.build import (
     velocity_limit,
 )
 
-__all__ = [
-    "Axis",
-    "Coupling",
-    "axis_of",
-    "coupled",
-    "couplings_of",
-    "follower_axes",
-    "resolved",
-    "restore_followers",
-    "unfit",
-    "with_followers",
-]
-
 Array = NDArray[np.float64]
 _MIMIC = "JointModelMimic"
 

@@ -24,8 +24,6 @@ from impactopt.robots.checks import INERTIAS, REPAIRED, repair_inertias
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
 from impactopt.robots.tendons import Tendon
 
-__all__ = ["Description", "Tie", "between"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Tie:

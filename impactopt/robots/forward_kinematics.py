@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from impactopt.robots.couplings import axis_of
 
-__all__ = ["ForwardKinematics"]
-
 Array = NDArray[np.float64]
 
 

@@ -27,27 +27,6 @@ from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot, Striker, Tool
 
-__all__ = [
-    "ARM7",
-    "GRIPPER_LENGTH",
-    "LINKS",
-    "PELVIS",
-    "PLANAR",
-    "SOLE_CORNERS",
-    "SOLE_HEIGHT",
-    "TOE",
-    "Box",
-    "Drive",
-    "Link",
-    "add_links",
-    "arm7",
-    "arm_model",
-    "link",
-    "planar_arm",
-    "space_arm",
-    "standin_model",
-]
-
 Vector = tuple[float, float, float]
 
 

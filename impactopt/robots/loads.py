@@ -12,21 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.robots.actuators import numbers_of
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "MIN_LOAD_FRACTION",
-    "SHARE",
-    "DriveLoads",
-    "cop_margin",
-    "fading",
-    "gear_torque",
-    "least_margins",
-    "margin_between_nodes",
-    "motor_power",
-    "motor_use",
-    "shortfalls",
-    "weight_of",
-]
-
 Array = NDArray[np.float64]
 
 

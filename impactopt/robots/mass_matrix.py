@@ -8,8 +8,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-__all__ = ["mass_matrix"]
-
 Array = NDArray[np.float64]
 
 

@@ -22,8 +22,6 @@ from impactopt.robots.build import ROOT, existing, friction, set_friction
 from impactopt.robots.description import Description, Tie, between
 from impactopt.robots.tendons import Tendon
 
-__all__ = ["Compiled", "compile_mjcf", "gravity_of", "notes_of", "read_mjcf", "tendons_of", "ties_of"]
-
 Array = NDArray[np.float64]
 _OUT = "take it out"
 

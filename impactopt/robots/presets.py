@@ -26,18 +26,6 @@ from impactopt.robots.robot import Robot, Sole, Striker
 
 P = ParamSpec("P")
 
-__all__ = [
-    "arm7",
-    "example_robots",
-    "g1",
-    "load_robot",
-    "planar_arm",
-    "robot_names",
-    "space_arm",
-    "standin",
-    "talos",
-]
-
 
 def _preset(make: Callable[P, Robot]) -> Callable[P, Robot]:
     """Decorator of a preset's function, which records name and arguments as the robot's `source`."""

@@ -12,8 +12,6 @@ from impactopt.errors import InputError
 from impactopt.robots.build import joint_index
 from impactopt.robots.couplings import Coupling
 
-__all__ = ["Ranges", "Tendon", "check_tendons"]
-
 Array = NDArray[np.float64]
 
 

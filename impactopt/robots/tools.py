@@ -16,23 +16,6 @@ from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import SoftGrip, Sole, Tool
 from impactopt.robots.checks import check_frame
 
-__all__ = [
-    "check_held",
-    "check_sole",
-    "extended",
-    "fields_with_grip",
-    "fields_with_tool",
-    "grip_limits",
-    "hinged",
-    "inside",
-    "replaced_grips",
-    "with_hinges",
-    "with_joint",
-    "with_tool",
-    "without",
-    "without_tool",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -21,8 +21,6 @@ from impactopt.robots.build import existing
 from impactopt.robots.checks import HEAVIEST
 from impactopt.robots.description import Description, Tie, between
 
-__all__ = ["read_urdf"]
-
 # Negative principal moments of inertia that are tolerated, [kg m2] or relative to the largest entry: files
 # have rounded decimals, and guesses for small parts such as antennas.
 _ROUNDED = 1e-6

@@ -17,11 +17,6 @@ from impactopt.kinematics.support import margin as margin_in
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "errors_against",
-    "posture_of_effective_mass",
-]
-
 Array = NDArray[np.float64]
 
 MIN_NORMAL_FORCE = 50.0  # [N] of the ground; with less the ZMP is a quotient of small numbers

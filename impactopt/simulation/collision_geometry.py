@@ -12,8 +12,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-__all__ = ["FLOOR", "Solid", "Solids", "UnintendedContact", "UnintendedContacts"]
-
 Array = NDArray[np.float64]
 FLOOR = -1  # in place of a solid's number
 NEAR = 0.05  # [m] between the enclosing balls of two solids in the reference's motion; others are ignored

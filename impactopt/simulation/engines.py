@@ -19,8 +19,6 @@ from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.result import Scene, Simulation
 
-__all__ = ["ALLOWED", "ENGINES", "check_steps", "scene_of", "simulate", "with_clearance", "with_step_error"]
-
 
 def scene_of(problem: ImpactProblem) -> Scene:
     """Target, contact and fixed soles of ``problem``."""

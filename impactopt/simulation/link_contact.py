@@ -11,8 +11,6 @@ from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import Scene
 
-__all__ = ["CONTACTS", "LinkContact", "solids_in_contact"]
-
 Array = NDArray[np.float64]
 CONTACTS = ("point", "link")
 MAX_DISTANCE = 0.05  # [m] between link and target; larger distances are not computed

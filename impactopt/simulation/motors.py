@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from impactopt.robots.actuators import numbers_of
 from impactopt.robots.robot import Robot
 
-__all__ = ["CutWatch", "Delay", "GearWatch", "MotorCut", "Motors", "Servo"]
-
 Array = NDArray[np.float64]
 
 

@@ -20,23 +20,6 @@ from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
 
-__all__ = [
-    "MujocoOptions",
-    "MujocoRobot",
-    "Welds",
-    "add_welds",
-    "build_world",
-    "mujoco_module",
-    "no_log_file",
-    "primitive",
-    "put_followers",
-    "quaternion",
-    "robot_bodies",
-    "robot_on_floor",
-    "site_name",
-    "spec_of",
-]
-
 Array = NDArray[np.float64]
 # hardest equality that MuJoCo accepts: impedance, and time constant in steps
 _MAX_IMPEDANCE, _MIN_TIME_CONSTANT = 0.9999, 2.0

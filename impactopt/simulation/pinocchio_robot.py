@@ -18,8 +18,6 @@ from impactopt.errors import InputError
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
-__all__ = ["FORMS", "Body", "DenseBody", "PinocchioBody"]
-
 Array = NDArray[np.float64]
 _AXES = pin.LOCAL_WORLD_ALIGNED
 

@@ -22,8 +22,6 @@ from impactopt.simulation.engines import check_steps, with_step_error
 from impactopt.simulation.mujoco_world import mujoco_module
 from impactopt.simulation.workers import map_on_workers
 
-__all__ = ["PerturbationRanges", "Robustness", "draw_perturbations", "robustness"]
-
 Array = NDArray[np.float64]
 Z95 = 1.959964  # 95 % of a normal distribution lie within as many standard deviations
 STEP = 5e-4  # [s]: the same robots stand as with 1e-4, at a fifth of the time

@@ -26,8 +26,6 @@ from typing import Any, TypeVar
 
 from impactopt.errors import InputError
 
-__all__ = ["Died", "each_on_workers", "map_on_workers"]
-
 _Shared = TypeVar("_Shared")
 _Input = TypeVar("_Input")
 _Output = TypeVar("_Output")

@@ -27,8 +27,6 @@ from impactopt.solvers.ipm.newton import acquire
 from impactopt.solvers.program import Matrix, NonlinearProgram, Vector, max_violation
 from impactopt.solvers.run import threads
 
-__all__ = ["ActiveSystem", "Change", "Offset", "Prediction", "Predictor"]
-
 Sides = npt.NDArray[np.int8]  # 1: at the upper bound, -1: at the lower one, 0: at none
 # Subtracted from the diagonal of constraints, against zero pivots by dependent ones. The first suits large
 # multipliers, the other constraints without any nonzero derivative.

@@ -22,27 +22,6 @@ from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinemati
 from impactopt.kinematics.stages import Stage, motion_in_stages
 from impactopt.problem.block import BlockExpression, make_block
 
-__all__ = [
-    "DEPTH_SCALE",
-    "FORCE_SCALE",
-    "RESTITUTING",
-    "SECOND",
-    "JointGroups",
-    "base_scale",
-    "carried",
-    "coasting",
-    "collision",
-    "first_instant",
-    "force",
-    "impact",
-    "join",
-    "leg_part",
-    "moved",
-    "two_mass_restitution",
-    "typical_state",
-    "with_gain_factors",
-]
-
 FORCE_SCALE = 100.0  # [N] of contact forces, and of their constraints
 DEPTH_SCALE = 0.01  # [m] of the constraints of penetration
 SECOND = ("second law", "second rate", "second penetration", "second separation")  # outputs of `force`

@@ -13,8 +13,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import weight_of
 from impactopt.transcription.plan import Plan, Trajectory
 
-__all__ = ["first_touch", "ground_force_share", "motion_measures"]
-
 Array = NDArray[np.float64]
 REVERSAL = 0.02  # [rad] by which a joint has to move back to count as a reversal
 TOUCH_WINDOW, TOUCH_STEP = 0.05, 2.5e-4  # [s] time before contact that is searched for a touch, and step

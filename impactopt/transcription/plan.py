@@ -33,22 +33,6 @@ from impactopt.robots.loads import (
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "Completed",
-    "Plan",
-    "PlannedCollision",
-    "PlannedScenario",
-    "PlannedStrike",
-    "Trajectory",
-    "complete_reference",
-    "gear_share",
-    "motion_loads",
-    "plan_loads",
-    "sampled",
-    "strike_loads",
-    "total_ground_wrench",
-]
-
 Array = NDArray[np.float64]
 MOMENT_COST = 10.0  # [1/m] weight of a wrench correction's moments relative to its forces
 

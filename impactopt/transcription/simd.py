@@ -30,8 +30,6 @@ import numpy.typing as npt
 from impactopt.codegen.compiler import NativeCode, SharedCode, address, find_compiler, native_library
 from impactopt.problem.block import LANES
 
-__all__ = ["InstructionTable", "in_lanes", "instruction_table"]
-
 WINDOW = 20_000  # operations by which one may be done earlier than in CasADi's order
 # Kinds of operations in addition to CasADi's; the numbers are also those of arrange.c.
 SUM_OF_PRODUCT, PRODUCT_LESS, LESS_PRODUCT = 252, 253, 254  # a b + c,  a b - c,  c - a b

@@ -17,16 +17,6 @@ from impactopt.transcription.layout import Affine, Array, Place, add, percent
 from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.plan import complete_reference
 
-__all__ = [
-    "SpringPoint",
-    "TorqueProfile",
-    "add_hinges",
-    "add_springs",
-    "follow_springs",
-    "swing_springs",
-    "torque_profiles",
-]
-
 
 class TorqueProfile(NamedTuple):
     """Torques of a motion phase at its nodes.

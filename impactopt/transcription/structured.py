@@ -38,16 +38,6 @@ from impactopt.solvers.program import Determined
 from impactopt.transcription.batched import Block
 from impactopt.transcription.layout import Affine, Array, Constraints, Index, Layout, stack
 
-__all__ = [
-    "Runs",
-    "StructuredProgram",
-    "count_up",
-    "derivative_functions",
-    "derivatives",
-    "union",
-    "with_transposed",
-]
-
 
 def derivatives(z: Any, out: Any, weights: Any, stages: Sequence[Stage] = ()) -> list[Any]:
     """``out`` (m,) of z (n,), its Jacobian (m, n) and the Hessian (n, n) of ``weights . out``, SX.

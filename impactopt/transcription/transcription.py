@@ -59,8 +59,6 @@ from impactopt.transcription.springs import (
 from impactopt.transcription.stance_change import PhaseSequence
 from impactopt.transcription.structured import derivative_functions
 
-__all__ = ["Transcription", "block_functions", "statement_of"]
-
 USER_PREFIX = "user_"  # of users' blocks in C, which has functions of its own, such as floor
 SECOND_BLOCKS = ("second_contact", "second_approach")
 

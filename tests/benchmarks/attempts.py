@@ -24,8 +24,6 @@ from impactopt.solvers.program import (
     stationarity,
 )
 
-__all__ = ["Attempt", "attempt"]
-
 Make = Callable[[int], tuple[NonlinearProgram, Vector]]  # number of the start -> program and start
 MEMORY = 8 << 30  # [bytes] of address space; a dense solver on a large program fails before it takes all
 GRACE = 5.0  # [s] beyond the limit, for solvers that look at the clock seldom

@@ -15,8 +15,6 @@ from benchmarks.peer_result import peer_result
 from impactopt.solvers.ipopt import BufferFunction, Functions, IterationCallback, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
-__all__ = ["solve_sqpmethod"]
-
 MAX_ITERATIONS = 500
 _STATUS = {
     "Solve_Succeeded": Status.SOLVED,

@@ -20,8 +20,6 @@ from impactopt.kinematics.stance import BothSoles
 from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import posture_of_effective_mass
 
-__all__ = ["PAPER_MASSES", "PAPER_SPEEDS", "Case", "paper_motions"]
-
 Array = NDArray[np.float64]
 
 PAPER_MASSES = {"A": 4.0, "B": 6.0, "C": 8.0}  # [kg] by the motions' letters (paper, Table I)

@@ -22,8 +22,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Phase
 from impactopt.problem.terms import TorqueLimit
 
-__all__ = ["PROBLEMS", "run"]
-
 PROBLEMS = ("arm_planar", "arm7", "chop_arm")
 # logarithms to base 10 of stiffness [N/m] and of the swing's duration [s]; intervals; torque over its limit
 STIFFNESS, DURATION, INTERVALS, TORQUE = (3.5, 7.5), (-0.82, 0.48), (6, 40), (0.3, 1.0)

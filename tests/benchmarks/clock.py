@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["medians", "runner", "shortest"]
-
 REPEATS = 51
 _LONG_ENOUGH = 1e-3  # [s] of one measurement; longer ones are cut up by what else runs
 _LEAST = 3  # measurements of what takes long

@@ -25,8 +25,6 @@ from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status
 
-__all__ = ["PROBLEMS", "drawn_problem", "run"]
-
 PROBLEMS = ("arm_planar", "arm7", "chop_arm")
 LONGEST = 0.2  # [s] of a phase of the contact
 TIME_LIMIT = 60.0  # [s] of the solver

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from impactopt.errors import InputError
 
-__all__ = ["HRP2", "TOTAL_TIME", "TreeSize", "cost_aba", "cost_full", "cost_sdc", "even_tree", "iterations"]
-
 TOTAL_TIME = 0.1  # [s] t_total of figs. 3 and 4
 
 

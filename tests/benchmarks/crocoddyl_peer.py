@@ -23,8 +23,6 @@ from impactopt.problem.terms import ContactWrenchCone, PositionLimit, TorqueLimi
 from impactopt.robots.tools import inside
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["CrocoddylPlan", "crocoddyl_plan"]
-
 Array = NDArray[np.float64]
 TIME_LIMIT = 600.0  # [s] of the other process
 _AXES = {"JointModelRX": (1, 0, 0), "JointModelRY": (0, 1, 0), "JointModelRZ": (0, 0, 1)}

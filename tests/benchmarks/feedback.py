@@ -27,8 +27,6 @@ from impactopt.simulation import Perturbation
 from impactopt.simulation.controller import CONTROLLERS
 from impactopt.simulation.robustness import STEP, PerturbationRanges, Robustness, robustness
 
-__all__ = ["loosened", "run"]
-
 ROWS = Path("results/bench/feedback.jsonl")
 
 

@@ -33,8 +33,6 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
 from impactopt.simulation.workers import map_on_workers
 
-__all__ = ["FREEZES", "KINDS", "ROBOTS", "Drawn", "draw", "judge", "run", "summary"]
-
 Array = NDArray[np.float64]
 
 ROBOTS = ("talos", "g1", "standin")

@@ -19,8 +19,6 @@ from impactopt.kinematics.operational_space import striking_velocity
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 
-__all__ = ["LAW", "ONLY_SERVO", "TARGET", "impulse_of", "run"]
-
 # robot: its striker, and the posture that it hits from
 BLOWS = {
     "planar_arm": ("hammer", "ready"),

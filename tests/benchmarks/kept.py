@@ -11,8 +11,6 @@ from impactopt.codegen.files import open_own, write_atomically
 from impactopt.errors import InputError
 from impactopt.files.output import make_directory, plain
 
-__all__ = ["Kept"]
-
 
 class Kept:
     """The rows in a file, and `found`: those that are there, by their values of `keys`.

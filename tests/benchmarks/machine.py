@@ -24,8 +24,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
 from impactopt.robots.robot import Robot
 
-__all__ = ["LIMITS", "run"]
-
 LIMITS: tuple[float | None, ...] = (None, 3.0, 2.0, 1.5, 1.0)
 COLUMNS = (
     ("problem", "problem", 0),

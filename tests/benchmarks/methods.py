@@ -17,8 +17,6 @@ from impactopt.collision import SDC, Collision, VirtualMass
 from impactopt.errors import InputError
 from impactopt.simulation.reference import FullDynamics
 
-__all__ = ["Entry", "entries"]
-
 PAPER_STEPS = (1e-3, 1e-4, 1e-5, 2e-6)  # [s]; 1e-6 would be more steps than a model allows
 OUR_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10)
 FREEZES = (1, 2, 4, 8)

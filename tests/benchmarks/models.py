@@ -19,8 +19,6 @@ from impactopt.planning.solve import solve
 from impactopt.problem.checks import INSTANT
 from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["run"]
-
 # a long push, a stiff hammer's blow, a light humanoid, an arm
 PROBLEMS = ("punch", "nailing", "punch_g1", "arm7")
 QUICK = ("arm_planar", "arm7")

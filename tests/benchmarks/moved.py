@@ -19,8 +19,6 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
 from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["run"]
-
 PROBLEMS, QUICK = ("punch", "arm_planar"), ("arm_planar",)
 FAR, HEAVIER, STIFFER = 0.02, 0.3, 2.0  # [m], of the mass, of the stiffness
 COLUMNS = (

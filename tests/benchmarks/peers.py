@@ -19,8 +19,6 @@ from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 from impactopt.simulation.reference.mujoco_dynamics import WeldedRobot, march
 
-__all__ = ["cvodes", "mujoco_loop", "mujoco_rollouts", "mujoco_steps", "pinocchio_calls"]
-
 Array = NDArray[np.float64]
 
 

@@ -16,8 +16,6 @@ from impactopt.errors import missing_package
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS, Functions, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
-__all__ = ["solve_pounce"]
-
 _OF_IPOPT = {name: value for name, value in IPOPT_DEFAULTS.items() if name != "linear_solver"}
 _STATUS = {
     0: Status.SOLVED,

@@ -12,8 +12,6 @@ from typing import Any
 from benchmarks.report import Report, Say, timed
 from impactopt.errors import InputError, did_you_mean
 
-__all__ = ["BENCHES", "REPRODUCED", "names_of", "reproduce", "run_bench"]
-
 # name -> module; `python -m benchmarks all` runs them in this order
 BENCHES = {
     "truth": "benchmarks.truth",

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from impactopt.report.pictures.style import Picture
 
-__all__ = ["Report", "Say", "cell", "columns_table", "machine", "make_table", "save_report", "timed"]
-
 Say = Callable[[str], None]  # told in words what is being done
 Column = tuple[str, str, int | str]  # heading, key of a row, digits or format
 

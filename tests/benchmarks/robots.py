@@ -31,8 +31,6 @@ from impactopt.planning.strike import optimize_strike
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.presets import example_robots
 
-__all__ = ["ROBOTS", "best_of_random", "run"]
-
 Array = NDArray[np.float64]
 ROWS = Path("results/bench/robots.jsonl")
 DRAFTS = Path("results/robots")

@@ -19,8 +19,6 @@ from benchmarks.report import Report, Say, columns_table
 from impactopt.files.problem_file import load_problem, problem_names
 from impactopt.planning.solve import solve
 
-__all__ = ["run"]
-
 ROWS = Path("results/bench/rounding.jsonl")
 MOVED = 1e-10  # [m]
 COLUMNS = (

@@ -11,8 +11,6 @@ import typer
 from benchmarks.report import Report, Say
 from impactopt.report.plain_errors import plain_errors
 
-__all__ = ["show_reports"]
-
 
 def show_reports(
     names: Sequence[str],

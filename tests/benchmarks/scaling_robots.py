@@ -22,8 +22,6 @@ from impactopt.kinematics.operational_space import holding_torque, striking_velo
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 
-__all__ = ["depth", "humanoid_setups", "tip_setup"]
-
 Array = NDArray[np.float64]
 
 X = np.array([1.0, 0.0, 0.0])

@@ -20,8 +20,6 @@ from impactopt.solvers.program import (
     Vector,
 )
 
-__all__ = ["solve_slsqp", "solve_trust_constr"]
-
 MAX_ITERATIONS = 500
 TOLERANCE = 1e-8
 

@@ -23,18 +23,6 @@ from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
 from impactopt.robots.presets import load_robot
 
-__all__ = [
-    "EVALUATION",
-    "MOTIONS",
-    "Setup",
-    "compiled",
-    "compiled_gradient",
-    "graph",
-    "inputs",
-    "outcome",
-    "run_of",
-]
-
 Array = NDArray[np.float64]
 
 # robot: which of the paper's nine motions

@@ -22,8 +22,6 @@ from impactopt.files.named_problems import problem_file
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.gains import GainFactor, scaled_gains
 
-__all__ = ["FACTORS", "PROBLEMS", "run"]
-
 PROBLEMS = ("arm7", "nailing")  # gains of servos, and a tool that is held softly
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 COLUMNS = (

@@ -23,8 +23,6 @@ from impactopt.files.named_problems import problem_file, problem_names
 from impactopt.files.problem_file import read_problem_file
 from impactopt.solvers.program import NonlinearProgram, Status, Vector
 
-__all__ = ["ATTEMPTS", "KINDS", "planning_program", "run", "strike_program", "summary"]
-
 ATTEMPTS = Path("results/bench/solve.jsonl")
 VIOLATION, KKT, LOSS = 1e-6, 1e-4, 0.01  # at most, of a success; loss: relative to the best known objective
 NOISE = 0.1  # [rad] of the posture at contact in a perturbed start

@@ -10,8 +10,6 @@ from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Vector
 from impactopt.solvers.sqp import QP_SOLVERS, SQPOptions, solve_sqp
 
-__all__ = ["SOLVERS", "Solver"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Solver:

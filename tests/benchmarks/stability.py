@@ -31,8 +31,6 @@ from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
 from impactopt.simulation.workers import map_on_workers
 
-__all__ = ["Outcome", "judge", "judge_rig", "run"]
-
 # of the impulse, or of that of a plastic blow of two masses where the contact is broken off before: what the
 # methods say of themselves (see `SymbolicModel`)
 TOLERANCES = {"implicit": 1e-5, "rk4": 1e-2}

@@ -23,8 +23,6 @@ from impactopt.contact import (
     SpringDamper,
 )
 
-__all__ = ["LAWS", "RIGS", "TARGETS", "Case", "Rig", "draw"]
-
 Array = NDArray[np.float64]
 
 LAWS: dict[str, Any] = {

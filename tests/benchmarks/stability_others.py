@@ -17,8 +17,6 @@ from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.kinematics.stance import BothSoles
 from impactopt.simulation.reference import FullDynamics
 
-__all__ = ["FREEZES", "MASSES", "freezes_of", "masses_of", "refusals"]
-
 MASSES = tuple(10.0**k for k in range(2, 16))  # [kg] M_g under the soles
 FREEZES = (1, 2, 4, 8, 32, 100, 300, 1000)
 X = np.array([1.0, 0.0, 0.0])

@@ -18,8 +18,6 @@ from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import Board, FreeMass
 from impactopt.errors import InputError
 
-__all__ = ["Expected", "TakesTooLong", "reference"]
-
 Array = NDArray[np.float64]
 
 # some seconds of work

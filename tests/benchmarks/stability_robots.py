@@ -11,8 +11,6 @@ import pinocchio as pin
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker
 
-__all__ = ["make_robot"]
-
 _KINDS = {"x": pin.JointModelRX, "y": pin.JointModelRY, "z": pin.JointModelRZ}
 
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot, Striker
 
-__all__ = ["random_robot", "tip_speed"]
-
 LIMBS = 4  # l of the paper's fig. 4
 
 

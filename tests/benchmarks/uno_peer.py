@@ -16,8 +16,6 @@ from impactopt.errors import missing_package
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS, Functions, Pattern
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
-__all__ = ["solve_uno"]
-
 _OPTIONS: dict[str, Any] = {
     "logger": "SILENT",
     "QP_solver": "BQPD",  # the other one, HiGHS, is for convex QPs

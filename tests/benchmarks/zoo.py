@@ -32,8 +32,6 @@ from impactopt.planning.solve import solve
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["BASES", "ROWS", "Base", "cleanliness", "draw", "drawn_problem", "row", "run"]
-
 Array = NDArray[np.float64]
 ROWS = Path("results/bench/zoo.jsonl")
 TIME_LIMIT = 300.0  # [s] of the solver, for drawn problems: G1 takes up to two minutes with its bodies

@@ -31,8 +31,6 @@ from fuzz.attack_replays import Replayed, replay_one
 from fuzz.attack_urdfs import URDFS, attack_urdf
 from impactopt.simulation.workers import map_on_workers
 
-__all__ = ["COUNTS", "case", "run"]
-
 # files, URDFs, command lines, calls; collisions a robot, and of those by several compilers; replayed plans
 COUNTS = {
     "file": 20_000,

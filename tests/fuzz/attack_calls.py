@@ -11,8 +11,6 @@ import numpy as np
 
 from fuzz.attack_cases import Found, Generator, attempt, numbers_in, odd_number, pick
 
-__all__ = ["CALLS", "attack_call"]
-
 Arguments = dict[str, Any]
 Call = tuple[Callable[..., Any], Arguments]
 

@@ -14,8 +14,6 @@ import numpy as np
 import impactopt
 from impactopt.errors import InputError
 
-__all__ = ["FINE", "SLOW", "Found", "Generator", "attempt", "numbers_in", "odd_number", "pick"]
-
 Generator = np.random.Generator
 
 SLOW = 5.0  # [s]: an answer that comes later is late

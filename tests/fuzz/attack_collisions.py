@@ -30,8 +30,6 @@ from impactopt.contact import (
 from impactopt.errors import InputError
 from impactopt.robots.presets import load_robot
 
-__all__ = ["LAWS", "ROBOTS", "TARGETS", "Struck", "draw", "model_of", "pairs_of", "strike"]
-
 Array = NDArray[np.float64]
 
 # with their strikers

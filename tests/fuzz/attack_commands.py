@@ -21,8 +21,6 @@ from fuzz.attack_cases import Found, Generator, attempt, odd_number, pick
 from fuzz.attack_files import mutated_file, spoil_bytes, texts
 from impactopt.report.plain_errors import BUG
 
-__all__ = ["attack_command", "damage", "make_result"]
-
 RESULT = "result"
 _PROBLEM = "arm_planar"
 # commands as they should be: FILE is a problem file with something wrong, RESULT a damaged one

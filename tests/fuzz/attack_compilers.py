@@ -22,8 +22,6 @@ from fuzz.attack_collisions import draw, model_of
 from fuzz.attack_equation import Blow
 from impactopt.errors import InputError
 
-__all__ = ["BUILDS", "ROBOTS", "Compared", "builds", "compare"]
-
 Array = NDArray[np.float64]
 
 ROBOTS = ("planar_arm", "arm7", "standin")

@@ -20,8 +20,6 @@ from impactopt.collision import SDC
 from impactopt.contact import Board, FreeMass, HertzDamped, HuntCrossley, SpringDamper
 from impactopt.robots.robot import Robot
 
-__all__ = ["Blow", "Frozen", "StruckTarget", "Truth", "Unjudged", "force_of", "switch_of", "truth"]
-
 Array = NDArray[np.float64]
 
 _MOST_PIECES, _MOST_SLOPES = 2_000, 400_000

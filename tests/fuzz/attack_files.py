@@ -15,8 +15,6 @@ from impactopt.files.named_problems import problem_file, problem_names
 from impactopt.files.problem_file import load_problem
 from impactopt.files.toml import read_toml, write_toml
 
-__all__ = ["attack_file", "mutated_file", "odd_text", "spoil_bytes", "spoil_data", "texts"]
-
 Change = Callable[[Generator, dict[str, Any]], bool]
 
 # a word that a file says is kept for reading a case: longer ones make a report unreadable

@@ -33,8 +33,6 @@ from impactopt.simulation import scene_of
 from impactopt.simulation.collision_geometry import Solids
 from impactopt.simulation.engines import ALLOWED, ENGINES, check_steps, with_step_error
 
-__all__ = ["Replayed", "drawn", "follow", "replay_one"]
-
 Array = NDArray[np.float64]
 
 LIGHTEST = 1.35e-6  # [kg] that has been seen to go wrong: every eighth target has it

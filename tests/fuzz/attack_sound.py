@@ -11,8 +11,6 @@ from fuzz.attack_cases import numbers_in
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 
-__all__ = ["wrong_with_problem", "wrong_with_robot"]
-
 LARGEST = 1e16
 _POSITIVE = ("mass", "stiffness", "resistance", "breaking_force", "exponent")
 _NOT_NEGATIVE = ("damping", "dissipation", "hardening", "depth", "smoothness", "wrench_price", "return_price")

@@ -15,8 +15,6 @@ from fuzz.attack_sound import wrong_with_robot
 from impactopt.robots.link_tables import ARM7, PLANAR, Link
 from impactopt.robots.robot import Robot
 
-__all__ = ["URDFS", "attack_urdf", "mutated_urdf", "urdf_of_links"]
-
 
 def urdf_of_links(name: str, links: Sequence[Link]) -> str:
     """A chain of links as a URDF; each link has a box to be seen and to touch with."""

@@ -18,8 +18,6 @@ from impactopt.problem.terms import KeepOut, SelfCollision
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["apart_pieces"]
-
 Array = NDArray[np.float64]
 ROUND = 1e-3  # [m] of supports
 LONGEST, STEPS, DONE = 0.3, 60, 1e-11  # of u a step, and how many; [m] of slope across u that is none

@@ -18,8 +18,6 @@ from oracle.motions import DIRECTIONS, Limits
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["Blow"]
-
 Array = NDArray[np.float64]
 FORCE, DEPTH = 100.0, 0.01  # [N], [m] by which rows weigh forces and depths
 _PROBES = [(x, rate) for x in (1e-4, 1e-3, 1e-2) for rate in (-1.0, -0.1, 0.1, 1.0)]

@@ -18,8 +18,6 @@ from oracle.motions import DIRECTIONS, Way
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["COASTED", "Drives", "node_torque"]
-
 Array = NDArray[np.float64]
 COASTED = "end of coasting, if nothing is hit"  # a node's place
 FEEDFORWARD = "feed-forward at contact"

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from oracle.variables import Piece, Variables
 
-__all__ = ["Residual", "lagrangian_gradient", "residual"]
-
 Array = NDArray[np.float64]
 STEP, SMALLEST = 1e-3, 1e-6  # of a variable of order one
 ENOUGH = 1e-8  # a difference is fine enough that changes by less when its step is halved

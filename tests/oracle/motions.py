@@ -26,8 +26,6 @@ from impactopt.robots.tools import inside
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["COASTING", "FREE", "REST", "Limits", "Way", "momentum_pieces", "node_piece", "rate_pieces"]
-
 Array = NDArray[Any]
 End = str | Callable[["Variables"], NDArray[np.float64]]  # rest, free, coasting, or at these coordinates
 NONE = np.zeros(0)

@@ -51,8 +51,6 @@ from oracle.worth import (
     worth_pieces,
 )
 
-__all__ = ["Claims", "Program", "unknown"]
-
 Array = NDArray[np.float64]
 EARLY = 0.12  # [s] before contact: from then on no corner of the striking link is beyond the target's plane
 # [m], [m/s], [m/s] how far the striker keeps off the target's plane; and a tool in a soft grip after contact

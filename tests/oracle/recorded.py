@@ -19,8 +19,6 @@ from oracle.program import Program
 from oracle.stances import fading_soles
 from oracle.variables import Variables
 
-__all__ = ["Off", "off_in_record"]
-
 Array = NDArray[np.float64]
 Arrays = Mapping[str, NDArray[Any]]
 FINER = 0.005  # of impulse and duration: by how much they may be others on elements half as long

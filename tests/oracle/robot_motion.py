@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["LEVER", "RobotMotion"]
-
 Array = NDArray[np.float64]
 GRAVITY = 9.81  # [m/s2] of the scale of forces, whatever the robot's is
 LEVER = 0.1  # [m] by which rows weigh moments against forces

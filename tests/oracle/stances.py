@@ -21,8 +21,6 @@ from oracle.motions import COASTING, FREE, REST, End, Way
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["change_pieces", "course", "fading_soles", "height_pieces"]
-
 Array = NDArray[np.float64]
 Course = Mapping[int, Way]  # phases one after the other, by their numbers
 # [m] that a sole in the air is above the ground, and beside its foothold at most, within so long [s]

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Piece", "RowName", "Variables"]
-
 Array = NDArray[np.float64]
 RowName = tuple[str, str, str]  # term, place, component
 

@@ -17,8 +17,6 @@ from oracle.program import Claims, Program
 from oracle.recorded import off_in_record
 from oracle.variables import Piece, RowName, Variables
 
-__all__ = ["KKT", "VIOLATION", "Verdict", "claims_of", "verify_record"]
-
 Array = NDArray[np.float64]
 VIOLATION = 1e-5  # of rows, which are of order one, and of what a record says
 KKT = 1e-4  # as of solvers that call a point acceptable

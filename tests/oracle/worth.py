@@ -25,8 +25,6 @@ from oracle.motions import Way
 from oracle.robot_motion import RobotMotion
 from oracle.variables import Piece, Variables
 
-__all__ = ["GONE", "gaze_pieces", "orientation_pieces", "price_pieces", "speed_pieces", "worth_pieces"]
-
 Array = NDArray[np.float64]
 GONE = "target's way after contact"  # [m], a variable where the target may be slow then
 PEAK = 100.0  # [N] of which the peak force is a multiple

@@ -34,26 +34,6 @@ from impactopt.collision.stepped import (
 from impactopt.contact import ContactLaw
 from impactopt.kinematics.stance import Stance
 
-__all__ = [
-    "TreeFunctions",
-    "backwards",
-    "c_code",
-    "directions",
-    "gamma_of",
-    "names_table",
-    "scalar_functions",
-    "shapes_in",
-    "shapes_out",
-    "shapes_table",
-    "simd_tangent",
-    "simd_tree",
-    "sizes",
-    "to_velocity_basis",
-    "tree_functions",
-    "with_derivatives",
-    "with_jacobians",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class TreeFunctions:

@@ -31,8 +31,6 @@ from impactopt.collision.native.sizes import (
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
 
-__all__ = ["least_size", "native_collision", "native_differences", "native_gradient", "native_jacobian"]
-
 # files of the time stepping, and of its discrete adjoint
 _IMPLICIT = ("", "_factor", "_step", "_remainders", "_events", "_run")  # parts of implicit.h
 _ADJOINT = {"rk4": ("rk4_adjoint.h", "steps_adjoint.h"), "implicit": ("implicit_adjoint.h",)}

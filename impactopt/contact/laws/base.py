@@ -18,8 +18,6 @@ import numpy as np
 from impactopt.contact.fields import Described, Parameters, check_numbers, choose, numbers_of, text_of
 from impactopt.errors import InputError
 
-__all__ = ["ContactLaw", "rough_at"]
-
 # [m] penetrations at which both branches are compared at rate zero, and relative difference allowed there
 _DEPTHS, _SAME = (1e-4, 1e-3, 1e-2), 1e-6
 

@@ -11,8 +11,6 @@ from impactopt.contact.fields import Parameters, choose
 from impactopt.contact.laws.base import ContactLaw, rough_at
 from impactopt.errors import InputError, check_array
 
-__all__ = ["CustomLaw"]
-
 Branch = Callable[..., Any]
 
 # [m] Below this penetration a law that is not smooth at zero continues along its tangent; and the step of the

@@ -11,8 +11,6 @@ from impactopt.contact.fields import Parameters, about, choose, power
 from impactopt.contact.laws.base import ContactLaw
 from impactopt.errors import InputError, check_array
 
-__all__ = ["HertzDamped"]
-
 # [m] Below this penetration a parabola replaces x^(1/4), which has no slope at zero.
 _ROUNDED = 1e-6
 

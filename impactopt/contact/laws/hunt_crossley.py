@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 from impactopt.contact.fields import Parameters, about, power
 from impactopt.contact.laws.base import ContactLaw
 
-__all__ = ["HuntCrossley"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class HuntCrossley(ContactLaw):

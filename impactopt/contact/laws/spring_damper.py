@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 from impactopt.contact.fields import Parameters, about
 from impactopt.contact.laws.base import ContactLaw
 
-__all__ = ["SpringDamper"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class SpringDamper(ContactLaw):

@@ -14,19 +14,6 @@ from impactopt.contact.fields import Described, Parameters, check_numbers, numbe
 from impactopt.contact.laws.base import ContactLaw
 from impactopt.errors import InputError
 
-__all__ = [
-    "SEPARATION",
-    "TOUCH",
-    "TURN",
-    "UNITS",
-    "ContactPhase",
-    "Target",
-    "contact_phases",
-    "is_order",
-    "order_of_touches",
-    "scaled_numbers",
-]
-
 UNITS = {"speed": "m_s", "depth": "m"}  # units of targets' results
 
 

@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 from impactopt.contact.fields import Parameters, about, choose, function
 from impactopt.contact.targets.base import Target
 
-__all__ = ["Board"]
-
 MARGIN = 0.1  # relative to the breaking force, at the touch; zero at the break
 RESERVE = 0.02  # relative to the deflection at the break
 ROUNDED = 1e-12  # added to |1 - damping ratio^2|, by which is divided

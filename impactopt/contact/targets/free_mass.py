@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 from impactopt.contact.fields import Parameters, about
 from impactopt.contact.targets.base import Target
 
-__all__ = ["FreeMass"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class FreeMass(Target):

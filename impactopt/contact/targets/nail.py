@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 from impactopt.contact.fields import Parameters, about, choose
 from impactopt.contact.targets.base import Target
 
-__all__ = ["Nail"]
-
 SOON, LEFT = 1e-3, 1e-4  # time scale [s] and relaxation of the complementarity condition in `Nail.guard`
 
 

@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 from impactopt.contact.fields import Parameters
 from impactopt.contact.targets.base import Target
 
-__all__ = ["RigidWall"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class RigidWall(Target):

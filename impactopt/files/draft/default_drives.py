@@ -12,8 +12,6 @@ from impactopt.robots.build import effort_limit, is_floating, joint_indices, joi
 from impactopt.robots.couplings import couplings_of
 from impactopt.robots.gains import USUAL_ROTOR
 
-__all__ = ["Drives", "guess_drives"]
-
 # by joint type: True for a revolute joint, False for a prismatic one
 MIN_ARMATURE = {True: 1e-3, False: 0.05}  # [kg m2], [kg]
 SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]

@@ -8,8 +8,6 @@ from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.robots.presets import example_robots
 
-__all__ = ["find_description"]
-
 SUFFIXES = (".urdf", ".xml", ".mjcf", ".xacro")  # of files; a robot's name may have another dot
 
 

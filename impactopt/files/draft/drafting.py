@@ -46,8 +46,6 @@ from impactopt.robots.checks import REPAIRED
 from impactopt.robots.gains import USUAL_ROTOR
 from impactopt.robots.robot import Robot
 
-__all__ = ["Draft", "draft_problem"]
-
 Array = NDArray[np.float64]
 MAX_TARGETS = 8  # tried
 SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # durations [s] for fast robots

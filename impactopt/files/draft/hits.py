@@ -17,8 +17,6 @@ from impactopt.problem.objectives import Objective, PeakForce, TargetEnergy
 from impactopt.problem.strength import DOWN, NORMALS
 from impactopt.robots.robot import Robot
 
-__all__ = ["Hit", "hits"]
-
 Array = NDArray[np.float64]
 MASS_RATIO = 0.06  # of a punched target to the robot
 FORCE_PER_MASS = 30.0  # [N/kg] of the robot: breaking force of a board, resistance of a nail

@@ -15,8 +15,6 @@ from impactopt.bodies.convex_hulls import Piece
 from impactopt.robots.build import effort_limit, is_floating, neutral
 from impactopt.robots.checks import LEG
 
-__all__ = ["Limb", "arms_of", "legs_of", "limbs_of", "renumbered", "to_lock", "toes", "unshared"]
-
 Array = NDArray[np.float64]
 _FINGERS = re.compile(r"finger|thumb|gripper|jaw|claw|knuckle|(?<![a-z])eyes?(?![a-z])", re.IGNORECASE)
 _WHEELS = re.compile(r"wheel|caster|roller", re.IGNORECASE)

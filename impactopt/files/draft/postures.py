@@ -16,8 +16,6 @@ from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
 from impactopt.robots.robot import Robot, Sole
 
-__all__ = ["arm_length", "bend_arm", "eased", "half_sitting", "rested", "shoulder"]
-
 Array = NDArray[np.float64]
 SQUAT = 0.06  # lowering of the hips, over the length of the legs
 LEVEL = 1e-7  # [m], [rad]: tolerance of a sole's placement

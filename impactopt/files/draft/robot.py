@@ -23,8 +23,6 @@ from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.robot import Robot
 from impactopt.robots.urdf import read_urdf
 
-__all__ = ["Drafted", "draft_robot"]
-
 Array = NDArray[np.float64]
 
 

@@ -18,8 +18,6 @@ from impactopt.robots.attachments import Sole
 from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
 
-__all__ = ["find_soles", "sides"]
-
 Array = NDArray[np.float64]
 SLICE = 0.005  # [m]: the part of a foot so near to its lowest plane is the sole
 STEEP = np.cos(np.radians(40))  # least cosine between the normals of sole and ground in the zero posture

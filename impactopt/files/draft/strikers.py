@@ -15,8 +15,6 @@ from impactopt.files.draft.limbs import Limb
 from impactopt.robots.attachments import Sole, Striker
 from impactopt.robots.couplings import axis_of
 
-__all__ = ["find_edge", "find_striker", "find_toe", "first_link"]
-
 Array = NDArray[np.float64]
 # names of tool frames by ROS-Industrial (tool0), manufacturers and MuJoCo Menagerie (sites), the most
 # reliable first

@@ -25,8 +25,6 @@ from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 
-__all__ = ["ITERATIONS", "SECONDS", "Strong", "duration", "strongest", "touches"]
-
 Array = NDArray[np.float64]
 MAX_STRIKES, MAX_CANDIDATES = 4, 60  # impacts solved as strikes; estimated impacts considered for them
 MIN_DISTANCE = 0.2  # of hit points with the same normal, over the reach

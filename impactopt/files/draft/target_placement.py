@@ -15,8 +15,6 @@ from impactopt.files.draft.postures import arm_length, bend_arm, shoulder
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.robots.robot import Robot
 
-__all__ = ["AHEAD", "STRIKE_DIRECTIONS", "Arm", "aims", "ready"]
-
 Array = NDArray[np.float64]
 # horizontal
 STRIKE_DIRECTIONS = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))

@@ -10,8 +10,6 @@ from pydantic import AfterValidator
 from impactopt.errors import did_you_mean
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS
 
-__all__ = ["ALLOWED", "IpoptOptions"]
-
 # A problem file is data, which must not make IPOPT load a library,
 # or read or write a file. This is a list of safe options, not of unsafe ones: a new IPOPT may add some of
 # those, and each option also exists with prefixes ("resto.hsllib"). Left out are options that load HSL or

@@ -25,18 +25,6 @@ from impactopt.robots.checks import check_legs
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
 
-__all__ = [
-    "ProblemFile",
-    "change_data",
-    "key_paths",
-    "key_place",
-    "load_problem",
-    "parse_problem_file",
-    "problem_file_from_data",
-    "problem_from_data",
-    "read_problem_file",
-]
-
 
 def change_data(data: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
     """A copy of a problem file's data with changed values, as of `change_and_place`."""

@@ -29,8 +29,6 @@ from impactopt.problem.checks import LONGEST_CONTACT, MOST_ELEMENTS
 from impactopt.problem.scenario import FINEST, LONGEST, SHORTEST, STEEPEST
 from impactopt.robots.checks import HEAVIEST
 
-__all__ = ["problem_template", "reference"]
-
 
 def problem_template(name: str) -> str:
     """The text of a named problem's file, with all keys of its sections.

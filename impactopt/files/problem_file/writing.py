@@ -46,17 +46,6 @@ from impactopt.robots.attachments import SoftGrip
 from impactopt.robots.checks import GIVEN
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
-__all__ = [
-    "law_data",
-    "problem_data",
-    "robot_data",
-    "sole_data",
-    "striker_data",
-    "target_data",
-    "tool_data",
-    "write_problem",
-]
-
 BY_JOINT = {
     "armature": "armature_kg_m2",
     "torque_limit": "torque_limit_N_m",

@@ -35,16 +35,6 @@ from impactopt.files.sections.values import (
 from impactopt.kinematics.stance import USUAL_POSTURE, BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.robots.robot import Robot
 
-__all__ = [
-    "LAWS",
-    "TARGETS",
-    "CollisionSections",
-    "ProblemSection",
-    "RigidSection",
-    "StanceSection",
-    "with_kinds",
-]
-
 _FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # defaults
 TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)
 LawKind: Any = one_of(kind.word for kind in laws.LAWS)

@@ -33,16 +33,6 @@ from impactopt.files.toml import (
     write_toml,
 )
 
-__all__ = [
-    "LONGEST_KEY",
-    "Collector",
-    "CollisionFile",
-    "change_and_place",
-    "find_key",
-    "parse_settings",
-    "paths_in",
-]
-
 LONGEST_KEY = 1000  # characters, dots included
 _WORD = re.compile(r"[A-Za-z_][\w -]*")
 _T = TypeVar("_T")

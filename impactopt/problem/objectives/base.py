@@ -14,8 +14,6 @@ from impactopt.contact.fields import Described, about
 from impactopt.errors import MOST, InputError, check_array
 from impactopt.problem.terms.base import check_known, kind_of
 
-__all__ = ["WEIGHT", "Objective", "check_objectives"]
-
 WEIGHT = about("value of one unit", unit="N s", key="weight")
 
 

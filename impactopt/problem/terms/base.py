@@ -12,8 +12,6 @@ from impactopt.bodies.world import vector
 from impactopt.contact.fields import About, Described, abouts
 from impactopt.errors import MOST, InputError, check_number, shortened
 
-__all__ = ["Term", "check_known", "kind_of", "of_joints"]
-
 _NO_METADATA = About(what="", least=0)  # of fields without metadata
 
 

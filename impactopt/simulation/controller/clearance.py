@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids
 
-__all__ = ["Clearance"]
-
 Array = NDArray[np.float64]
 MIN_DISTANCE = 2e-3  # [m]: plans keep more, but for half a millimetre between their nodes
 BANDWIDTH = 40.0  # [rad/s] of the barrier: a tenth of what 1 kHz and a millisecond of delay follow

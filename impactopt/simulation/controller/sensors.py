@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
 
-__all__ = ["Measured", "Sensors", "StateEstimate"]
-
 Array = NDArray[np.float64]
 # standard deviations, at noise = 1
 ENCODER = 2 * np.pi / 2**19 / np.sqrt(12)  # [rad] quantization: uniform over one count

@@ -8,8 +8,6 @@ from typing import Any
 from impactopt.contact.fields import Described, about, abouts
 from impactopt.errors import check_choice, check_whole
 
-__all__ = ["CONTROLLERS", "ControllerSettings", "controller_of"]
-
 CONTROLLERS = ("servo", "wbc")
 
 IMPACTS = ("planned", "none", "project", "spread", "both")

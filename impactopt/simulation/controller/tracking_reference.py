@@ -20,8 +20,6 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.result import Scene, distance_inside, stance_at, stance_begins
 
-__all__ = ["Recovery", "ReferenceSample", "TrackingReference"]
-
 Array = NDArray[np.float64]
 
 

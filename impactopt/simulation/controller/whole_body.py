@@ -28,16 +28,6 @@ from impactopt.simulation.controller.tracking_reference import Recovery, Referen
 from impactopt.simulation.motors import Servo
 from impactopt.simulation.result import Scene, stance_at, stance_begins
 
-__all__ = [
-    "ConstrainedDynamics",
-    "StanceProblem",
-    "Tasks",
-    "TorqueQP",
-    "WholeBodyController",
-    "WrenchCones",
-    "wrench_cone",
-]
-
 Array = NDArray[np.float64]
 ADMM_PENALTY = 1.0  # OSQP's rho: after the change of variables the Hessian is the identity
 OSQP_INFINITY = 1e30

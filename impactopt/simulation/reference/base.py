@@ -17,8 +17,6 @@ from impactopt.contact.friction import check_friction
 from impactopt.errors import InputError, check_array, check_positive
 from impactopt.robots.robot import Robot
 
-__all__ = ["Forces", "Phase", "ReferenceModel", "converge"]
-
 Array = NDArray[np.float64]
 
 

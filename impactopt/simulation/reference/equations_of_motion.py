@@ -27,8 +27,6 @@ from impactopt.errors import InputError
 from impactopt.simulation.pinocchio_robot import Body
 from impactopt.simulation.reference.base import Forces, Phase
 
-__all__ = ["Instant", "Motion", "Run", "Scales", "collision_from", "contact_scales"]
-
 Array = NDArray[np.float64]
 _OVERSHOOT = 1e-10  # fraction of a step beyond its event, so that the next step starts in the new phase
 # fractions of a step at which events are looked for; an oscillation turns by less than a radian in a step

@@ -14,8 +14,6 @@ from impactopt.simulation.pinocchio_robot import FORMS
 from impactopt.simulation.reference.base import Forces, ReferenceModel, converge
 from impactopt.simulation.reference.equations_of_motion import Motion, Run, collision_from
 
-__all__ = ["FullDynamics"]
-
 Array = NDArray[np.float64]
 # Tolerance of a step: fraction of the impulse's tolerance in the first run, and factor from run to run
 _STEP_FRACTION, _FACTOR = 1e-3, 1e-2

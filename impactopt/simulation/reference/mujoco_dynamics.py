@@ -26,8 +26,6 @@ from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.reference.base import Forces, Phase, ReferenceModel, converge
 from impactopt.simulation.reference.equations_of_motion import Instant, Scales, collision_from, contact_scales
 
-__all__ = ["MujocoDynamics", "WeldedRobot", "march"]
-
 Array = NDArray[np.float64]
 _RECORD = 5e-5  # [s] between recorded instants
 _RESOLUTION = 0.02  # step of the first run, times the contact's fastest rate

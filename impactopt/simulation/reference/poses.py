@@ -15,8 +15,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["Poses", "inverse_mass", "poses_of"]
-
 Array = NDArray[np.float64]
 POSES_BEFORE, POSES_AFTER = 4, 2  # up to contact, and after the end of contact
 

@@ -15,8 +15,6 @@ from impactopt.robots.presets import standin
 if TYPE_CHECKING:
     from impactopt.report.pictures.style import Picture
 
-__all__ = ["run"]
-
 STEPS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5, 1e-6)  # [s]
 # what the paper's text says of fig. 3: C_r1 "about 0.016", C_r3 "about 1/4"
 PRINTED = {"C_r1": {1e-3: 0.016}, "C_r3": {1e-4: 0.25}}

@@ -19,8 +19,6 @@ from benchmarks.trees import random_robot, tip_speed
 if TYPE_CHECKING:
     from impactopt.report.pictures.style import Picture
 
-__all__ = ["run"]
-
 SIZES = (*range(8, 101, 4), 97)
 STEP = 1e-4  # [s]
 LEAST = 8  # the formula of C_3 is next to zero for a single joint

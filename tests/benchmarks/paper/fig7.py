@@ -18,8 +18,6 @@ from impactopt.collision import Collision
 if TYPE_CHECKING:
     from impactopt.report.pictures.style import Picture
 
-__all__ = ["run"]
-
 ROBOT, TYPE = "standin", "C"
 # as the legend has them; the reference
 FULL = "full dynamics"

@@ -20,8 +20,6 @@ from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
 
-__all__ = ["HIERARCHY", "HORIZON", "ROBOTS", "WHOSE", "Fidelity", "motions", "reference", "setting"]
-
 ROBOTS = ("standin", "talos")
 WHOSE = {"standin": "a stand-in for the paper's HRP-2", "talos": "TALOS, which the paper has not"}
 HORIZON = 0.4  # [s]; the longest of these contacts, TALOS A-2, takes 0.25 s

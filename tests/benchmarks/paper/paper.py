@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from benchmarks.cases import PAPER_MASSES, PAPER_SPEEDS
 from impactopt.contact import FreeMass, SpringDamper
 
-__all__ = ["LAW", "MOTIONS", "OPENHRP3", "STEP", "TABLE_2", "TABLE_3", "TARGET", "Estimate", "Motion"]
-
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
 TARGET = FreeMass(mass=5.0)
 STEP = 1e-4  # [s] of its Runge-Kutta method

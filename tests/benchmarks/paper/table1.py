@@ -17,8 +17,6 @@ from benchmarks.paper.motions import ROBOTS, WHOSE, motions
 from benchmarks.paper.paper import MOTIONS
 from benchmarks.report import Report, Say, columns_table
 
-__all__ = ["run"]
-
 COLUMNS = (
     ("motion", "motion", 0),
     ("m_a kg", "m_a_kg", 4),

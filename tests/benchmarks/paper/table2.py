@@ -24,8 +24,6 @@ from benchmarks.report import Report, Say, columns_table
 from impactopt.collision import Collision, CollisionModel
 from impactopt.simulation.cases import errors_against
 
-__all__ = ["run"]
-
 ERRORS = ("impulse_error_pct", "f_max_error_pct", "zmp_error_mm", "torque_error_pct")
 PRINTED = {"sdc-paper": TABLE_2, "virtual-mass": TABLE_3}
 COLUMNS = (

@@ -17,8 +17,6 @@ from benchmarks.report import Report, Say, columns_table
 from impactopt.collision import VirtualMass
 from impactopt.robots.robot import Robot, Striker
 
-__all__ = ["point_mass", "run"]
-
 COLUMNS = (
     ("motion", "motion", 0),
     ("m_a kg", "m_a_kg", 1),

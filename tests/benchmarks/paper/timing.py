@@ -34,8 +34,6 @@ from impactopt.collision.runge_kutta import rk4_step
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 
-__all__ = ["Times", "measure"]
-
 Array = NDArray[np.float64]
 MANY = 20  # evaluations inside C a call; with more their outputs would fill the caches
 STEPS = 200  # of the time loop a call

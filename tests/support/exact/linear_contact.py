@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from impactopt.contact import Board, ContactLaw, Nail, Target
 from impactopt.errors import InputError
 
-__all__ = ["TargetMode", "force_coefficients", "target_modes"]
-
 Array = NDArray[np.float64]
 _INSTEAD = "the exact solution: {} is not linear between events; measure by SciPy"
 

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from impactopt.collision.model import JointSpaceModel
 from support.exact.linear_contact import force_coefficients, target_modes
 
-__all__ = ["Modes", "Phase", "Watch"]
-
 Array = NDArray[np.float64]
 
 

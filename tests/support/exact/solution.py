@@ -28,8 +28,6 @@ from impactopt.errors import InputError, check_array
 from support.exact.linear_contact import force_coefficients, target_modes
 from support.exact.modes import Modes, Phase
 
-__all__ = ["ExactCollision", "Path", "exact_path"]
-
 Array = NDArray[np.float64]
 
 _DEGREE = 20

@@ -189,7 +189,8 @@ def test_code_names_that_the_architecture_uses_exist() -> None:
     # modules of the package and of Pinocchio, by their own names
     words = {name for name in words if name.split(".")[0] not in ROOMS | {"pin"}}
     assert len(words) > 20
-    files = [*SOURCES, TEST_LAYERS]
+    tests = [ROOT / name for name in sorted(NAMED) if name.startswith("tests/") and name.endswith(".py")]
+    files = [*SOURCES, TEST_LAYERS, *tests]
     assert [wrong for name in sorted(words) if (wrong := missing(name, files))] == []
 
 

@@ -174,7 +174,7 @@ _OTHERS: Mapping[str, _Kinds] = {
         _NUMBER,
     ),
     **dict.fromkeys(("freezes?", "price_scale?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),
-    "touches?": ([_TEXT],),
+    "touches?": (int, [_TEXT]),  # a number in records of older versions
     "stances?": (
         [
             (

@@ -220,8 +220,8 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
         problem = with_chosen(problem, [each["factor"] for each in gains])
         if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
             problem = replace(problem, price_scale=scale)
-        if order := record.summary.get("touches"):
-            problem = replace(problem, touches=tuple(order))
+        if touches := record.summary.get("touches"):
+            problem = replace(problem, touches=tuple(touches) if isinstance(touches, list) else touches)
         return with_lazy_constraints(problem, record.summary.get("rows_on_demand", ()))
     except InputError as error:
         if given:

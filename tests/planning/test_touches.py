@@ -232,11 +232,16 @@ def test_what_is_saved_is_read_with_its_touches(chopped: Solution, tmp_path: Pat
     text = (Path(__file__).resolve().parents[2] / "problems" / "chop_arm.toml").read_text("utf-8")
     text = text.replace("stiffness_N_m = 1e5\ndamping_N_s_m = 50", f"stiffness_N_m = {k}\ndamping_N_s_m = 50")
     text += "\n[terms.gear_load]\nenabled = false\n"
-    save_record(record_of(chopped, problem=text, problem_path=tmp_path / "chop.toml"), tmp_path)
+    record = record_of(chopped, problem=text, problem_path=tmp_path / "chop.toml")
+    save_record(record, tmp_path)
     planned = load_planned(tmp_path)
     assert planned.problem.order == chopped.problem.order
     assert planned.problem.law == chopped.problem.law
 
+    older = dataclasses.replace(record, summary={**record.summary, "touches": 2})
+    save_record(older, tmp_path / "older")  # older versions have their number
+    phases = order_of_touches(planned.problem.law, BOARD, 2)
+    assert load_planned(tmp_path / "older").problem.order == phases
 
 def test_a_board_with_a_heavier_one_as_a_scenario() -> None:
     """All targets are met as often; point masses are not asked then."""

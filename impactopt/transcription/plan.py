@@ -335,7 +335,7 @@ class PlannedScenario:
             "impulse_Ns": self.impulse,
             "target": hit.outcome,
             "peak_force_N": float(hit.force.max()),
-            "contact_ms": 1e3 * float(hit.time[-1]),
+            "contact_ms": 1e3 * hit.last_touch,
             "torque_ratio": float(np.abs(hit.torque / torque_limit).max()),
         }
         return out | ({"zmp_margin_m": float(margin(polygon, zmp(hit.ground)).min())} if len(polygon) else {})

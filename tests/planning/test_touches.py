@@ -254,6 +254,17 @@ def test_a_board_with_a_heavier_one_as_a_scenario() -> None:
 
 
 # ---- phases and their number
+def test_contact_time_of_a_scenario_is_without_the_swing_to_the_break() -> None:
+    others = (Scenario(name="heavier", mass=1.2),)
+    solution = solve(stiff(1e7, scenarios=others, touches=(SEPARATION, "break")))
+    assert solution.status is Status.SOLVED
+    (heavier,) = solution.summary()["scenarios"]
+    collision = solution.plan.scenarios[0].collision
+    last = int(np.flatnonzero(collision.force > 1e-6 * collision.force.max())[-1])
+    assert heavier["contact_ms"] == pytest.approx(1e3 * collision.time[last + 1], rel=1e-3)
+    assert heavier["contact_ms"] < 0.5e3 * collision.time[-1]
+
+
 
 
 @pytest.mark.parametrize("target", [BOARD, FreeMass(mass=1.0), Nail(mass=0.05, resistance=600.0)])

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.contact.laws import KelvinVoigt
+from impactopt.contact.targets.base import is_order
 from impactopt.errors import InputError
 from impactopt.kinematics.operational_space import holding_torque
 from impactopt.planning.budget import Budget
@@ -140,16 +141,18 @@ def with_order_of(start: Solved, problem: ImpactProblem) -> ImpactProblem:
 
     Raises
     ------
-    InputError : the problem gives another number of touches, or another order.
+    InputError : the problem gives another number of touches, or another order; or its law or its target
+        does not allow that of the solution.
     """
     order, touches = start.problem.order, start.problem.planned_touches
     if problem.order == order:
         return problem
-    if problem.touches in (None, touches) and not met_once(problem):
+    possible = not met_once(problem) and is_order(problem.law, problem.target, order)
+    if possible and problem.touches in (None, touches):
         return changed(problem, touches=order)
     raise InputError(
-        f"start: the solution touches its target {touches} times in the impact ({', '.join(order)}), and "
-        f"this problem's plan {problem.planned_touches} times: leave start out"
+        f"start: the contact of the solution is planned as {', '.join(order) or 'one touch'}, and not so in "
+        "this problem: leave start out"
     )
 
 

@@ -155,11 +155,14 @@ def _planned(
     t, given = _program(problem, start, budget)
     # From here on the time limit counts: a first run compiles for longer than it solves.
     budget = budget.started()
-    heavy = overloaded(t.problem)
-    if heavy and budget.solver != "ipopt":
-        budget = replace(budget, options={"max_iterations": _HOPELESS_ITERATIONS, **(budget.options or {})})
-    if isinstance(given, SolverResult) and Outcome.of(t, given).own_violation <= VIOLATED:
-        budget = budget.near_by()  # a feasible warm start may be the optimum
+    heavy, whole, options = overloaded(t.problem), budget, budget.options or {}
+    limited = bool(heavy) and budget.solver != "ipopt" and "max_iterations" not in options
+    if isinstance(given, SolverResult):
+        limited = False  # a solution of a similar problem is more than an estimate
+        if Outcome.of(t, given).own_violation <= VIOLATED:
+            budget = budget.near_by()  # a feasible warm start may be the optimum
+    if limited:
+        budget = replace(budget, options={**options, "max_iterations": _HOPELESS_ITERATIONS})
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(t.problem) if t.problem.keeps_apart else None
     # Solutions of different guesses compare only once they keep their clearances and gear limits, so each is
@@ -170,6 +173,12 @@ def _planned(
     # A start's draw depends on seed and number only, so further ones continue the sequence.
     built, guesses = time.perf_counter(), _guesses(t, given, range(which.start, last), seed, solver)
     outcome = best_of(guesses, solver.from_guess, budget, len(which))
+    if limited and not ended_with_violations(outcome.program, outcome.result):
+        # a motion within all bounds refutes the estimate
+        budget, solver = whole, replace(solver, budget=whole)
+        if outcome.result.status is Status.ITERATION_LIMIT:
+            more = solver.from_guess(Guess(program=outcome.program, start=outcome.result))
+            outcome = outcome.else_then(more)
     if refined and margins is None:
         outcome = solver.on(outcome)
     known: list[str] = []

@@ -340,6 +340,23 @@ def test_gears_that_bear_no_impact_are_named_without_a_search() -> None:
     assert solution.result.iterations < 500
 
 
+def test_an_estimate_of_gears_does_not_end_a_solve_that_has_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few iterations are for problems without one: a motion within all bounds goes on to the optimum."""
+    problem = stiff(touches=2)
+    best = solve(problem, refine=False)
+    monkeypatch.setattr("impactopt.planning.solve.overloaded", lambda _: ["gears, by a wrong estimate"])
+    monkeypatch.setattr("impactopt.planning.solve._HOPELESS_ITERATIONS", best.result.iterations - 2)
+    found = solve(problem, refine=False)
+    assert found.status is Status.SOLVED
+    assert found.impulse == pytest.approx(best.impulse, rel=1e-4)
+    limit = {"max_iterations": best.result.iterations - 2}
+    with pytest.warns(NotSolvedWarning, match="iteration limit"):
+        assert solve(problem, refine=False, options=limit).status is Status.ITERATION_LIMIT
+    monkeypatch.setattr("impactopt.planning.solve._HOPELESS_ITERATIONS", 1)
+    near = solve(stiff(1.02e6, touches=2), refine=False, start=best)
+    assert near.status is Status.SOLVED
+
+
 def test_what_gears_bear_is_what_they_carry_at_that_force(swung: Solution) -> None:
     force, joint = largest_force(stiff(terms=load_problem("chop_arm").terms))
     loads = swung.loads

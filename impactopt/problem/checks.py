@@ -18,7 +18,7 @@ from impactopt.bodies.world import Ground, Obstacle, TargetBody
 from impactopt.contact.friction import check_friction
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
-from impactopt.contact.targets.base import TOUCH, is_order
+from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN, is_order
 from impactopt.errors import (
     MANY,
     MOST,
@@ -256,10 +256,12 @@ def check_touches(problem: Any) -> None:
     object.__setattr__(problem, "touches", order or number)
     if (order or number > 1) and (why := met_once(problem)):
         raise InputError(f"touches is {touches}, but {why}: leave it out")
-    if order and isinstance(problem.law, ContactLaw) and not is_order(problem.law, problem.target, order):
+    law, target = problem.law, problem.target
+    if order and isinstance(law, ContactLaw) and not is_order(law, target, order):
+        possible = [*([TURN] if law.switches else []), SEPARATION, *target.guards]
         raise InputError(
-            f"touches: {list(order)} are no ends of a contact's phases, such as ['separation', "
-            f"{problem.target.guards[-1]!r}]: leave it out"
+            f"touches: {list(order)} are no ends of a contact's phases under the law {type(law).__name__}, "
+            f"such as {possible}: leave it out"
         )
 
 

@@ -158,9 +158,10 @@ class Outcome(Generic[Program]):
 
     @property
     def refused(self) -> bool:
-        """True if the constraints are met, and the solution is refused for penetration or its replay."""
-        # `touching` and the replay's `checked` write the depth or the error into max_violation, and the
-        # program's own violation stays.
+        """True if the constraints are met, and the solution is refused: for penetration, its replay, or what
+        an oracle still lacks after its last round.
+        """
+        # Those who refuse it raise max_violation, and the program's own violation stays.
         failed = self.result.status is Status.FAILED and self.result.max_violation > VIOLATED
         return failed and self.own_violation <= VIOLATED
 

@@ -29,9 +29,7 @@ _TOOLS = tuple(
 )
 APART = 0.01  # [m] least distance of two points that defines a direction
 SHORT = 0.06  # [m]: a link so short, such as a flange, does not fold back over the link before it
-EDGE = (
-    5e-3  # [m]: the part of a hand so near to its lowest plane is its edge; of a foot to its front, its toe
-)
+EDGE = 5e-3  # [m]: the part so near to a hand's lowest plane is its edge, to a foot's front its toe
 TOE = 0.02  # [m] height of a toe's striking point above the sole, if the toe has such a point
 LONG = 0.12  # [m] least length of a hand from a tool's frame
 # least cosines of angles between

@@ -238,11 +238,11 @@ def test_what_is_saved_is_read_with_its_touches(chopped: Solution, tmp_path: Pat
     planned = load_planned(tmp_path)
     assert planned.problem.order == chopped.problem.order
     assert planned.problem.law == chopped.problem.law
-
     older = dataclasses.replace(record, summary={**record.summary, "touches": 2})
     save_record(older, tmp_path / "older")  # older versions have their number
     phases = order_of_touches(planned.problem.law, BOARD, 2)
     assert load_planned(tmp_path / "older").problem.order == phases
+
 
 def test_a_board_with_a_heavier_one_as_a_scenario() -> None:
     """All targets are met as often; point masses are not asked then."""
@@ -254,7 +254,6 @@ def test_a_board_with_a_heavier_one_as_a_scenario() -> None:
     assert heavier.impulse != solution.impulse
 
 
-# ---- phases and their number
 def test_contact_time_of_a_scenario_is_without_the_swing_to_the_break() -> None:
     others = (Scenario(name="heavier", mass=1.2),)
     solution = solve(stiff(1e7, scenarios=others, touches=(SEPARATION, "break")))
@@ -266,6 +265,7 @@ def test_contact_time_of_a_scenario_is_without_the_swing_to_the_break() -> None:
     assert heavier["contact_ms"] < 0.5e3 * collision.time[-1]
 
 
+# ---- phases and their number
 
 
 @pytest.mark.parametrize("target", [BOARD, FreeMass(mass=1.0), Nail(mass=0.05, resistance=600.0)])

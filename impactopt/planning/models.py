@@ -195,11 +195,14 @@ def good_enough(problem: ImpactProblem, error: ModelError) -> bool:
 
 
 def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
-    """True if the coarsest model is not accurate enough in the posture of the initial guess, for an impact
-    half as fast as the joints allow.
+    """True if the coarsest model lacks the order of contact events that point masses have, or is not accurate
+    enough in the posture of the initial guess, for an impact half as fast as the joints allow.
 
     A faster impact moves the robot farther during contact, so the frozen model's error grows with the speed.
     """
+    if with_order(replace(problem, collision=_MODELS[1]), lambda _: None).order:
+        say(f"{_MODELS[0]} has one contact, in which point masses part too early: {_MODELS[1]} at once")
+        return True
     first, c = replace(problem, collision=_MODELS[0]), problem.coordinates
     y, legs = c.split(problem.contact_posture)
     most = fastest_at_contact(problem)

@@ -142,6 +142,13 @@ def test_a_servo_of_much_damping_is_followed_too(chopped: Solution) -> None:
     assert coarse.impulse == pytest.approx(fine.impulse, rel=5e-3)
 
 
+def test_the_model_is_full_where_the_frozen_one_has_no_such_order() -> None:
+    solution = solve(stiff(1e7, collision="auto"))
+    assert solution.status is Status.SOLVED
+    assert solution.problem.collision == "full"
+    assert solution.problem.order == (SEPARATION, "break")
+
+
 def test_a_strike_is_planned_so_too() -> None:
     strike = optimize_strike(stiff())
     assert strike.status is Status.SOLVED

@@ -27,7 +27,8 @@ class ContactLaw(Described, ABC):
 
     To write one, make a frozen dataclass whose fields are its parameters, and implement `branch`. The
     branches have to agree where the rate is zero; contact ends when the force of the restitution branch has
-    fallen to zero. Both are checked when a law is made, and fields with `impactopt.contact.fields.about`.
+    fallen to zero. When a law is made, both branches are called with CasADi expressions and compared at rate
+    zero, and fields with `impactopt.contact.fields.about` as metadata are checked.
 
     Attributes
     ----------

@@ -260,8 +260,8 @@ def check_touches(problem: Any) -> None:
     if order and isinstance(law, ContactLaw) and not is_order(law, target, order):
         possible = [*([TURN] if law.switches else []), SEPARATION, *target.guards]
         raise InputError(
-            f"touches: {list(order)} are no ends of a contact's phases under the law {type(law).__name__}, "
-            f"such as {possible}: leave it out"
+            f"touches: {list(order)} are no ends of a contact's phases, such as {possible} under the law "
+            f"{type(law).__name__}: leave it out"
         )
 
 

@@ -329,7 +329,7 @@ def impact_summary(hit: Plan | PlannedStrike, collision: PlannedCollision) -> di
         "impulse_Ns": hit.impulse,
         "target": collision.outcome,
         "peak_force_N": collision.peak_force if duration > 0 else None,
-        "contact_ms": 1e3 * collision.last_touch if duration > 0 else 0.0,
+        "contact_ms": 1e3 * hit.collision.last_touch if duration > 0 else 0.0,
         "hand_speed_m_s": hit.hand_speed,
     }
 

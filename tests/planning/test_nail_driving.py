@@ -59,7 +59,7 @@ class Solver:
         self.asked.append((problem, start, options))
         k = len(self.asked)
         assert isinstance(problem.target, Nail)
-        collision = SimpleNamespace(outcome={"depth_m": self.drives(problem.target)}, force=np.array([900.0]))
+        collision = SimpleNamespace(outcome={"depth_m": self.drives(problem.target)}, peak_force=900.0)
         return SimpleNamespace(
             problem=problem,
             status=Status.INFEASIBLE if k in self.fails_at else Status.SOLVED,

@@ -45,7 +45,7 @@ from impactopt.cli.verify import verify
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
-    from impactopt.files.output import Record
+    from impactopt.files.record import Record
 
 app = typer.Typer(
     name="impactopt",

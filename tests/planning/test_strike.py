@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 
 from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.files.output import load_record
 from impactopt.files.problem_file import ProblemFile
+from impactopt.files.record import load_record
 from impactopt.kinematics.support import support_polygon
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike

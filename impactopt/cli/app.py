@@ -244,11 +244,6 @@ def _show(record: Record, as_json: bool, ok: bool) -> None:
     cautions = (summary.get("caution"), touches_message(summary), beyond, switched_off_message(summary))
     say(console, reason_message(summary), summary.get("note"), error, reach.get("error"), *cautions)
     say_details(console, summary)
-    say(
-        console,
-        f"{summary['solver']}: {summary['status']} after {summary['iterations']} iterations, "
-        f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
-    )
 
 
 if __name__ == "__main__":

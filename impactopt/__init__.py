@@ -67,7 +67,7 @@ _EXPORTS = {
     "LawFit": "identification",
     "identify": "identification",
     "load_problem": "files.problem_file",
-    "load_record": "files.output",
+    "load_record": "files.record",
     "load_robot": "robots.presets",
     "moved_solution": "api",
     "optimize_strike": "api",

@@ -45,7 +45,7 @@ from impactopt.cli.verify import verify
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
-    from impactopt.files.output import Record
+    from impactopt.files.record import Record
 
 app = typer.Typer(
     name="impactopt",
@@ -244,11 +244,6 @@ def _show(record: Record, as_json: bool, ok: bool) -> None:
     cautions = (summary.get("caution"), touches_message(summary), beyond, switched_off_message(summary))
     say(console, reason_message(summary), summary.get("note"), error, reach.get("error"), *cautions)
     say_details(console, summary)
-    say(
-        console,
-        f"{summary['solver']}: {summary['status']} after {summary['iterations']} iterations, "
-        f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
-    )
 
 
 if __name__ == "__main__":

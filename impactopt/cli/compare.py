@@ -29,7 +29,8 @@ def compare(
     Exit code: 0 compared, 2 bad input.
     """
     with plain_errors("interrupted before the results were compared"):
-        from impactopt.files.output import load_record, make_directory, write_file
+        from impactopt.files.output import make_directory, write_file
+        from impactopt.files.record import load_record
         from impactopt.report.comparison import compare as comparison_of
 
         names = _names(results)

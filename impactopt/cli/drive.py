@@ -29,8 +29,9 @@ def drive(
     is in, 1 it is not, 2 bad input.
     """
     with plain_errors("interrupted before the nail was in", verbose=verbose) as console:
-        from impactopt.files.output import keep_series, make_directory, plain, set_aside
+        from impactopt.files.output import keep_series, make_directory, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.files.record import plain
         from impactopt.planning.nail_driving import drive_nail
         from impactopt.report.console import SolveConsole, nail_driving_table, output
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from impactopt.errors import InputError
-from impactopt.files.output import Record, record_of
+from impactopt.files.output import record_of
 from impactopt.files.problem_file import ProblemFile
+from impactopt.files.record import Record
 from impactopt.files.replay import has_mujoco
 from impactopt.planning.budget import VIOLATED
 from impactopt.planning.minimum_jerk import minimum_jerk_baseline

@@ -140,7 +140,7 @@ def _is_robot(what: Path) -> bool:
 def _result(result: Path, problem: Path | None) -> tuple[Page, Path]:
     """Page of a result, and its default path."""
     from impactopt.errors import InputError, did_you_mean
-    from impactopt.files.output import load_record
+    from impactopt.files.record import load_record
     from impactopt.files.replay import load_planned
     from impactopt.report.report import report_of
     from impactopt.robots.presets import robot_names

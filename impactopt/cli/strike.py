@@ -46,6 +46,7 @@ def strike(
     there is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
+        from impactopt.errors import printable
         from impactopt.files.output import keep_record, make_directory, record_of_strike, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.planning.strike import optimize_strike
@@ -89,6 +90,8 @@ def strike(
             shown.print(strike_table(s))
             say(shown, reason_message(s), s.get("gear_caution"), switched_off_message(s))
             say_details(shown, s)
-            say(shown, *written, set_aside(s))
+            say(shown, *written)
+            if aside := set_aside(s):
+                typer.echo(printable(aside))
         if not solution.status.usable:
             raise typer.Exit(NOT_SOLVED)

@@ -25,14 +25,12 @@ from impactopt.files.problem_file.reading import change_data
 from impactopt.files.problem_file.sections import comment_at
 from impactopt.files.record import (
     FORMAT,
-    LARGEST,
     NUMBERS,
     SUMMARY,
     Record,
     load_record,
     plain,
     read_json,
-    replay_name,
 )
 from impactopt.files.toml import read_toml, write_toml
 from impactopt.kinematics.support import corners_at, support_polygon
@@ -43,30 +41,6 @@ from impactopt.solvers.program import SolverResult, Status
 if TYPE_CHECKING:  # reading a record does not import the planner
     from impactopt.planning.solution import Solution
     from impactopt.planning.strike import StrikeSolution
-
-__all__ = [
-    "DERIVED",
-    "FORMAT",
-    "LARGEST",
-    "NUMBERS",
-    "SUMMARY",
-    "Record",
-    "keep_record",
-    "keep_series",
-    "load_record",
-    "make_directory",
-    "plain",
-    "read_json",
-    "record_of",
-    "record_of_strike",
-    "remove_file",
-    "replay_arrays",
-    "replay_name",
-    "save_record",
-    "set_aside",
-    "summary_of",
-    "write_file",
-]
 
 # Bits of saved histories, by prefix, relative to each channel's largest value. References have 32 (5e-10 rad
 # of 2 rad): with 24, accelerations are beyond what `verify` allows. Replays have 15 (3e-5 rad, 15 mN of

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.files.output import Record, load_record, plain, replay_arrays
+from impactopt.files.output import replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
+from impactopt.files.record import Record, load_record, plain
 from impactopt.planning.gain_selection import ChosenGains, with_chosen
 from impactopt.planning.lazy_constraints import gear_caution, with_lazy_constraints
 from impactopt.planning.refinement import Outcome

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.files.output import NUMBERS, load_record, make_directory, record_of, save_record
+from impactopt.files.output import make_directory, record_of, save_record
 from impactopt.files.problem_file import ProblemFile
+from impactopt.files.record import NUMBERS, load_record
 from impactopt.files.replay import problem_of, resumed
 from impactopt.files.toml import read_toml
 from impactopt.planning.budget import one_after_the_other

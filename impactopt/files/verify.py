@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError
-from impactopt.files.output import LARGEST, NUMBERS, SUMMARY, Record, load_record, record_of
+from impactopt.files.output import record_of
+from impactopt.files.record import LARGEST, NUMBERS, SUMMARY, Record, load_record
 from impactopt.files.replay import problem_of, program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import weight_of

@@ -7,7 +7,8 @@ from html import escape
 from typing import Any
 
 from impactopt.errors import InputError
-from impactopt.files.output import Record, record_of
+from impactopt.files.output import record_of
+from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.page import Page, html_page

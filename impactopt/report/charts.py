@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.files.output import Record, replay_name
+from impactopt.files.record import Record, replay_name
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import (
     BUCKETS,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.files.output import Record, plain
+from impactopt.files.record import Record, plain
 from impactopt.files.toml import TOMLError, read_toml
 from impactopt.report.charts import chart, series_of
 from impactopt.report.histories import at_contact, ground_wrenches, planned_torque, thinned, zmp_margins

@@ -103,11 +103,16 @@ def say(console: Console, *texts: Any) -> None:
 
 
 def say_details(console: Console, summary: Mapping[str, Any]) -> None:
-    """Prints the starts of a plan or a strike, if there are several, and its violations."""
+    """Prints the starts of a plan or a strike, if there are several, its violations, and its status."""
     if len(summary["starts"]) > 1:
         console.print(multistart_table(summary["starts"]))
     if summary["violations"]:
         console.print(violation_table(summary["violations"]))
+    say(
+        console,
+        f"{summary['solver']}: {summary['status']} after {summary['iterations']} iterations, "
+        f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
+    )
 
 
 def result_table(summary: Mapping[str, Any]) -> Table:

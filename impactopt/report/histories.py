@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.kinematics.support import convex_polygon, margin
 from impactopt.simulation.result import centre_of_pressure
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.errors import InputError
-from impactopt.files.output import plain, write_file
+from impactopt.files.output import write_file
+from impactopt.files.record import plain
 from impactopt.report.result_rows import Row
 
 KINDS = {"<f4": np.float32, "<u2": np.uint16, "<u4": np.uint32, "|u1": np.uint8}  # JavaScript's typed arrays

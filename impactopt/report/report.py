@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 from html import escape
 from typing import Any
 
-from impactopt.files.output import Record, record_of
+from impactopt.files.output import record_of
+from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.charts import charts_of

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.solids import Solid, simplified
 from impactopt.bodies.visuals import Visual, joined_visuals, surroundings_of
 from impactopt.bodies.world import WorldBody
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import footprints
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.sweeps.sections import SweepSection
 
 Array = NDArray[np.float64]

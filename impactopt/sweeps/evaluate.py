@@ -16,8 +16,9 @@ from threadpoolctl import threadpool_limits
 
 from impactopt import __version__
 from impactopt.errors import InputError
-from impactopt.files.output import Record, plain, record_of, record_of_strike, summary_of
+from impactopt.files.output import record_of, record_of_strike, summary_of
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.files.record import Record, plain
 from impactopt.files.solution_library import SolvedFolder
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve

@@ -9,7 +9,8 @@ from typing import Any
 
 from impactopt.codegen.files import open_own, write_atomically
 from impactopt.errors import InputError
-from impactopt.files.output import make_directory, plain
+from impactopt.files.output import make_directory
+from impactopt.files.record import plain
 
 
 class Kept:

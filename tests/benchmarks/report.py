@@ -116,7 +116,8 @@ def save_report(report: Report, directory: Path) -> list[Path]:
     ------
     InputError : they cannot be written.
     """
-    from impactopt.files.output import plain, write_file
+    from impactopt.files.output import write_file
+    from impactopt.files.record import plain
 
     written = [directory / f"{report.name}.json"]
     text = json.dumps(plain(report.numbers), indent=2, allow_nan=False)

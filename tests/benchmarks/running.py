@@ -32,7 +32,8 @@ def show_reports(
         from rich.console import Console
 
         from benchmarks.report import save_report
-        from impactopt.files.output import make_directory, plain
+        from impactopt.files.output import make_directory
+        from impactopt.files.record import plain
         from impactopt.report.console import SolveConsole
 
         directory = make_directory(out) if out is not None else None

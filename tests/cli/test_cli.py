@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 import impactopt
 from impactopt import Solution
 from impactopt.cli.app import app
-from impactopt.files.output import Record, load_record
 from impactopt.files.problem_file import ProblemFile
+from impactopt.files.record import Record, load_record
 from impactopt.planning.refinement import Attempt
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures import PICTURES

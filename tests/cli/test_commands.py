@@ -32,6 +32,7 @@ from impactopt.files.problem_file import (
     read_toml,
     write_toml,
 )
+from impactopt.files.problem_file.reading import key_paths
 from impactopt.report.console import output
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
@@ -170,6 +171,13 @@ def test_a_collision_needs_no_sections_of_plans(file: Path) -> None:
     assert "no collision depends on [swing]" in run(*words, "--set", "swing.intervals=9", code=2)[1]
     file.write_text(wrong.replace("[contact]", "[contakt]"))
     assert "did you mean 'contact'" in run(*words, code=2)[1]
+    keys = [key for key in key_paths(read_toml(wrong)) if key.startswith("collision.")]
+    assert "collision.touches" in keys
+    plan = "\n".join(f"{key} = 1" for key in keys if "restitution" not in key)
+    file.write_text(f"{plan}\n{wrong}")
+    assert json.loads(run(*words)[0]) == right
+    file.write_text(f"collision.coefficient_of_restituton = 0.5\n{wrong}")
+    assert "did you mean 'coefficient_of_restitution'" in run(*words, code=2)[1]
 
 
 def test_a_collision_that_there_is_not_exits_1(file: Path) -> None:

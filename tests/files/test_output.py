@@ -15,7 +15,8 @@ import pytest
 from support.fake_solution import MissingSolution, simulation_of, still_problem, still_solution
 
 from impactopt.errors import InputError
-from impactopt.files.output import FORMAT, Record, load_record, record_of, save_record, write_file
+from impactopt.files.output import record_of, save_record, write_file
+from impactopt.files.record import FORMAT, Record, load_record
 from impactopt.files.record_schema import check_summary
 from impactopt.kinematics.support import margin
 from impactopt.problem.problem import ImpactProblem

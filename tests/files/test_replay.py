@@ -18,7 +18,8 @@ from impactopt import Solution
 from impactopt.cli.app import app
 from impactopt.cli.validate import validate
 from impactopt.errors import InputError
-from impactopt.files.output import Record, load_record, record_of, save_record
+from impactopt.files.output import record_of, save_record
+from impactopt.files.record import Record, load_record
 from impactopt.files.replay import Planned, Replay, load_planned, replay
 from impactopt.report.console import touch_message
 from impactopt.report.pictures.animation import AROUND, FPS, SLOW, _Drawing, save_animation, shown_times

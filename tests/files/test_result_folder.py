@@ -14,15 +14,14 @@ from impactopt.cli.show import PAGE
 from impactopt.errors import InputError
 from impactopt.files.output import (
     DERIVED,
-    Record,
     keep_record,
     keep_series,
-    load_record,
     remove_file,
     save_record,
     set_aside,
     write_file,
 )
+from impactopt.files.record import Record, load_record
 from impactopt.report.pictures import PICTURES
 from impactopt.solvers.program import Status
 

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from impactopt import Solution
 from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.files.output import NUMBERS
 from impactopt.files.problem_file import ProblemFile, read_problem_file
+from impactopt.files.record import NUMBERS
 from impactopt.files.solution_library import SolvedFolder
 from impactopt.planning.solve import solve
 from impactopt.sweeps import sweep_from_data

@@ -30,7 +30,8 @@ from impactopt import Solution, load_problem, moved_solution, solve
 from impactopt.cli.app import app
 from impactopt.contact.targets import RigidWall
 from impactopt.errors import InputError
-from impactopt.files.output import load_record, record_of, save_record
+from impactopt.files.output import record_of, save_record
+from impactopt.files.record import load_record
 from impactopt.files.replay import problem_of, resumed
 from impactopt.live import plan_page as look_module
 from impactopt.live.drawing import moment_of

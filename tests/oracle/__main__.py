@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from impactopt.files.output import load_record
+from impactopt.files.record import load_record
 from impactopt.files.replay import problem_of
 from oracle.verdict import verify_record
 

@@ -14,8 +14,8 @@ from support.small_robots import arm, biped
 
 from impactopt.errors import InputError
 from impactopt.files.export.motion import motion_at
-from impactopt.files.output import Record
 from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
+from impactopt.files.record import Record
 from impactopt.files.verify import motion_of_record
 from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.bounds import bounds_of

@@ -28,8 +28,9 @@ from impactopt.collision import SDC, Effects
 from impactopt.collision.settings import REFERENCE_ORDER, constant_reference
 from impactopt.contact import FreeMass
 from impactopt.errors import InputError
-from impactopt.files.output import load_record, record_of, record_of_strike, save_record
+from impactopt.files.output import record_of, record_of_strike, save_record
 from impactopt.files.problem_file import read_problem_file
+from impactopt.files.record import load_record
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.planning.strike import StrikeSolution
 from impactopt.problem.problem import ImpactProblem

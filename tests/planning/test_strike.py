@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 
 from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.files.output import load_record
 from impactopt.files.problem_file import ProblemFile
+from impactopt.files.record import load_record
 from impactopt.kinematics.support import support_polygon
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike
@@ -460,6 +460,7 @@ def test_the_command_prints_and_writes(
     table = runner.invoke(app, [*command[:2], "--starts", "1"])
     assert table.exit_code == 0
     assert f"{summary['starts'][0]['impulse_Ns']:.2f}" in table.stdout
+    assert f"solved after {summary['starts'][0]['iterations']} iterations" in table.stdout
     assert runner.invoke(app, [*command[:2], "--starts", "0"]).exit_code == 2
     assert runner.invoke(app, [*command[:2], "--time-limit", "1e-6", "--quiet"]).exit_code == 1
 

@@ -19,7 +19,8 @@ from typer.testing import CliRunner
 
 from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.files.output import Record, record_of, save_record
+from impactopt.files.output import record_of, save_record
+from impactopt.files.record import Record
 from impactopt.report.comparison import compare, histories_of
 from impactopt.report.pictures.compare import comparison_picture
 from impactopt.report.result_rows import result_rows, standing

@@ -24,7 +24,8 @@ from impactopt.cli.app import app
 from impactopt.contact import Board, KelvinVoigt
 from impactopt.errors import InputError
 from impactopt.files.named_problems import problem_file
-from impactopt.files.output import Record, record_of, save_record
+from impactopt.files.output import record_of, save_record
+from impactopt.files.record import Record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.animation import animation_of
 from impactopt.report.page import unpack

@@ -32,7 +32,8 @@ from impactopt.bodies.world import Obstacle, TargetBody
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
-from impactopt.files.output import BITS, Record, record_of
+from impactopt.files.output import BITS, record_of
+from impactopt.files.record import Record
 from impactopt.report.charts import charts_of
 from impactopt.report.histories import thinned
 from impactopt.report.page import pack, unpack

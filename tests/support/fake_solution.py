@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from impactopt import Solution
 from impactopt.contact import FreeMass, SpringDamper
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.planning.refinement import Attempt

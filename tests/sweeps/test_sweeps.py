@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.files.output import load_record
+from impactopt.files.record import load_record
 from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.sweeps import SweepProgress, sweep, sweep_from_data
 from impactopt.sweeps.collisions import collide_many

@@ -11,7 +11,8 @@ from support.small_plans import Planned, changed
 
 from impactopt import Solution
 from impactopt.errors import InputError
-from impactopt.files.output import load_record, record_of, save_record
+from impactopt.files.output import record_of, save_record
+from impactopt.files.record import load_record
 from impactopt.files.replay import load_planned
 from impactopt.problem.scenario import Scenario
 from impactopt.simulation import Perturbation

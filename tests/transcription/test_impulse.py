@@ -15,7 +15,8 @@ from scipy.integrate import solve_ivp
 from support.small_plans import LAW, OPTIONS, Planned, changed, planned
 
 from impactopt import Solution
-from impactopt.files.output import load_record, record_of, save_record
+from impactopt.files.output import record_of, save_record
+from impactopt.files.record import load_record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import TorqueLimit
 from impactopt.report.console import result_table

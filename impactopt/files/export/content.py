@@ -25,7 +25,7 @@ from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_choice, check_number
 from impactopt.files.export.motion import JUMP, Motion, motion_at, with_passive_at_rest
 from impactopt.files.export.smooth import Smoothness, smoothed
-from impactopt.files.output import plain, read_json
+from impactopt.files.record import plain, read_json
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot

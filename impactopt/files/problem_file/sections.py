@@ -17,7 +17,7 @@ from impactopt.bodies.world import Ground, Obstacle
 from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
 from impactopt.files.problem_file.ipopt_options import IpoptOptions
-from impactopt.files.sections.collision import CollisionSections, ProblemSection, with_kinds
+from impactopt.files.sections.collision import CollisionSections, ProblemSection, RigidSection, with_kinds
 from impactopt.files.sections.diagnostics import section_at
 from impactopt.files.sections.values import (
     AtLeastOne,
@@ -26,7 +26,6 @@ from impactopt.files.sections.values import (
     Fractions,
     NotNegative,
     Positive,
-    Restitution,
     Section,
     Vector,
     attribute_docs,
@@ -176,7 +175,7 @@ def touches_or_order(value: Any) -> Any:
 Touches = Annotated[Any, PlainValidator(touches_or_order)]
 
 
-class CollisionSection(Section):
+class CollisionSection(RigidSection):
     """Model and discretization of the collision."""
 
     collision: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full", "auto"] = optional(
@@ -187,7 +186,6 @@ class CollisionSection(Section):
     freezes: Annotated[int, Field(ge=0, le=MOST_FREEZES)] = optional('of the model "sdc", during contact')
     auto_impulse_pct: Positive = optional('of "auto": largest change of the impulse by full dynamics [%]')
     auto_zmp_mm: Positive = optional('of "auto": largest change of the ZMP [mm]')
-    coefficient_of_restitution: Restitution = optional('of "rigid": speed of separation over approach')
     contact_duration: ContactDuration = optional(
         "time of compression and of restitution [s]",
         "duration_s",

@@ -137,18 +137,24 @@ class StanceSection(Section):
 FrictionSection: Any = section_of(ContactFriction)
 
 
-class _Rigid(Section):
-    """The key of [collision] that a rigid impact needs; the others are a plan's."""
+class RigidSection(Section):
+    """[collision], of which a rigid impact needs one key; the others are a plan's, and are not checked."""
 
-    model_config = ConfigDict(extra="ignore")
+    collision: object = optional("", "model")
+    freezes: object = optional("")
+    auto_impulse_pct: object = optional("")
+    auto_zmp_mm: object = optional("")
     coefficient_of_restitution: Restitution = optional('of "rigid": speed of separation over approach')
-
-
-RigidSection: Any = _Rigid
+    contact_duration: object = optional("", "duration_s")
+    collision_stages: object = optional("", "stages")
+    touches: object = optional("")
+    compression: object = optional("")
+    restitution: object = optional("")
 
 
 class CollisionSections(Section):
-    """A problem file as a collision needs it: the content of a plan's sections is not checked.
+    """A problem file as a collision needs it: the content of a plan's sections, of the type `object`, is not
+    checked.
 
     `with_kinds` sets the classes of [target] and [contact].
     """
@@ -158,20 +164,20 @@ class CollisionSections(Section):
     target: Target
     contact: Contact
     friction: FrictionSection = optional("")
-    second: Any = optional("")
+    second: object = optional("")
     stance: StanceSection = optional("")
-    stances: Any = optional("")
-    swing: Any = optional("")
-    follow: Any = optional("")
+    stances: object = optional("")
+    swing: object = optional("")
+    follow: object = optional("")
     collision: RigidSection = optional("")
-    scenarios: Any = optional("")
-    obstacles: Any = optional("")
-    ground: Any = optional("")
-    objectives: Any = optional("")
-    objective: Any = optional("")
-    terms: Any = optional("")
-    solver: Any = optional("")
-    controller: Any = optional("")
+    scenarios: object = optional("")
+    obstacles: object = optional("")
+    ground: object = optional("")
+    objectives: object = optional("")
+    objective: object = optional("")
+    terms: object = optional("")
+    solver: object = optional("")
+    controller: object = optional("")
 
     def make_robot(self, folder: Path) -> Robot:
         """The robot of [robot], or the preset in [problem]."""

@@ -363,8 +363,9 @@ def find_key(model: type[Section], data: Mapping[str, Any], key: str) -> Place:
             if not isinstance(value, Mapping):
                 raise KeyError(f"{key}: {where} is no table in the file")
             name, kind = _field(kind, part, key, where)
-            if kind is Any and not place:  # the section of a plan, in a file read for a collision
-                raise KeyError(f"{key}: no collision depends on [{name}]; leave it out")
+            if kind is object:  # of a plan, in a file read for a collision
+                told = f"{where}.{name}" if place else f"[{name}]"
+                raise KeyError(f"{key}: no collision depends on {told}; leave it out")
             place.append(name)
             value = value.get(name)
             if value is None and isinstance(kind, type) and issubclass(kind, Section):

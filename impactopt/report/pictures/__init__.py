@@ -14,7 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from impactopt.errors import InputError, check_choice
-from impactopt.files.output import Record, record_of, write_file
+from impactopt.files.output import record_of, write_file
+from impactopt.files.record import Record
 from impactopt.planning.solution import Solution
 from impactopt.report.pictures.ellipsoid import ellipsoid
 from impactopt.report.pictures.force import draw_force, force

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from impactopt.errors import InputError
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.report.comparison import histories_of
 from impactopt.report.pictures.style import PAGE, Picture, impulse_text, styled
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.report.pictures.style import BLACK, BLUE, GREEN, RIGHT, VERMILION, Array, picture, title
 
 # of each view: axes across and up, their labels, and its name

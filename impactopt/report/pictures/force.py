@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.report.pictures.style import COLUMN, PLANNED, SIMULATED, impulse_text, picture, title
 
 

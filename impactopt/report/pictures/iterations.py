@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.report.pictures.style import BLUE, COLUMN, GREEN, VERMILION, Array, picture
 
 MIN_VALUE = 1e-12  # smaller values are drawn there

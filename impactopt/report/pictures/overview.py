@@ -6,7 +6,7 @@ from typing import Any
 
 from matplotlib.figure import FigureBase
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.report.pictures.force import draw_force
 from impactopt.report.pictures.strobe import strobe, strobe_height
 from impactopt.report.pictures.style import picture, title

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp
 from impactopt.report.pictures.style import (
     BLACK,

@@ -8,7 +8,7 @@ from matplotlib.collections import PolyCollection
 
 from impactopt.bodies.solids import Solid, simplified
 from impactopt.bodies.visuals import Part, surroundings_of
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.problem.motion_style import joints_to
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures.style import BLUE, ORANGE, VERMILION, Array, Picture, styled, title

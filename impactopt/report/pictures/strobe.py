@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.spatial import ConvexHull
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.report.pictures.style import BLACK, BLUE, PAGE, VERMILION, Array, picture
 
 GAP = 0.12  # [m] between poses

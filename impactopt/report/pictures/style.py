@@ -15,7 +15,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.rcsetup import cycler
 from numpy.typing import NDArray
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 
 Array = NDArray[np.float64]
 Given = ParamSpec("Given")

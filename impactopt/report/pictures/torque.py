@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.report.pictures.style import (
     BLUE,
     GREEN,

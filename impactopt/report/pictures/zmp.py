@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from impactopt.files.output import Record
+from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp
 from impactopt.report.histories import footprints
 from impactopt.report.pictures.style import BLACK, OVER, PHASES, RIGHT, Array, picture, simulated_phases

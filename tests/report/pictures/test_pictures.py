@@ -26,7 +26,8 @@ from impactopt import Solution
 from impactopt.bodies.world import Ground
 from impactopt.collision import effective_mass
 from impactopt.errors import InputError
-from impactopt.files.output import Record, record_of
+from impactopt.files.output import record_of
+from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp
 from impactopt.report.pictures import PICTURES, hierarchy, overview
 from impactopt.report.pictures.ellipsoid import effective_masses

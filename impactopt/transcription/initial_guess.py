@@ -143,7 +143,7 @@ def _with_bent_legs(problem: ImpactProblem, c: StanceCoordinates, curve: CubicSp
     """Spline with the base lowered where a leg of the given one is nearly straight or out of reach.
 
     The ends stay. Near a straight knee the legs' rates grow without bound: a guess of G1 asked for 33 times
-    its hip's torque, from which the solver took 885 iterations, and 130 from this one.
+    its hip's torque, from which the solver took 885 iterations in place of 154.
     """
     values, rates, _ = curve.sample(curve.breaks * curve.duration)
     least = _GUESSED_EXTENSION * problem.term(LegExtension).minimum

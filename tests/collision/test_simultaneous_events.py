@@ -14,6 +14,8 @@ from impactopt.contact import FreeMass, Nail, SpringDamper, Target
 from impactopt.contact.fields import about, choose
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 
+pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
+
 LAW = SpringDamper(stiffness=1e6, damping=512.0)
 MODELS = (SDC, VirtualMass, FullDynamics)
 # relative: what the numbers beside the tie are off it, and what the models' steps leave out

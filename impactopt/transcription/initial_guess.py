@@ -15,7 +15,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates, independent_rate
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import LegExtension, TargetSpeed
+from impactopt.problem.terms import TargetSpeed
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, speed_that_leaves, speed_with_order
@@ -96,11 +96,12 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)
     bounds = p.extra(TargetSpeed)
-    mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]
-    if p.order:
-        speed = speed_with_order(p.law, p.target, mass, speed, p.order)
-    elif bounds is not None:
-        speed = speed_that_leaves(p.law, p.target, mass, speed, bounds.least, bounds.most)
+    if p.order or bounds is not None:
+        mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]
+        if p.order:
+            speed = speed_with_order(p.law, p.target, mass, speed, p.order)
+        elif bounds is not None:
+            speed = speed_that_leaves(p.law, p.target, mass, speed, bounds.least, bounds.most)
     base = 0.0 if c.drifts else 0.3  # momentum determines the rates of a floating base
     limit = 0.8 * limits.rate_limit[c.independent]
     most = np.concatenate([np.full(c.base, np.inf), limit]) if p.order else None
@@ -132,22 +133,22 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
         hit = replace(hit, y=curve.sample(swing_T)[0][0], rates=curve.sample(swing_T)[1][0])
         after = _drifting(t.problem, after, hit)
     elif t.coordinates.soles:
-        curve, after = (_with_bent_legs(t.problem, t.coordinates, spline) for spline in (curve, after))
+        curve, after = (_with_bent_legs(t, spline) for spline in (curve, after))
     x = _motion(t, curve, after)
     t.hit.guess(x, hit.y, hit.rates, hit.legs)
     _draw_gains(t, x, noise, seed)
     return _finished(t, x)
 
 
-def _with_bent_legs(problem: ImpactProblem, c: StanceCoordinates, curve: CubicSpline) -> CubicSpline:
+def _with_bent_legs(t: Transcription, curve: CubicSpline) -> CubicSpline:
     """Spline with the base lowered where a leg of the given one is nearly straight or out of reach.
 
     The ends stay. Near a straight knee the legs' rates grow without bound: a guess of G1 asked for 33 times
     its hip's torque, from which the solver took 885 iterations in place of 154.
     """
     values, rates, _ = curve.sample(curve.breaks * curve.duration)
-    least = _GUESSED_EXTENSION * problem.term(LegExtension).minimum
-    down = np.array([0.0, *(_descent(c, y, least) for y in values[1:-1]), 0.0])
+    least = _GUESSED_EXTENSION * t.builder.limits.extension.minimum
+    down = np.array([0.0, *(_descent(t.coordinates, y, least) for y in values[1:-1]), 0.0])
     if not down.any():
         return curve
     values[:, 2] -= down

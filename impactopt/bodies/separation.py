@@ -88,6 +88,11 @@ class Shapes:
     radius (P,) [m] : of the second if it is a capsule or a sphere, else zero.
     points (k, 3) [m], blocks (k / 8, 3, 8) : all vertices, see `packed`.
     hulls (P, 4) : first vertex and number of vertices of both.
+    of (B,), balls (B, 4) : joint of each piece of a link, and its bounding ball in the joint's frame, centre and
+        radius [m].
+    boxes (W, 4) : half sides of the bodies of the world, and their radius [m]. They have no balls: those of
+        large ones, such as walls, would be huge.
+    pieces (P, 2) : index of both pieces in ``of``; for a body of the world zero.
     """
 
     def __init__(
@@ -101,18 +106,24 @@ class Shapes:
         # A capsule or sphere is its axis or point, and its radius is subtracted from the distance.
         corners = [_corners(body.half) for body in world]
         own = {id(piece): _thinned_piece(piece) for piece in links.pieces}
-        ball = {id(piece): np.append(*bounding_ball(piece.vertices)) for piece in links.pieces}
+        joint_of = {id(piece): j for j, pieces in links.of_joint.items() for piece in pieces}
+        self.of = np.array([joint_of[id(piece)] for piece in links.pieces], dtype=np.int64)
+        balls = [np.append(*bounding_ball(piece.vertices)) for piece in links.pieces]
+        self.balls = np.array(balls, dtype=float).reshape(-1, 4)
+        self.boxes = np.array([(*body.half, body.radius) for body in world], dtype=float).reshape(-1, 4)
         self.points, self.blocks, ranges = packed([*own.values(), *corners])
         keys: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
         where = dict(zip(keys, ranges, strict=True))
-        self.room = np.zeros(self.points.shape[0] + 1)  # work memory of the C code
-        pairs, number, hulls, balls, radius = [], [], [], [], []
+        # work memory of the C code
+        self.room = np.zeros(len(self.points) + 3 * len(self.of) + links.robot.model.njoints + 1)
+        piece_index = {id(piece): k for k, piece in enumerate(links.pieces)}
+        pairs, number, hulls, pieces_of, radius = [], [], [], [], []
         for (a, b), pieces in pairs_of_links.items():
             for k, (one, two) in enumerate(pieces):
                 pairs.append((a, b))
                 number.append(k)
                 hulls.append((*where[id(one)], *where[id(two)]))
-                balls.append((*ball[id(one)], *ball[id(two)]))
+                pieces_of.append((piece_index[id(one)], piece_index[id(two)]))
                 radius.append(0.0)
         for j, w in pairs_with_world:
             body = world[w]
@@ -120,15 +131,13 @@ class Shapes:
                 pairs.append((j, -1 - w))
                 number.append(k)
                 hulls.append((*where[id(one)], *where["world", w]))
-                # A body of the world has half sides in place of a centre: large ones, such as
-                # walls, would have huge balls.
-                balls.append((*ball[id(one)], *body.half, body.radius))
+                pieces_of.append((piece_index[id(one)], 0))
                 radius.append(body.radius)
         self.pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         self.number = np.array(number, dtype=np.int64)
         self.hulls = np.array(hulls, dtype=np.int64).reshape(-1, 4)
         self.radius = np.array(radius, dtype=float)
-        self._balls = np.array(balls, dtype=float).reshape(-1, 8)
+        self.pieces = np.array(pieces_of, dtype=np.int64).reshape(-1, 2)
         # Joints from the root to each; those of only one of the two are between them.
         supports = [set(joints) for joints in links.robot.model.supports]
         self.between = np.array(
@@ -152,11 +161,11 @@ class Shapes:
         if library is None:
             found = separation_numpy.look(self, at, within, directions, wanted, gaps)
             return Looked(gaps, *found)
-        counts = (ctypes.c_int64(n) for n in (k, j, w, p))
-        arrays = (at.joints, at.world, self.pairs, self._balls, self.hulls, self.radius, at.present, chosen)
+        counts = (ctypes.c_int64(n) for n in (k, j, w, p, len(self.of)))
+        bodies = (self.of, self.balls, self.boxes, self.pairs, self.pieces, self.hulls, self.radius)
         n = library.look(
             *counts,
-            *map(address, (*arrays, self.blocks)),
+            *map(address, (at.joints, at.world, *bodies, at.present, chosen, self.blocks)),
             ctypes.c_double(1 / ROUNDING),
             ctypes.c_double(within),
             *map(address, (directions, gaps, self.room)),
@@ -170,16 +179,18 @@ class Shapes:
     ) -> tuple[Index, Index]:
         """Instants and indices of pairs that have clearance in both placements, but may penetrate in between.
 
-        These are pairs of which one moves, relative to the other, by more than the sum of both distances.
+        These are pairs that move by more than the sum of both distances: both in the world, and one relative to
+        the other.
         """
         (k, j), w, p = one[0].joints.shape[:2], one[0].world.shape[1], len(self)
         near = np.empty((k * p, 2), dtype=np.int64)
         chosen, library = wanted.astype(np.uint8), _library()
         if library is None:
             return separation_numpy.may_meet(self, one, two, wanted)
-        counts = (ctypes.c_int64(n) for n in (k, j, w, p))
+        counts = (ctypes.c_int64(n) for n in (k, j, w, p, len(self.of)))
         places = (one[0].joints, one[0].world, two[0].joints, two[0].world)
-        arrays = (*places, self.pairs, self._balls, chosen, one[1].gaps, two[1].gaps)
+        bodies = (self.of, self.balls, self.pairs, self.pieces)
+        arrays = (*places, *bodies, chosen, one[1].gaps, two[1].gaps, self.room)
         n = library.may_meet(*counts, *map(address, arrays), ctypes.c_int64(len(near)), address(near))
         return near[:n, 0].copy(), near[:n, 1].copy()
 
@@ -200,6 +211,7 @@ class Separations:
         self.directions = np.ascontiguousarray(directions, dtype=float)
         self._hulls = np.ascontiguousarray(shapes.hulls[pairs])
         self._known, self._room = np.zeros((self.count, _SIDE)), shapes.room
+        self._turn = np.zeros((self.count, 3 + 4 * (joints + 3)))
         self.forget()
 
     def copy(self) -> Separations:
@@ -228,7 +240,7 @@ class Separations:
             ctypes.c_int64(self.joints),
             *map(address, (z, self.numbers, self._hulls, self._shapes.blocks)),
             ctypes.c_double(1 / ROUNDING),
-            *map(address, (self.directions, self._known, self._seen, self._room)),
+            *map(address, (self.directions, self._known, self._seen, self._turn, self._room)),
             ctypes.c_int64(what),
             *map(address, (by, out)),
         )

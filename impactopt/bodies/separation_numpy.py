@@ -258,13 +258,16 @@ def look(
     spot, pair = spot[present], pair[present]
     turn, shift = _of_pairs(shapes, at, spot, pair)
     # lower bounds: distance of the first's bounding ball from that of the second, or from a box of the world
-    balls, world = shapes._balls[pair], shapes.pairs[pair, 1] < 0
-    x = np.einsum("mij,mj->mi", turn, balls[:, :3]) + shift - np.where(world[:, None], 0.0, balls[:, 4:7])
-    out = np.abs(x) - balls[:, 4:7]
+    one, second = shapes.pieces[pair].T
+    other, ball = shapes.pairs[pair, 1], shapes.balls[one]
+    world = other < 0
+    two = shapes.balls[second]  # centre or half sides, and the radius that is subtracted
+    two[world] = shapes.boxes[-1 - other[world]]
+    x = np.einsum("mij,mj->mi", turn, ball[:, :3]) + shift - np.where(world[:, None], 0.0, two[:, :3])
+    out = np.abs(x) - two[:, :3]
     outside, deepest = np.maximum(out, 0.0), out.max(axis=1)
     box = np.where(deepest > 0, np.linalg.norm(outside, axis=1), deepest)
-    # balls[:, 7]: the second ball's radius, or the inflation of a body of the world.
-    bound = np.where(world, box, np.linalg.norm(x, axis=1)) - balls[:, 3] - balls[:, 7]
+    bound = np.where(world, box, np.linalg.norm(x, axis=1)) - ball[:, 3] - two[:, 3]
     # initial direction: between the centres; from a box, its nearest corner's, edge's or face's
     face = np.where(outside.any(axis=1)[:, None], outside, np.eye(3)[out.argmax(axis=1)]) * np.where(
         x > 0, 1.0, -1.0
@@ -291,12 +294,31 @@ def may_meet(
     before, after = one[1].gaps, two[1].gaps
     # Pairs farther apart than 5 m cannot meet in a step; this also leaves out those with the gap 1e3.
     spot, pair = np.nonzero(wanted & (before > 0) & (after > 0) & (before + after <= 5.0))
-    (turn0, shift0), (turn1, shift1) = (_of_pairs(shapes, p[0], spot, pair) for p in (one, two))
-    centre, radius = shapes._balls[pair, :3], shapes._balls[pair, 3]
-    moved = np.einsum("mij,mj->mi", turn1 - turn0, centre) + shift1 - shift0
-    # trace(R0' R1) = 1 + 2 cos of the angle between both: no point of the ball moves farther than the
-    # centre's way and angle times radius.
-    cosine = (np.einsum("mij,mij->m", turn0, turn1) - 1) / 2
-    far = np.linalg.norm(moved, axis=1) + np.arccos(np.clip(cosine, -1.0, 1.0)) * radius
-    met = far >= before[spot, pair] + after[spot, pair]
+    joint, other = shapes.pairs[pair].T
+    first, second = shapes.pieces[pair].T
+    places0, places1 = one[0], two[0]
+    moved = _moved(places0.joints, places1.joints, shapes.of, shapes.balls)
+    of_second = moved[spot, second]
+    world = other < 0  # bodies of the world do not turn
+    at = spot[world], -1 - other[world]
+    of_second[world] = np.linalg.norm((places1.world[at] - places0.world[at])[:, 9:], axis=1)
+    # of the first relative to the second
+    (turn0, shift0), (turn1, shift1) = (_of_pairs(shapes, p, spot, pair) for p in (places0, places1))
+    balls = shapes.balls[first]
+    way = np.einsum("mij,mj->mi", turn1 - turn0, balls[:, :3]) + shift1 - shift0
+    relative = np.linalg.norm(way, axis=1) + _angle(turn0, turn1) * balls[:, 3]
+    met = np.minimum(moved[spot, first] + of_second, relative) >= before[spot, pair] + after[spot, pair]
     return spot[met], pair[met]
+
+
+def _moved(before: Array, after: Array, of: Index, balls: Array) -> Array:
+    """Largest way (K, B) [m] of any point of the pieces' balls between placements of joints (K, J, 12)."""
+    turn0, turn1 = (x[:, of, :9].reshape(len(x), -1, 3, 3) for x in (before, after))
+    way = np.einsum("kbij,bj->kbi", turn1 - turn0, balls[:, :3]) + (after - before)[:, of, 9:]
+    return np.asarray(np.linalg.norm(way, axis=2) + _angle(turn0, turn1) * balls[:, 3])
+
+
+def _angle(one: Array, two: Array) -> Array:
+    """Angles [rad] between rotations (..., 3, 3): trace(R0' R1) = 1 + 2 cos."""
+    cosine = (np.einsum("...ij,...ij->...", one, two) - 1) / 2
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))

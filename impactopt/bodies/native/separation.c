@@ -5,6 +5,10 @@
 
 #define EXPORT __attribute__((visibility("default")))
 #define MAX_JOINTS 64
+/* [rad] last step of a search for the separating direction: where only the distance is wanted, and with derivatives. A
+ * direction that is wrong by d makes the distance wrong by some 0.2 m d^2. */
+#define DISTANCES 1e-3
+#define DERIVATIVES 1e-6
 #define MAX_EXPONENT 36.0 /* exp(-36) = 2e-16: vertices with larger exponents do not count */
 
 /* Rounded support in one direction; mean and covariance of the vertices, weighted by their share of it. */
@@ -153,9 +157,11 @@ static int leave_saddle(const Side *at, double *step) {
     return 1;
 }
 
-/* Local maximum of the separation over directions, from u (3) on, which moves there: Newton's method on the sphere. */
+/* Local maximum of the separation over directions, from u (3) on, which moves there: Newton's method on the sphere.
+ * It ends after a step of less than `last` radians: convergence is quadratic, and the separation's error is of second
+ * order in that of u. */
 static void separate(const double *R, const double *t, int64_t n1, const double *p1, int64_t n2, const double *p2,
-                    double *u, double sharp, double *far, Side *at) {
+                    double *u, double sharp, double last, double *far, Side *at) {
     side(R, t, n1, p1, n2, p2, u, sharp, far, at);
     for (int taken = 0; taken < 100; ++taken) {
         double inv[3], step[2], next[3];
@@ -163,8 +169,8 @@ static void separate(const double *R, const double *t, int64_t n1, const double 
         step[0] = inv[0] * at->slope[0] + inv[1] * at->slope[1];
         step[1] = inv[1] * at->slope[0] + inv[2] * at->slope[1];
         double size = sqrt(step[0] * step[0] + step[1] * step[1]), gain = step[0] * at->slope[0] + step[1] * at->slope[1];
-        if (size < 1e-9 && leave_saddle(at, step)) { size = 0.1; gain = 0.0; }
-        if (size < 1e-11) break;
+        if (size < 1e-2 * last && leave_saddle(at, step)) { size = 0.1; gain = 0.0; }
+        if (size < 1e-4 * last) break;
         double part = size > 0.5 ? 0.5 / size : 1.0;
         Side found;
         int moved = 0;
@@ -178,7 +184,7 @@ static void separate(const double *R, const double *t, int64_t n1, const double 
         if (!moved) break;
         for (int i = 0; i < 3; ++i) u[i] = next[i];
         *at = found;
-        if (part * size < 1e-7 && !leave_saddle(at, step)) break;
+        if (part * size < last && !leave_saddle(at, step)) break;
     }
 }
 
@@ -206,6 +212,19 @@ static void chain(int64_t n, const double *z, const double *p, double *R, double
     }
 }
 
+/* Direction way (3) to begin the search at: u, turned by what the last derivatives foresee for z. */
+static void predicted(int64_t size, const double *z, const double *rate, const double *u, double *way) {
+    double turn[3] = {0, 0, 0};
+    if (rate[0] > 0.5) for (int64_t k = 0; k < size; ++k) {
+        const double d = z[k] - rate[3 + k];
+        for (int i = 0; i < 3; ++i) turn[i] += rate[3 + size + 3 * k + i] * d;
+    }
+    const double length = sqrt(dot(turn, turn)), part = length > 0.3 ? 0.3 / length : 1.0;
+    for (int i = 0; i < 3; ++i) way[i] = u[i] + part * turn[i];
+    const double norm = 1.0 / sqrt(dot(way, way));
+    for (int i = 0; i < 3; ++i) way[i] *= norm;
+}
+
 /* Separation minus required distance of `count` pairs, each along a chain of n joints.
  * z (count, n + 3): base translation, joint angles.  p (count, 13 n + 13): chain, required distance.
  * hulls (count, 4): first vertex and number of vertices of both bodies; first vertices are multiples of EIGHT.
@@ -214,8 +233,8 @@ static void chain(int64_t n, const double *z, const double *p, double *R, double
  * far: work memory for the largest hull.
  * what: 0 values (count,); 1 gradients (count, n + 3); 2 lam times Hessians, lower triangles by columns. */
 EXPORT void separation(int64_t count, int64_t n, const double *z, const double *p, const int64_t *hulls,
-                          const double *points, double sharp, double *u, double *known, double *seen, double *far,
-                          int64_t what, const double *lam, double *out) {
+                          const double *points, double sharp, double *u, double *known, double *seen, double *turn,
+                          double *far, int64_t what, const double *lam, double *out) {
     const int64_t size = n + 3, width = 13 * n + 13;
     for (int64_t row = 0; row < count; ++row) {
         double R[9], t[3], axis[3 * MAX_JOINTS], origin[3 * MAX_JOINTS];
@@ -227,8 +246,8 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
         for (int64_t i = 0; i < size; ++i) same &= last[i] == z[row * size + i];
         if (!same || what) chain(n, z + row * size, mine, R, t, axis, origin);
         if (!same) {
-            for (int i = 0; i < 3; ++i) way[i] = u[3 * row + i];
-            separate(R, t, h[1], points + 3 * h[0], h[3], points + 3 * h[2], way, sharp, far, &at);
+            predicted(size, z + row * size, turn + row * (3 + 4 * size), u + 3 * row, way);
+            separate(R, t, h[1], points + 3 * h[0], h[3], points + 3 * h[2], way, sharp, DERIVATIVES, far, &at);
             for (int i = 0; i < 3; ++i) at.u[i] = way[i];
             *kept = at;
             for (int64_t i = 0; i < size; ++i) last[i] = z[row * size + i];
@@ -252,7 +271,6 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
         }
         const double by = lam[row];
         double *H = out + row * size * (size + 1) / 2;
-        if (by == 0.0) { for (int64_t i = 0; i < size * (size + 1) / 2; ++i) H[i] = 0.0; continue; }
         /* mixed (2,): derivative of the gradient on the tangents by each variable; f = u x axis, C f */
         double f[3 * MAX_JOINTS], Cf[3 * MAX_JOINTS], mixed[2 * (MAX_JOINTS + 3)], spread[2 * (MAX_JOINTS + 3)], inv[3];
         inverse(at.neg_hessian, 1e-4, inv);
@@ -268,6 +286,14 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
             spread[2 * k] = inv[0] * mixed[2 * k] + inv[1] * mixed[2 * k + 1];
             spread[2 * k + 1] = inv[1] * mixed[2 * k] + inv[2] * mixed[2 * k + 1];
         }
+        /* for `predicted`: z, and how u turns with it */
+        double *rate = turn + row * (3 + 4 * size);
+        rate[0] = 1.0;
+        for (int64_t k = 0; k < size; ++k) {
+            rate[3 + k] = z[row * size + k];
+            for (int i = 0; i < 3; ++i) rate[3 + size + 3 * k + i] = at.basis[i] * spread[2 * k] + at.basis[3 + i] * spread[2 * k + 1];
+        }
+        if (by == 0.0) { for (int64_t i = 0; i < size * (size + 1) / 2; ++i) H[i] = 0.0; continue; }
         for (int64_t i = 0; i < size; ++i) for (int64_t k = i; k < size; ++k) {
             double v = spread[2 * i] * mixed[2 * k] + spread[2 * i + 1] * mixed[2 * k + 1];
             if (i >= 3) /* u . (axis_i x arm_k) - sharp f_i C f_k */
@@ -278,10 +304,12 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
 }
 
 /* ---- search for near pairs. Placements of joints (K, J, 12) and of the world's bodies (K, W, 12): rotation by rows,
- * translation.  pairs (P, 2): joint, and joint or -1 - the world's body.  balls (P, 8): centre and radius of both; of a
- * body of the world half sides and radius.  hulls (P, 4).  extra (P,): inflation of the second body.  present (K, W).
+ * translation.  B pieces of links: of (B,) joints, balls (B, 4) centre and radius in the joint's frame.  boxes (W, 4):
+ * half sides and inflation of the world's bodies.  pairs (P, 2): joint, and joint or -1 - the world's body.
+ * pieces (P, 2): the same pairs by pieces.  hulls (P, 4).  extra (P,): inflation of the second body.  present (K, W).
  * directions (K, P, 3): updated; zero if unknown.  gaps (K, P): separations, or lower bounds of those that are not
- * below `within`.  Returns the number of pairs below `within`; their indices are in near (2 each), at most `most`. */
+ * below `within`.  room: work memory for the heights of the largest hull, and (2 B + J) numbers.
+ * Returns the number of pairs below `within`; their indices are in near (2 each), at most `most`. */
 /* Placement of a in b's frame. */
 static void relative(const double *a, const double *b, double *R) {
     double d[3] = {a[9] - b[9], a[10] - b[10], a[11] - b[11]};
@@ -290,80 +318,108 @@ static void relative(const double *a, const double *b, double *R) {
         R[9 + i] = b[i] * d[0] + b[3 + i] * d[1] + b[6 + i] * d[2];
     }
 }
-EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, const double *joints, const double *world,
-                    const int64_t *pairs, const double *balls, const int64_t *hulls, const double *extra,
-                    const uint8_t *present, const uint8_t *wanted, const double *points, double sharp, double within, double *directions,
-                    double *gaps, double *far, int64_t most, int64_t *near) {
+/* Distance of a point from a box (half sides) at a placement, negative inside; way (3): from its surface, in its frame. */
+static double from_box(const double *point, const double *box, const double *half, double *way) {
+    double rel[3], x[3], deepest = -1e300, sum = 0.0;
+    for (int j = 0; j < 3; ++j) rel[j] = point[j] - box[9 + j];
+    times_t(box, rel, x);
+    for (int j = 0; j < 3; ++j) {
+        const double d = fabs(x[j]) - half[j], out = d > 0 ? d : 0.0;
+        deepest = d > deepest ? d : deepest;
+        way[j] = x[j] > 0 ? out : -out; sum += out * out;
+    }
+    if (sum > 0) return sqrt(sum);
+    for (int j = 0; j < 3; ++j) way[j] = fabs(x[j]) - half[j] == deepest ? (x[j] > 0 ? 1.0 : -1.0) : 0.0;
+    return deepest;
+}
+static void centre_of(const double *place, const double *ball, double *c) {
+    times(place, ball, c);
+    for (int j = 0; j < 3; ++j) c[j] += place[9 + j];
+}
+EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, int64_t B, const double *joints, const double *world,
+                    const int64_t *of, const double *balls, const double *boxes, const int64_t *pairs,
+                    const int64_t *pieces, const int64_t *hulls, const double *extra, const uint8_t *present,
+                    const uint8_t *wanted, const double *points, double sharp, double within, double *directions,
+                    double *gaps, double *room, int64_t most, int64_t *near) {
     int64_t found = 0;
-    for (int64_t k = 0; k < K; ++k) for (int64_t i = 0; i < P; ++i) {
-        double *u = directions + 3 * (k * P + i), *gap = gaps + k * P + i;
-        *gap = 1e3;
-        if (!wanted[i]) continue;
-        int64_t other = pairs[2 * i + 1];
-        if (other < 0 && !present[k * W - 1 - other]) continue;
-        const double *a = joints + 12 * (k * J + pairs[2 * i]);
-        const double *b = other < 0 ? world + 12 * (k * W - 1 - other) : joints + 12 * (k * J + other);
-        const double *ball = balls + 8 * i;
-        double c[3], rel[3], x[3], R[12], bound;
-        times(a, ball, c);
-        for (int j = 0; j < 3; ++j) c[j] += a[9 + j];
-        if (other >= 0) {
-            double e[3]; times(b, ball + 4, e);
-            for (int j = 0; j < 3; ++j) rel[j] = c[j] - e[j] - b[9 + j];
-            bound = sqrt(dot(rel, rel)) - ball[3] - ball[7];
-        } else {
-            for (int j = 0; j < 3; ++j) rel[j] = c[j] - b[9 + j];
-            times_t(b, rel, x);
-            double out[3], most_in = -1e300, sum = 0.0;
-            for (int j = 0; j < 3; ++j) {
-                double d = fabs(x[j]) - ball[4 + j];
-                if (d > most_in) most_in = d;
-                out[j] = d > 0 ? d : 0.0; sum += out[j] * out[j];
+    double *centres = room, *far = room + 3 * B;
+    for (int64_t k = 0; k < K; ++k) {
+        for (int64_t i = 0; i < B; ++i) centre_of(joints + 12 * (k * J + of[i]), balls + 4 * i, centres + 3 * i);
+        for (int64_t i = 0; i < P; ++i) {
+            double *u = directions + 3 * (k * P + i), *gap = gaps + k * P + i;
+            *gap = 1e3;
+            if (!wanted[i]) continue;
+            const int64_t other = pairs[2 * i + 1], one = pieces[2 * i], two = pieces[2 * i + 1];
+            if (other < 0 && !present[k * W - 1 - other]) continue;
+            const double *b = other < 0 ? world + 12 * (k * W - 1 - other) : joints + 12 * (k * J + other), *c = centres + 3 * one;
+            double way[3], R[12], bound;
+            if (other >= 0) {
+                for (int j = 0; j < 3; ++j) way[j] = c[j] - centres[3 * two + j];
+                bound = sqrt(dot(way, way)) - balls[4 * one + 3] - balls[4 * two + 3];
+            } else bound = from_box(c, b, boxes - 4 * (1 + other), way) - balls[4 * one + 3] - boxes[3 - 4 * (1 + other)];
+            *gap = bound;
+            if (bound > within) continue;
+            relative(joints + 12 * (k * J + pairs[2 * i]), b, R);
+            if (u[0] == 0.0 && u[1] == 0.0 && u[2] == 0.0) {
+                if (other >= 0) { double x[3]; times_t(b, way, x); for (int j = 0; j < 3; ++j) way[j] = x[j]; }
+                const double length = sqrt(dot(way, way)) + 1e-300;
+                for (int j = 0; j < 3; ++j) u[j] = way[j] / length;
             }
-            bound = (most_in > 0 ? sqrt(sum) : most_in) - ball[3] - ball[7];
-            for (int j = 0; j < 3; ++j) rel[j] = sum > 0 ? (x[j] > 0 ? out[j] : -out[j]) : (fabs(x[j]) - ball[4 + j] == most_in ? (x[j] > 0 ? 1.0 : -1.0) : 0.0);
+            const int64_t *h = hulls + 4 * i;
+            double down[3] = {-u[0], -u[1], -u[2]}, local[3];
+            times_t(R, down, local);
+            double rough = dot(u, R + 9) - support_heights(h[1], points + 3 * h[0], local, far) - support_heights(h[3], points + 3 * h[2], u, far) - extra[i];
+            rough -= 10.0 / sharp;
+            if (rough > within) { *gap = rough; continue; }
+            Side at;
+            separate(R, R + 9, h[1], points + 3 * h[0], h[3], points + 3 * h[2], u, sharp, DISTANCES, far, &at);
+            *gap = at.s - extra[i];
+            if (*gap < within && found < most) { near[2 * found] = k; near[2 * found + 1] = i; ++found; }
         }
-        *gap = bound;
-        if (bound > within) continue;
-        relative(a, b, R);
-        if (u[0] == 0.0 && u[1] == 0.0 && u[2] == 0.0) {
-            if (other >= 0) { for (int j = 0; j < 3; ++j) x[j] = rel[j]; times_t(b, x, rel); }
-            double length = sqrt(dot(rel, rel)) + 1e-300;
-            for (int j = 0; j < 3; ++j) u[j] = rel[j] / length;
-        }
-        const int64_t *h = hulls + 4 * i;
-        double down[3] = {-u[0], -u[1], -u[2]}, local[3];
-        times_t(R, down, local);
-        double rough = dot(u, R + 9) - support_heights(h[1], points + 3 * h[0], local, far) - support_heights(h[3], points + 3 * h[2], u, far) - extra[i];
-        rough -= 10.0 / sharp;
-        if (rough > within) { *gap = rough; continue; }
-        Side at;
-        separate(R, R + 9, h[1], points + 3 * h[0], h[3], points + 3 * h[2], u, sharp, far, &at);
-        *gap = at.s - extra[i];
-        if (*gap < within && found < most) { near[2 * found] = k; near[2 * found + 1] = i; ++found; }
     }
     return found;
 }
-/* Pairs that may have collided between two sets of placements: they are separated at both, but the ball of the first
- * moved farther, relative to the second, than both gaps together.  Returns their number; indices are in met (2 each). */
-EXPORT int64_t may_meet(int64_t K, int64_t J, int64_t W, int64_t P, const double *joints0, const double *world0,
-                        const double *joints1, const double *world1, const int64_t *pairs, const double *balls,
-                        const uint8_t *wanted, const double *gaps0, const double *gaps1, int64_t most, int64_t *met) {
+static double angle_between(const double *R0, const double *R1) {
+    double trace = 0.0;
+    for (int j = 0; j < 9; ++j) trace += R0[j] * R1[j];
+    return acos(fmax(-1.0, fmin(1.0, 0.5 * (trace - 1.0))));
+}
+static double length_between(const double *a, const double *b) {
+    const double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
+    return sqrt(dot(d, d));
+}
+/* Pairs that may have collided between two sets of placements: they are separated at both, but moved farther than both
+ * gaps together: the balls of both in the world, and that of the first relative to the second. The first is quick to
+ * tell, the second finds what moves with the whole robot.  Returns their number; indices are in met (2 each). */
+EXPORT int64_t may_meet(int64_t K, int64_t J, int64_t W, int64_t P, int64_t B, const double *joints0, const double *world0,
+                        const double *joints1, const double *world1, const int64_t *of, const double *balls,
+                        const int64_t *pairs, const int64_t *pieces, const uint8_t *wanted, const double *gaps0,
+                        const double *gaps1, double *room, int64_t most, int64_t *met) {
     int64_t found = 0;
-    for (int64_t k = 0; k < K; ++k) for (int64_t i = 0; i < P; ++i) {
-        double g = gaps0[k * P + i] + gaps1[k * P + i];
-        if (!wanted[i] || gaps0[k * P + i] <= 0.0 || gaps1[k * P + i] <= 0.0 || g > 5.0) continue;
-        int64_t other = pairs[2 * i + 1];
-        double R0[12], R1[12], x0[3], x1[3];
-        const double *ball = balls + 8 * i;
-        relative(joints0 + 12 * (k * J + pairs[2 * i]), other < 0 ? world0 + 12 * (k * W - 1 - other) : joints0 + 12 * (k * J + other), R0);
-        relative(joints1 + 12 * (k * J + pairs[2 * i]), other < 0 ? world1 + 12 * (k * W - 1 - other) : joints1 + 12 * (k * J + other), R1);
-        times(R0, ball, x0); times(R1, ball, x1);
-        double d = 0.0, trace = 0.0;
-        for (int j = 0; j < 3; ++j) { double e = x1[j] + R1[9 + j] - x0[j] - R0[9 + j]; d += e * e; }
-        for (int j = 0; j < 9; ++j) trace += R0[j] * R1[j];
-        double cosine = fmax(-1.0, fmin(1.0, 0.5 * (trace - 1.0)));
-        if (sqrt(d) + acos(cosine) * ball[3] >= g && found < most) { met[2 * found] = k; met[2 * found + 1] = i; ++found; }
+    double *moved = room, *turned = room + B;
+    for (int64_t k = 0; k < K; ++k) {
+        const double *from = joints0 + 12 * k * J, *to = joints1 + 12 * k * J;
+        for (int64_t j = 0; j < J; ++j) turned[j] = angle_between(from + 12 * j, to + 12 * j);
+        for (int64_t i = 0; i < B; ++i) {
+            double c0[3], c1[3];
+            centre_of(from + 12 * of[i], balls + 4 * i, c0); centre_of(to + 12 * of[i], balls + 4 * i, c1);
+            moved[i] = length_between(c0, c1) + turned[of[i]] * balls[4 * i + 3];
+        }
+        for (int64_t i = 0; i < P; ++i) {
+            const double before = gaps0[k * P + i], after = gaps1[k * P + i], g = before + after;
+            if (!wanted[i] || before <= 0.0 || after <= 0.0 || g > 5.0) continue;
+            const int64_t other = pairs[2 * i + 1], joint = pairs[2 * i], one = pieces[2 * i];
+            /* bodies of the world do not turn */
+            const double *b0 = other < 0 ? world0 + 12 * (k * W - 1 - other) : from + 12 * other;
+            const double *b1 = other < 0 ? world1 + 12 * (k * W - 1 - other) : to + 12 * other;
+            if (moved[one] + (other < 0 ? length_between(b0 + 9, b1 + 9) : moved[pieces[2 * i + 1]]) < g) continue;
+            double R0[12], R1[12], x0[3], x1[3];
+            relative(from + 12 * joint, b0, R0); relative(to + 12 * joint, b1, R1);
+            centre_of(R0, balls + 4 * one, x0); centre_of(R1, balls + 4 * one, x1);
+            if (length_between(x0, x1) + angle_between(R0, R1) * balls[4 * one + 3] >= g && found < most) {
+                met[2 * found] = k; met[2 * found + 1] = i; ++found;
+            }
+        }
     }
     return found;
 }

@@ -88,8 +88,8 @@ class Shapes:
     radius (P,) [m] : of the second if it is a capsule or a sphere, else zero.
     points (k, 3) [m], blocks (k / 8, 3, 8) : all vertices, see `packed`.
     hulls (P, 4) : first vertex and number of vertices of both.
-    of (B,), balls (B, 4) : joint of each piece of a link, and its bounding ball in the joint's frame, centre and
-        radius [m].
+    of (B,), balls (B, 4) : joint of each piece of a link, and its bounding ball in the joint's frame: centre
+        and radius [m].
     boxes (W, 4) : half sides of the bodies of the world, and their radius [m]. They have no balls: those of
         large ones, such as walls, would be huge.
     pieces (P, 2) : index of both pieces in ``of``; for a body of the world zero.
@@ -179,8 +179,8 @@ class Shapes:
     ) -> tuple[Index, Index]:
         """Instants and indices of pairs that have clearance in both placements, but may penetrate in between.
 
-        These are pairs that move by more than the sum of both distances: both in the world, and one relative to
-        the other.
+        These are pairs that move by more than the sum of both distances: both in the world, and one relative
+        to the other.
         """
         (k, j), w, p = one[0].joints.shape[:2], one[0].world.shape[1], len(self)
         near = np.empty((k * p, 2), dtype=np.int64)
@@ -211,7 +211,6 @@ class Separations:
         self.directions = np.ascontiguousarray(directions, dtype=float)
         self._hulls = np.ascontiguousarray(shapes.hulls[pairs])
         self._known, self._room = np.zeros((self.count, _SIDE)), shapes.room
-        self._turn = np.zeros((self.count, 3 + 4 * (joints + 3)))
         self.forget()
 
     def copy(self) -> Separations:
@@ -220,7 +219,9 @@ class Separations:
         return Separations(self._shapes, self.joints, self._pairs, numbers, directions)
 
     def forget(self) -> None:
-        """Clears the last result, as ``numbers`` have changed."""
+        """Clears the last results, as ``numbers`` have changed."""
+        # Whether there is one, z, and the derivative of the directions by z at the last Hessians.
+        self._turn = np.zeros((self.count, 3 + 4 * (self.joints + 3)))
         # nan equals no z, so everything is computed anew.
         self._seen = np.full((self.count, self.joints + 3), np.nan)
 

@@ -294,7 +294,7 @@ def may_meet(
     before, after = one[1].gaps, two[1].gaps
     # Pairs farther apart than 5 m cannot meet in a step; this also leaves out those with the gap 1e3.
     spot, pair = np.nonzero(wanted & (before > 0) & (after > 0) & (before + after <= 5.0))
-    joint, other = shapes.pairs[pair].T
+    other = shapes.pairs[pair, 1]
     first, second = shapes.pieces[pair].T
     places0, places1 = one[0], two[0]
     moved = _moved(places0.joints, places1.joints, shapes.of, shapes.balls)

@@ -170,6 +170,21 @@ def test_derivatives_agree_with_differences(seed: int, near: float) -> None:
         np.testing.assert_allclose(h[k], -2.5 * difference, atol=1e-5 * np.abs(h).max() + 1e-6)
 
 
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("size", [1e-3, 0.05, 0.5])
+def test_a_search_that_begins_where_derivatives_foresee_finds_the_same_distance(
+    seed: int, size: float
+) -> None:
+    """Bodies apart have one separating direction, however far the step that was foreseen."""
+    of, z = random_pair(seed, 0.03)
+    fresh, step = of.copy(), size * np.random.default_rng(seed).uniform(-1, 1, N + 3)
+    step[:3] += 0.5 * size * gradient(of, z)[:3]  # apart rather than into each other
+    expected = value(fresh, z + step)
+    hessian(of, z, 0.0)
+    if expected > 0:
+        assert value(of, z + step) == pytest.approx(expected, abs=1e-12)
+
+
 def test_values_of_trials_do_not_move_the_side_of_an_iterate() -> None:
     plate = box(0.3, 0.3, 0.04)
     of = Two(plate, plate).pair(np.eye(3), np.array([0.0, 0.0, 0.05]))

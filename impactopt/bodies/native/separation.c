@@ -8,7 +8,7 @@
 /* [rad] last step of a search for the separating direction: where only the distance is wanted, and with derivatives. A
  * direction that is wrong by d makes the distance wrong by some 0.2 m d^2. */
 #define DISTANCES 1e-3
-#define DERIVATIVES 1e-6
+#define DERIVATIVES 1e-7
 #define MAX_EXPONENT 36.0 /* exp(-36) = 2e-16: vertices with larger exponents do not count */
 
 /* Rounded support in one direction; mean and covariance of the vertices, weighted by their share of it. */
@@ -230,6 +230,7 @@ static void predicted(int64_t size, const double *z, const double *rate, const d
  * hulls (count, 4): first vertex and number of vertices of both bodies; first vertices are multiples of EIGHT.
  * points: vertices in blocks.  u (count, 3): initial directions, updated if derivatives are requested.
  * known (count, SIDE), seen (count, n + 3): last results, and the z that they belong to.
+ * turn (count, 3 + 4 (n + 3)): 1 after Hessians, two numbers that are not used, their z, derivatives of u by it (n + 3, 3).
  * far: work memory for the largest hull.
  * what: 0 values (count,); 1 gradients (count, n + 3); 2 lam times Hessians, lower triangles by columns. */
 EXPORT void separation(int64_t count, int64_t n, const double *z, const double *p, const int64_t *hulls,

@@ -110,7 +110,8 @@ class _Charts:
         time, speed = at_contact(self.record, a["collision_target_speed"], np.nan)
         series.append(self._series("speed_target", "target, planned", OTHERS[0], time, speed))
         view = [max(0.0, self.start - 0.2), self.end + 0.2]
-        return self._chart("Speed of striking point and target along the normal", "speed [m/s]", series, view=view)
+        title = "Speed of striking point and target along the normal"
+        return self._chart(title, "speed [m/s]", series, view=view)
 
     def _zmp_margin(self) -> dict[str, Any]:
         series = []

@@ -151,5 +151,5 @@ def _draw(ax: object, triangles: Array, normals: Array, colours: Array, view: Ar
     order = np.argsort(depth)
     shaded = (colours[facing] * light[:, None])[order]
     ax.add_collection(  # type: ignore[attr-defined]
-        PolyCollection(flat[order], facecolors=shaded, edgecolors=shaded, linewidths=0.2, rasterized=True)
+        PolyCollection(flat[order], facecolors=shaded, edgecolors=shaded, linewidths=0.4, rasterized=True)
     )

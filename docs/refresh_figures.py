@@ -29,7 +29,7 @@ def measured(figure: dict[str, Any], results: Path) -> float | None:
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
     found = [row.get(figure["key"]) for row in rows if figure["row"].items() <= row.items()]
     number = next((x for x in found if x is not None), None)
-    return None if number is None else round(figure.get("times", 1) * number, 2)
+    return None if number is None else round(figure.get("times", 1) * number, 2) + 0.0  # no -0
 
 
 def refresh(results: Path, root: Path = ROOT) -> list[str]:

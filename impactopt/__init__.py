@@ -69,6 +69,7 @@ _EXPORTS = {
     "load_problem": "files.problem_file",
     "load_record": "files.record",
     "load_robot": "robots.presets",
+    "load_solution": "api",
     "moved_solution": "api",
     "optimize_strike": "api",
     "planar_arm": "robots.presets",

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -170,6 +170,27 @@ class Solution(solution.Solution):
         from impactopt.files.export import export
 
         return export(self, to, directory, rate=rate, joints=joints, gravity=gravity, smooth=smooth)
+
+
+def load_solution(
+    result: str | PathLike[str], *, problem_file: str | PathLike[str] | None = None
+) -> Solution:
+    """The solution that `impactopt solve` saved: to plot, validate, change, export or start from.
+
+    It has no history of the iterations. If the package makes another program of the problem today, that is
+    solved again from the saved variables.
+
+    result : its directory, or its `solution.npz`.
+    problem_file : used instead of the saved text, such as when the problem's URDF has moved.
+
+    Raises
+    ------
+    InputError : there is no result, it is damaged, or it is no plan of a motion.
+    """
+    from impactopt.files.replay import load_planned, resumed
+
+    planned = load_planned(result, problem_file=problem_file)
+    return cast(Solution, _public(resumed(planned.record, planned.problem)))
 
 
 def _or_file(run: Callable[..., R]) -> Callable[..., R]:

@@ -87,6 +87,12 @@ def check_choice(what: str, given: object, known: Iterable[str]) -> None:
         raise InputError(f"{what} {shortened(repr(given))}{near}; there are {', '.join(names) or 'none'}")
 
 
+def check_kind(name: str, given: object, kind: type) -> None:
+    """InputError unless an argument is an instance of a class."""
+    if not isinstance(given, kind):
+        raise InputError(f"{name} must be a {kind.__name__}, not {shortened(repr(given))}")
+
+
 def missing_package(what: str, package: str, extra: str) -> InputError:
     """Error for a package that is not installed, with the command that installs it; impactopt is on no index.
 

@@ -133,7 +133,7 @@ def solve(
             if store is None:
                 solution = plan(problem, **chosen)
             else:
-                kept = SolvedFolder(store)
+                kept = SolvedFolder(make_directory(store))
                 solution, near = kept.solve(problem, read, **chosen)
                 kept.keep(solution, read)
                 progress.say(f"warm start from {near}" if near else f"no plan in {store} is near enough")

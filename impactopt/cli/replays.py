@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, missing_package
 from impactopt.files.output import record_of
 from impactopt.files.problem_file import ProblemFile
 from impactopt.files.record import Record
@@ -82,8 +82,12 @@ def _engines(solution: Solution, progress: SolveConsole) -> list[str]:
         progress.say("no replay after an interruption; `impactopt validate` does it")
     elif not violation <= VIOLATED:
         progress.say(f"no replay: the constraints are violated by up to {violation:.2g}")
+    elif has_mujoco():
+        return ["pinocchio", "mujoco"]
     else:
-        return ["pinocchio", *(["mujoco"] if has_mujoco() else [])]
+        unknown = ": whether the robot stands is not checked" if solution.problem.soles else ""
+        progress.say(f"{missing_package('no replay in MuJoCo', 'mujoco', 'validate')}{unknown}")
+        return ["pinocchio"]
     return []
 
 

@@ -93,15 +93,14 @@ def _sheet(result: Path, problem: Path | None, file: Path) -> None:
     """Writes the contact sheet of a result."""
     with plain_errors("interrupted before the picture was written"):
         from impactopt.errors import printable
-        from impactopt.files.output import make_directory
+        from impactopt.files.output import check_ending, make_directory, write_file
         from impactopt.files.replay import load_planned
         from impactopt.report.pictures.sheet import sheet
 
-        planned = load_planned(result, problem_file=problem)
-        picture = sheet(planned.record, planned.problem)
+        check_ending("a sheet is a PNG", file, ".png")
         make_directory(file.parent)
-        with file.open("wb") as stream:
-            picture.write(stream)
+        planned = load_planned(result, problem_file=problem)
+        write_file(file, sheet(planned.record, planned.problem).write)
         typer.echo(printable(str(file)))
 
 

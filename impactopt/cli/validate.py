@@ -90,7 +90,7 @@ def validate(
     Exit code: 0 stands (or the engine fixes the soles), 1 fell, 2 bad input.
     """
     with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
-        from impactopt.files.output import make_directory, remove_file, write_file
+        from impactopt.files.output import check_ending, make_directory, remove_file, write_file
         from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned, replay
         from impactopt.report.console import SolveConsole
@@ -100,6 +100,7 @@ def validate(
         world = Perturbation(**{field.name: context.params[field.name] for field in fields(Perturbation)})
         directory = None if out is None else make_directory(out)
         if animation is not None:
+            check_ending("an animation is a GIF", animation, ".gif")
             make_directory(animation.parent)
         options = {name: value for name, value in (("step", step), ("settle", settle)) if value is not None}
         changes, written = parse_settings(settings or ()), []

@@ -262,9 +262,19 @@ def usable_directory() -> Path:
             )
         _sweep(directory)
         return directory
-    except (UnsafePath, OSError) as error:
-        warn(f"{error}; compiling into a temporary directory, for this process only")
-        return temporary_private_directory()
+    except UnsafePath as error:
+        _warn_temporary(str(error))
+    except OSError as error:
+        _warn_temporary(
+            f"cannot use {cache_directory()}: {error.strerror}; set IMPACTOPT_CACHE to a directory that you "
+            "can write"
+        )
+    return temporary_private_directory()
+
+
+@functools.cache  # once a process
+def _warn_temporary(reason: str) -> None:
+    warn(f"{reason}; compiling into a temporary directory, for this process only")
 
 
 @functools.cache  # once a process

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.outputs import HISTORIES, OUTPUTS, SCALARS
 from impactopt.contact import ContactLaw, Target
-from impactopt.errors import InputError, check_direction, check_positive
+from impactopt.errors import InputError, check_direction, check_kind, check_positive
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.robot import Robot
 
@@ -138,6 +138,7 @@ class CollisionModel(ABC):
     horizon: float = 0.2
 
     def __post_init__(self) -> None:
+        check_kind("robot", self.robot, Robot)
         frame = self.robot.striker(self.striker).model_frame
         if frame in self.held_by.constraint_frames(self.robot):
             raise InputError(f"striker {self.striker!r}: it is held by the stance; strike with another")

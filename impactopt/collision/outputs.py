@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -41,8 +42,10 @@ OF_SOLES = ("sole_wrench", "ground_wrench", "zmp")
 OF_SERVO = ("joint_velocity", "torque", "demand", "hand_wrench", *OF_SOLES)
 
 
-def check_outputs(names: tuple[str, ...]) -> None:
-    """InputError for an unknown output."""
+def check_outputs(names: Sequence[str]) -> None:
+    """InputError for an unknown output, or for a name in place of a tuple of names."""
+    if isinstance(names, str):
+        raise InputError(f"outputs: give a tuple of names, ({names!r},), not {names!r}")
     for name in names:
         check_choice("no output", name, OUTPUTS)
 

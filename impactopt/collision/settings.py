@@ -16,6 +16,7 @@ from impactopt.errors import (
     check_array,
     check_choice,
     check_direction,
+    check_kind,
     check_positive,
     raw_array,
 )
@@ -136,6 +137,8 @@ class Settings(Mapping[str, Array]):
         servo: Mapping[str, ArrayLike],
         friction: ContactFriction | None = None,
     ) -> None:
+        check_kind("law", law, ContactLaw)
+        check_kind("target", target, Target)
         self._owners: dict[str, tuple[type, dict[str, float]]] = {
             "contact_": (type(law), law.parameters),
             "target_": (type(target), target.parameters),

@@ -276,7 +276,7 @@ class SymbolicModel(SteppedModel):
         )
 
     def _check_outputs(self, outputs: tuple[str, ...], every: int) -> None:
-        check_outputs(tuple(outputs))
+        check_outputs(outputs)
         if every < 1:
             raise InputError(f"every: {every}; give a number of steps >= 1")
         for name in outputs:

@@ -260,6 +260,15 @@ def remove_file(path: Path) -> None:
         raise InputError(f"cannot write over {path}: {error.strerror}") from error
 
 
+def check_ending(what: str, path: Path, *endings: str) -> None:
+    """InputError unless the name of a file ends with one of the endings.
+
+    what : start of the message, such as "a page is HTML".
+    """
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{what}: give {path.name or str(path)!r} the ending {endings[0]}")
+
+
 def write_file(
     path: Path, write: Callable[[IO[bytes]], Any], *, before: Callable[[], object] | None = None
 ) -> None:

@@ -14,7 +14,7 @@ from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError, check_array, check_choice, check_number
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
+from impactopt.problem.terms import DEFAULT_TERMS, TERMS, ContactWrenchCone, Term
 
 # Cached properties of a problem that stay valid with the same robot, stance and start; and those that also
 # need the same terms, or other ones that do not switch the bodies of the world on or off.
@@ -154,6 +154,10 @@ def parameter_of(problem: ImpactProblem, name: str) -> Parameter:
             value = getattr(term, parameter.name)
             if isinstance(value, float) and np.isfinite(value):
                 known[f"terms.{section}.{parameter.name}"] = ("terms", (type(term), parameter.name), value)
+    sections = {f"terms.{snake_case(kind.__name__)}": kind for kind in TERMS}
+    section, _, key = str(name).rpartition(".")
+    if name not in known and key in getattr(sections.get(section), "__dataclass_fields__", ()):
+        raise InputError(f"{name}: the problem has no number for it; give {sections[section].__name__} one")
     check_choice("this problem has no parameter", name, known)
     field, part, value = known[name]
     return Parameter(

@@ -213,10 +213,15 @@ class Solution(Solved):
     def clearance(self) -> dict[str, Any]:
         """Clearances and unintended contacts in the plan, by exact geometry at 1 ms: the keys
         ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``. They include the motion
-        after a missed target, whose contacts are marked.
+        after a missed target, whose contacts are marked. ``clearance_mm`` is None if all bodies stay
+        farther apart than 0.1 m.
         """
         least, nearest, touches = self._clearance
-        return {"clearance_mm": 1e3 * least, "nearest": nearest, "contacts_besides": [{**t} for t in touches]}
+        return {
+            "clearance_mm": 1e3 * least if nearest else None,
+            "nearest": nearest,
+            "contacts_besides": [{**t} for t in touches],
+        }
 
     @cached_property
     def _clearance(self) -> tuple[float, str, list[dict[str, Any]]]:

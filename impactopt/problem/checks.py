@@ -25,6 +25,7 @@ from impactopt.errors import (
     InputError,
     check_array,
     check_choice,
+    check_kind,
     check_number,
     check_whole,
     did_you_mean,
@@ -196,9 +197,7 @@ def check_moves(problem: Any) -> None:
 def check_collision(problem: Any) -> None:
     """InputError for a law, target and collision model that do not fit together."""
     for name, kind in (("law", ContactLaw), ("target", Target)):
-        thing = getattr(problem, name)
-        if not isinstance(thing, kind):
-            raise InputError(f"{name} must be a {kind.__name__} of impactopt.contact, not {thing!r}")
+        check_kind(name, getattr(problem, name), kind)
     law = problem.law
     rough = rough_at([lambda x, rate: law.branch(x, rate, True), lambda x, rate: law.branch(x, rate, False)])
     if rough is not None:

@@ -38,7 +38,7 @@ OTHERS = ("one", "two")  # styles of series that are no motions
 def charts_of(record: Record, problem: ImpactProblem | None = None) -> tuple[list[dict[str, Any]], Arrays]:
     """Descriptions in the order of the page, and arrays by name.
 
-    problem : for the planned speed of the hand; None: without it.
+    problem : for the planned speed of the striking point; None: without it.
     """
     arrays: Arrays = {}
     charts = list(_Charts(record, problem, arrays).all()) if record.completed else []
@@ -106,11 +106,12 @@ class _Charts:
                 speed = planned_hand_speed(self.record, self.problem)
             if speed is not None:
                 time = a[f"{prefix}_time"]
-                series.append(self._series(f"speed_{style}", f"hand, {label}", style, time, speed))
+                series.append(self._series(f"speed_{style}", f"striking point, {label}", style, time, speed))
         time, speed = at_contact(self.record, a["collision_target_speed"], np.nan)
         series.append(self._series("speed_target", "target, planned", OTHERS[0], time, speed))
         view = [max(0.0, self.start - 0.2), self.end + 0.2]
-        return self._chart("Speed of hand and target along the normal", "speed [m/s]", series, view=view)
+        title = "Speed of striking point and target along the normal"
+        return self._chart(title, "speed [m/s]", series, view=view)
 
     def _zmp_margin(self) -> dict[str, Any]:
         series = []

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.errors import InputError
-from impactopt.files.output import write_file
+from impactopt.files.output import check_ending, write_file
 from impactopt.files.record import plain
 from impactopt.report.result_rows import Row
 
@@ -40,8 +39,7 @@ class Page:
         InputError : the file cannot be written, or its name does not end with .html.
         """
         path = Path(path)
-        if path.suffix.lower() not in (".html", ".htm"):
-            raise InputError(f"a page is HTML: give {path.name!r} the ending .html")
+        check_ending("a page is HTML", path, ".html", ".htm")
         write_file(path, lambda file: file.write(self.html.encode()))
         return path
 

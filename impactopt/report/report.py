@@ -64,7 +64,7 @@ def _parts(record: Record, *, animated: bool) -> Iterator[str]:
     heading = "Planned beside simulated" if len(result_columns(s)) > 1 else "Planned"
     table = f'<section class="card" aria-label="numbers"><h3>{heading}</h3>{_table(s)}</section>'
     if animated:
-        yield '<div class="top"><section class="card" id="animation" aria-label="animation"></section>'
+        yield '<div class="top"><section class="card stays" id="animation" aria-label="animation"></section>'
         yield f"{table}</div>"
     else:
         yield table
@@ -104,7 +104,7 @@ def _cards(s: Mapping[str, Any]) -> str:
     if s.get("peak_force_N") is not None:
         card(f"{s['peak_force_N']:.0f} N", f"planned peak force, over {s['contact_ms']:.0f}{NARROW}ms")
     if s.get("hand_speed_m_s") is not None:
-        card(f"{s['hand_speed_m_s']:.2f} m/s", "speed of the hand at contact")
+        card(f"{s['hand_speed_m_s']:.2f} m/s", "speed of the striking point at contact")
     margins = s.get("sole_cop_margin_mm") or {}
     if margins:
         least = min(min(phases.values()) for phases in margins.values())

@@ -163,7 +163,8 @@ class Simulation:
     Bodies and scene:
 
     touched : unintended contacts
-    clearance [m], nearest : least exact distance of two bodies that must not touch, and their names
+    clearance [m], nearest : least exact distance of two bodies that must not touch, and their names; no
+        names if all stay farther apart than 0.1 m
     soles, stands, polygons : names of the soles; the scene's ``standing`` and ``polygons``
     """
 
@@ -275,7 +276,7 @@ class Simulation:
             # None: no joint is out of its range
             "beyond_range_rad": self.beyond_range[1] or None,
             "beyond_range": self.beyond_range[0] or None,
-            "clearance_mm": 1e3 * self.clearance if known else None,
+            "clearance_mm": 1e3 * self.clearance if known and self.nearest else None,
             "nearest": " and ".join(self.nearest),
             "contacts_besides": [contact.summary() for contact in self.touched] if known else None,
             **({} if self.loads is None else self.loads.summary()),

@@ -186,7 +186,7 @@ def test_free_soles_have_a_column_where_mujoco_is_installed(
     assert summary["replayed"]["engine"] == "mujoco" and summary["simulated"]["engine"] == "pinocchio"
     monkeypatch.setattr("impactopt.cli.replays.has_mujoco", lambda: False)
     out, err = run("solve", file, "--out", tmp_path / "without")
-    assert "free soles" not in out and "mujoco" not in (out + err).lower()
+    assert "free soles" not in out and "whether the robot stands is not checked" in err
     assert "replayed" not in json.loads((tmp_path / "without" / "summary.json").read_text())
 
 
@@ -500,3 +500,17 @@ def test_every_public_name_is_there_whatever_modules_were_imported() -> None:
         assert getattr(impactopt, name) is getattr(sys.modules[f"impactopt.{module}"], name)
     modules = {path.stem for path in Path(str(impactopt.__file__)).parent.iterdir()}
     assert not modules & set(exports), "a module would hide the name once it is imported"
+
+
+def test_places_that_cannot_be_written_are_refused_before_the_work(
+    planner: Planner, file: Path, tmp_path: Path
+) -> None:
+    below = file / "below"  # a file has no room for one
+    _, error = run("solve", file, "--store", below, "--out", tmp_path / "out", code=2)
+    assert f"cannot make the directory {below}" in error and not planner.options
+    _, error = run("show", tmp_path / "out", "--sheet", below / "sheet.png", code=2)
+    assert f"cannot make the directory {below}" in error
+    _, error = run("show", tmp_path / "out", "--sheet", "sheet.svg", code=2)
+    assert "give 'sheet.svg' the ending .png" in error
+    _, error = run("validate", tmp_path / "out", "--animation", "motion.mp4", code=2)
+    assert "give 'motion.mp4' the ending .gif" in error

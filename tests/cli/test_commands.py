@@ -235,6 +235,8 @@ def test_settings_are_checked_before_work_starts(
     options = ["--speed", "1"] if command == "collide" else []
     _, err = run(command, file, *options, "--set", "target.mass=-1", code=2)
     assert "as set, [target] mass_kg: -1; give a number > 0" in err
+    _, err = run(command, file, *options, "--set", "contact.stiffness=1e99", code=2)
+    assert "as set, [contact]: " in err and "stiffness [N/m]: 1e+99" in err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.toml"]
 
 

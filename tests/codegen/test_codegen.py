@@ -67,6 +67,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     path = tmp_path / "cache"
     monkeypatch.setenv("IMPACTOPT_CACHE", str(path))
     private_files.temporary_private_directory.cache_clear()
+    private_files._warn_temporary.cache_clear()
     gc.freeze()  # the tests' own objects are collected, not all that other tests have left
     yield path
     gc.collect()  # unload the libraries: a later test may put others at the same paths
@@ -404,16 +405,16 @@ def test_file_that_others_can_write_is_not_loaded(
 
 
 @needs_compiler
+@pytest.mark.parametrize("mode", [0o770, 0o707])
 def test_directory_that_others_can_write_is_not_used(
-    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int
 ) -> None:
     poison(cache, tmp_path, monkeypatch)
     before = sorted(path.name for path in cache.iterdir())
-    for mode in (0o770, 0o707):
-        cache.chmod(mode)
-        with pytest.warns(CacheWarning, match=r"cache is writable by others; run: chmod go-w .*temporary"):
-            functions = cached("toy", (1,), Builder())
-        assert value(functions) == pytest.approx(TRUE, rel=1e-14)
+    cache.chmod(mode)
+    with pytest.warns(CacheWarning, match=r"cache is writable by others; run: chmod go-w .*temporary"):
+        functions = cached("toy", (1,), Builder())
+    assert value(functions) == pytest.approx(TRUE, rel=1e-14)
     assert sorted(path.name for path in cache.iterdir()) == before
 
 
@@ -559,6 +560,19 @@ def test_a_place_that_allows_no_code_is_not_used(cache: Path, monkeypatch: pytes
         functions = cached("toy", (1,), Builder())
     assert value(functions) == pytest.approx(TRUE, rel=1e-14)
     assert not list(cache.iterdir())
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_made_gets_one_warning_with_the_remedy(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("IMPACTOPT_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.warns(CacheWarning) as warned:
+        for name in ("toy", "another"):
+            assert value(cached(name, (1,), Builder())) == pytest.approx(TRUE, rel=1e-14)
+    (message,) = (str(one.message) for one in warned)
+    assert f"cannot use {tmp_path / 'file' / 'cache'}" in message and "set IMPACTOPT_CACHE" in message
 
 
 @needs_compiler

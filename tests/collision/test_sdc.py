@@ -602,12 +602,22 @@ def test_stable_step_is_where_the_method_turns_unstable():
         ({"horizon": -0.1}, r"horizon"),
         ({"effects": Effects(friction=True)}, r"JointFriction"),
         ({"friction": FRICTION}, r"effects.friction is off"),
+        ({"robot": "talos"}, r"robot must be a Robot, not 'talos'"),
+        ({"law": SpringDamper}, r"law must be a ContactLaw, not <class"),
+        ({"law": None}, r"law must be a ContactLaw, not None"),
+        ({"target": 5.0}, r"target must be a Target, not 5.0"),
     ],
 )
 def test_bad_models_are_refused_before_anything_is_built(options, message):
-    options = {"striker": "right_hand", "normal": X, **options}
+    scene = {
+        "robot": robot_named("talos"),
+        "striker": "right_hand",
+        "normal": X,
+        "law": LAW,
+        "target": TARGET,
+    }
     with pytest.raises(InputError, match=message):
-        SDC(robot=robot_named("talos"), law=LAW, target=TARGET, **options)
+        SDC(**(scene | options))
 
 
 def test_bad_numbers_are_refused():
@@ -629,7 +639,10 @@ def test_bad_numbers_are_refused():
     ):
         with pytest.raises(InputError, match=message):
             sdc.collide(**{"q": q, "v": v, "torque": torque, **changes})
-    for outputs, message in ((("impluse",), r"did you mean 'impulse'"),):
+    for outputs, message in (
+        (("impluse",), r"did you mean 'impulse'"),
+        ("impulse", r"give a tuple of names, \('impulse',\)"),
+    ):
         with pytest.raises(InputError, match=message):
             sdc.function(outputs)
     with pytest.raises(InputError, match="gradient of 'torque'"):

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from impactopt import Solution
+from impactopt import Solution, load_solution, sensitivity_of
 from impactopt.cli.app import app
 from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile, read_problem_file
@@ -135,3 +135,13 @@ def test_solve_keeps_and_finds_plans(tmp_path: Path) -> None:
     again = runner.invoke(app, ["solve", str(ARM), "--set", "target.mass=0.055", *options])
     assert again.exit_code == 0 and "warm start from" in again.output, again.output
     assert len(list((tmp_path / "store").iterdir())) == 2
+
+
+def test_a_saved_result_is_a_solution_again(folder: SolvedFolder, solution: Solution, tmp_path: Path) -> None:
+    again, price = load_solution(folder.path / "plain"), "terms.torque_limit.collision"
+    assert again.status is solution.status and again.impulse == pytest.approx(solution.impulse, rel=1e-12)
+    assert again.trajectory.q == pytest.approx(solution.trajectory.q, abs=1e-12)
+    expected = sensitivity_of(solution, price).impulse
+    assert again.sensitivity(price).impulse == pytest.approx(expected, rel=1e-6)
+    with pytest.raises(InputError, match=r"there is no .*solution\.npz"):
+        load_solution(tmp_path / "nothing")

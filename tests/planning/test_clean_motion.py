@@ -12,6 +12,7 @@ from support.meshes import Meshes
 from support.small_plans import BODILESS
 
 from impactopt import Solution, load_problem, solve, talos
+from impactopt.files.output import record_of
 from impactopt.problem.terms import GroundForce
 
 
@@ -65,3 +66,11 @@ def test_what_is_switched_off_is_told() -> None:
     said = solve(dataclasses.replace(problem, robot=robot, terms=terms, style="strongest")).clearance()
     assert said["clearance_mm"] < -50
     assert len({(touch["one"], touch["other"]) for touch in said["contacts_besides"]}) > 20
+
+
+def test_bodies_that_stay_apart_have_no_distance() -> None:
+    solution = solve(load_problem("arm_planar"))
+    none = {"clearance_mm": None, "nearest": "", "contacts_besides": []}
+    assert solution.clearance() == none
+    replayed = record_of(solution, simulation=solution.validate()).summary["simulated"]
+    assert none.items() <= replayed.items()

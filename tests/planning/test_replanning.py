@@ -184,6 +184,8 @@ def test_what_cannot_be_bent_is_said(arm: Solution) -> None:
         arm.moved()
     with pytest.raises(InputError, match=r"target\.mas.*target\.mass"):
         arm.sensitivity("target.mas")
+    with pytest.raises(InputError, match=r"terms\.power_limit\.limit: .* give PowerLimit one"):
+        arm.sensitivity("terms.power_limit.limit")
     stopped = dataclasses.replace(arm, result=dataclasses.replace(arm.result, status=Status.ITERATION_LIMIT))
     with pytest.raises(InputError, match="not a solution"):
         stopped.moved(mass=0.06)

@@ -283,6 +283,11 @@ WORLD = {
     ".click(), "
     "page.clock.view.surroundings(0).map((w) => w.part.kind))",
     "fewer": DRAWN % "0, 0",
+    # the tip of the largest force's arrow, for a target that is hit upwards
+    "tips": "(page.header.normal = [0, 0, 1], page.clock.view.frame(), ['3/4', 'side'].map((n) => { "
+    "const v = page.clock.view; v.look(n); const now = v.draw(0, page.header.tracks[0].contact_start); "
+    "const [x, y] = v.project(now.tip), { clientWidth: w, clientHeight: h } = v.canvas; "
+    "return now.force > 0 && x > 0 && x < w && y > 0 && y < h; }))",
 }
 MARKS = "[...document.querySelectorAll('.marks .key')]"
 BODIES = {
@@ -332,6 +337,7 @@ def test_the_world_moves_on_a_page_as_it_does_in_pictures(
     assert page["gone"] == ["held"] * 2 + ["obstacle"], "what has flown off is not shown"
     assert page["hidden"] == ["target"] * 2 + ["held"] * 2
     assert page["all"][1] == page["fewer"][1] == 0
+    assert page["tips"] == [True] * 2
 
 
 def test_a_robots_bodies_are_drawn_over_it(shown: list[dict[str, Any]]) -> None:

@@ -445,8 +445,8 @@ def test_the_planned_hand_is_as_fast_as_the_plan_says(biped_plan: Any) -> None:
     solved = still_solution(problem=problem)
     made = record_of(type(solved)(**{**vars(solved), "plan": plan}))
     charts, arrays = charts_of(made, problem)
-    (chart,) = (chart for chart in charts if chart["title"].startswith("Speed of hand"))
-    (hand,) = (s for s in chart["series"] if s["label"] == "hand, planned")
+    (chart,) = (chart for chart in charts if chart["title"].startswith("Speed of striking point"))
+    (hand,) = (s for s in chart["series"] if s["label"] == "striking point, planned")
     time, speed = arrays[hand["x"]], arrays[hand["y"]]
     assert speed[0] == pytest.approx(0.0, abs=1e-6), "from rest"
     assert np.nanmax(speed[time <= plan.contact_start]) == pytest.approx(plan.hand_speed, rel=1e-3)

@@ -69,6 +69,8 @@ def report_mistakes(where: str, lines: Mapping[Place, int], mistakes: Iterable[M
         place = mistake.place
         # the line of the key, or of the nearest table above, for keys that are missing or inside a value
         line = next((lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in lines), None)
+        if place and any(not number and key[: len(place)] == place for key, number in lines.items()):
+            line = 0  # of a table with a changed value
         at = "" if line is None else f"line {line}, " if line else "as set, "
         found.append((not mistake.first, line is None, line or 0, f"{at}{mistake}"))
     texts = list(dict.fromkeys(shortened(text, _MAX_LENGTH) for *_, text in sorted(found)))

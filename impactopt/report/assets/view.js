@@ -35,6 +35,7 @@ void main() {
 // colours of hulls, one after the other: neighbours differ
 const HULLS = [[0.9, 0.62, 0], [0.34, 0.71, 0.91], [0, 0.62, 0.45], [0.8, 0.47, 0.65], [0.84, 0.37, 0], [0, 0.45, 0.7]];
 const CLEAR = 0.4; // of what the robot is seen through
+const LONGEST = 0.5; // [m] arrow of the largest force on the target
 const ANGLE = (32 * Math.PI) / 180;
 // yaw and pitch, for a target on the right; else the yaws are mirrored
 const VIEWS = { "3/4": [-1.95, 0.2], side: [-Math.PI / 2, 0.05], front: [-0.15, 0.08], top: [-Math.PI / 2, 1.5] };
@@ -120,10 +121,14 @@ class View {
     const { arrays, header } = this, { name } = header.tracks[0];
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
     const take = (p) => p.forEach((x, k) => { low[k] = Math.min(low[k], x); high[k] = Math.max(high[k], x); });
-    const [places, hand] = [arrays[`${name}_places`], arrays[`${name}_hand`]];
+    const [places, hand, force] = ["places", "hand", "force"].map((part) => arrays[`${name}_${part}`]);
     const joints = places.length / 7 / arrays[`${name}_time`].length;
     for (let k = 0; k < places.length / 7; k++) if (k % joints) take([...places.slice(7 * k, 7 * k + 3)]);
-    for (let k = 0; k < hand.length / 3; k++) take([...hand.slice(3 * k, 3 * k + 3)]);
+    for (let k = 0; k < hand.length / 3; k++) {
+      const at = [...hand.slice(3 * k, 3 * k + 3)];
+      take(at);
+      take(this.tipOf(at, force[k], 0));
+    }
     take(header.point);
     const still = this.instant(header.tracks[0], 0);
     for (const { joint, low: from, step } of header.bodies) {
@@ -321,9 +326,14 @@ class View {
       this.put(this.ball, scaled([...zmp, 0], 1.5 * small), themeColour("zmp"));
     }
     if (pressed && shown.ground) this.arrow([...zmp, 0], ground.map((x) => (0.5 * x) / header.weight), themeColour("ground"), small);
-    const way = header.normal.map((x) => (0.5 * force * x) / this.strongest(k));
-    if (force > 0 && shown.force) this.arrow(hand, way, themeColour("force"), 1.1 * small);
-    return { force, zmp: pressed ? zmp : null, mass, hand, tip: hand.map((x, i) => x + way[i]) };
+    const tip = this.tipOf(hand, force, k);
+    if (force > 0 && shown.force) this.arrow(hand, tip.map((x, i) => x - hand[i]), themeColour("force"), 1.1 * small);
+    return { force, zmp: pressed ? zmp : null, mass, hand, tip };
+  }
+
+  // where the arrow of a force on the target ends
+  tipOf(hand, force, k) {
+    return hand.map((x, i) => x + (LONGEST * force * this.header.normal[i]) / this.strongest(k));
   }
 
   strongest(k) {

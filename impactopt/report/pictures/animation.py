@@ -18,8 +18,7 @@ from PIL import Image, ImageColor
 from scipy.spatial import ConvexHull
 
 from impactopt.bodies.visuals import surroundings_of
-from impactopt.errors import InputError
-from impactopt.files.output import write_file
+from impactopt.files.output import check_ending, write_file
 from impactopt.files.replay import Replay
 from impactopt.kinematics.support import corners_at
 from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
@@ -223,8 +222,7 @@ def save_animation(done: Replay, path: Path) -> Path:
     ------
     InputError : the file cannot be written, or its name does not end with .gif.
     """
-    if path.suffix.lower() != ".gif":
-        raise InputError(f"an animation is a GIF: give {path.name!r} the ending .gif")
+    check_ending("an animation is a GIF", path, ".gif")
     sim = done.simulation
     last = min(float(sim.time[-1]), float(done.planned.reference.end) + AFTER)
     times, paces = shown_times(sim.contact_start, sim.contact_end, last)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 from matplotlib.collections import PolyCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from impactopt.bodies.solids import Solid, simplified
 from impactopt.bodies.visuals import Part, surroundings_of
@@ -49,7 +51,7 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
     sizes = [[np.ptp(ends @ np.abs(direction)) for direction in view[:2]] for _, view in VIEWS]
     heights = [high for _, high in sizes]
     scale = (WIDTH - 0.4) / (len(chosen) * max(wide for wide, _ in sizes))  # [in/m]
-    figure = Picture(WIDTH, scale * sum(heights) + 0.9)
+    figure = Picture(WIDTH, scale * sum(heights) + 1.3)
     axes = figure.subplots(len(VIEWS), len(chosen), squeeze=False, gridspec_kw={"height_ratios": heights})
     for column, k in enumerate(chosen):
         scene = _joined([robots[column], *around[column]])
@@ -63,10 +65,20 @@ def sheet(record: Record, problem: ImpactProblem) -> Picture:
             if row < 2 and problem.ground_height is not None:
                 ax.axhline(problem.ground_height, color="#999999", linewidth=0.6, zorder=0)
             if column == 0:
-                ax.text(0.0, 1.0, name, transform=ax.transAxes, fontsize=7, va="top")
+                left_of = {"ha": "right", "va": "center", "rotation": 90}
+                ax.text(-0.01, 0.5, name, transform=ax.transAxes, fontsize=7, **left_of)
         contact = abs(track.time[k] - track.contact_start) < 1e-6
         axes[0, column].set_title(f"{'contact, ' if contact else ''}{track.time[k]:.2f} s")
     figure.suptitle(title(record, "planned motion"))
+    figure.legend(
+        handles=[
+            Patch(color=BLUE, label="limb that strikes"),
+            Line2D([], [], color=VERMILION, marker="o", markersize=3, linestyle="", label="hit point"),
+            Patch(color=ORANGE, label=f"target, until it has moved by {MAX_TRAVEL:g} m"),
+        ],
+        loc="outside lower center",
+        ncols=3,
+    )
     return figure
 
 
@@ -139,5 +151,5 @@ def _draw(ax: object, triangles: Array, normals: Array, colours: Array, view: Ar
     order = np.argsort(depth)
     shaded = (colours[facing] * light[:, None])[order]
     ax.add_collection(  # type: ignore[attr-defined]
-        PolyCollection(flat[order], facecolors=shaded, edgecolors=shaded, linewidths=0.2, rasterized=True)
+        PolyCollection(flat[order], facecolors=shaded, edgecolors=shaded, linewidths=0.4, rasterized=True)
     )

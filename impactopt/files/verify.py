@@ -138,7 +138,7 @@ def _same_program(t: Transcription, record: Record) -> bool:
     recorded, today = json.loads(str(record.arrays["program_statement"])), json.loads(statement_of(t))
     n, m = t.program.n, t.program.m
     sizes = {"solver_x": n, "solver_bound_multipliers": n, "solver_multipliers": m}
-    return all(recorded[key] == today[key] for key in ("groups", "rows", "components")) and all(
+    return all(recorded[key] == today[key] for key in ("groups", "constraints", "components")) and all(
         len(np.atleast_1d(record.arrays[name])) == size for name, size in sizes.items()
     )
 

@@ -169,7 +169,7 @@ def _planned(
     # refined. Without clearance constraints only the best one is.
     solver = PlanSolver(budget=budget, margins=margins, refined=refined and margins is not None)
     if isinstance(start, Solution) and margins is not None and same_bodies(t.problem, start.problem):
-        t = t.with_clearance(start.apart)
+        t = t.with_clearance(start.clearance_constraints)
     # A start's draw depends on seed and number only, so further ones continue the sequence.
     built, guesses = time.perf_counter(), _guesses(t, given, range(which.start, last), seed, solver)
     outcome = best_of(guesses, solver.from_guess, budget, len(which))
@@ -224,7 +224,7 @@ def _program(
         problem = replace(problem, price_scale=start.problem.price_scale)
     problem = with_order_of(start, problem)
     t = program_on(with_room_for_gains(problem), start.nodes, start.elements, start.shares, budget.report)
-    apart = start.apart if same_bodies(problem, start.problem) else {}
+    apart = start.clearance_constraints if same_bodies(problem, start.problem) else {}
     given = carried_start(t, partial(program_of, start), start, apart)
     check_array("start", given.x, (t.program.n,))
     return t, given

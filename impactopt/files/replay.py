@@ -177,10 +177,7 @@ def _trajectory(record: Record, prefix: str) -> Trajectory:
 
 
 def problem_of(
-    record: Record,
-    result: Path,
-    problem_file: str | os.PathLike[str] | None,
-    settings: Mapping[str, Any] | None,
+    record: Record, result: Path, problem_file: str | os.PathLike[str] | None = None
 ) -> ImpactProblem:
     """The problem of a record, rebuilt; arguments as of `load_planned`.
 
@@ -188,7 +185,7 @@ def problem_of(
     ------
     InputError : the record has no problem file, or the problem cannot be rebuilt.
     """
-    file = _problem_file(record, result, problem_file, settings)
+    file = _problem_file(record, result, problem_file, None)
     return _built(record, file, result, given=problem_file is not None)
 
 

@@ -87,7 +87,7 @@ def verify(result: str | os.PathLike[str], *, problem_file: str | os.PathLike[st
     InputError : there is no record, or it does not describe its program.
     """
     record, path = load_record(result), Path(result)
-    problem = problem_of(record, path, problem_file, None)
+    problem = problem_of(record, path, problem_file)
     summary_file = (path.parent if path.name == NUMBERS and not path.is_dir() else path) / SUMMARY
     other_summary = summary_file.exists() and _read(summary_file) != record.summary
     return verify_record(record, problem, other_summary=other_summary)

@@ -17,34 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from impactopt.collision.implicit import STAGES, Contact, StateMaps, Step, first_negative, largest, tables
+from impactopt.collision.implicit import (
+    CONTROL,
+    STAGES,
+    Contact,
+    StateMaps,
+    Step,
+    first_negative,
+    largest,
+    tables,
+)
 from impactopt.collision.model import JointSpaceModel
 
 Array = NDArray[np.float64]
 
 _TERMS = STAGES + 1
-# The constants are those of native/implicit.h, by the same names. A step with an event ends beyond it by this
-# part, so that the next step begins in the new phase. An event before this part of a step counts as
-# immediate.
-_EVENT_OVERSHOOT, _IMMEDIATE_EVENT = 1e-9, 1e-5
-# [rad] Phase of the contact's fastest mode in the first step. With a nonlinear law instead: the change of
-# speed in the first step, relative to the speed; the second value is for a force that begins without a slope,
-# as x^1.5.
-_FIRST_STEP_PHASE, _FIRST_SPEED_CHANGE, _FIRST_SPEED_CHANGE_FLAT = 0.5, 0.1, 3e-4
-# Errors are relative to the permitted one. Below the first value the next step is longer, for an error of
-# `_AIMED_ERROR`. That costs a factorization, which nonlinear laws and targets need at each step in any case.
-_LENGTHEN_BELOW, _LENGTHEN_BELOW_NONLINEAR, _AIMED_ERROR = 2e-3, 0.1, 0.2
-_MAX_TRIES = 200
-_RETRY_FACTOR = 0.3  # of a step for which Newton's method has not converged
-# In restitution with a nonlinear law, a step is at most this part of the time that is left to separation: a
-# force like x^1.5 has no Taylor series there, and needs ever shorter steps, down to the first one's length.
-_SEPARATION_FRACTION = 0.6
-_ERROR_OF_LIMIT = 1e-2  # permitted error of a servo torque, relative to its limit
-# Permitted error of a switch that depends on a position, relative to that of others. A position that changes
-# slowly passes its switch too late by this error: a board bent slowly to its break was off by 1.1e-5 without
-# the factor.
-_ERROR_OF_SWITCH = 0.1
-
 _TABLES = tables()
 _POWERS, _AT_ONE = np.asarray(_TABLES["POWERS"]), np.asarray(_TABLES["AT_ONE"])
 _HULL = np.asarray(_TABLES["HULL"])[:, :_TERMS]
@@ -243,7 +230,7 @@ class _Run:
         error *= _LEFT_OUT / self.loop.tolerance
         if self.saturates:
             most = float(np.max(np.abs(self.terms_of(now, s)[1][STAGES]) / self.limit))
-            error = max(error, most * _LEFT_OUT / _ERROR_OF_LIMIT)
+            error = max(error, most * _LEFT_OUT / CONTROL.error_of_limit)
         return float(error)
 
     def _error_of_switches(self, s: Step, scale: float) -> float:
@@ -260,7 +247,7 @@ class _Run:
         by_speed = np.abs(by_z @ self.law.slopes(z, force)[2]) * scale
         place = np.maximum(np.abs(terms[0]), np.abs(by_z * z).max(axis=1, initial=0.0))
         size = np.max(
-            [_ERROR_OF_SWITCH * place, np.abs(by_force * force), by_speed, np.abs(terms[1])], axis=0
+            [CONTROL.error_of_switch * place, np.abs(by_force * force), by_speed, np.abs(terms[1])], axis=0
         )
         return float(np.max(np.abs(terms[STAGES]) / np.where(size > 0.0, size, np.inf)))
 
@@ -280,9 +267,9 @@ class _Run:
         mobility, force, k, d = self.mobility(y, now)
         if not self.loop.contact.law_is_nonlinear:
             rate = max(d * mobility, sqrt(max(k * mobility, 0.0)))
-            return _FIRST_STEP_PHASE / rate if rate * left > _FIRST_STEP_PHASE else left
+            return CONTROL.first_step_phase / rate if rate * left > CONTROL.first_step_phase else left
         h, depth = left, self.number(y, "penetration")
-        permitted = _FIRST_SPEED_CHANGE_FLAT if k == 0.0 and d == 0.0 else _FIRST_SPEED_CHANGE
+        permitted = CONTROL.first_speed_change_flat if k == 0.0 and d == 0.0 else CONTROL.first_speed_change
         for _ in range(60):
             then = self.law.force(depth + abs(now.rate) * h, now.rate, now.compressing)[0]
             if abs(then - force) * mobility * h <= permitted * abs(now.rate):
@@ -371,15 +358,15 @@ class _Run:
             h = self.first_step(y, now, left) if h == 0.0 else h
             if self.loop.contact.law_is_nonlinear and not now.compressing:
                 to_separation = self.number(y, "penetration") / -now.rate if now.rate else np.inf
-                h = min(h, _SEPARATION_FRACTION * to_separation) if to_separation > 2.0 * first else h
+                h = min(h, CONTROL.separation_fraction * to_separation) if to_separation > 2.0 * first else h
             mobility = self.mobility(y, now)[0]
-            for _ in range(_MAX_TRIES):
+            for _ in range(CONTROL.max_tries):
                 s = self.step(y, now, h)
                 error = self.error_of(now, s, scale, mobility)
                 if error <= 1.0 or (s.converged and np.isnan(error)):
                     break
                 # the neglected term is of order nine in h
-                h *= max(0.2, 0.9 * error ** (-1.0 / _TERMS)) if s.converged else _RETRY_FACTOR
+                h *= max(0.2, 0.9 * error ** (-1.0 / _TERMS)) if s.converged else CONTROL.retry_factor
             if not np.isfinite(error):
                 y = np.full_like(y, np.nan)
                 break
@@ -388,19 +375,21 @@ class _Run:
             at = self.event(y, now, s, end)
             # immediate events in a row are one whose end rounding hides: overshoot eight times farther each
             # time
-            repeated = repeated + 1 if at is not None and at < _IMMEDIATE_EVENT and repeated < 8 else 0
+            repeated = repeated + 1 if at is not None and at < CONTROL.immediate_event and repeated < 8 else 0
             theta = end
             if at is not None:
-                theta = min(end, at + _EVENT_OVERSHOOT * max(at, _IMMEDIATE_EVENT * (1 << 3 * repeated)))
+                theta = min(
+                    end, at + CONTROL.event_overshoot * max(at, CONTROL.immediate_event * (1 << 3 * repeated))
+                )
             while len(kept) < columns - 1 and (part := (len(kept) * spacing - time) / h) < theta:
                 kept.append(self.state_at(y, s, part))
             y = self.move(y, s, theta)
             if theta == end and end < 1.0:
                 # exactly, as the loop ends at this time, and rounding would add a step
                 y[self.parts["time"]] = self.until
-            lengthen_below = _LENGTHEN_BELOW_NONLINEAR if self.is_nonlinear else _LENGTHEN_BELOW
+            lengthen_below = CONTROL.lengthen_below_nonlinear if self.is_nonlinear else CONTROL.lengthen_below
             if at is None and error < lengthen_below and left > 2.0 * h:
-                h *= min((_AIMED_ERROR / error) ** (1.0 / _TERMS) if error > 0.0 else 4.0, 4.0)
+                h *= min((CONTROL.aimed_error / error) ** (1.0 / _TERMS) if error > 0.0 else 4.0, 4.0)
         if np.isnan(self.instant(y).rate):
             y = np.full_like(y, np.nan)
         return np.array([*kept[: max(columns - 1, 0)], *[y] * max(columns - len(kept), 1), y])

@@ -40,11 +40,6 @@ def problem_file(name: str | os.PathLike[str]) -> Path:
     return _file(name, named_files(), "problem")
 
 
-def sweep_names() -> tuple[str, ...]:
-    """Names of the package's sweeps, arguments of `read_sweep_file`."""
-    return tuple(named_files(SWEEPS))
-
-
 def sweep_file(name: str | os.PathLike[str]) -> Path:
     """The file of a sweep's name, as `problem_file` of a problem's."""
     return _file(name, named_files(SWEEPS), "sweep")

@@ -20,7 +20,10 @@ from impactopt.codegen.files import read_archive, read_plain
 from impactopt.errors import InputError
 from impactopt.files.record_schema import check_arrays, check_summary
 
-FORMAT = 1  # of solution.npz; increased by a change that an older reader would misread
+FORMAT = 2  # of solution.npz; increased by a change that an older reader would misread
+# Names of the program's statement since format 2, by those of format 1.
+_RENAMED = {"rows": "constraints", "more": "added_nodes", "apart": "clearance"}
+_RENAMED |= {"way": "vector", "reach": "least_distance"}
 LARGEST, MOST_ARRAYS = 1 << 29, 1000  # bytes and arrays of solution.npz; ours have some MB, and a hundred
 NUMBERS, SUMMARY = "solution.npz", "summary.json"
 
@@ -90,6 +93,15 @@ def _unpacked(array: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(array, dtype=float) if array.dtype == np.float32 else array
 
 
+def _renamed(statement: str) -> str:
+    """Statement of a program in format 1, with the names of format 2."""
+
+    def table(entries: dict[str, Any]) -> dict[str, Any]:
+        return {_RENAMED.get(name, name): value for name, value in entries.items()}
+
+    return json.dumps(json.loads(statement, object_hook=table))
+
+
 def load_record(directory: str | os.PathLike[str]) -> Record:
     """The record that `save_record` wrote into a directory, or of a path to `solution.npz`.
 
@@ -111,6 +123,8 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         problem.encode().decode()  # a damaged array may have invalid characters
         relative = str(arrays.pop("problem_path", ""))
         del arrays["format"]
+        if version < 2 and "program_statement" in arrays:
+            arrays["program_statement"] = np.array(_renamed(str(arrays["program_statement"])))
         check_summary(summary, whole="joints" in arrays)
         check_arrays(arrays)
     except InputError:

@@ -60,14 +60,14 @@ def program_of_record(record: Record, problem: ImpactProblem) -> Transcription |
         return None
     statement: dict[str, Any] = json.loads(str(record.arrays["program_statement"]))
     elements: Elements = tuple(tuple(e) for e in statement["elements"]) if statement["guarded"] else ()
-    swing, follow, *stances = (tuple(added) for added in statement["more"])  # added mesh nodes
+    swing, follow, *stances = (tuple(added) for added in statement["added_nodes"])
     nodes = MoreNodes(swing, follow, tuple(stances))
     t = program_on(problem, nodes, elements, tuple(statement.get("shares", ())))
     clearances = {
         ClearanceKey(*(entry[key] for key in ClearanceKey._fields)): SeparatingDirection(
-            tuple(entry["way"]), entry["reach"], entry["travel"]
+            tuple(entry["vector"]), entry["least_distance"], entry["travel"]
         )
-        for entry in statement["apart"]
+        for entry in statement["clearance"]
     }
     return t.with_clearance(clearances) if clearances else t
 
@@ -177,10 +177,7 @@ def _trajectory(record: Record, prefix: str) -> Trajectory:
 
 
 def problem_of(
-    record: Record,
-    result: Path,
-    problem_file: str | os.PathLike[str] | None,
-    settings: Mapping[str, Any] | None,
+    record: Record, result: Path, problem_file: str | os.PathLike[str] | None = None
 ) -> ImpactProblem:
     """The problem of a record, rebuilt; arguments as of `load_planned`.
 
@@ -188,7 +185,7 @@ def problem_of(
     ------
     InputError : the record has no problem file, or the problem cannot be rebuilt.
     """
-    file = _problem_file(record, result, problem_file, settings)
+    file = _problem_file(record, result, problem_file, None)
     return _built(record, file, result, given=problem_file is not None)
 
 

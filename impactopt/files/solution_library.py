@@ -97,7 +97,7 @@ class SolvedFolder:
         # the record may be damaged, of another robot, or have other variables
         with contextlib.suppress(InputError):
             record = load_record(near.path)
-            neighbour = resumed(record, problem_of(record, near.path, None, None))
+            neighbour = resumed(record, problem_of(record, near.path))
             rest = {key: value for key, value in options.items() if key not in ("start", "starts")}
             first = solve(problem, start=neighbour, **rest)
             if first.status.usable or first.status is Status.INTERRUPTED:

@@ -87,7 +87,7 @@ def verify(result: str | os.PathLike[str], *, problem_file: str | os.PathLike[st
     InputError : there is no record, or it does not describe its program.
     """
     record, path = load_record(result), Path(result)
-    problem = problem_of(record, path, problem_file, None)
+    problem = problem_of(record, path, problem_file)
     summary_file = (path.parent if path.name == NUMBERS and not path.is_dir() else path) / SUMMARY
     other_summary = summary_file.exists() and _read(summary_file) != record.summary
     return verify_record(record, problem, other_summary=other_summary)
@@ -138,7 +138,7 @@ def _same_program(t: Transcription, record: Record) -> bool:
     recorded, today = json.loads(str(record.arrays["program_statement"])), json.loads(statement_of(t))
     n, m = t.program.n, t.program.m
     sizes = {"solver_x": n, "solver_bound_multipliers": n, "solver_multipliers": m}
-    return all(recorded[key] == today[key] for key in ("groups", "rows", "components")) and all(
+    return all(recorded[key] == today[key] for key in ("groups", "constraints", "components")) and all(
         len(np.atleast_1d(record.arrays[name])) == size for name, size in sizes.items()
     )
 

@@ -449,8 +449,9 @@ class _RaisedClearances:
             nearest = min(gaps.values(), default=0.0)
             for key, held in own.items():
                 if gaps[key] < nearest + RAISED_WITHIN:
-                    reach = max(held.reach, self.constraints.get(key, held).reach, nearest + missing)
-                    self.constraints[ClearanceKey(*key)] = held._replace(reach=reach)
+                    raised = self.constraints.get(key, held).least_distance
+                    least = max(held.least_distance, raised, nearest + missing)
+                    self.constraints[ClearanceKey(*key)] = held._replace(least_distance=least)
 
 
 class _AddedNodes:

@@ -224,14 +224,12 @@ def _coasting(problem: ImpactProblem, strike: PlannedStrike) -> Trajectory:
     )
 
 
-def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = None) -> ModelError | None:
+def model_error(t: ContactProgram, x: Array) -> ModelError | None:
     """Error of a program's collision model against full dynamics, for solver variables (n,).
 
-    problem : the one with the model; None: the program's.
-    The result is None for full dynamics, for an impact with a given restitution, and if a contact does not
-    end.
+    None for full dynamics, for an impact with a given restitution, and if a contact does not end.
     """
-    problem, c = problem or t.problem, t.coordinates
+    problem, c = t.problem, t.coordinates
     if problem.collision in ("full", "auto", "rigid"):
         return None
     y, legs = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x)
@@ -239,14 +237,6 @@ def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = Non
     # The variable is scaled by the limit.
     torque = t.feedforward.read(x)[0] * problem.robot.torque_limit
     return collision_error(problem, q, v, torque, max(sum(t.expected.durations(x)), 1e-2))
-
-
-def planned_contact(
-    t: ContactProgram, x: Array, planned: Plan | PlannedStrike, problem: ImpactProblem | None = None
-) -> PlannedContact:
-    """Planned contact of a program at solver variables (n,); ``problem``: as of `model_error`."""
-    error = model_error(t, x, problem)
-    return PlannedContact(problem=problem or t.problem, planned=planned, model_error=error)
 
 
 def collision_error(

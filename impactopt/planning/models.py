@@ -64,7 +64,7 @@ def carried_start(
     if before == now:
         return start.result
     new = t.with_clearance(constraints)
-    found = carried(new, old().with_clearance(start.apart), start.result)
+    found = carried(new, old().with_clearance(start.clearance_constraints), start.result)
     return with_factors_of(new, start.problem.robot, found) if now[-1] else found
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.planning.budget import VIOLATED, Budget, one_after_the_other, rank_of, with_effort_of
-from impactopt.planning.contact_replay import ContactReplay, PlannedContact, checked, planned_contact
+from impactopt.planning.contact_replay import ContactReplay, PlannedContact, checked, model_error
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, Violation, max_violation, worst_violations
 from impactopt.transcription.clearance import ClearanceKey, SeparatingDirection
@@ -113,7 +113,11 @@ class Evaluation(Generic[Program]):
     @cached_property
     def contact(self) -> PlannedContact | None:
         """The planned contact; None while gains are open, as the robot's own are not those of the plan."""
-        return None if self.program.problem.gains else planned_contact(self.program, self.x, self.planned)
+        problem = self.program.problem
+        if problem.gains:
+            return None
+        error = model_error(self.program, self.x)
+        return PlannedContact(problem=problem, planned=self.planned, model_error=error)
 
     @property
     def replay(self) -> ContactReplay | None:

@@ -88,10 +88,10 @@ class ParametricProgram:
     def _built(self, problem: ImpactProblem, report: Callable[[str], None] | None = None) -> Transcription:
         s = self.solution
         t = program_on(problem, s.nodes, s.elements, s.shares, report)
-        if s.apart:
+        if s.clearance_constraints:
             if not same_bodies(problem, s.problem):
                 raise InputError("the world has other bodies then: use solve(problem, start=solution)")
-            t = t.with_clearance(s.apart)
+            t = t.with_clearance(s.clearance_constraints)
         if (t.program.n, t.program.m) != (len(s.result.x), len(s.result.multipliers)):
             raise InputError("the program has other constraints then: use solve(problem, start=solution)")
         return t

@@ -41,7 +41,7 @@ class Solved:
     violations : violated constraints, worst first.
     objectives : value of each of the problem's objectives, by name, in its own unit.
     attempts : result of each start.
-    apart : clearance constraints of the program.
+    clearance_constraints : of the program.
     elements : lengths of the collocation elements of each phase of the contact, as fractions of the phase, if
         they are finer than the problem's; else ().
     shares : each phase's fraction of the contact's duration, if the model freezes during contact; else ().
@@ -58,7 +58,7 @@ class Solved:
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
     contact: PlannedContact | None = None
-    apart: Mapping[Any, Any] = field(default_factory=dict)
+    clearance_constraints: Mapping[Any, Any] = field(default_factory=dict)
     elements: Elements = ()
     shares: Shares = ()
     gains: tuple[ChosenGains, ...] = ()
@@ -397,6 +397,6 @@ def solution_of(
         # (): the default elements, which a program of this problem has again.
         elements=t.hit.elements if t.hit.guarded else (),
         shares=t.hit.shares,
-        apart=t.clearance_constraints,
+        clearance_constraints=t.clearance_constraints,
         contact=at.contact if outcome.usable else None,
     )

@@ -1,7 +1,8 @@
 """Planner: solution of an impact problem.
 
-`solve` checks its arguments. `_planned` makes the nonlinear program (`Transcription`) and its initial
-guesses, solves and refines these (`refine`), diagnoses a failure, and makes the `Solution`.
+`solve` checks its arguments. `_planned` makes the nonlinear program (`_program`) and its initial guesses
+(`_guesses`), solves these and keeps the best (`_best`), refines it (`PlanSolver`), diagnoses a failure
+(`_diagnosed`), and makes the `Solution`.
 """
 
 from __future__ import annotations
@@ -155,38 +156,26 @@ def _planned(
     t, given = _program(problem, start, budget)
     # From here on the time limit counts: a first run compiles for longer than it solves.
     budget = budget.started()
-    heavy, whole, options = overloaded(t.problem), budget, budget.options or {}
-    limited = bool(heavy) and budget.solver != "ipopt" and "max_iterations" not in options
-    if isinstance(given, SolverResult):
-        limited = False  # a solution of a similar problem is more than an estimate
-        if Outcome.of(t, given).own_violation <= VIOLATED:
-            budget = budget.near_by()  # a feasible warm start may be the optimum
-    if limited:
-        budget = replace(budget, options={**options, "max_iterations": _HOPELESS_ITERATIONS})
+    if isinstance(given, SolverResult) and Outcome.of(t, given).own_violation <= VIOLATED:
+        budget = budget.near_by()  # a feasible warm start may be the optimum
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     margins = Margins(t.problem) if t.problem.keeps_apart else None
     # Solutions of different guesses compare only once they keep their clearances and gear limits, so each is
     # refined. Without clearance constraints only the best one is.
     solver = PlanSolver(budget=budget, margins=margins, refined=refined and margins is not None)
-    if isinstance(start, Solution) and margins is not None and same_bodies(t.problem, start.problem):
-        t = t.with_clearance(start.apart)
+    if isinstance(start, Solution) and same_bodies(t.problem, start.problem):
+        t = t.with_clearance(start.clearance_constraints)
+    doubts, built = overloaded(t.problem), time.perf_counter()
     # A start's draw depends on seed and number only, so further ones continue the sequence.
-    built, guesses = time.perf_counter(), _guesses(t, given, range(which.start, last), seed, solver)
-    outcome = best_of(guesses, solver.from_guess, budget, len(which))
-    if limited and not ended_with_violations(outcome.program, outcome.result):
-        # a motion within all bounds refutes the estimate
-        budget, solver = whole, replace(solver, budget=whole)
-        if outcome.result.status is Status.ITERATION_LIMIT:
-            more = solver.from_guess(Guess(program=outcome.program, start=outcome.result))
-            outcome = outcome.else_then(more)
+    guesses = partial(_guesses, t, given, range(which.start, last), seed)
+    # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.
+    outcome = _best(guesses, len(which), solver, doubted=bool(doubts) and not isinstance(given, SolverResult))
     if refined and margins is None:
         outcome = solver.on(outcome)
-    known: list[str] = []
-    if ended_with_violations(outcome.program, outcome.result):
-        known = hopeless(t.problem) or heavy  # reasons that need no search come first
-    causes: tuple[Cause, ...] = ()
-    if not known:
-        outcome, causes = _diagnosed(outcome, solver)
+    # Reasons that need no search come first.
+    failed = ended_with_violations(outcome.program, outcome.result)
+    known = (hopeless(t.problem) or doubts) if failed else []
+    outcome, causes = (outcome, ()) if known else _diagnosed(outcome, solver)
     gains = chosen_gains(outcome.program, outcome.result.x)
     # Before the replay, which needs a robot with gains of its own.
     outcome = with_gains_fixed(outcome, gains, budget)
@@ -224,7 +213,7 @@ def _program(
         problem = replace(problem, price_scale=start.problem.price_scale)
     problem = with_order_of(start, problem)
     t = program_on(with_room_for_gains(problem), start.nodes, start.elements, start.shares, budget.report)
-    apart = start.apart if same_bodies(problem, start.problem) else {}
+    apart = start.clearance_constraints if same_bodies(problem, start.problem) else {}
     given = carried_start(t, partial(program_of, start), start, apart)
     check_array("start", given.x, (t.program.n,))
     return t, given
@@ -304,6 +293,26 @@ class PlanSolver:
         found = self._between(Outcome.of(free, self.budget.run(free.program, stuck.origin.x), stuck.origin))
         # Either way the result has the effort of both.
         return stuck.then(found) if found.usable else found.then(stuck)
+
+
+def _best(
+    guesses: Callable[[PlanSolver], Guesses[Transcription]], count: int, solver: PlanSolver, *, doubted: bool
+) -> Outcome[Transcription]:
+    """Best outcome of `count` initial guesses, and of more while all are refused (`best_of`).
+
+    doubted : an estimate has the problem infeasible, so each solve ends after few iterations.
+    """
+    budget, options = solver.budget, solver.budget.options or {}
+    if not doubted or budget.solver == "ipopt" or "max_iterations" in options:
+        return best_of(guesses(solver), solver.from_guess, budget, count)
+    few = replace(budget, options={**options, "max_iterations": _HOPELESS_ITERATIONS})
+    quick = replace(solver, budget=few)
+    outcome = best_of(guesses(quick), quick.from_guess, few, count)
+    program, result = outcome.program, outcome.result
+    if result.status is not Status.ITERATION_LIMIT or ended_with_violations(program, result):
+        return outcome
+    # A motion within all bounds refutes the estimate: it gets the iterations that are left.
+    return outcome.else_then(solver.from_guess(Guess(program=program, start=result)))
 
 
 def _diagnosed(

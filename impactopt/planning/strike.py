@@ -145,7 +145,7 @@ def _optimized(
     t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
         # Only its variables: clearance constraints enter by themselves.
-        start = carried_start(t, partial(_program_of, start), start, start.apart).x
+        start = carried_start(t, partial(_program_of, start), start, start.clearance_constraints).x
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     solve = partial(_clean_strike, budget, Margins(problem) if problem.keeps_apart else None)
 
@@ -178,7 +178,7 @@ def _optimized(
         contact=at.contact if outcome.usable else None,
         elements=t.hit.elements if t.hit.guarded else (),
         shares=t.hit.shares,
-        apart=t.clearance_constraints,
+        clearance_constraints=t.clearance_constraints,
     )
 
 

@@ -282,8 +282,6 @@ def solve_ipopt(
     options: Mapping[str, Any] | None = None,
     callback: Callback | None = None,
     time_limit: float | None = None,
-    multipliers: npt.ArrayLike | None = None,
-    bound_multipliers: npt.ArrayLike | None = None,
 ) -> SolverResult:
     """Solve a nonlinear program with IPOPT (Waechter and Biegler 2006).
 
@@ -295,8 +293,6 @@ def solve_ipopt(
         `hessian_approximation="limited-memory"` makes the program's Hessian unnecessary.
     callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
     time_limit : wall time [s].
-    multipliers, bound_multipliers : initial guess of the multipliers (m,), (n,); IPOPT uses them with
-        `warm_start_init_point="yes"` and a small `mu_init`.
 
     Returns
     -------
@@ -328,10 +324,6 @@ def solve_ipopt(
         "lbg": program.g_lower,
         "ubg": program.g_upper,
     }
-    if multipliers is not None:
-        initial["lam_g0"] = check_array("multipliers", multipliers, (program.m,))
-    if bound_multipliers is not None:
-        initial["lam_x0"] = check_array("bound_multipliers", bound_multipliers, (program.n,))
     try:
         answer = solver(**initial)
         outcome = str(solver.stats()["return_status"])

@@ -251,12 +251,12 @@ class SeparatingDirection(NamedTuple):
 
     vector (3) : unit vector from the other body to the link, in the other's frame. The maximization of the
         separation starts there.
-    reach : least distance [m].
+    least_distance : [m].
     travel : of the target [m], if the other body moves with it.
     """
 
     vector: tuple[float, ...]
-    reach: float
+    least_distance: float
     travel: float = 0.0
 
 
@@ -300,7 +300,9 @@ def add_clearance_constraints(
         group.patterns.append(pattern)
         group.spots.append(spot_of[key.place])
         # capsules and spheres are their axes and centres, at a distance that is larger by their radius
-        group.parameters.append(np.append(chain.parameters(before), direction.reach + shapes.radius[n]))
+        group.parameters.append(
+            np.append(chain.parameters(before), direction.least_distance + shapes.radius[n])
+        )
         term = (SelfCollision if key.other >= 0 else KeepOut).name
         # each pair of pieces of two bodies has a name of its own, by which multipliers are mapped
         piece = f"{name} {key.number + 1}" if key.number else name

@@ -891,18 +891,11 @@ class PlannedStrike:
         out["zmp_margin_m"] = {
             name: float(margin(polygon, zmp(wrench)).min()) for name, wrench in grounds.items() if len(wrench)
         }
-        out["capture_margin_m"] = float(margin(polygon, self._capture_point()[None])[0])
+        capture = self.problem.robot.capture_point(self.posture_after, self.velocity_after)
+        out["capture_margin_m"] = float(margin(polygon, capture[None])[0])
         return out
 
     def loads(self) -> DriveLoads:
         """Peak loads of gears and motors in the impact."""
         before, after = self.velocity, self.velocity_after
         return strike_loads(self.problem.robot, before, after, self.collision)
-
-    def _capture_point(self) -> Array:
-        """(2,) [m] after contact: c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012)."""
-        model = self.problem.robot.model
-        data = model.createData()
-        pin.centerOfMass(model, data, self.posture_after, self.velocity_after)
-        com, rate = np.array(data.com[0]), np.array(data.vcom[0])
-        return np.asarray(com[:2] + rate[:2] * np.sqrt(com[2] / np.linalg.norm(model.gravity.linear)))

@@ -462,10 +462,10 @@ class Transcription(ContactProgram):
 def statement_of(t: Transcription) -> str:
     """JSON summary of a program, which a reader understands without this package.
 
-    `groups`: name, count and size of the groups of variables, in their order. `rows`: constraints, by term,
-    place and the index of a list in `components`. `more`: nodes in addition to the mesh's, as of `MoreNodes`.
+    `groups`: name, count and size of the groups of variables, in their order. `constraints`: by term, place
+    and the index of a list in `components`. `added_nodes`: beside the mesh's own, as of `MoreNodes`.
     `elements`, `guarded`, `shares`, `shortest`: of the contact; its least durations [s] by collision.
-    `apart`: clearance constraints.
+    `clearance`: fields of `ClearanceKey` and `SeparatingDirection`.
     """
     component_lists: dict[tuple[str, ...], int] = {}  # each list once, with its index
     constraints = []
@@ -481,19 +481,19 @@ def statement_of(t: Transcription) -> str:
         d.tolist() for block in t.blocks if isinstance(block, SeparationBlock) for d in block.of.directions
     ]
     clearance: list[dict[str, Any]] = [
-        {**constraint._asdict(), "way": direction, "reach": held.reach, "travel": held.travel}
+        {**constraint._asdict(), **held._asdict(), "vector": direction}
         for (constraint, held), direction in zip(t.clearance_constraints.items(), directions, strict=True)
     ]
     return json.dumps(
         {
             "groups": [[g.name, g.count, g.size] for g in t.layout.groups.values()],
-            "rows": constraints,
+            "constraints": constraints,
             "components": list(component_lists),
-            "more": [list(t.nodes.swing), list(t.nodes.follow), *map(list, t.nodes.stands)],
+            "added_nodes": [list(t.nodes.swing), list(t.nodes.follow), *map(list, t.nodes.stands)],
             "elements": t.hit.elements if collisions else [],
             "guarded": t.hit.guarded,
             "shares": list(t.hit.shares),
             "shortest": [c.shortest for c in collisions],
-            "apart": clearance,
+            "clearance": clearance,
         }
     )

@@ -281,6 +281,20 @@ def test_a_record_of_a_newer_version_is_refused(tmp_path: Path) -> None:
         load_record(tmp_path)
 
 
+def test_a_record_of_the_first_format_has_todays_names(record: Record, tmp_path: Path) -> None:
+    numbers, _ = save_record(record, tmp_path)
+    pair = {"place": "0 %", "joint": 3, "other": -1, "number": 0, "travel": 0.0}
+    old = {"rows": [["a", "b", 0]], "more": [[]], "apart": [{**pair, "way": [0.1, 0.2, 1.0], "reach": 0.03}]}
+    with np.load(numbers) as file:
+        arrays = {key: file[key] for key in file.files}
+    np.savez(numbers, **{**arrays, "format": 1, "program_statement": json.dumps(old)})
+    assert json.loads(str(load_record(tmp_path).arrays["program_statement"])) == {
+        "constraints": [["a", "b", 0]],
+        "added_nodes": [[]],
+        "clearance": [{**pair, "vector": [0.1, 0.2, 1.0], "least_distance": 0.03}],
+    }
+
+
 def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "solution.npz"
     path.write_bytes(b"old")

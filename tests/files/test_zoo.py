@@ -87,7 +87,6 @@ def test_a_wheel_has_them_inside_the_package(monkeypatch: pytest.MonkeyPatch, tm
     (tmp_path / "_problems" / "sweeps" / "many.toml").touch()
     monkeypatch.setattr(named_problems, "FOLDERS", (tmp_path / "_problems", *named_problems.FOLDERS[1:]))
     assert problem_names() == ("inside",) and named_problems.problem_summary("inside") == "What it is"
-    assert named_problems.sweep_names() == ("many",)
     assert named_problems.sweep_file("many") == tmp_path / "_problems" / "sweeps" / "many.toml"
 
 

@@ -210,7 +210,7 @@ def test_a_solutions_track_is_its_records(arm: Solution) -> None:
 
 def test_a_saved_result_is_a_start_again(arm: Solution, saved: Path) -> None:
     record = load_record(saved)
-    again = resumed(record, problem_of(record, saved, None, None))
+    again = resumed(record, problem_of(record, saved))
     for field in dataclasses.fields(SolverResult):
         if field.name != "history":
             np.testing.assert_equal(getattr(again.result, field.name), getattr(arm.result, field.name))

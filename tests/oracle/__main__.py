@@ -13,7 +13,7 @@ from oracle.verdict import verify_record
 def main() -> int:
     path = Path(sys.argv[1])
     record = load_record(path)
-    verdict = verify_record(problem_of(record, path, None, None), record.arrays, record.summary)
+    verdict = verify_record(problem_of(record, path), record.arrays, record.summary)
     kkt = "unknown" if verdict.kkt is None else f"{verdict.kkt:.1e}"
     print(f"oracle: max. violation {verdict.max_violation:.1e}, KKT residual {kkt}; {verdict.reason or 'ok'}")
     return 0 if verdict.ok else 1

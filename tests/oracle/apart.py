@@ -31,8 +31,8 @@ def apart_pieces(
 ) -> tuple[list[Piece], list[str]]:
     """The constraints that a result says it had, in its order; and what is not known of them.
 
-    postures (nq,) : at all nodes, by their places.  rows : place, joint, other and number, way, reach [m] and
-    travel [m], as `impactopt.transcription.clearance` has them.
+    postures (nq,) : at all nodes, by their places.  rows : place, joint, other and number, vector,
+    least_distance [m] and travel [m], as `impactopt.transcription.clearance` has them.
     """
     known: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
@@ -117,8 +117,8 @@ def _piece(
         _Hulls(shapes.points, shapes.hulls[numbers, :2]),
         _Hulls(shapes.points, shapes.hulls[numbers, 2:]),
     )
-    reach = np.array([row["reach"] for _, _, row in flat], dtype=float) + shapes.radius[numbers]
-    ways = np.array([row["way"] for _, _, row in flat], dtype=float)
+    reach = np.array([row["least_distance"] for _, _, row in flat], dtype=float) + shapes.radius[numbers]
+    ways = np.array([row["vector"] for _, _, row in flat], dtype=float)
     # frames: those of joints, and behind them one for each row whose other body is the world's
     joints = sorted({joint for joint, _, _ in flat} | {other for _, other, _ in flat if other >= 0})
     index = {joint: k for k, joint in enumerate(joints)}

@@ -71,12 +71,12 @@ def claims_of(arrays: Mapping[str, NDArray[Any]]) -> Claims:
         lists = [tuple(map(str, components)) for components in told["components"]]
         return Claims(
             groups=[(str(name), int(count), int(size)) for name, count, size in told["groups"]],
-            rows=[(str(term), str(place), c) for term, place, k in told["rows"] for c in lists[k]],
-            more=[tuple(map(float, places)) for places in told["more"]],
+            rows=[(str(term), str(place), c) for term, place, k in told["constraints"] for c in lists[k]],
+            more=[tuple(map(float, places)) for places in told["added_nodes"]],
             elements=[tuple(map(float, phase)) for phase in told["elements"]],
             shortest=[tuple(map(float, times)) for times in told["shortest"]],
             guarded=bool(told["guarded"]),
-            apart=[dict(row) for row in told["apart"]],
+            apart=[dict(row) for row in told["clearance"]],
         )
     except (ValueError, KeyError, TypeError, IndexError) as error:
         mend = "solve again with `impactopt solve`"

@@ -54,7 +54,7 @@ def test_nor_in_another_problem() -> None:
 def test_the_summary_says_so(punch: Solution) -> None:
     said = punch.clearance()
     assert said["contacts_besides"] == [] and said["clearance_mm"] > 0 and " and " in said["nearest"]
-    assert np.isfinite(said["clearance_mm"]) and len(punch.apart) > 0
+    assert np.isfinite(said["clearance_mm"]) and len(punch.clearance_constraints) > 0
 
 
 def test_what_is_switched_off_is_told() -> None:

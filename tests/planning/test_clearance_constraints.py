@@ -42,7 +42,7 @@ def with_peg(problem: ImpactProblem, x: float, z: float) -> ImpactProblem:
 def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
     c = problem.coordinates
     return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_clearance(
-        solution.apart
+        solution.clearance_constraints
     )
 
 

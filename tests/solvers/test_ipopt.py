@@ -114,8 +114,6 @@ def test_bad_options_are_refused():
     case = CASES["HS6"]
     with pytest.raises(InputError, match="max_itre"):
         solve_ipopt(case.build(), case.x0, options={"max_itre": 3})
-    with pytest.raises(InputError, match="multipliers"):
-        solve_ipopt(case.build(), case.x0, multipliers=[1.0, 2.0])
 
 
 def test_an_options_file_in_the_working_directory_is_not_read(tmp_path, monkeypatch):
@@ -206,19 +204,3 @@ def test_functions_not_finite_at_the_start_are_said_so():
     result = solve_ipopt(Textbook(1, lambda x: ca.log(x), lambda x: [(0, ca.sqrt(x), 1)]), [-1.0])
     assert result.status is Status.FAILED
     assert "not finite" in result.message
-
-
-def test_solutions_start_the_next_solve():
-    case = CASES["HS71"]
-    first = solve_ipopt(case.build(), case.x0)
-    warm = {"warm_start_init_point": "yes", "mu_init": 1e-7, "mu_strategy": "monotone"}
-    warm |= {f"warm_start_{what}_push": 1e-9 for what in ("bound", "mult_bound", "slack_bound")}
-    again = solve_ipopt(
-        case.build(),
-        first.x,
-        options=warm,
-        multipliers=first.multipliers,
-        bound_multipliers=first.bound_multipliers,
-    )
-    assert again.status is Status.SOLVED
-    assert again.iterations < first.iterations

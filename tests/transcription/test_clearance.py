@@ -188,9 +188,9 @@ def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any,
         term = SelfCollision.name if row.other >= 0 else KeepOut.name
         (i,) = [i for i, text in enumerate(names) if text == f"{term}, {row.place}, {what}"]
         most = THIN + 1e-6
-        assert g[i] + held.reach <= apart + most, names[i]
+        assert g[i] + held.least_distance <= apart + most, names[i]
         if apart > 1e-3:
-            assert g[i] + held.reach >= apart - 10e-3, names[i]
+            assert g[i] + held.least_distance >= apart - 10e-3, names[i]
         assert t.program.g_lower[i] == 0 and t.program.g_upper[i] == np.inf
         told, by = t.program.describe_violation(i, x, 0.012)
         assert told.startswith(term) and told.endswith(what) and by == "12 mm too near"
@@ -264,7 +264,7 @@ def test_constraints_are_met_at_the_start(biped_transcription: Transcription) ->
     shapes = margins.bodies.shapes
     gaps = shapes.look(margins.bodies.placed(at), 1.0, np.zeros((1, len(shapes), 3)), margins.wanted).gaps[0]
     for row, held in rows.items():
-        assert gaps[shapes.index[row[1:]]] > held.reach, row
+        assert gaps[shapes.index[row[1:]]] > held.least_distance, row
 
 
 def test_only_what_is_switched_off_is_not_kept_apart(biped_transcription: Transcription) -> None:
@@ -330,10 +330,10 @@ def test_a_plan_goes_around_what_is_in_its_way(free: Solution, barred: Solution)
     assert passing(free.problem, free.plan) > 0
     assert passing(barred.problem, free.plan) < -0.02
     assert passing(barred.problem, barred.plan) > 0
-    assert barred.apart and barred.problem.hash != free.problem.hash
+    assert barred.clearance_constraints and barred.problem.hash != free.problem.hash
     ignoring = solve(dataclasses.replace(barred.problem, terms=(*barred.problem.terms, *BODILESS)))
     assert ignoring.status is Status.SOLVED
-    assert not ignoring.apart
+    assert not ignoring.clearance_constraints
     assert passing(barred.problem, ignoring.plan) < -0.02
 
 
@@ -341,7 +341,7 @@ def test_a_neighbour_starts_with_the_same_rows(barred: Solution) -> None:
     point = np.asarray(barred.problem.point) + np.array([0.0, 0.0, 0.005])
     moved = solve(dataclasses.replace(barred.problem, point=point), start=barred)
     assert moved.status is Status.SOLVED and passing(moved.problem, moved.plan) > 0
-    assert set(moved.apart) >= set(barred.apart)
+    assert set(moved.clearance_constraints) >= set(barred.clearance_constraints)
 
 
 def test_a_solution_is_a_start_in_another_world_too(free: Solution, barred: Solution) -> None:
@@ -357,7 +357,7 @@ def test_a_solution_is_a_start_in_another_world_too(free: Solution, barred: Solu
 def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
     c = problem.coordinates
     return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_clearance(
-        solution.apart
+        solution.clearance_constraints
     )
 
 

@@ -1,4 +1,5 @@
-/* Implicit steps that end on events; see collision/implicit.py for the method and its symbols.
+/* Implicit steps that end on events; see collision/implicit.py for the method, its symbols and the
+   constants of its step control.
 
    The joints' velocity and the hand's speed are v = Q (T, -p) + drift t. With g = gamma h and D = kd + g kp of the
    joints that are not saturated (plus the slope of their friction), a stage solves v = X (rho, -p), where
@@ -8,31 +9,6 @@
    implicit_remainders.h. */
 
 #define TERMS (STAGES + 1)
-/* A step passes an event by this part of its length, so that the next step begins in the new phase. */
-#define EVENT_OVERSHOOT 1e-9
-/* An event before this part of a step is immediate: rounding may have hidden that the last one is over. */
-#define IMMEDIATE_EVENT 1e-5
-/* [rad] phase of the stiffest contact mode in the first step */
-#define FIRST_STEP_PHASE 0.5
-/* Errors are relative to the tolerance. A step gets longer only below this error, as another length costs another X;
-   it then aims at AIMED_ERROR. Where law or target are nonlinear, the step is factored anew in any case. */
-#define LENGTHEN_BELOW 2e-3
-#define LENGTHEN_BELOW_NONLINEAR 0.1
-#define AIMED_ERROR 0.2
-/* Relative change of the hand's speed in the first step under a nonlinear law; the second where the force begins
-   without a slope, as x^1.5 */
-#define FIRST_SPEED_CHANGE 0.1
-#define FIRST_SPEED_CHANGE_FLAT 3e-4
-/* Shorter step where Newton's method has not converged */
-#define RETRY_FACTOR 0.3
-/* Near separation a step takes at most this part of the time that is left, as a force like x^1.5 has no Taylor series
-   there: steps get shorter, down to the first one's length */
-#define SEPARATION_FRACTION 0.6
-/* Allowed error of a joint's demand, relative to its torque limit */
-#define ERROR_OF_LIMIT 1e-2
-/* Allowed error of a target's switch by position, relative to other errors */
-#define ERROR_OF_SWITCH 0.1
-#define MAX_TRIES 200
 
 /* Law and target linearized where the step begins, and the inverse of I - g dz'/dz. */
 typedef struct {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from impactopt.collision.checks import LEAST_PIVOT
 from impactopt.collision.frozen import FrozenDynamics
 from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model, target_start
-from impactopt.collision.implicit import NODES, STAGES, gamma, tables
+from impactopt.collision.implicit import CONTROL, NODES, STAGES, gamma, tables
 from impactopt.collision.model import GIVES_WAY, JointSpaceModel, cuts, shape_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
 from impactopt.collision.runge_kutta import BLOCK, LEFT_OUT_BY_RK4
@@ -454,7 +454,8 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         shapes_table("SHAPES_IN", shapes.values()),
     ]
     if collision.stepping == "implicit":
-        text += [_matrix(name, x) for name, x in tables().items()]
+        control = {name.upper(): value for name, value in asdict(CONTROL).items()}
+        text += [_matrix(name, x) for name, x in {**tables(), **control}.items()]
     return "\n".join(text) + "\n"
 
 

@@ -16,7 +16,6 @@ from impactopt.robots.rigid_body._dynamics import (
     Factor,
     Kinematics,
     Velocities,
-    add_to_diagonal,
     tree_entries,
 )
 from impactopt.robots.rigid_body._spatial import (
@@ -118,14 +117,13 @@ class RigidBody:
             out[joint.idx_v] += stiffness * (self.q[at] - rest)
         return out
 
-    def factorize(self, H: Any = None, damping: Any = None) -> Factor:
-        """H + diag(damping) = L' D L, sparse and without fill-in.
+    def factorize(self, H: Any = None) -> Factor:
+        """H = L' D L, sparse and without fill-in.
 
         Parameters
         ----------
         H : SX (nv, nv) symmetric with the pattern of `mass_matrix()`, of which the upper triangle is read;
             None: the mass matrix.
-        damping : added to the diagonal; one number or (nv) numbers, SX or float. None: nothing.
         """
         parents = self._tree.velocity_parents()
         if H is None:
@@ -135,11 +133,6 @@ class RigidBody:
             if H.shape != (self.nv, self.nv):
                 raise InputError(f"H: expected shape {(self.nv, self.nv)}, got {H.shape}")
             upper = tree_entries(parents, H)
-        if damping is not None:
-            damping = as_sx("damping", damping)
-            if damping.is_scalar():
-                damping = ca.repmat(damping, self.nv, 1)
-            upper = add_to_diagonal(upper, self._numbers("damping", damping))
         return Factor(parents, upper)
 
     # ------------------------------------------------------------ momentum

@@ -351,15 +351,6 @@ def tree_entries(parents: list[int], H: Any) -> dict[tuple[int, int], Number]:
     return upper
 
 
-def add_to_diagonal(
-    upper: Mapping[tuple[int, int], Number], damping: Vector
-) -> dict[tuple[int, int], Number]:
-    damped = dict(upper)
-    for k, x in enumerate(damping):
-        damped[k, k] = damped.get((k, k), 0.0) + x
-    return damped
-
-
 class CompositeInertias:
     """Mass, first moment and inertia tensor of each link's subtree, about the link's origin."""
 

@@ -68,7 +68,7 @@ class Recovery:
             standing = np.asarray(reference.q[stance_begins(reference, stance_at(reference, np.inf))])
             q = _shifted_posture(robot, last, standing, scene, settings.recovery_margin)
             shift = np.array(pin.difference(self.model, last, q))
-        self.shift = shift * _clear_fraction(self.model, reference, scene, shift)
+        self.shift = shift * _clear_fraction(robot, reference, scene, shift)
         q = pin.integrate(self.model, last, self.shift)
         self.com_goal = np.array(pin.centerOfMass(self.model, self.model.createData(), q)[:2])
 
@@ -101,7 +101,7 @@ class Recovery:
         )
 
 
-def _clear_fraction(model: Any, reference: Any, scene: Scene, shift: Array) -> float:
+def _clear_fraction(robot: Robot, reference: Any, scene: Scene, shift: Array) -> float:
     """Largest of `SHIFT_FRACTIONS` of a shift (nv,) that keeps links apart after the impact; else 0.
 
     Links stay as far apart as planned, or by `LINK_CLEARANCE`: legs that shift the body may bring thighs
@@ -112,8 +112,8 @@ def _clear_fraction(model: Any, reference: Any, scene: Scene, shift: Array) -> f
     sampled = np.arange(float(reference.contact_end), float(time[-1]) + SAMPLING, SAMPLING)
     instants = np.searchsorted(time, sampled).clip(0, len(time) - 1)
     q = postures[instants]
-    v, data = np.asarray(reference.v)[instants], model.createData()
-    capture = [_capture_point(model, data, *state) for state in zip(q, v, strict=True)]
+    v, model = np.asarray(reference.v)[instants], robot.model
+    capture = [robot.capture_point(*state) for state in zip(q, v, strict=True)]
     if distance_inside(scene.polygon, np.array(capture)).min() < MIN_CAPTURE_MARGIN:
         return 1.0
     links = scene.solids.links_between(model, shift)
@@ -123,12 +123,6 @@ def _clear_fraction(model: Any, reference: Any, scene: Scene, shift: Array) -> f
         if np.all(links.least_distance(model, shifted) >= required):
             return fraction
     return 0.0
-
-
-def _capture_point(model: Any, data: Any, q: Array, v: Array) -> Array:
-    """Capture point (2,) [m] on the ground."""
-    com = pin.centerOfMass(model, data, q, v)
-    return np.asarray(com[:2] + data.vcom[0][:2] * np.sqrt(com[2] / np.linalg.norm(model.gravity.linear)))
 
 
 def _com_goal(scene: Scene, com: Array, margin: float) -> Array:

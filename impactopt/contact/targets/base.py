@@ -110,7 +110,7 @@ class Target(Described, ABC):
     def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
     ) -> Any:
-        """Expression of order 1 that is zero at the end of a phase which one of `guards` ends.
+        """Expression of order 1 that rises to zero at the end of a phase which one of `guards` ends.
 
         phase : 0 for the first.  late [s] : time by which the phase exceeds its shortest duration.
         """
@@ -262,13 +262,14 @@ def contact_phases(target: Target, order: Sequence[str] = ()) -> tuple[ContactPh
 def order_of_touches(law: ContactLaw, target: Target, touches: int) -> tuple[str, ...]:
     """Ends of the phases of a contact with several touches; () for one touch.
 
-    All guards are passed in the last touch. Compression and restitution are phases of their own if they are
-    different branches of the law.
+    All guards are passed in the last touch, but for one that may be zero at the first touch. Compression and
+    restitution are phases of their own if they are different branches of the law.
     """
     if touches == 1:
         return ()
     touch = (TURN, SEPARATION) if law.switches else (SEPARATION,)
-    return (*((*touch, TOUCH) * (touches - 1)), *target.guards, *touch)
+    first, last = (target.guards[:1], target.guards[1:]) if target.at_once else ((), target.guards)
+    return (*first, *((*touch, TOUCH) * (touches - 1)), *last, *touch)
 
 
 def is_order(law: ContactLaw, target: Target, order: Sequence[str]) -> bool:

@@ -441,6 +441,10 @@ def test_what_gears_bear_is_what_they_carry_at_that_force(swung: Solution) -> No
         ({"touches": 2, "target": 7}, "target must be a Target"),
         ({"touches": 2, "law": "stiff"}, "law must be a ContactLaw"),
         ({"touches": ("touch",)}, "no ends of a contact's phases, such as .'separation', 'break'."),
+        (
+            {"touches": (SEPARATION, "start", "stop"), "target": Nail(mass=0.05, resistance=600.0)},
+            "such as .'start', 'separation', 'stop'.",
+        ),
         ({"touches": (SEPARATION, "break"), "law": SpringDamper(stiffness=1e6, damping=50.0)}, "'end of com"),
         ({"touches": (SEPARATION, "break"), "collision": "sdc"}, "'sdc' of the collision has one contact"),
         ({"touches": 2, "collision": "sdc"}, "'sdc' of the collision has one contact"),

@@ -276,11 +276,12 @@ def is_order(law: ContactLaw, target: Target, order: Sequence[str]) -> bool:
     """True if these can be the ends of a contact's phases.
 
     Striker and target touch, part and touch again, and pass the guards in turn. The last end is the last
-    guard in a gap, or a separation after it. With a law that switches, compression and restitution alternate
-    in a touch, with a `TURN` between them.
+    guard in a gap, or a separation after it. A guard that may be zero at first touch ends the first phase.
+    With a law that switches, compression and restitution alternate in a touch, with a `TURN` between them.
     """
     guards = [end for end in order if end in target.guards]
     letters = {TURN: "C", SEPARATION: "S", TOUCH: "T"} | dict.fromkeys(target.guards, "G")
     touch = "G*C(G*CG*C)*G*S" if law.switches else "G*S"
     text = "".join(letters.get(end, "?") for end in order)
-    return guards == list(target.guards) and bool(re.fullmatch(f"({touch}G*T)*{touch}G*", text))
+    begins = not target.at_once or list(order[:1]) == list(target.guards[:1])
+    return begins and guards == list(target.guards) and bool(re.fullmatch(f"({touch}G*T)*{touch}G*", text))

@@ -29,6 +29,7 @@ _HISTORIES = {
     **dict.fromkeys(("slip", "lift", "cop_margin"), "k s"),
     **dict.fromkeys(("impulse", "saturated", "posture_error", "contact_start", "contact_end"), ""),
     "sole_ground": "k s 6",
+    **dict.fromkeys(("contact_time", "contact_force"), "? m"),
 }
 _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "": {

@@ -21,6 +21,7 @@ from impactopt.collision.sdc import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import independent_rates
 from impactopt.planning.budget import VIOLATED
+from impactopt.problem.checks import MOST_TOUCHES, met_once
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.engines import scene_of
@@ -68,8 +69,8 @@ class ContactReplay:
     outcome : of the target, by name and unit.  contact [s] : from the first touch to the end of the last one.
     events [s] : times since contact at which the target switches its mode, such as a board that breaks.
     partings, planned_partings : numbers of times that striker and target part and meet again.
-    guards : names of the target's events, in their order.  known [%] : part of `impulse_pct` that is reported
-        as the model error.
+    guards : names of the target's events, in their order.  may_plan : a plan may have so many touches.
+    known [%] : part of `impulse_pct` that is reported as the model error.
     """
 
     planned: float
@@ -81,6 +82,7 @@ class ContactReplay:
     partings: int
     guards: tuple[str, ...]
     planned_partings: int = 0
+    may_plan: bool = False
     known: float = 0.0
 
     @property
@@ -108,6 +110,7 @@ class ContactReplay:
             return (
                 f"striker and target part and meet again {times} within the impact, which is planned as "
                 f"{contacts}: {off}, and the largest force is {self.peak:.0f} N, whatever is planned"
+                + (f"; plan them by `[collision] touches = {self.partings + 1}`" if self.may_plan else "")
             )
         names = [self.guards[k % len(self.guards)] for k in range(len(self.events))] if self.guards else []
         events = [f"{name} at {1e3 * t:.3g} ms" for name, t in zip(names, self.events, strict=False)]
@@ -165,6 +168,7 @@ def _contact_replay(
     duration = planned.compression + planned.restitution
     # touches: (start, end) of each, in their order.
     gaps = [after[0] - before[1] for before, after in pairwise(found.touches)]
+    partings = sum(gap > _MIN_GAP * duration for gap in gaps)
     return ContactReplay(
         planned=planned.impulse,
         impulse=found.impulse,
@@ -172,9 +176,10 @@ def _contact_replay(
         outcome=found.outcome,
         contact=found.touches[-1][1] - found.touches[0][0] if found.touches else 0.0,
         events=found.events,
-        partings=sum(gap > _MIN_GAP * duration for gap in gaps),
+        partings=partings,
         planned_partings=problem.planned_touches - 1,
         guards=problem.target.guards,
+        may_plan=0 < partings < MOST_TOUCHES and not met_once(problem),
         known=known,
     )
 

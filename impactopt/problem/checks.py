@@ -257,7 +257,9 @@ def check_touches(problem: Any) -> None:
         raise InputError(f"touches is {touches}, but {why}: leave it out")
     law, target = problem.law, problem.target
     if order and isinstance(law, ContactLaw) and not is_order(law, target, order):
-        possible = [*([TURN] if law.switches else []), SEPARATION, *target.guards]
+        first = int(target.at_once)
+        turn = [TURN] if law.switches else []
+        possible = [*target.guards[:first], *turn, SEPARATION, *target.guards[first:]]
         raise InputError(
             f"touches: {list(order)} are no ends of a contact's phases, such as {possible} under the law "
             f"{type(law).__name__}: leave it out"

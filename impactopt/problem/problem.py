@@ -117,9 +117,9 @@ class ImpactProblem:
         that sum to 1. With a `Nail` or a `Board` those of compression are used before and after the event,
         and every element is halved.
     collision_stages : Radau IIA stages of an element, 2 or 3 (order 3 or 5).
-    touches : number of contacts with a `Board` in the impact; or what ends each phase of the contact, as
-        ("separation", "break") for a board that swings on and breaks after one touch. None: as for point
-        masses in place of robot and target.
+    touches : number of contacts with a `Board` or a `Nail` in the impact; or what ends each phase of the
+        contact, as ("separation", "break") for a board that swings on and breaks after one touch. None: as
+        for point masses in place of robot and target, of a nail one.
     collision : model of the collision. "full": the equations of motion, at every instant. "sdc": H, J and
         bias are frozen at contact, and ``freezes`` times during it, as in :class:`impactopt.SDC`.
         "sdc-paper": the same with the effects of `SDC.paper`. "auto": "sdc", or "full" if full dynamics at

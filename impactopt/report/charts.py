@@ -13,6 +13,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import (
     BUCKETS,
     at_contact,
+    contact_force,
     footprints,
     ground_wrenches,
     planned_torque,
@@ -90,11 +91,9 @@ class _Charts:
         return series_of(self.arrays, name, label, style, *thinned(time, values, whole=self.close_up))
 
     def _force(self) -> dict[str, Any]:
-        a, series = self.record.arrays, []
+        series = []
         for label, prefix, style in self.present:
-            time, force = a[f"{prefix}_time"], a.get(f"{prefix}_force")
-            if force is None:
-                time, force = at_contact(self.record, a["collision_force"], 0.0)
+            time, force = contact_force(self.record, prefix)
             series.append(self._series(f"force_{style}", label, style, time, force))
         return self._chart("Force on the target", "force [N]", series, view=self.close_up, include=[0.0])
 

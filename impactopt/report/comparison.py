@@ -13,7 +13,7 @@ from impactopt.errors import InputError
 from impactopt.files.record import Record, plain
 from impactopt.files.toml import TOMLError, read_toml
 from impactopt.report.charts import chart, series_of
-from impactopt.report.histories import at_contact, ground_wrenches, planned_torque, thinned, zmp_margins
+from impactopt.report.histories import contact_force, ground_wrenches, planned_torque, thinned, zmp_margins
 from impactopt.report.page import Page, html_table, report_html
 from impactopt.report.result_rows import Cell, Row, contact_rows, number_row, phase_rows, standing, word_row
 
@@ -172,7 +172,7 @@ def histories_of(record: Record) -> dict[str, tuple[Array, Array]]:
         return histories
     start = float(a["reference_contact_start"])
     if len(a["collision_time"]) > 1:
-        time, force = at_contact(record, a["collision_force"], 0.0)
+        time, force = contact_force(record, "reference")
         histories["force"] = time - start, force
     if len(a["polygon"]):
         time, wrench = ground_wrenches(record, "reference")

@@ -41,6 +41,18 @@ def thinned(time: Array, *columns: Array, whole: Sequence[float] = (np.inf, -np.
     return [time[chosen], *(column[chosen] for column in columns)]
 
 
+def contact_force(record: Record, prefix: str) -> tuple[Array, Array]:
+    """Times (k,) [s] and force (k,) [N] on the target: planned, or of a replay; zero before and after."""
+    a = record.arrays
+    if prefix == "reference":
+        return at_contact(record, a["collision_force"], 0.0)
+    if f"{prefix}_contact_force" not in a:  # records of older versions
+        return a[f"{prefix}_time"], a[f"{prefix}_force"]
+    time, force = a[f"{prefix}_contact_time"], a[f"{prefix}_contact_force"]
+    first, last = a[f"{prefix}_time"][[0, -1]]
+    return np.concatenate([[first], time, [time.max(initial=last)]]), np.concatenate([[0.0], force, [0.0]])
+
+
 def at_contact(record: Record, values: Array, otherwise: float) -> tuple[Array, Array]:
     """Time [s] and values of a history of the planned collision, with a constant value before and after."""
     a = record.arrays

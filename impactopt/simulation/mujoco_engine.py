@@ -389,10 +389,10 @@ def simulate_mujoco(
     waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # step in which a command takes effect; command
     # (2, n) demand, and demand after saturation: as commanded, and as it reaches the motors
     commanded, reached = np.zeros((2, robot.n)), np.zeros((2, robot.n))
-    force, forces = 0.0, np.zeros(len(scene.strikers))
+    forces = np.zeros(len(scene.strikers))
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     recorded: list[tuple[Any, ...]] = []
-    touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
+    touches, saturated, fall = Touches(), 0.0, ""
     followed = FollowedReference(reference, missed)
     motors, motor_delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
     has_passive = bool(passive.any())
@@ -430,15 +430,14 @@ def simulate_mujoco(
             speeds = replay.hand_speeds()
             target_before = replay.target
             push = replay.push(speeds, step)
-            forces, force = push.forces, push.force
-            peak = max(peak, push.peak)
+            forces = push.forces
             replay.apply(torque, push.forces)
             replay.apply_perturbation(t)
-            touches.add(t, force, step, push.since)
+            touches.add(t + push.times, push.total, push.given)
             saturated += step * saturates
             replay.place_target()
             impulses += step * push.forces
-            last_touched = replay.target if force > 0 else last_touched
+            last_touched = replay.target if push.given[-1] > 0 else last_touched
             records = k % record == 0 or touches.touched
             # positions are those before the step, forces and accelerations those in it
             state = replay.state() if records else None
@@ -449,7 +448,7 @@ def simulate_mujoco(
             if records:
                 ground = replay.ground()
                 assert state is not None
-                contact_values = force, replay.contact.speed(target_before), float(speeds[0])
+                contact_values = float(push.total[0]), replay.contact.speed(target_before), float(speeds[0])
                 loads = demand, torque, ground, corners, gears.take()
                 recorded.append((t, *state, *contact_values, *loads, stance_at(now, t)))
                 check_not_diverged(data.qvel, t, step)
@@ -465,7 +464,6 @@ def simulate_mujoco(
         engine="mujoco",
         impulse=float(impulses.sum()),
         impulses=impulses,
-        peak_force=peak,
         outcome=replay.scene.target.outcome(last_touched),
         saturated=saturated,
         cuts=cuts.cuts() if motors.lines else None,

@@ -271,39 +271,35 @@ def follow_contact(
     world.body.update(state.q, state.v)
     fastest = world.body.fastest_rate(np.diag(world.servo.kd))
     step = min(step, 1 / fastest) if fastest > 0 else step  # explicit midpoint rule: stable up to 2 / fastest
-    last_touched, peak, touches = state.target, 0.0, list[list[float]]()  # target state at the last touch
+    last_touched, touches = state.target, Touches()  # target state at the last touch
     side, events = world.contact.side(state.target, 0.0), list[float]()
-    touching = False
     for k in range(round(longest / step)):
         since = k * step
-        if since >= until and not touching:
+        if since >= until and not touches.touching:
             break
         first = world.rates(start + since, state, step=step)
         world.delay.keep(start + since, first.commanded)
         push = first.push
-        if push is None:
-            touching = False
-        else:
-            peak = max(peak, push.peak)
-            for t, on in zip(since + push.times, push.touching, strict=True):
-                if on and not touching:
-                    touches.append([t, t])
-                if on:
-                    touches[-1][1] = t
-                touching = bool(on)
+        _add(touches, since, push)
         before, state = state, world.step(start + since, state, first, step)
-        now = world.contact.side(state.target, 0.0 if push is None else push.last)
+        now = world.contact.side(state.target, 0.0 if push is None else float(push.total[-1]))
         events += [since + step] if now != side else []
         side = now
         last_touched = state.target if state.impulses.sum() > before.impulses.sum() else last_touched
         check_not_diverged(state.v, start + since, step)
     return Followed(
         impulse=float(state.impulses.sum()),
-        peak=peak,
+        peak=float(touches.curve()[1].max(initial=0.0)),
         outcome=scene.target.outcome(last_touched),
-        touches=tuple((float(a), float(b)) for a, b in touches),
+        touches=tuple((start, end) for start, end, _ in touches.intervals),
         events=tuple(events),
     )
+
+
+def _add(touches: Touches, t: float, push: Push | None) -> None:
+    """Records the contact in a step that begins at a time [s]; None: there is none."""
+    none = np.zeros(1)
+    touches.add(t + none, none, none) if push is None else touches.add(t + push.times, push.total, push.given)
 
 
 def simulate_pinocchio(
@@ -339,7 +335,7 @@ def simulate_pinocchio(
     last_touched = state.target  # the target's state at the last touch
     end = min(float(reference.end) + settle, until)
     recorded: list[tuple[Any, ...]] = []
-    saturated = peak = 0.0
+    saturated = 0.0
     touches, gears, cuts = Touches(), GearWatch(robot), CutWatch(robot)
     followed = FollowedReference(reference, missed)
     for k in range(round(end / step)):
@@ -352,11 +348,7 @@ def simulate_pinocchio(
         cuts.update(t, first.saturated, first.cut, step)
         push = first.push
         saturated += step * bool(np.any(np.abs(first.demand) > world.servo.limit))
-        if push is None:
-            touches.add(t, 0.0, step)
-        else:
-            touches.add(t, push.force, step, push.since)
-        peak = max(peak, float(first.forces.sum()) if push is None else push.peak)
+        _add(touches, t, push)
         gears.update(first.torque, first.a)
         if touches.touched or k % record == 0:
             motion = (state.q, state.v, float(first.forces.sum()), first.target_speed, first.hand_speed)
@@ -385,7 +377,6 @@ def simulate_pinocchio(
         engine="pinocchio",
         impulse=float(state.impulses.sum()),
         impulses=state.impulses,
-        peak_force=peak,
         outcome=scene.target.outcome(last_touched),
         saturated=saturated,
         cuts=cuts.cuts() if world.motors.lines else None,

@@ -122,7 +122,7 @@ class Simulation:
     Histories:
 
     q (k, nq), v (k, nv) : Pinocchio's
-    force (k,) [N] : contact force of all strikers
+    force (k,) [N] : contact force of all strikers, at the instant
     target_speed, hand_speed (k,) : [m/s] along the normal
     demand, torque (k, n) [N m] : of the servo before saturation, and of the motors
     gear (k, n) [N m] : torque of largest magnitude through each gear since the instant before
@@ -140,6 +140,9 @@ class Simulation:
     contact_start, contact_end [s] : of the impact, whose touches are less than 5 ms apart; nan if the target
         was not hit
     touches : start [s], end [s] and impulse [N s] of each
+    contact_time (m,) [s], contact_force (m,) [N] : the contact force of all strikers at the instants of its
+        own integration, which is finer than ``time``, on both sides of each begin and end of contact; zero
+        between touches. Its largest value is ``peak_force``, and its integral the impulse.
     impulse, impulses [N s] : integral of the contact force over the whole motion; of each striker
     peak_force [N] : largest force, which may occur within a step
     outcome : the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
@@ -197,6 +200,8 @@ class Simulation:
     missed: bool = False
     expected: float = np.nan
     touches: tuple[tuple[float, float, float], ...] = ()
+    contact_time: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    contact_force: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     step_error: float = np.nan
     gear: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     loads: DriveLoads | None = field(default=None, repr=False)
@@ -427,32 +432,44 @@ class FollowedReference:
 
 
 class Touches:
-    """Intervals of contact, recorded step by step.
+    """Intervals of contact and its force, recorded step by step.
 
     A graze before or after the impact is an interval of its own, and so is each touch of an impact in which
     bodies separate and touch again.
 
-    touched : whether there was contact in the last recorded step, or in the one before it.
+    touched : whether there was contact in the last recorded step, or at the end of the one before it.
     """
 
     def __init__(self) -> None:
         self.intervals: list[list[float]] = []  # start [s], end [s], impulse [N s]
         self.touching = self.touched = False
+        self._parts: list[tuple[Array, Array]] = []
 
-    def add(self, t: float, force: float, step: float, since: float = 0.0) -> None:
-        """Records a step that begins at time t [s], with the mean contact force [N] in it.
+    def add(self, times: Array, force: Array, given: Array) -> None:
+        """Records a step: contact force (k,) [N], and impulse (k,) [N s] in the step, at times (k,) [s]."""
+        on = force > 0
+        self.touched = self.touching or bool(on.any())
+        if not self.touched:
+            return
+        self._parts.append((times, force))
+        for k in np.flatnonzero(np.diff(on, prepend=self.touching)):
+            if on[k]:
+                self.intervals.append([float(times[k]), float(times[k]), -float(given[k])])
+            else:
+                self._until(times[k], given[k])
+        if on[-1]:
+            self._until(times[-1], given[-1])
+        self.touching = bool(on[-1])
 
-        since [s] : time within the step at which the force begins.
-        """
-        if force > 0:
-            if not self.touching:
-                self.intervals.append([t + since, t + since, 0.0])
-            self.intervals[-1][2] += force * step
-        self.touched = self.touching or force > 0
-        # in the step after a touch, too: its start is the touch's end
-        if self.touched:
-            self.intervals[-1][1] = max(t, self.intervals[-1][0])
-        self.touching = force > 0
+    def _until(self, time: float, given: float) -> None:
+        self.intervals[-1][1] = float(time)
+        self.intervals[-1][2] += float(given)
+
+    def curve(self) -> tuple[Array, Array]:
+        """Times (m,) [s] and contact force (m,) [N] of all steps with contact; zero before and after each."""
+        time, force = (np.concatenate([np.zeros(0), *(part[i] for part in self._parts)]) for i in (0, 1))
+        # a step's end and the next one's start differ by rounding
+        return np.maximum.accumulate(time), force
 
     def impact(self) -> tuple[float, float]:
         """Start and end [s] of the impact with the largest impulse; nan if there was none."""
@@ -583,6 +600,7 @@ def simulation_of(
     slip, lift = slip_and_lift(scene, corners, stance)
     landings = landing_speeds(scene, time, corners, sole_ground, stance) if stance.size else np.zeros(0)
     contact_start, contact_end = touches.impact()
+    contact_time, contact_force = touches.curve()
     joints, soles = v[:, -robot.n :], len(scene.soles)
     sole_ground, grips = sole_ground[:, :soles], sole_ground[:, soles:]
     return Simulation(
@@ -611,6 +629,9 @@ def simulation_of(
         contact_start=contact_start,
         contact_end=contact_end,
         touches=tuple((start, end, impulse) for start, end, impulse in touches.intervals),
+        contact_time=contact_time,
+        contact_force=contact_force,
+        peak_force=float(contact_force.max(initial=0.0)),
         stance=stance,
         stands=scene.standing,
         polygons=scene.polygons,

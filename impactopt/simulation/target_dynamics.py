@@ -18,7 +18,7 @@ State = TypeVar("State")
 Move = Callable[[float], tuple[State, bool]]
 FACE = 0.2  # [m] radius of the target's surface about the hit point, across the normal
 MAX_SWITCHES = 20  # of a target within one step
-BISECTIONS = 30  # of a step, to locate a switch
+BISECTIONS = 30  # of a step, to locate a switch, or a begin or end of contact
 # Tolerances of the contact within a step. The absolute one is in m, N s and units of the target's state.
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-10
 NEAR_STEPS = 2.0  # steps before a touch from which on the contact is integrated within them
@@ -34,10 +34,9 @@ class Push:
     peaks (h,) [N] : at the instant at which their sum is largest
     state, travel [m] : of the target, at the end
     depths (h,) [m] : of each striker in the target, at the end
-    since [s] : time in the step up to which there was no force
-    times (k,) [s] : instants in the step
-    touching (k,) : whether there is a force then
-    last [N] : sum of the forces at the end
+    times (k,) [s] : instants in the step, from its start to its end; two at each begin and end of contact
+    total (k,) [N] : sum of the forces then
+    given (k,) [N s] : impulse of all strikers since the start of the step
     """
 
     forces: Array
@@ -46,20 +45,9 @@ class Push:
     state: Array
     travel: float
     depths: Array
-    since: float = 0.0
-    times: Array = field(default_factory=lambda: np.zeros(0))
-    touching: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    last: float = 0.0
-
-    @property
-    def force(self) -> float:
-        """Mean over the step [N], of all strikers together."""
-        return float(self.forces.sum())
-
-    @property
-    def peak(self) -> float:
-        """The largest force [N] of all strikers together."""
-        return float(self.peaks.sum())
+    times: Array = field(default_factory=lambda: np.zeros(1))
+    total: Array = field(default_factory=lambda: np.zeros(1))
+    given: Array = field(default_factory=lambda: np.zeros(1))
 
 
 class TargetContact:
@@ -163,6 +151,7 @@ class TargetContact:
             atol=ABSOLUTE_TOLERANCE,
             # a touch that begins within the step would else be stepped over, as there is no force before it
             max_step=0.5 * step,
+            dense_output=True,
         )
         if not found.success or found.t.size > MAX_POINTS or not np.isfinite(found.y).all():
             raise InputError(
@@ -170,7 +159,9 @@ class TargetContact:
                 "more mass"
             )
         end, impulses = found.y[:, -1], found.y[h : 2 * h]
-        values = np.array([forces(t, y)[0] for t, y in zip(found.t, found.y.T, strict=True)])
+        times = _with_both_sides(found.t, lambda t: bool(forces(t, found.sol(t))[0].any()))
+        states = found.sol(times)
+        values = np.array([forces(t, y)[0] for t, y in zip(times, states.T, strict=True)])
         total = values.sum(axis=1)
         return Push(
             forces=impulses[:, -1] / step,
@@ -179,11 +170,9 @@ class TargetContact:
             state=np.array(end[2 * h + 1 :]),
             travel=travel + float(end[2 * h]),
             depths=np.where(np.isfinite(depths), end[:h], -np.inf),
-            # the last instant of the integration without a force
-            since=float(found.t[max(int(np.argmax(total > 0)) - 1, 0)]),
-            times=found.t,
-            touching=total > 0,
-            last=float(total[-1]),
+            times=times,
+            total=total,
+            given=states[h : 2 * h].sum(axis=0),
         )
 
     def untouched_step(self, state: Array, travel: float, step: float) -> tuple[Array, float]:
@@ -223,6 +212,22 @@ class TargetContact:
             return move
 
         return smooth_steps(begin, state, length)
+
+
+def _with_both_sides(times: Array, touches: Callable[[float], bool]) -> Array:
+    """Instants (k,) [s], with two more at each begin and end of contact: just before and just after it.
+
+    touches : tells whether there is a force at a time [s].
+    """
+    on, more = [touches(t) for t in times], []
+    for k in range(len(times) - 1):
+        if on[k] != on[k + 1]:
+            low, high = times[k], times[k + 1]
+            for _ in range(BISECTIONS):
+                middle = (low + high) / 2
+                low, high = (middle, high) if touches(middle) == on[k] else (low, middle)
+            more += [low, high]
+    return np.union1d(times, more)
 
 
 def smooth_steps(begin: Callable[[float, State], Move[State]], state: State, length: float) -> State:

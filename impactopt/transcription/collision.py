@@ -410,10 +410,11 @@ class Collision(ContactParameters, Collocated):
         self.u = add("collision rate", b.ny, labels=c.labels)
         self.d = add("collision travel", b.ny, labels=c.labels)
         self.legs = add("collision legs", b.nl, **limits.of_legs)
-        # In contact chatter a driven nail jumps ahead of the hammer. A plan has no events for that: the force
-        # may pull meanwhile, and the check of the plan in full dynamics reports the difference. The peak
-        # force of such a plan is wrong, so an objective on it excludes this.
-        self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
+        # In contact chatter a driven nail jumps ahead of the hammer. A plan of one touch has no events for
+        # that: the force may pull meanwhile, and the check of the plan in full dynamics reports the
+        # difference. The peak force of such a plan is wrong, so an objective on it excludes this.
+        by_peak = any(isinstance(o, PeakForce) for o in p.objectives)
+        self.holds = not (p.target.turns or p.order or by_peak)
         least, most = self._least_force(guarded), np.where(self.forceless, 0.0, np.inf)[:, None]
         self.f = add("contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))

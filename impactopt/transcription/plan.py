@@ -278,7 +278,8 @@ class Motion:
 class PlannedCollision:
     """Predicted collision of a plan, at contact and at the m collocation points.
 
-    time (m + 1,) : [s] since contact.
+    time (m + 1,) : [s] since contact. The force of a later touch that begins with a jump is that of its first
+        collocation point.
     force (m + 1,), forces (m + 1, strikers) : [N] total contact force, and that on each striker.
     target_speed (m + 1,) : of the target's surface [m/s].
     outcome : effect on the target, by name and unit (``speed_m_s`` of a free mass, ``depth_m`` of a nail,

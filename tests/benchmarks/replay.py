@@ -91,7 +91,7 @@ def row(settings: dict[str, Any], simulation: Simulation | str, other: Simulatio
     out = dict(settings)
     if isinstance(simulation, str):
         return {**out, "standing": None, "reason": simulation}
-    peak, other_peak = float(simulation.force.max()), float(other.force.max())
+    peak, other_peak = simulation.peak_force, other.peak_force
     moved = simulation.q[-1][:3] - other.q[-1][:3]
     return {
         **out,

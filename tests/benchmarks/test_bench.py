@@ -100,7 +100,8 @@ class FirstOrder(FakeSolution):
     def validate(self, *, engine: str = "", step: float = 0.0, **options: Any) -> Simulation:
         simulation = super().validate()
         off = 1 + 30 * step + (0.01 if options.get("iterations") == 10 else 0.0)
-        return dataclasses.replace(simulation, impulse=off * simulation.impulse, force=off * simulation.force)
+        peak = off * simulation.peak_force
+        return dataclasses.replace(simulation, impulse=off * simulation.impulse, peak_force=peak)
 
 
 class Diverging(FirstOrder):

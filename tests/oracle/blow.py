@@ -157,7 +157,7 @@ class Blow:
         free = np.array(self.free)
         pulls = float(type(p.law)(**self.problem.law.parameters).branch(1e-6, -10.0, False)) < 0
         least = np.zeros(n) if target.guards or pulls or guarded else np.where(free, 0.0, -np.inf)
-        if not target.turns and not any(isinstance(o, PeakForce) for o in p.objectives):
+        if not (target.turns or p.order or any(isinstance(o, PeakForce) for o in p.objectives)):
             least = np.where([0 < s.phase < self.phases - 1 for s in self.stages], -np.inf, 0.0)
         most = np.where(free, 0.0, np.inf)
         longest = p.contact_duration[1]

@@ -168,6 +168,62 @@ def test_one_touch_has_no_plan_and_the_order_that_has_one_is_named() -> None:
     assert f"`[collision] touches = {order}` plans them" in strike.result.message
 
 
+# ---- nails that jump ahead of the hammer
+
+
+@pytest.fixture(scope="module", params=[(1e7, 200.0), (1e8, 1000.0)], ids=["1e7", "1e8"])
+def rattled(request: pytest.FixtureRequest) -> Solution:
+    stiffness, damping = request.param
+    problem = load_problem("arm_planar")
+    law = KelvinVoigt(stiffness=stiffness, damping=damping)
+    return solve(
+        dataclasses.replace(problem, law=law, touches=3, terms=(*problem.terms, GearLoad(enabled=False)))
+    )
+
+
+def test_a_nail_starts_in_its_first_touch_and_stops_in_its_last(rattled: Solution) -> None:
+    assert rattled.status is Status.SOLVED
+    assert rattled.problem.order == ("start", *(SEPARATION, TOUCH) * 2, "stop", SEPARATION)
+    assert rattled.contact_replay is not None and not rattled.contact_replay.unforeseen
+    assert "caution" not in rattled.summary()
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
+def test_its_touches_are_those_of_replays(rattled: Solution, engine: str) -> None:
+    """One touch would have 34 and 40 % less peak force."""
+    replay, hit = rattled.validate(engine=engine), rattled.plan.collision
+    assert hit.peak_force == pytest.approx(replay.peak_force, rel=0.03)
+    assert replay.impulse == pytest.approx(rattled.impulse, rel=5e-3)
+    assert replay.outcome == pytest.approx(hit.outcome, rel=5e-3)
+    assert len(replay.touches) == 3
+    edges = np.flatnonzero(np.diff(hit.force > 1e-6 * hit.peak_force))
+    found = np.array([touch[:2] for touch in replay.touches]) - replay.contact_start
+    # separations are collocation points; a touch begins between one without a force and one with it
+    ends, begins = hit.time[edges[::2] + 1], hit.time[edges[1::2]]
+    np.testing.assert_allclose(ends, found[:, 1], rtol=0.03)
+    np.testing.assert_allclose(begins, found[1:, 0], rtol=0.05)
+
+
+def test_work_on_its_head_is_that_of_the_wood(rattled: Solution) -> None:
+    """R z + hardening z^2 / 2, with what the nail coasts in the gaps; impulse and momentum agree there."""
+    wood, hit = rattled.problem.target, rattled.plan.collision
+    depth = hit.outcome["depth_m"]
+    assert isinstance(wood, Nail)
+    assert np.trapezoid(hit.target_speed, hit.time) == pytest.approx(depth, rel=0.02)
+    gaps = (hit.force[1:-1] == 0) & (hit.force[:-2] == 0) & (hit.force[2:] == 0)
+    resisted = np.gradient(hit.target_speed, hit.time)[1:-1][gaps]
+    deep = wood.resistance + wood.hardening * np.array([0.0, depth])
+    assert gaps.any() and (-wood.mass * resisted >= 0.99 * deep[0]).all()
+    assert (-wood.mass * resisted <= 1.01 * deep[1]).all()
+
+
+def test_a_plan_of_one_touch_names_the_number_that_plans_them() -> None:
+    problem = load_problem("arm_planar")
+    law = KelvinVoigt(stiffness=1e7, damping=200.0)
+    solution = solve(dataclasses.replace(problem, law=law, terms=(*problem.terms, GearLoad(enabled=False))))
+    assert "`[collision] touches = 3`" in solution.summary()["caution"]
+
+
 # ---- boards that break after the last touch
 
 
@@ -385,6 +441,10 @@ def test_what_gears_bear_is_what_they_carry_at_that_force(swung: Solution) -> No
         ({"touches": 2, "target": 7}, "target must be a Target"),
         ({"touches": 2, "law": "stiff"}, "law must be a ContactLaw"),
         ({"touches": ("touch",)}, "no ends of a contact's phases, such as .'separation', 'break'."),
+        (
+            {"touches": (SEPARATION, "start", "stop"), "target": Nail(mass=0.05, resistance=600.0)},
+            "such as .'start', 'separation', 'stop'.",
+        ),
         ({"touches": (SEPARATION, "break"), "law": SpringDamper(stiffness=1e6, damping=50.0)}, "'end of com"),
         ({"touches": (SEPARATION, "break"), "collision": "sdc"}, "'sdc' of the collision has one contact"),
         ({"touches": 2, "collision": "sdc"}, "'sdc' of the collision has one contact"),

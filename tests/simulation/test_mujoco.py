@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.small_motions import blow_motion, reference, scene, standing, strike
+from support.small_motions import blow_motion, given_until, reference, scene, standing, strike
 from support.small_robots import arm, biped, slider
 
 from impactopt import Solution
@@ -291,7 +291,8 @@ def test_momentum_is_balanced_by_ground_gravity_and_target(blow: tuple[Robot, An
     for step in (4e-4, 2e-4):
         sim = simulate_mujoco(robot, motion, there, step=step, settle=0.0, record=1)
         momentum, force = [], []
-        for q, v, ground, push in zip(sim.q, sim.v, sim.ground, sim.force, strict=True):
+        means = np.diff(given_until(sim, step * np.arange(len(sim.time) + 1))) / step
+        for q, v, ground, push in zip(sim.q, sim.v, sim.ground, means, strict=True):
             h = pin.computeCentroidalMomentum(model, data, q, v)
             centre = np.array(data.com[0])
             momentum.append(np.concatenate([h.linear, h.angular + np.cross(centre, h.linear)]))
@@ -303,7 +304,6 @@ def test_momentum_is_balanced_by_ground_gravity_and_target(blow: tuple[Robot, An
         change = np.array(momentum) - momentum[0]
         missing = step * np.cumsum(force, axis=0)[:-1] - change[1:]
         worst.append(np.abs(missing).max() / np.abs(change).max())
-        assert sim.impulse == pytest.approx(step * float(sim.force.sum()), rel=1e-9)
         assert sim.impulse > 0.5
     assert worst[1] < 0.6 * worst[0] < 2e-3
 

@@ -123,6 +123,8 @@ def simulation_of(solution: Solution, *, touches: bool = True, peak: float = 0.9
         lift=np.zeros((len(time), 2)),
         contact_start=start,
         contact_end=end,
+        contact_time=np.array([start, start, end] if touches else []),
+        contact_force=np.array([0.0, 700.0, 0.0] if touches else []),
         impulse=1.01 * IMPULSE if touches else 0.0,
         peak_force=700.0 if touches else 0.0,
         outcome={"speed_m_s": 1.01 * IMPULSE / MASS if touches else 0.0},

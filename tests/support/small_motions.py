@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -133,3 +134,9 @@ def blow_motion() -> tuple[Robot, Any, Scene]:
     normal = speed / np.linalg.norm(speed)
     there = replace(where, point=point, normal=normal, target=FreeMass(mass=3.0))
     return robot, motion, there
+
+
+def given_until(sim: Simulation, times: Any) -> Array:
+    """Impulse [N s] until each time [s], by the trapezoidal rule from the recorded contact force."""
+    time, force = sim.contact_time, sim.contact_force
+    return np.asarray(np.interp(times, time, cumulative_trapezoid(force, time, initial=0.0)))

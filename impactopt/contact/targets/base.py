@@ -110,7 +110,7 @@ class Target(Described, ABC):
     def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
     ) -> Any:
-        """Expression of order 1 that is zero at the end of a phase which one of `guards` ends.
+        """Expression of order 1 that rises to zero at the end of a phase which one of `guards` ends.
 
         phase : 0 for the first.  late [s] : time by which the phase exceeds its shortest duration.
         """
@@ -262,24 +262,26 @@ def contact_phases(target: Target, order: Sequence[str] = ()) -> tuple[ContactPh
 def order_of_touches(law: ContactLaw, target: Target, touches: int) -> tuple[str, ...]:
     """Ends of the phases of a contact with several touches; () for one touch.
 
-    All guards are passed in the last touch. Compression and restitution are phases of their own if they are
-    different branches of the law.
+    All guards are passed in the last touch, but for one that may be zero at the first touch. Compression and
+    restitution are phases of their own if they are different branches of the law.
     """
     if touches == 1:
         return ()
     touch = (TURN, SEPARATION) if law.switches else (SEPARATION,)
-    return (*((*touch, TOUCH) * (touches - 1)), *target.guards, *touch)
+    first, last = (target.guards[:1], target.guards[1:]) if target.at_once else ((), target.guards)
+    return (*first, *((*touch, TOUCH) * (touches - 1)), *last, *touch)
 
 
 def is_order(law: ContactLaw, target: Target, order: Sequence[str]) -> bool:
     """True if these can be the ends of a contact's phases.
 
     Striker and target touch, part and touch again, and pass the guards in turn. The last end is the last
-    guard in a gap, or a separation after it. With a law that switches, compression and restitution alternate
-    in a touch, with a `TURN` between them.
+    guard in a gap, or a separation after it. A guard that may be zero at first touch ends the first phase.
+    With a law that switches, compression and restitution alternate in a touch, with a `TURN` between them.
     """
     guards = [end for end in order if end in target.guards]
     letters = {TURN: "C", SEPARATION: "S", TOUCH: "T"} | dict.fromkeys(target.guards, "G")
     touch = "G*C(G*CG*C)*G*S" if law.switches else "G*S"
     text = "".join(letters.get(end, "?") for end in order)
-    return guards == list(target.guards) and bool(re.fullmatch(f"({touch}G*T)*{touch}G*", text))
+    begins = not target.at_once or list(order[:1]) == list(target.guards[:1])
+    return begins and guards == list(target.guards) and bool(re.fullmatch(f"({touch}G*T)*{touch}G*", text))

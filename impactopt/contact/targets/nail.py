@@ -42,6 +42,7 @@ class Nail(Target):
     phases: ClassVar[tuple[str, ...]] = ("press", "drive", "release")
     at_once: ClassVar[bool] = True
     stays: ClassVar[bool] = True
+    met_again: ClassVar[bool] = True
 
     def _resistance(self, state: Any, p: Parameters) -> Any:
         return p["resistance"] + p["hardening"] * (p["depth"] + state[1])
@@ -83,7 +84,7 @@ class Nail(Target):
         """
         p = self.parameters if parameters is None else parameters
         if phase == 1:
-            return state[0]
+            return -state[0]
         wait, beyond = late / SOON, force / self._resistance(state, p) - 1.0
         return wait + beyond - ((wait - beyond) ** 2 + 4.0 * LEFT) ** 0.5
 

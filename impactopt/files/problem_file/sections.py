@@ -192,7 +192,8 @@ class CollisionSection(RigidSection):
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
     touches: Touches = optional(
-        "number of contacts with a board, or the ends of the contact's phases; left out: as of point masses"
+        "number of contacts with a board or a nail, or the ends of the contact's phases; left out: as of "
+        "point masses, of a nail one"
     )
     compression: Fractions = optional("lengths of its collocation elements")
     restitution: Fractions = optional("lengths of its collocation elements")

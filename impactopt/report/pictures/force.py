@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from impactopt.files.record import Record
+from impactopt.report.histories import contact_force
 from impactopt.report.pictures.style import COLUMN, PLANNED, SIMULATED, impulse_text, picture, title
 
 
@@ -32,12 +33,12 @@ def draw_force(place: FigureBase | Axes, record: Record) -> None:
         end = 1e3 * float(a.get("simulated_contact_end", 0.0) - a.get("simulated_contact_start", 0.0))
         end = end if np.isfinite(end) else 0.0
     if record.simulated and np.isfinite(a["simulated_contact_start"]):
-        time = 1e3 * (a["simulated_time"] - a["simulated_contact_start"])
+        time, value = contact_force(record, "simulated")
+        time = 1e3 * (time - a["simulated_contact_start"])
         keep = (time >= 0) & (time < 1.08 * end)
         label = f"simulated: {impulse_text(summary.get('simulated', {}))}"
-        # before contact there is no force, however coarsely the simulation was recorded
         shown = np.concatenate([[-0.05 * end, 0.0], time[keep]])
-        value = np.concatenate([[0.0, 0.0], a["simulated_force"][keep]])
+        value = np.concatenate([[0.0, 0.0], value[keep]])
         axes.plot(shown, value, color=SIMULATED, label=label)
     axes.set(xlabel="time since contact [ms]", ylabel="force on the target [N]")
     axes.set_ylim(bottom=0.0)

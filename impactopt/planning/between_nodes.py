@@ -36,6 +36,7 @@ class BetweenNodes:
     """
 
     most = _MAX_ROUNDS
+    of_refused = False
 
     def __init__(self, budget: Budget, margins: Margins | None, *, mesh: bool = True) -> None:
         self._budget, self._margins, self._mesh = budget, margins, mesh

@@ -181,6 +181,7 @@ class LazyTerms(Generic[Program]):
     """
 
     most = len(_KINDS)  # rounds: the constraints of one term may lead to a violation of another
+    of_refused = True  # a push that slides off its target is refused for its replay
 
     def __init__(self, report: Callable[[str], None] | None = None, *, finer: bool = True) -> None:
         self._report, self._finer = report, finer

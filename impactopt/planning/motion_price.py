@@ -49,6 +49,7 @@ class MotionPrice:
     """
 
     most = _MAX_REDUCTIONS
+    of_refused = False
 
     def missing(self, outcome: Outcome[Transcription]) -> Additions[Transcription] | None:
         """Program with reduced prices, from the solution."""

@@ -235,9 +235,11 @@ class Oracle(Protocol[Program]):
     """Check of one aspect of a solution.
 
     most : rounds of one refinement, at most; the solution of the last one is checked, too.
+    of_refused : True if it also checks refused solutions, which its additions may make valid.
     """
 
     most: int
+    of_refused: bool
 
     def missing(self, outcome: Outcome[Program]) -> Additions[Program] | None:
         """Additions that a solution requires; None if there are none, or none that are possible."""
@@ -265,7 +267,9 @@ def refine(
         return refine(solve(guess), before, solve, budget)
 
     for left in range(oracle.most, -1, -1):
-        lacks = oracle.missing(outcome) if outcome.usable else None
+        # Of a program without a solution nothing is known to be missing: additions only restrict it further.
+        met = outcome.usable or (oracle.of_refused and outcome.refused)
+        lacks = oracle.missing(outcome) if met else None
         # without rounds or time left, a solution that is not valid without the additions becomes a failure
         if lacks is None or (0 in (left, budget.left) and not lacks.without):
             break
@@ -277,8 +281,8 @@ def refine(
         budget.say(lacks.why)
         new = _first_usable(lacks.guesses, refined, budget)
         if not new.usable:
-            if not lacks.without:
-                break  # the solution before the additions stays
+            if not lacks.without or not outcome.usable:
+                break  # the solution before the additions stays, or the reason that it was refused for
             if new.result.status is not Status.INTERRUPTED:
                 message = f"{new.result.message} {lacks.without}"
                 new = replace(new, result=replace(new.result, message=message))

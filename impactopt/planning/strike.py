@@ -234,6 +234,7 @@ class Freezes:
     """
 
     most = 10
+    of_refused = False
 
     def missing(self, outcome: Outcome[StrikeTranscription]) -> Additions[StrikeTranscription] | None:
         """Program whose phases have the fractions of the contact that the solution has."""

@@ -190,6 +190,22 @@ def test_a_biped_stands_on_the_soles_of_its_feet(tmp_path: Path, behind: bool) -
         assert knee.translation[0] > hip.translation[0] + 0.05
 
 
+def test_weak_ankles_carry_the_start_posture(tmp_path: Path) -> None:
+    """Above the soles' middle, 4 cm ahead of the ankles, each would need 8 N m."""
+    strong = urdfs.biped()
+    weak = re.sub(r'(name="\w+_ankle_pitch".*?effort=)"80.0"', r'\1"5.0"', strong, flags=re.DOTALL)
+    ahead = []
+    for text in (strong, weak):
+        problem = _problem(tmp_path, text)
+        robot, q = problem.robot, problem.start_posture
+        data = robot.model.createData()
+        centre = pin.centerOfMass(robot.model, data, q)
+        ahead.append(float((centre - data.oMi[robot.model.getJointId("left_ankle_pitch")].translation)[0]))
+        assert too_weak(problem) == ""
+    assert robot.torque_limit[robot.joint_index("left_ankle_pitch")] == 5.0
+    assert 0.0 < ahead[1] < 0.025 < ahead[0]
+
+
 @pytest.mark.parametrize(
     "text", [urdfs.biped(), urdfs.arm(), urdfs.arm(wheels=True)], ids=["biped", "arm", "cart"]
 )

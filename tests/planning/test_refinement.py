@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -43,6 +44,7 @@ class Lacking:
     """Oracle that has one entry of x raised to a value, from guesses some of which fail."""
 
     most = 5
+    of_refused = False
 
     def __init__(
         self, entry: int, value: float, asked: list[int], *, fails: int = 0, without: str = ""
@@ -101,3 +103,37 @@ def test_the_effort_of_all_guesses_and_rounds_is_counted() -> None:
         False,
         True,
     ]
+
+
+@pytest.mark.parametrize("met", [True, False])
+@pytest.mark.parametrize(("of_refused", "fails"), [(True, 0), (True, 2), (False, 0)])
+def test_an_oracle_may_mend_a_refused_solution_but_no_violated_program(
+    met: bool, of_refused: bool, fails: int
+) -> None:
+    """As a push that slides off its target, which its replay refuses until the slide is bounded."""
+    own = SimpleNamespace(  # a program whose one constraint is met, or not
+        x_lower=np.full(2, -np.inf),
+        x_upper=np.full(2, np.inf),
+        g_lower=np.array([0.0 if met else 1.0]),
+        g_upper=np.ones(1),
+        constraints=lambda x: np.zeros(1),
+    )
+    program: Any = SimpleNamespace(impulse=PROGRAM.impulse, program=own)
+
+    def solve(guess: Guess[Any]) -> Outcome[Any]:
+        outcome = solved(guess)
+        if guess.x[0] > 0:
+            return outcome
+        failed = replace(outcome.result, status=Status.FAILED, max_violation=1.0)
+        return replace(outcome, result=failed)
+
+    asked = list[int]()
+    oracle = Lacking(0, 1.0, asked, fails=fails, without="It slides.")
+    oracle.of_refused = of_refused
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
+    first = solve(Guess(program=program, start=np.zeros(2)))
+    assert first.refused is met
+    found = refine(first, [oracle], solve, budget)
+    assert bool(asked) is (met and of_refused)
+    assert found.usable is (bool(asked) and not fails)
+    assert found.usable or found.result.message == first.result.message, "the reason of the refusal stays"

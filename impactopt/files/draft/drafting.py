@@ -48,6 +48,7 @@ from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 MAX_TARGETS = 8  # tried
+MAX_STROKES = 3  # targets of a robot on legs, below its hand, that a strike is tried to
 SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # durations [s] for fast robots
 SHIFT = (0.6, 1.2)  # duration [s] from two feet to one, and back
 START = "ready"
@@ -311,17 +312,25 @@ def _stroke(
     q, way = ready(robot, [hand], q, directions=[tuple(DOWN)])
     # the easiest target: on soles, a strike alone is far harder than the strike of a whole motion
     data = {**_data(drafted, robot, soles, strikers, q, folder), **hits(motion, robot)[-1].data}
-    data = _aimed(data, name, aims(robot, hand, q, way), way, folder)
-    edgewise, messages = _edgewise(data), list[str]()
-    say("trying a strike with any part of the hand (compiles the first time)")
-    solved = _strike(edgewise, folder)
+    points, tried = aims(robot, hand, q, way), list[tuple[dict[str, Any], StrikeSolution]]()
+    say("trying strikes with any part of the hand (compiles the first time)")
+    while len(tried) < MAX_STROKES and not any(solved.status.usable for _, solved in tried):
+        try:
+            aimed = _aimed(data, name, points, way, folder)
+        except InputError:
+            if not tried:
+                raise
+            break
+        tried.append((aimed, _strike(_edgewise(aimed), folder)))
+    data, solved = min(tried, key=lambda one: (not one[1].status.usable, one[1].result.max_violation))
+    messages = list[str]()
     if not solved.status.usable:
         messages = [f"{UNSOLVED}{NEAREST}{solved.result.message}"]
     else:
         # with the face to the target, most strikes are only solved from this one as the initial guess
         say("turning the hand's face to the target")
-        square = _strike(data, folder, start=solved).status.usable
-        data, messages = (data, []) if square else (edgewise, [EDGEWISE])
+        if not _strike(data, folder, start=solved).status.usable:
+            data, messages = _edgewise(data), [EDGEWISE]
     return Draft(text=_text(data, drafted, robot), said=(*_messages(data, drafted, robot), *messages))
 
 

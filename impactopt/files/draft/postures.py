@@ -22,17 +22,19 @@ LEVEL = 1e-7  # [m], [rad]: tolerance of a sole's placement
 STARTS = 10  # random initial guesses
 # distances of the soles tried, over that in the zero posture: with splayed legs they may not be level
 WIDTHS = (1.0, 0.9, 0.8)
-GRAVITY_SHARE = 0.5  # largest gravity torque of a joint that does not strike, over its limit
+GRAVITY_SHARE = 0.5  # largest gravity torque of an ankle or of an idle arm's joint, over its limit
 MARGIN = 0.1  # of a joint's range, to both limits together
 RANGE_COST = 0.02  # [m]: position error that costs as much as a deviation by a joint's whole range
 UPPER_ARM = 0.2  # least length of an upper arm, over the arm's
-# largest cosine between a shoulder's axis and the arm for which the shoulder may be moved along the axis
+# largest cosine between a shoulder's axis and the arm for which the shoulder may be moved along the axis, and
+# least one between an ankle's pitch axis and the lateral direction
 ACROSS = 0.7
 EDGE = 0.2  # of a joint's range: nearest that its rest angle 0 may be to a limit, else it is the middle
 
 
 def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array) -> Array:
-    """A configuration (nq,) with level soles side by side, knees forward, and the centre of mass above them.
+    """A configuration (nq,) with level soles side by side, knees forward, and the centre of mass above their
+    middle, or as near to it as the ankles carry the weight with `GRAVITY_SHARE` of their torque limits.
 
     robot : with the soles.  forward (3,) : in the root's frame.
 
@@ -75,11 +77,34 @@ def _half_sitting(
         middles = [
             data.oMf[model.getFrameId(s.frame)].act(np.append(s.polygon.mean(axis=0), 0.0)) for s in soles
         ]
-        off = float((centre - np.mean(middles, axis=0)) @ turn[:, 0])
+        above = float(np.mean(middles, axis=0) @ turn[:, 0])
+        off = float(centre @ turn[:, 0]) - float(np.clip(above, *_carried(robot, chains, q, turn[:, :2])))
         if abs(off) < 2e-3:
             break
         ahead += off
     return robot.place(q, soles)
+
+
+def _carried(robot: Robot, chains: Sequence[Sequence[int]], q: Array, axes: Array) -> tuple[float, float]:
+    """Least and largest position [m] ahead at which the legs' ankles carry the centre of mass.
+
+    chains : joints of each leg.  axes (3, 2) : directions ahead and to the side.
+    """
+    model, data = robot.model, robot.model.createData()
+    pin.computeJointJacobians(model, data, q)
+    weight = sum(float(body.mass) for body in model.inertias) * float(np.linalg.norm(model.gravity.linear))
+    low, high = -np.inf, np.inf
+    for own in chains:
+        for joint in reversed(own):
+            jac = np.array(pin.getJointJacobian(model, data, joint, pin.LOCAL_WORLD_ALIGNED))
+            axis = jac[3:, model.joints[joint].idx_v]
+            if abs(float(axis @ axes[:, 1])) > ACROSS:  # the ankle's pitch joint
+                at = float(data.oMi[joint].translation @ axes[:, 0])
+                limit = float(robot.torque_limit[_columns(robot, [joint])[0]])
+                reach = GRAVITY_SHARE * limit * len(chains) / weight if weight > 0 else np.inf
+                low, high = max(low, at - reach), min(high, at + reach)
+                break
+    return low, max(low, high)
 
 
 def bend_arm(

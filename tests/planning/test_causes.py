@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 import pytest
+from support.causes import searched
 
 from impactopt import (
     FreeMass,
@@ -24,6 +25,7 @@ from impactopt import (
     solve,
 )
 from impactopt.planning.budget import stopping
+from impactopt.planning.diagnosis import with_reason
 from impactopt.problem.feasibility import too_weak
 
 
@@ -54,11 +56,13 @@ def changes(arm: ImpactProblem) -> dict[str, tuple[ImpactProblem, str]]:
 @pytest.mark.parametrize("name", ["hard wood", "short swing", "long swing", "soft contact"])
 def test_the_bound_that_is_named_is_the_one_that_has_to_move(arm: ImpactProblem, name: str) -> None:
     problem, first = changes(arm)[name]
-    solution = unsolved(problem)
-    assert solution.causes
-    cause = solution.causes[0]
+    t, result, found = searched(problem)
+    assert found.causes
+    cause = found.causes[0]
     assert cause.kind == first
-    assert solution.result.message.startswith(f"Infeasible: {first}. {cause.text} would do")
+    assert with_reason(t, result, found.causes).message.startswith(
+        f"Infeasible: {first}. {cause.text} would do"
+    )
     assert cause.problem is not None
     assert solve(cause.problem).status.usable
 

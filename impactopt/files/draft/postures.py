@@ -207,15 +207,23 @@ def _leg(
     now = robot.joint_positions(q)[own]
     best, nearest = None, np.inf
 
+    def remaining(angles: Array) -> pin.SE3:
+        pin.computeJointJacobians(model, data, _set(robot, q, own, angles))
+        return pin.updateFramePlacement(model, data, fid).actInv(goal)
+
     def errors(angles: Array) -> Array:
-        pin.forwardKinematics(model, data, _set(robot, q, own, angles))
-        pin.updateFramePlacement(model, data, fid)
-        return np.asarray(pin.log6(data.oMf[fid].actInv(goal)).vector)
+        return np.asarray(pin.log6(remaining(angles)).vector)
+
+    def jacobian(angles: Array) -> Array:
+        left = remaining(angles)
+        twists = pin.getFrameJacobian(model, data, fid, pin.LOCAL)[:, robot.nv - robot.n + own]
+        # the sole moves by exp(twist): exp(-twist) left = left exp(-Ad(left)^-1 twist)
+        return np.asarray(-pin.Jlog6(left) @ left.toActionMatrixInverse() @ twists)
 
     for k in range(2 * STARTS):
         start = np.clip(now + (0.6 * rng.standard_normal(len(own)) if k else 0.0), low, high)
         found = least_squares(
-            errors, start, bounds=(low - 1e-9, high + 1e-9), xtol=1e-14, ftol=1e-14, gtol=1e-14
+            errors, start, jacobian, bounds=(low - 1e-9, high + 1e-9), xtol=1e-14, ftol=1e-14, gtol=1e-14
         )
         off = float(np.abs(errors(found.x)).max())
         nearest = min(nearest, off)

@@ -111,7 +111,7 @@ def solve(
     there is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     interrupted = "interrupted before there was a plan to keep"
-    with plain_errors(interrupted, verbose=verbose, keeps=True) as console:
+    with plain_errors(interrupted, verbose=verbose, keeps=True, as_json=as_json) as console:
         from impactopt.cli.replays import compared_record
         from impactopt.errors import printable
         from impactopt.files.output import keep_record, make_directory, set_aside

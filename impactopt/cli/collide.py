@@ -69,7 +69,9 @@ def collide(
     terms, are not checked. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
     limit, no separation), 2 bad input.
     """
-    with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
+    with plain_errors(
+        "interrupted before the collision was over", verbose=verbose, as_json=as_json
+    ) as console:
         from impactopt.collide.single_collision import collide_once, problem_of_result
         from impactopt.files.sections.reading import CollisionFile, parse_settings
         from impactopt.report.console import SolveConsole

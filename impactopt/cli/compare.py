@@ -28,7 +28,7 @@ def compare(
 
     Exit code: 0 compared, 2 bad input.
     """
-    with plain_errors("interrupted before the results were compared"):
+    with plain_errors("interrupted before the results were compared", as_json=as_json):
         from impactopt.files.output import make_directory, write_file
         from impactopt.files.record import load_record
         from impactopt.report.comparison import compare as comparison_of

@@ -28,7 +28,7 @@ def drive(
     A series that ends earlier is written to DIR/failed if DIR has a complete one. Exit code: 0 the nail
     is in, 1 it is not, 2 bad input.
     """
-    with plain_errors("interrupted before the nail was in", verbose=verbose) as console:
+    with plain_errors("interrupted before the nail was in", verbose=verbose, as_json=as_json) as console:
         from impactopt.files.output import keep_series, make_directory, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.record import plain

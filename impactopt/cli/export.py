@@ -64,7 +64,7 @@ def export(
 
     Exit code: 0 written, 2 bad input.
     """
-    with plain_errors("interrupted before the files were written"):
+    with plain_errors("interrupted before the files were written", as_json=as_json):
         from impactopt.errors import printable
         from impactopt.files.export import export_planned
         from impactopt.files.replay import load_planned

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -27,7 +26,7 @@ def check(
     The mistake to fix first comes first. With --json {"ok", "file", "hash", "problem", "doubts"}, or {"ok",
     "file", "mistakes"}. Exit code: 0 sound, 2 not.
     """
-    with plain_errors("interrupted", verbose=verbose):
+    with plain_errors("interrupted", verbose=verbose, as_json=as_json):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.problem.feasibility import hopeless, sticks_out, too_weak
@@ -151,7 +150,7 @@ def new(
     file is drafted for that robot: soles, strikers, a posture, a target, and guesses for what its description
     lacks. --json prints the file as `toml` and its tables as `data`, or the list.
     """
-    with plain_errors("interrupted"):
+    with plain_errors("interrupted", as_json=as_json):
         if sum(x is not None for x in (name, urdf, mjcf)) + reference > 1:
             raise typer.BadParameter("give one of NAME, --urdf, --mjcf and --reference")
         if name is not None and Path(name).suffix.lower() in (".urdf", ".xacro"):
@@ -225,13 +224,13 @@ def _give(text: str, out: Path | None, as_json: bool = False) -> None:
 
 def problems(as_json: AsJson = False) -> None:
     """List the problems that come with the package: `impactopt solve NAME`."""
-    with plain_errors("interrupted"):
+    with plain_errors("interrupted", as_json=as_json):
         from impactopt.files.named_problems import problem_file, problem_names, problem_summary
 
         found = {name: problem_summary(name) for name in problem_names()}
         if as_json:
             rows = [{"name": n, "about": about, "file": str(problem_file(n))} for n, about in found.items()]
-            typer.echo(json.dumps(rows, indent=2))
+            print_json({"problems": rows}, True)
             return
         for name, about in found.items():
             typer.echo(f"{name:<{max(map(len, found))}}  {about}")
@@ -239,7 +238,7 @@ def problems(as_json: AsJson = False) -> None:
 
 def robots(as_json: AsJson = False) -> None:
     """List the robots that problem files can name, with their strikers, soles and postures."""
-    with plain_errors("interrupted"):
+    with plain_errors("interrupted", as_json=as_json):
         from impactopt.errors import InputError
         from impactopt.robots.presets import robot_names
 
@@ -250,7 +249,7 @@ def robots(as_json: AsJson = False) -> None:
             except InputError as error:
                 rows.append({"name": name, "error": str(error)})
         if as_json:
-            typer.echo(json.dumps(rows, indent=2))
+            print_json({"robots": rows}, True)
             return
         for row in rows:
             if "error" in row:

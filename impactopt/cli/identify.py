@@ -51,7 +51,7 @@ def identify(
     Each contact law is fitted by least squares to the collision of two masses. Prints the laws, the best
     first, and cautions. Exit code: 0 done, 2 bad input.
     """
-    with plain_errors("interrupted before the laws were fitted", verbose=verbose):
+    with plain_errors("interrupted before the laws were fitted", verbose=verbose, as_json=as_json):
         import numpy as np
 
         from impactopt.contact.laws import LAWS

@@ -45,7 +45,9 @@ def strike(
     It starts from several initial guesses, as local optima differ much. A failed result goes to DIR/failed if
     there is a good one in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
-    with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
+    with plain_errors(
+        "interrupted before there was a strike to keep", verbose=verbose, as_json=as_json
+    ) as console:
         from impactopt.errors import printable
         from impactopt.files.output import keep_record, make_directory, record_of_strike, set_aside
         from impactopt.files.problem_file import parse_settings, read_problem_file

@@ -58,7 +58,7 @@ def sweep(
     case that fails is a row with its reason. Exit code: 0 done, 1 no case has a usable result, 2 bad input.
     """
     interrupted = f"interrupted; finished cases are in {out}, and the same command resumes the sweep"
-    with plain_errors(interrupted, verbose=verbose) as console:
+    with plain_errors(interrupted, verbose=verbose, as_json=as_json) as console:
         from impactopt.files.problem_file import parse_settings
         from impactopt.sweeps import read_sweep_file
         from impactopt.sweeps import sweep as run

@@ -89,7 +89,7 @@ def validate(
 
     Exit code: 0 stands (or the engine fixes the soles), 1 fell, 2 bad input.
     """
-    with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
+    with plain_errors("interrupted before the replay was done", verbose=verbose, as_json=as_json) as stderr:
         from impactopt.files.output import check_ending, make_directory, remove_file, write_file
         from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned, replay

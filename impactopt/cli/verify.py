@@ -21,7 +21,9 @@ def verify(
 
     Exit code: 0 all agree, 1 some do not, or could not be computed, 2 bad input.
     """
-    with plain_errors("interrupted before the result was verified", verbose=verbose) as stderr:
+    with plain_errors(
+        "interrupted before the result was verified", verbose=verbose, as_json=as_json
+    ) as stderr:
         from impactopt.files.record import plain
         from impactopt.files.verify import verify as verified
         from impactopt.report.console import SolveConsole, verdict_table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import threading
 import traceback
@@ -33,11 +34,14 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def plain_errors(interrupted: str, *, verbose: bool = False, keeps: bool = False) -> Iterator[Console]:
+def plain_errors(
+    interrupted: str, *, verbose: bool = False, keeps: bool = False, as_json: bool = False
+) -> Iterator[Console]:
     """Context of a command's body, with a console on stderr.
 
     interrupted : printed on a Ctrl-C that the body does not catch.
     verbose : bad input prints a traceback.
+    as_json : bad input is printed on stdout, too, as {"ok": false, "error"}.
     keeps : the body saves its results on Ctrl-C; then SIGTERM, as of a scheduler, has the same effect.
     """
     from rich.console import Console
@@ -56,6 +60,8 @@ def plain_errors(interrupted: str, *, verbose: bool = False, keeps: bool = False
             if verbose:
                 traceback.print_exc()
             typer.echo(printable(f"error: {error}"), err=True)
+            if as_json:
+                typer.echo(json.dumps({"ok": False, "error": str(error)}, indent=2))
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt:
             typer.echo(interrupted, err=True)

@@ -105,13 +105,22 @@ def test_new_prints_a_file_that_can_be_used(tmp_path: Path) -> None:
 
 
 def test_lists_as_json() -> None:
-    found = json.loads(run("problems", "--json")[0])
+    listed = json.loads(run("problems", "--json")[0])
+    assert listed["ok"]
+    found = listed["problems"]
     assert [row["name"] for row in found] == list(problem_names())
     assert all(Path(row["file"]).is_file() and row["about"] for row in found)
-    assert json.loads(run("new", "--json")[0]) == found
-    arms = {row["name"]: row for row in json.loads(run("robots", "--json")[0])}
+    assert json.loads(run("new", "--json")[0]) == listed
+    arms = {row["name"]: row for row in json.loads(run("robots", "--json")[0])["robots"]}
     assert arms["planar_arm"]["joints"] == 3 and arms["planar_arm"]["strikers"] == ["hammer"]
     assert arms["planar_arm"]["mass_kg"] == pytest.approx(9.65)  # links of 5, 3 and 1 kg, and the hammer
+
+
+def test_bad_input_is_told_as_json_too() -> None:
+    out, told = run("solve", "arm_plana", "--json", code=2)
+    found = json.loads(out)
+    assert found["ok"] is False and "arm_planar" in found["error"] and found["error"] in told
+    assert run("solve", "arm_plana", code=2)[0] == ""
 
 
 # ---------------------------------------------------------------- collide

@@ -29,6 +29,7 @@ _SHALLOW, _DEEP_INTERVAL = 2e-3, 5e-3
 _CLOSE = 2e-2  # [m] clearance up to which a survey is tried first
 DEEPEST = -1e-6  # [m] distance below which bodies penetrate
 SLACK = 2 * THIN  # [m] by which bodies may be nearer than the smooth distances of their thinned hulls
+SURVEYED = 0.1  # [m] larger clearances are not measured in surveys of a motion
 _CHUNK = 256  # instants that are evaluated together; memory is proportional to them times the pairs
 
 
@@ -261,7 +262,7 @@ class Bodies:
         for (k, pair), gap in sorted(found.items(), key=lambda item: item[1]):
             yield gap, k, pair
 
-    def survey(self, time: Array, at: Places, within: float = 0.1) -> Survey:
+    def survey(self, time: Array, at: Places, within: float = SURVEYED) -> Survey:
         """Least distance of all pairs at all instants, and all penetrations.
 
         time (k,) [s] : of the instants.  within [m] : clearances above it count as `FAR`.

@@ -19,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.clearance import SURVEYED
 from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError
 from impactopt.files.output import record_of
@@ -212,9 +213,9 @@ def _deviations(t: Transcription, record: Record) -> Iterator[Deviation]:
     for key in KEYS:
         if key in record.summary:
             yield from _differences(record.summary[key], again.summary.get(key), key)
-    clearance = again.summary.get("clearance_mm")
-    if t.problem.keeps_apart and clearance is not None:
-        yield "distance of bodies", -1e-3 * clearance, "the motion"
+    if t.problem.keeps_apart:
+        clearance = again.summary["clearance_mm"]  # None: above SURVEYED
+        yield "distance of bodies", -SURVEYED if clearance is None else -1e-3 * clearance, "the motion"
     for prefix in ("reference", "missed"):
         if f"{prefix}_time" in record.arrays:
             yield from motion_of_record(t.problem, record.arrays, prefix)

@@ -156,7 +156,7 @@ def test_a_file_leaves_gains_open_and_its_result_says_which(tmp_path: Path) -> N
     record = record_of(solution, problem=text, problem_path=tmp_path / "soft.toml")
     save_record(record, tmp_path)
     kept = load_record(tmp_path)
-    again = problem_of(kept, tmp_path, None, None)
+    again = problem_of(kept, tmp_path)
     assert again.hash == solution.problem.hash
     assert resumed(kept, again).gains == solution.gains == solution.moved(damping=210.0).gains
     (told,) = kept.summary["gains"]
@@ -165,7 +165,7 @@ def test_a_file_leaves_gains_open_and_its_result_says_which(tmp_path: Path) -> N
     label, row = next((r.label, r.cells[0].text) for r in rows if r.label.startswith("stiffness"))
     assert "0.1 to 10" in label and float(row) == pytest.approx(told["factor"], rel=1e-2)
     (tmp_path / "open.toml").write_text(text, "utf-8")
-    assert problem_of(kept, tmp_path, tmp_path / "open.toml", None).hash == again.hash
+    assert problem_of(kept, tmp_path, tmp_path / "open.toml").hash == again.hash
     verdict = verify(tmp_path)
     assert verdict.ok and verdict.kkt < 1e-5
 

@@ -28,7 +28,7 @@ VIOLATION, KKT, LOSS = 1e-6, 1e-4, 0.01  # at most, of a success; loss: relative
 NOISE = 0.1  # [rad] of the posture at contact in a perturbed start
 SPEEDS = (0.5, 1.5)  # [m/s] of the strike in a perturbed start
 QUICK = ("ipm", "ipopt")
-KINDS = ("motion", "strike")
+KINDS = ("motion", "clear", "strike")
 KEYS = ("problem", "solver", "start", "time_limit")  # of an attempt
 
 COLUMNS = (
@@ -59,8 +59,8 @@ def run(
 ) -> Report:
     """One row a problem and solver.
 
-    problem : one of `problem_names()`, or a file; default: all.  kind : "motion", or the "strike" alone, of
-    collocated contact.  starts : the plain first iterate,
+    problem : one of `problem_names()`, or a file; default: all.  kind : "motion", without clearance of
+    bodies; "clear", with it; or the "strike" alone, of collocated contact.  starts : the plain first iterate,
     and perturbed ones.  time_limit [s] : of one solve.  solvers : labels in `SOLVERS`; default: all.
     quick : one start, our default and IPOPT.  attempts : file that keeps every solve, a JSON object a line.
     resume : do not repeat solves that it has.
@@ -71,7 +71,7 @@ def run(
     """
     if kind not in KINDS:
         raise InputError(f"kind {kind!r}{did_you_mean(kind, KINDS)}: give {' or '.join(KINDS)}")
-    made = strike_program if kind == "strike" else planning_program
+    made = {"motion": planning_program, "clear": clear_program, "strike": strike_program}[kind]
     makes: dict[str, Make] = {path.stem: partial(made, path, seed) for path in _files(problem)}
     chosen = _chosen(solvers or (QUICK if quick else tuple(SOLVERS)))
     number = 1 if quick else starts
@@ -100,6 +100,25 @@ def planning_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgra
     problem = load_problem(file)
     transcription = Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
     return transcription.program, first_iterate(transcription, **_drawn(seed, start))
+
+
+def clear_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgram, Vector]:
+    """As :func:`planning_program`, with clearance constraints from the start: those that our solver has at
+    the end of its solve from the plain start. So all solvers have the same.
+    """
+    from impactopt.files.problem_file import load_problem
+    from impactopt.planning.budget import Budget
+    from impactopt.planning.clearance_constraints import Margins, solve_with_clearance
+    from impactopt.planning.refinement import Guess
+    from impactopt.transcription.initial_guess import first_iterate
+    from impactopt.transcription.transcription import Transcription, block_functions
+
+    problem = load_problem(file)
+    plain = Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
+    margins = Margins(problem) if problem.keeps_apart else None
+    solved = solve_with_clearance(budget, margins, Guess(program=plain, start=first_iterate(plain)))
+    return solved.program.program, first_iterate(plain, **_drawn(seed, start))
 
 
 def strike_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgram, Vector]:

@@ -21,7 +21,7 @@ from impactopt.robots.checks import LEG
 Array = NDArray[np.float64]
 SLICE = 0.005  # [m]: the part of a foot so near to its lowest plane is the sole
 STEEP = np.cos(np.radians(40))  # least cosine between the normals of sole and ground in the zero posture
-MAX_CORNERS = 6  # of a polygon: the facets of the wrench cone grow with their square
+MAX_CORNERS = 8  # of a polygon
 MIN_AREA = 2e-3  # [m2] of a sole
 AHEAD = 0.01  # [m] least distance from ankle to the foot's centre that shows the forward direction
 BENDS = 0.2  # [rad] least asymmetry |lower + upper| of a knee's limits that shows its bending direction

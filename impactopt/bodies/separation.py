@@ -220,8 +220,8 @@ class Separations:
 
     def forget(self) -> None:
         """Clears the last results, as ``numbers`` have changed."""
-        # Whether there is one, z, and the derivative of the directions by z at the last Hessians.
-        self._turn = np.zeros((self.count, 3 + 4 * (self.joints + 3)))
+        # z at the last Hessians, and the derivatives of the directions by z; zeros foresee no change.
+        self._turn = np.zeros((self.count, 4 * (self.joints + 3)))
         # nan equals no z, so everything is computed anew.
         self._seen = np.full((self.count, self.joints + 3), np.nan)
 

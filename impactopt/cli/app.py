@@ -35,14 +35,13 @@ from impactopt.cli.options import (
     Workers,
     command_line,
     out_option,
-    print_json,
 )
 from impactopt.cli.show import show
 from impactopt.cli.strike import strike
 from impactopt.cli.sweep import sweep
 from impactopt.cli.validate import validate
 from impactopt.cli.verify import verify
-from impactopt.report.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors, print_json
 
 if TYPE_CHECKING:
     from impactopt.files.record import Record

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, complete_problem, print_json
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, complete_problem
+from impactopt.report.plain_errors import plain_errors, print_json
 
 NO_COLLISION = 1  # exit code
 RESULT_FREEZES = 16  # default for a saved result, as the contacts of plans are long

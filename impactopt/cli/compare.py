@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, out_option, print_json
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.options import AsJson, out_option
+from impactopt.report.plain_errors import plain_errors, print_json
 
 FILES = ("compare.json", "compare.png", "compare.html")
 

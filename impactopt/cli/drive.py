@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, ProblemPath, Quiet, Settings, Verbose, out_option, print_json
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.options import AsJson, ProblemPath, Quiet, Settings, Verbose, out_option
+from impactopt.report.plain_errors import plain_errors, print_json
 
 NOT_IN = 1  # exit code
 

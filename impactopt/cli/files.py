@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem, out_option, print_json
-from impactopt.report.plain_errors import BAD_INPUT, plain_errors
+from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem, out_option
+from impactopt.report.plain_errors import BAD_INPUT, plain_errors, print_json
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem

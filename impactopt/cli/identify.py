@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, Verbose, complete_problem, out_option, print_json
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.options import AsJson, Verbose, complete_problem, out_option
+from impactopt.report.plain_errors import plain_errors, print_json
 
 
 def identify(

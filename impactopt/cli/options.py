@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import shlex
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -137,12 +135,6 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="A line for every iteration, and the traceback of an error.")
 ]
-
-
-def print_json(summary: Mapping[str, Any], ok: bool) -> None:
-    """Prints the result of a command as JSON; its first key is `ok` for every command: exit code 0."""
-    fields = {key: value for key, value in summary.items() if key != "ok"}
-    typer.echo(json.dumps({"ok": ok} | fields, indent=2))
 
 
 class _Plain:

@@ -21,9 +21,8 @@ from impactopt.cli.options import (
     Workers,
     command_line,
     out_option,
-    print_json,
 )
-from impactopt.report.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors, print_json
 
 
 def strike(

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, complete_sweep, out_option, print_json
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, complete_sweep, out_option
+from impactopt.report.plain_errors import plain_errors, print_json
 
 if TYPE_CHECKING:
     from impactopt.sweeps import SweepResult

@@ -17,9 +17,8 @@ from impactopt.cli.options import (
     Settings,
     Verbose,
     out_option,
-    print_json,
 )
-from impactopt.report.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors, print_json
 
 FELL = 1  # exit code
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import typer
 
-from impactopt.cli.options import AsJson, OtherProblem, Quiet, ResultPath, Verbose, print_json
-from impactopt.report.plain_errors import plain_errors
+from impactopt.cli.options import AsJson, OtherProblem, Quiet, ResultPath, Verbose
+from impactopt.report.plain_errors import plain_errors, print_json
 
 NOT_OK = 1  # exit code
 

@@ -1,4 +1,4 @@
-"""Plain messages on stderr for bad input and warnings, without tracebacks, for every command."""
+"""Plain messages on stderr for bad input and warnings, without tracebacks, and the JSON of every command."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import signal
 import threading
 import traceback
 import warnings
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 BAD_INPUT, BUG, INTERRUPTED = 2, 70, 130  # exit codes
+
+
+def print_json(summary: Mapping[str, Any], ok: bool) -> None:
+    """Prints the result of a command as JSON; its first key is `ok` for every command: exit code 0."""
+    fields = {key: value for key, value in summary.items() if key != "ok"}
+    typer.echo(json.dumps({"ok": ok} | fields, indent=2))
 
 
 @contextlib.contextmanager
@@ -61,7 +67,7 @@ def plain_errors(
                 traceback.print_exc()
             typer.echo(printable(f"error: {error}"), err=True)
             if as_json:
-                typer.echo(json.dumps({"ok": False, "error": str(error)}, indent=2))
+                print_json({"error": str(error)}, False)
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt:
             typer.echo(interrupted, err=True)

@@ -362,9 +362,8 @@ class Robot:
         """Forces (nv,) [N, N m] at rest: `pin.computeGeneralizedGravity` and the springs' torques."""
         return self._plus_springs(q, pin.computeGeneralizedGravity(self.model, data, q))
 
-    def capture_point(self, q: Array, v: Array) -> Array:
+    def capture_point(self, data: Any, q: Array, v: Array) -> Array:
         """Capture point (2,) [m] on the ground: c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012)."""
-        data = self.model.createData()
         com = pin.centerOfMass(self.model, data, q, v)
         fall = np.sqrt(com[2] / np.linalg.norm(self.model.gravity.linear))
         return np.asarray(com[:2] + data.vcom[0][:2] * fall)

@@ -892,7 +892,9 @@ class PlannedStrike:
         out["zmp_margin_m"] = {
             name: float(margin(polygon, zmp(wrench)).min()) for name, wrench in grounds.items() if len(wrench)
         }
-        capture = self.problem.robot.capture_point(self.posture_after, self.velocity_after)
+        robot = self.problem.robot
+        data = robot.model.createData()
+        capture = robot.capture_point(data, self.posture_after, self.velocity_after)
         out["capture_margin_m"] = float(margin(polygon, capture[None])[0])
         return out
 

@@ -277,7 +277,9 @@ def _solve(
     problem: Annotated[
         str | None, typer.Option("--problem", metavar="NAME", help="A problem's name or file (default: all).")
     ] = None,
-    kind: Annotated[str, typer.Option(metavar="KIND", help="motion, or strike: the blow alone.")] = "motion",
+    kind: Annotated[
+        str, typer.Option(metavar="KIND", help="motion, clear (of bodies), or strike: the blow alone.")
+    ] = "motion",
     starts: Annotated[int, typer.Option(min=1, help="Starts: the plain one, and perturbed ones.")] = 3,
     time_limit: Annotated[float, typer.Option(min=0.1, help="Time limit of one solve, in seconds.")] = 60.0,
     solvers: Annotated[

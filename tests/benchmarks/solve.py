@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from impactopt.errors import InputError, did_you_mean
 from impactopt.files.named_problems import problem_file, problem_names
 from impactopt.files.problem_file import read_problem_file
 from impactopt.solvers.program import NonlinearProgram, Status, Vector
+
+if TYPE_CHECKING:
+    from impactopt.transcription.transcription import Transcription
 
 ATTEMPTS = Path("results/bench/solve.jsonl")
 VIOLATION, KKT, LOSS = 1e-6, 1e-4, 0.01  # at most, of a success; loss: relative to the best known objective
@@ -93,12 +96,9 @@ def planning_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgra
     """The program of a problem file, and a start: number 0 is the plain reach, others strike at another speed
     from another posture.
     """
-    from impactopt.files.problem_file import load_problem
     from impactopt.transcription.initial_guess import first_iterate
-    from impactopt.transcription.transcription import Transcription, block_functions
 
-    problem = load_problem(file)
-    transcription = Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
+    transcription = _transcription(file)
     return transcription.program, first_iterate(transcription, **_drawn(seed, start))
 
 
@@ -106,19 +106,24 @@ def clear_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgram, 
     """As :func:`planning_program`, with clearance constraints from the start: those that our solver has at
     the end of its solve from the plain start. So all solvers have the same.
     """
-    from impactopt.files.problem_file import load_problem
     from impactopt.planning.budget import Budget
     from impactopt.planning.clearance_constraints import Margins, solve_with_clearance
     from impactopt.planning.refinement import Guess
     from impactopt.transcription.initial_guess import first_iterate
+
+    plain = _transcription(file)
+    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
+    margins = Margins(plain.problem) if plain.problem.keeps_apart else None
+    solved = solve_with_clearance(budget, margins, Guess(program=plain, start=first_iterate(plain)))
+    return solved.program.program, first_iterate(plain, **_drawn(seed, start))
+
+
+def _transcription(file: Path) -> Transcription:
+    from impactopt.files.problem_file import load_problem
     from impactopt.transcription.transcription import Transcription, block_functions
 
     problem = load_problem(file)
-    plain = Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
-    budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)
-    margins = Margins(problem) if problem.keeps_apart else None
-    solved = solve_with_clearance(budget, margins, Guess(program=plain, start=first_iterate(plain)))
-    return solved.program.program, first_iterate(plain, **_drawn(seed, start))
+    return Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
 
 
 def strike_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgram, Vector]:

@@ -261,11 +261,12 @@ def test_place_moves_the_robot_rigidly_to_the_origin_of_the_ground(talos_robot: 
 def test_capture_point_is_where_the_inverted_pendulum_comes_to_rest(humanoid: Robot) -> None:
     """With p at the capture point, x'' = (g / z) (x - p) has the solution x - p ~ exp(-t sqrt(g / z))."""
     q, v = np.array(humanoid.posture("half_sitting")), np.zeros(humanoid.nv)
-    com = pin.centerOfMass(humanoid.model, humanoid.model.createData(), q)
-    p, rate = humanoid.capture_point(q, v), np.sqrt(9.81 / com[2])
+    data = humanoid.model.createData()
+    com = np.array(pin.centerOfMass(humanoid.model, humanoid.model.createData(), q))
+    p, rate = humanoid.capture_point(data, q, v), np.sqrt(9.81 / com[2])
     np.testing.assert_allclose(p, com[:2], atol=1e-12)
     v[:2] = 0.3, -0.2  # of the base, whose axes are the world's here
-    np.testing.assert_allclose((com[:2] - humanoid.capture_point(q, v)) * -rate, v[:2], atol=1e-9)
+    np.testing.assert_allclose((com[:2] - humanoid.capture_point(data, q, v)) * -rate, v[:2], atol=1e-9)
 
 
 def test_with_striker_adds_a_frame_to_a_copy(talos_robot: Robot) -> None:

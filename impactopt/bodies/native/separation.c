@@ -215,10 +215,8 @@ static void chain(int64_t n, const double *z, const double *p, double *R, double
 /* Direction way (3) to begin the search at: u, turned by what the last derivatives foresee for z. */
 static void predicted(int64_t size, const double *z, const double *rate, const double *u, double *way) {
     double turn[3] = {0, 0, 0};
-    if (rate[0] > 0.5) for (int64_t k = 0; k < size; ++k) {
-        const double d = z[k] - rate[3 + k];
-        for (int i = 0; i < 3; ++i) turn[i] += rate[3 + size + 3 * k + i] * d;
-    }
+    for (int64_t k = 0; k < size; ++k)
+        for (int i = 0; i < 3; ++i) turn[i] += rate[size + 3 * k + i] * (z[k] - rate[k]);
     const double length = sqrt(dot(turn, turn)), part = length > 0.3 ? 0.3 / length : 1.0;
     for (int i = 0; i < 3; ++i) way[i] = u[i] + part * turn[i];
     const double norm = 1.0 / sqrt(dot(way, way));
@@ -230,7 +228,7 @@ static void predicted(int64_t size, const double *z, const double *rate, const d
  * hulls (count, 4): first vertex and number of vertices of both bodies; first vertices are multiples of EIGHT.
  * points: vertices in blocks.  u (count, 3): initial directions, updated if derivatives are requested.
  * known (count, SIDE), seen (count, n + 3): last results, and the z that they belong to.
- * turn (count, 3 + 4 (n + 3)): 1 after Hessians, two numbers that are not used, their z, derivatives of u by it (n + 3, 3).
+ * turn (count, 4 (n + 3)): z at the last Hessians, and the derivatives of u by it (n + 3, 3); zeros before.
  * far: work memory for the largest hull.
  * what: 0 values (count,); 1 gradients (count, n + 3); 2 lam times Hessians, lower triangles by columns. */
 EXPORT void separation(int64_t count, int64_t n, const double *z, const double *p, const int64_t *hulls,
@@ -247,7 +245,7 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
         for (int64_t i = 0; i < size; ++i) same &= last[i] == z[row * size + i];
         if (!same || what) chain(n, z + row * size, mine, R, t, axis, origin);
         if (!same) {
-            predicted(size, z + row * size, turn + row * (3 + 4 * size), u + 3 * row, way);
+            predicted(size, z + row * size, turn + 4 * row * size, u + 3 * row, way);
             separate(R, t, h[1], points + 3 * h[0], h[3], points + 3 * h[2], way, sharp, DERIVATIVES, far, &at);
             for (int i = 0; i < 3; ++i) at.u[i] = way[i];
             *kept = at;
@@ -288,11 +286,10 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
             spread[2 * k + 1] = inv[1] * mixed[2 * k] + inv[2] * mixed[2 * k + 1];
         }
         /* for `predicted`: z, and how u turns with it */
-        double *rate = turn + row * (3 + 4 * size);
-        rate[0] = 1.0;
+        double *rate = turn + 4 * row * size;
         for (int64_t k = 0; k < size; ++k) {
-            rate[3 + k] = z[row * size + k];
-            for (int i = 0; i < 3; ++i) rate[3 + size + 3 * k + i] = at.basis[i] * spread[2 * k] + at.basis[3 + i] * spread[2 * k + 1];
+            rate[k] = z[row * size + k];
+            for (int i = 0; i < 3; ++i) rate[size + 3 * k + i] = at.basis[i] * spread[2 * k] + at.basis[3 + i] * spread[2 * k + 1];
         }
         if (by == 0.0) { for (int64_t i = 0; i < size * (size + 1) / 2; ++i) H[i] = 0.0; continue; }
         for (int64_t i = 0; i < size; ++i) for (int64_t k = i; k < size; ++k) {

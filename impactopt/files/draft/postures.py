@@ -14,6 +14,7 @@ from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
 from impactopt.robots.build import neutral
 from impactopt.robots.checks import LEG
+from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot, Sole
 
 Array = NDArray[np.float64]
@@ -92,8 +93,7 @@ def _carried(robot: Robot, chains: Sequence[Sequence[int]], q: Array, axes: Arra
     """
     model, data = robot.model, robot.model.createData()
     pin.computeJointJacobians(model, data, q)
-    weight = sum(float(body.mass) for body in model.inertias) * float(np.linalg.norm(model.gravity.linear))
-    low, high = -np.inf, np.inf
+    weight, low, high = weight_of(robot), -np.inf, np.inf
     for own in chains:
         for joint in reversed(own):
             jac = np.array(pin.getJointJacobian(model, data, joint, pin.LOCAL_WORLD_ALIGNED))

@@ -35,10 +35,12 @@ def draw_force(place: FigureBase | Axes, record: Record) -> None:
     if record.simulated and np.isfinite(a["simulated_contact_start"]):
         time, value = contact_force(record, "simulated")
         time = 1e3 * (time - a["simulated_contact_start"])
-        keep = (time >= 0) & (time < 1.08 * end)
+        last = 1.08 * end
+        keep = (time >= 0) & (time < last)
         label = f"simulated: {impulse_text(summary.get('simulated', {}))}"
-        shown = np.concatenate([[-0.05 * end, 0.0], time[keep]])
-        value = np.concatenate([[0.0, 0.0], value[keep]])
+        # before contact there is no force, however coarsely an older record has it
+        shown = np.concatenate([[-0.05 * end, 0.0], time[keep], [last]])
+        value = np.concatenate([[0.0, 0.0], value[keep], [np.interp(last, time, value)]])
         axes.plot(shown, value, color=SIMULATED, label=label)
     axes.set(xlabel="time since contact [ms]", ylabel="force on the target [N]")
     axes.set_ylim(bottom=0.0)

@@ -113,7 +113,8 @@ def _clear_fraction(robot: Robot, reference: Any, scene: Scene, shift: Array) ->
     instants = np.searchsorted(time, sampled).clip(0, len(time) - 1)
     q = postures[instants]
     v, model = np.asarray(reference.v)[instants], robot.model
-    capture = [robot.capture_point(*state) for state in zip(q, v, strict=True)]
+    data = model.createData()
+    capture = [robot.capture_point(data, *state) for state in zip(q, v, strict=True)]
     if distance_inside(scene.polygon, np.array(capture)).min() < MIN_CAPTURE_MARGIN:
         return 1.0
     links = scene.solids.links_between(model, shift)

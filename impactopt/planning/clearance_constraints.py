@@ -162,7 +162,7 @@ class Watch:
         self._t, self._margins, self._shapes = t, margins, margins.bodies.shapes
         placements = node_placements(t, x)
         self._names, self._travel, self._phase = placements.names, placements.at.travel, placements.at.phase
-        parts_of = {node.name: parts for node, parts in t.body_spots()}
+        parts_of = {node.name: parts for node, parts in t.body_spots}
         lift = stack([part for name in self._names for part in parts_of[name]])
         # coordinates and legs of all nodes are self._lift @ x + self._const
         self._lift, self._const = lift.matrix(t.layout.n), lift.const

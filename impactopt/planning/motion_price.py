@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
-from impactopt.planning.refinement import Additions, Guess, Outcome, program_for
+from impactopt.planning.refinement import Additions, Guess, Outcome
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription
@@ -35,12 +34,12 @@ def with_first_scale(t: Transcription) -> Transcription:
     scale = float(np.clip(objective / _REFERENCE_OBJECTIVE, _MIN_SCALE, 1.0))
     if not np.isfinite(objective) or scale == 1.0:
         return t
-    return program_for(t, replace(p, price_scale=scale))
+    return t.repriced(scale)
 
 
 def unpriced(t: Transcription) -> Transcription:
     """Program without prices of the motion style."""
-    return program_for(t, replace(t.problem, price_scale=0.0))
+    return t.repriced(0.0)
 
 
 class MotionPrice:
@@ -65,7 +64,7 @@ class MotionPrice:
         scale = t.problem.price_scale * left / style if style > 0 else 0.0
 
         def guesses() -> Iterator[Guess[Transcription]]:
-            yield Guess.mapped(program_for(t, replace(t.problem, price_scale=scale)), t, outcome.result)
+            yield Guess.mapped(t.repriced(scale), t, outcome.result)
 
         why = f"the motion's style takes {100 * share:.1f} % of the objective: its prices are reduced"
         return Additions(name="lower prices of motion", why=why, guesses=guesses(), without="")

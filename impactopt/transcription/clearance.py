@@ -277,7 +277,7 @@ def add_clearance_constraints(
     # All nodes' (y, legs) as one sparse matrix, of which a product with a selection takes the z of all
     # constraints at once.
     everywhere = stack([part for _, slots in spots for part in slots])
-    coordinates, constants = everywhere.matrix(b.layout.n), everywhere.const
+    coordinates, constants, radius = everywhere.matrix(b.layout.n), everywhere.const, shapes.radius.tolist()
     known: dict[tuple[int, int], _BodyPair] = {}
     groups: dict[int, _Group] = {}  # by number of joints: a block has one
     for key, direction in constraints.items():
@@ -300,9 +300,8 @@ def add_clearance_constraints(
         group.patterns.append(pattern)
         group.spots.append(spot_of[key.place])
         # capsules and spheres are their axes and centres, at a distance that is larger by their radius
-        group.parameters.append(
-            np.append(chain.parameters(before), direction.least_distance + shapes.radius[n])
-        )
+        group.parameters.append(chain.parameters(before))
+        group.distances.append(direction.least_distance + radius[n])
         term = (SelfCollision if key.other >= 0 else KeepOut).name
         # each pair of pieces of two bodies has a name of its own, by which multipliers are mapped
         piece = f"{name} {key.number + 1}" if key.number else name
@@ -322,7 +321,7 @@ def add_clearance_constraints(
             shapes,
             length,
             np.array(group.pairs),
-            np.array(group.parameters),
+            np.column_stack([np.array(group.parameters), group.distances]),
             np.array(group.directions, dtype=float),
         )
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
@@ -395,3 +394,4 @@ class _Group:
     patterns: list[tuple[Index, Index, Array]] = field(default_factory=list)
     spots: list[int] = field(default_factory=list)
     parameters: list[Array] = field(default_factory=list)
+    distances: list[float] = field(default_factory=list)

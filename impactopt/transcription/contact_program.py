@@ -235,7 +235,7 @@ class ContactProgram(ABC):
         objective, quadratic, linear = self._objective
         # one structure for all sets of clearance constraints, which solvers can reuse
         if self.clearance_constraints:
-            quadratic = coupled(quadratic, self.body_spots())
+            quadratic = coupled(quadratic, self.body_spots)
         return StructuredProgram(
             self.layout,
             self.blocks,
@@ -254,10 +254,11 @@ class ContactProgram(ABC):
         # the copy has the cached program of the old constraints
         other.__dict__.pop("program", None)
         other.builder = self._without_clearance.copy()
-        order = add_clearance_constraints(other.builder, self.body_spots(), constraints)
+        order = add_clearance_constraints(other.builder, self.body_spots, constraints)
         other.clearance_constraints = {key: constraints[key] for key in order}
         return other
 
+    @cached_property
     def body_spots(self) -> list[tuple[Place, list[Affine]]]:
         """Nodes with coordinates and legs, at which clearance and tendons' ranges are constrained."""
         return [*self.swing_spots(), *self.follow_spots()]

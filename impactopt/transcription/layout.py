@@ -140,10 +140,13 @@ class Affine:
 
 def select(expression: Affine, keep: NDArray[np.intp]) -> Affine:
     """Expressions with numbers ``keep``, in this order; a number may be repeated."""
-    # O(len(keep) x triplets), which suffices for expressions of single nodes
-    found = [np.flatnonzero(expression.rows == k) for k in keep]
-    triplets = np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
-    rows = np.repeat(np.arange(len(keep)), [len(each) for each in found])
+    order = np.argsort(expression.rows, kind="stable")
+    of_row = expression.rows[order]
+    first = np.searchsorted(of_row, keep)
+    counts = np.searchsorted(of_row, keep, side="right") - first
+    rows = np.repeat(np.arange(len(keep)), counts)
+    # each chosen row's triplets are consecutive in `order`, from `first` on
+    triplets = order[np.arange(len(rows)) + np.repeat(first - np.cumsum(counts) + counts, counts)]
     cols, vals = expression.cols[triplets], expression.vals[triplets]
     return Affine(len(keep), rows, cols, vals, expression.const[keep])
 

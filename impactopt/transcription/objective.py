@@ -109,18 +109,17 @@ def motion_prices(
     p = b.problem
     prices = MotionPrices(acceleration=p.smoothness, end=p.return_price)
     of_wrenches = wrench_prices(b, [(group, group.count) for group in wrenches])
-    return _priced(b, prices, motions, to_rest) + Prices(sp.diags_array(of_wrenches), np.zeros(b.layout.n))
+    return cost_of_motion(b, prices, motions, to_rest) + Prices(
+        sp.diags_array(of_wrenches), np.zeros(b.layout.n)
+    )
 
 
-def style_prices(b: Builder, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase]) -> Prices:
-    """Prices of the problem's motion style."""
-    return _priced(b, b.problem.style_prices, motions, to_rest)
-
-
-def _priced(
+def cost_of_motion(
     b: Builder, prices: MotionPrices, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase]
 ) -> Prices:
     """Cost of prices of integrals over motions, and of the end posture.
+
+    to_rest : those of the motions that end at rest.
 
     Integrals become sums over the nodes, |M x + constants|^2 / 2. With the duration as a variable they would
     not be quadratic, so each phase's mean permitted duration T stands for it.

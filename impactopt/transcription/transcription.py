@@ -8,9 +8,11 @@ durations as variables.
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
+from functools import cached_property, partial
 from itertools import groupby
 from typing import Any, cast
 
@@ -46,7 +48,7 @@ from impactopt.transcription.layout import (
 )
 from impactopt.transcription.mesh import NO_MORE, Elements, MoreNodes, Shares
 from impactopt.transcription.motion_phase import AbortMotion, FollowThrough, Swing, add_nodes
-from impactopt.transcription.objective import Prices, motion_prices, style_prices
+from impactopt.transcription.objective import Prices, assemble, cost_of_motion, motion_prices
 from impactopt.transcription.plan import Piece, Plan
 from impactopt.transcription.simd import in_lanes
 from impactopt.transcription.springs import (
@@ -359,16 +361,16 @@ class Transcription(ContactProgram):
     def _prices(self) -> Prices:
         coasting = [] if self.abort is None else [self.abort.coast_w]
         wrenches = [part.w for part in (self.swing, *self.follows, *self.hit.collisions)]
-        motions, b = [self.swing, *self.follows], self.builder
+        motions, b, style = [self.swing, *self.follows], self.builder, self.problem.style_prices
         # the price of coming to rest is on the last stance phase: the follow-through, if none comes after it
         to_rest = self.follows if len(self.after[0].numbers) == 1 else []
-        self._style = style_prices(b, motions, to_rest)
+        self._style = cost_of_motion(b, style, motions, to_rest)
         prices = motion_prices(b, motions, to_rest, [*wrenches, *coasting])
         for sequence in (self.before, *self.after):
             for k, phase in sequence.stands.items():
                 last = [phase] if k == len(self.problem.stances) - 1 else []
                 prices = prices + motion_prices(sequence.builders[k], [phase], last, [phase.w])
-                self._style = self._style + style_prices(sequence.builders[k], [phase], last)
+                self._style = self._style + cost_of_motion(sequence.builders[k], style, [phase], last)
         return prices + self._style
 
     def _determined(self) -> list[Determined]:
@@ -383,6 +385,13 @@ class Transcription(ContactProgram):
     def objective_sum(self, x: Array) -> float:
         """Weighted sum of the objectives [N s] at solver variables x (n,), without prices."""
         return sum((-o.weight if o.cost else o.weight) * q.evaluate(x) for o, q in self.objectives)
+
+    def repriced(self, scale: float) -> Transcription:
+        """The same program with another `ImpactProblem.price_scale`."""
+        other = copy.copy(self)
+        other.problem = replace(self.problem, price_scale=scale)
+        other._objective = assemble(other.layout, other.objectives, other._prices())
+        return other.with_clearance(self.clearance_constraints)
 
     def price_shares(self, x: Array) -> tuple[float, float]:
         """Prices of the motion over the objectives' sum, at solver variables x (n,): all, and style only."""
@@ -426,9 +435,10 @@ class Transcription(ContactProgram):
             for s, (place, slots) in zip(stand.nodes, found, strict=False)
         ]
 
+    @cached_property
     def body_spots(self) -> list[tuple[Place, list[Affine]]]:
         stands = [spot for sequence in (self.before, *self.after) for spot in sequence.spots()]
-        return [*super().body_spots(), *stands]
+        return [*self.swing_spots(), *self.follow_spots(), *stands]
 
     def travel(self, x: Array, time: Array) -> Array:
         return self.decode(x).travel(time)

@@ -113,7 +113,7 @@ def test_a_plan_keeps_a_tendon_in_its_range(arm_plan: Planned) -> None:
     plan = planned(transcribed(problem), {})
     assert plan.result.status.usable
     t = plan.transcription
-    nodes = np.array([t.posture(plan.result.x, slots) for _, slots in t.body_spots()])
+    nodes = np.array([t.posture(plan.result.x, slots) for _, slots in t.body_spots])
     nodes = problem.robot.joint_positions(nodes)[:, :2].sum(axis=1)
     assert nodes.max() == pytest.approx(upper - margin, abs=1e-6)  # the bound is active, and kept
     assert sums(plan).max() < upper

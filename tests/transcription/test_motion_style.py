@@ -17,7 +17,7 @@ from impactopt.problem.motion_style import STYLES, MotionPrices
 from impactopt.problem.terms import GroundForce
 from impactopt.robots.presets import talos
 from impactopt.transcription.motion_measures import ground_force_share, motion_measures
-from impactopt.transcription.objective import style_prices
+from impactopt.transcription.objective import cost_of_motion
 from impactopt.transcription.transcription import Transcription
 
 
@@ -47,7 +47,7 @@ def test_the_price_of_jerk_is_the_integral_of_its_square(
     x = arm_plan.result.x.copy()
     for motion in (t.swing, *t.follows):  # prices take a phase's typical duration
         motion.T.write(x, float(np.mean(motion.phase.duration)))
-    found = style_prices(t.builder, [t.swing, *t.follows], t.follows).evaluate(x)
+    found = cost_of_motion(t.builder, t.problem.style_prices, [t.swing, *t.follows], t.follows).evaluate(x)
     expected = 2.0 * sum(integrals(motion.spline(x), 3).sum() for motion in (t.swing, *t.follows))
     assert found == pytest.approx(expected, rel=1e-3)
 
@@ -60,7 +60,7 @@ def test_the_price_of_speed_is_nearly_that_of_its_square(
     x = arm_plan.result.x.copy()
     for motion in (t.swing, *t.follows):
         motion.T.write(x, float(np.mean(motion.phase.duration)))
-    found = style_prices(t.builder, [t.swing, *t.follows], t.follows).evaluate(x)
+    found = cost_of_motion(t.builder, t.problem.style_prices, [t.swing, *t.follows], t.follows).evaluate(x)
     expected = 3.0 * sum(integrals(motion.spline(x), 1).sum() for motion in (t.swing, *t.follows))
     assert found == pytest.approx(expected, rel=0.05)
 
@@ -68,7 +68,7 @@ def test_the_price_of_speed_is_nearly_that_of_its_square(
 def priced(t: Transcription, monkeypatch: pytest.MonkeyPatch, **prices: float) -> Transcription:
     """The program, whose problem has a style with these prices alone."""
     monkeypatch.setitem(STYLES, "of this test", MotionPrices(**prices))
-    monkeypatch.setattr(t.builder, "problem", replace(t.problem, style="of this test"))
+    monkeypatch.setattr(t, "problem", replace(t.problem, style="of this test"))
     return t
 
 

@@ -34,7 +34,7 @@ class PositionLimit(Term):
             return
         # tendon lengths are of_y @ y + (matrix of the legs) @ legs
         of_y = np.pad(own.matrix[:, c.independent], ((0, 0), (c.base, 0)))
-        for place, (y, legs) in program.body_spots():
+        for place, (y, legs) in program.body_spots:
             program.constraints.add(
                 term=self.name,
                 place=place,

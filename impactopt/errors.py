@@ -150,8 +150,8 @@ def check_array(
     import numpy as np
 
     try:
-        # NumPy would convert text to numbers, and drop the imaginary part of complex ones
-        if np.asarray(value).dtype.kind in "USc":
+        # NumPy would convert text and truth values to numbers, and drop the imaginary part of complex ones
+        if np.asarray(value).dtype.kind in "bUSc":
             raise TypeError
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:

@@ -16,6 +16,7 @@ from impactopt.errors import (
     FARTHEST,
     InputError,
     check_array,
+    check_kind,
     check_name,
     check_number,
     raw_array,
@@ -184,7 +185,10 @@ class Scenario(Described):
             value = getattr(self, f.name)
             if value is None and f.default is None:
                 continue
-            description.checked(f"{where}: {f.name}", value)
+            if isinstance(f.default, bool):
+                check_kind(f"{where}: {f.name}", value, bool)
+            else:
+                description.checked(f"{where}: {f.name}", value)
         changed = [f.name for f in fields(self)[1:] if getattr(self, f.name) != f.default]
         unused = [name for name in changed if name not in ("missing", "abort_after", "capture_margin")]
         if self.missing and unused:

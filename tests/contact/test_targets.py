@@ -529,6 +529,7 @@ def test_derivatives_of_the_impulse_by_all_numbers_against_central_differences(l
         ("board", {"breaking_force": np.inf}, r"Board: breaking_force \[N\]"),
         ("board", {"damping": -0.1}, r"Board: damping \[N s/m\]"),
         ("board", {"damping": "some"}, r"Board: damping \[N s/m\]: expected numbers"),
+        ("board", {"damping": True}, r"Board: damping \[N s/m\]: expected numbers, got True"),
     ],
 )
 def test_targets_refuse_numbers_out_of_range(name, changes, message):

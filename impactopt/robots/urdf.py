@@ -64,6 +64,7 @@ def read_urdf(
     out = Description(kind="URDF", model=model)
     out.ties += [*_mimics(root, model), *_of_gazebo(root, model), *_hollow(root, model)]
     out.springs |= _springs(root, model)
+    out.unranged += _unranged(root)
     out.notes += [*_weightless(root), *_rotors(root)]
     out.lead_from_root()
     return out
@@ -118,6 +119,15 @@ def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
                 free=0,
                 fix="give its <inertial> a mass > 0",
             )
+
+
+def _unranged(root: Any) -> Iterator[str]:
+    """Revolute joints with neither `lower` nor `upper`, whose default is 0, except followers."""
+    for joint in _children(root, "joint"):
+        limits = _children(joint, "limit")
+        given = any(limit.hasAttribute(key) for limit in limits for key in ("lower", "upper"))
+        if joint.getAttribute("type") == "revolute" and not given and not _children(joint, "mimic"):
+            yield joint.getAttribute("name")
 
 
 def _springs(root: Any, model: pin.Model) -> dict[str, tuple[float, float]]:

@@ -548,6 +548,28 @@ def test_what_the_file_lacks_is_guessed_and_said_to_be(tmp_path: Path) -> None:
     assert sum("guessed" in line for line in draft.said) == 4  # and the gains
 
 
+def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
+    """Exporters write 1e9 where a model has no limit: as a torque, it would have a rotor of 1e6 kg m2."""
+    drafted = _robot(tmp_path, urdfs.arm(effort=1e9, velocity=1e9))
+    plain = _robot(tmp_path, urdfs.arm(effort=0.0, velocity=0.0))
+    for key in ("armature", "torque_limit", "velocity_limit"):
+        np.testing.assert_array_equal(getattr(drafted.robot, key), getattr(plain.robot, key))
+
+
+def test_joints_whose_range_is_left_out_get_one(tmp_path: Path) -> None:
+    """A range that is given as 0 to 0 is that of a fixed joint; onshape-to-robot leaves unknown ones out."""
+    arm = urdfs.arm()
+    text, count = re.subn(r'<limit lower="-\S+" upper="\S+" ', "<limit ", arm)
+    assert count == 4
+    draft = _drafted(tmp_path, text)
+    problem = _problem(tmp_path, text)
+    assert "guessed, as the URDF has none: position limits of 4 joints" in draft.said
+    assert problem.robot.n == 4 and (problem.robot.upper > 3.1).all() and (problem.robot.lower < -3.1).all()
+    # the wrist is given 0 to 0
+    fixed = _robot(tmp_path, arm.replace('lower="-2.0" upper="2.0"', 'lower="0" upper="0"'))
+    assert fixed.locked["wrist"] == "no range"
+
+
 def test_numbers_that_the_file_has_are_not_guessed(tmp_path: Path) -> None:
     keys = read_toml(_drafted(tmp_path, urdfs.arm()).text)["robot"]
     assert "torque_limit_N_m" not in keys and "velocity_limit_rad_s" not in keys

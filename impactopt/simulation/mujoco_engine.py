@@ -45,8 +45,8 @@ from impactopt.simulation.target_dynamics import Push, TargetContact
 Array = NDArray[np.float64]
 AXES, NEXT_AXES, PREVIOUS_AXES = np.arange(3), [1, 2, 0], [2, 0, 1]
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where the body of a broken target goes
-# A robot has fallen beyond these errors of its base: tilt [rad], loss of height over the height of the centre of
-# mass at the start, as the base's own origin may lie on the ground
+# A robot has fallen beyond these errors of its base: tilt [rad], and loss of height, over the height of the
+# centre of mass at the start, as the base's own origin may lie on the ground
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3
 # A robot does not stand at the end beyond these: tilt [rad] and speed [m/s] of the base
 STANDING_TILT, STANDING_SPEED = 0.2, 0.05

@@ -50,7 +50,10 @@ def read_urdf(
             "robot.urdf"
         )
     try:
-        model = pin.buildModelFromUrdf(urdf, *joints)
+        if _without_negative_limits(root):
+            model = pin.buildModelFromXML(root.toxml(), *joints)
+        else:
+            model = pin.buildModelFromUrdf(urdf, *joints)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
     _check_links(root, urdf, moments=not repaired)
@@ -77,6 +80,23 @@ def _parsed(urdf: str) -> Any:
         return expatbuilder.parse(urdf, namespaces=False).documentElement
     except ExpatError as error:
         raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
+
+
+def _without_negative_limits(root: Any) -> bool:
+    """Set negative limits of torque and speed, which stand for none as in SDF, to 0; True if there are any.
+
+    Pinocchio refuses them.
+    """
+    negative = [
+        (limit, key)
+        for joint in _children(root, "joint")
+        for limit in _children(joint, "limit")
+        for key in ("effort", "velocity")
+        if _urdf_number(limit.getAttribute(key)) < 0
+    ]
+    for limit, key in negative:
+        limit.setAttribute(key, "0")
+    return bool(negative)
 
 
 def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:

@@ -618,6 +618,13 @@ def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: floa
     draft = _drafted(tmp_path, text.replace("</robot>", f"{lift}{rail}</robot>"))
     assert ("rise cannot lift what it carries" in "".join(draft.said)) == locked
     assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
+def test_negative_limits_stand_for_none(tmp_path: Path) -> None:
+    """As in SDF; Pinocchio refuses them."""
+    robots = [_robot(tmp_path, urdfs.arm(effort=limit, velocity=limit)).robot for limit in (-1.0, 0.0)]
+    for key in ("armature", "torque_limit", "velocity_limit"):
+        np.testing.assert_array_equal(*(getattr(robot, key) for robot in robots))
+
+
 
 
 def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:

@@ -332,6 +332,23 @@ def _strike(problem: ImpactProblem) -> float:
 
 def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
     """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
+@pytest.mark.parametrize("ball", [0.04, 0.2])
+def test_of_a_forearm_with_a_ball_for_a_collision_shape_the_drawn_end_strikes(
+    tmp_path: Path, ball: float
+) -> None:
+    """Files for reinforcement learning have a small ball there; a large one is the robot's own."""
+    box = '<geometry><box size="0.08 0.08 0.3"/></geometry>'
+    shapes = f'<collision><geometry><sphere radius="{ball}"/></geometry></collision>'
+    seen = f'<visual><origin xyz="0 0 0.15"/>{box}</visual>'
+    head, forearm, tail = urdfs.arm().partition('<link name="elbow_link">')
+    forearm = re.sub(r"<collision>.*?</collision>", shapes + seen, forearm + tail, count=1)
+    text = re.sub(r'<link name="(wrist_link|claw_\d)">.*?</link>', "", head + forearm)
+    text = re.sub(r'<joint name="(wrist|slide_\d)".*?</joint>', "", text)
+    (striker,) = read_toml(_drafted(tmp_path, text).text)["robot"]["strikers"]
+    assert striker["frame"] == "elbow_link"
+    assert striker["point_m"] == pytest.approx([0.0, 0.0, 0.3 if ball < 0.1 else ball], abs=1e-3)
+
+
     problem = _problem(tmp_path, urdfs.arm())
     drafted, model = _strike(problem), problem.robot.model
     rng, data, elsewhere = np.random.default_rng(1), model.createData(), []

@@ -389,6 +389,28 @@ def _two_arms() -> str:
     return urdfs.robot("two arms", *parts)
 
 
+def test_a_telescope_that_reaches_to_a_side_strikes_there(tmp_path: Path) -> None:
+    """Its slides are shorter than a usual run-up, and nothing is within reach ahead of its base."""
+    slide = {"kind": "prismatic", "effort": 100.0, "velocity": 1.0}
+    parts = [
+        urdfs.link("mast", 15.0, (0.2, 0.2, 1.0), (0.0, 0.0, 0.5)),
+        urdfs.link("lift", 2.0, (0.08, 0.08, 0.08), (-0.1, -0.16, 0.0)),
+        urdfs.joint("rise", "mast", "lift", "0 0 1", (0.0, 0.0, 0.2), (0.0, 0.7), **slide),
+    ]
+    parent = "lift"
+    for k in range(3):
+        parts += [urdfs.link(f"tube_{k}", 0.3, (0.05, 0.02, 0.05), (-0.1, -0.22 - 0.03 * k, 0.0))]
+        parts += [urdfs.joint(f"slide_{k}", parent, f"tube_{k}", "0 -1 0", (0, 0, 0), (0.0, 0.13), **slide)]
+        parent = f"tube_{k}"
+    parts += [urdfs.link("hand", 0.3, (0.05, 0.1, 0.05), (0.0, -0.05, 0.0))]
+    parts += [urdfs.joint("wrist", parent, "hand", "0 0 1", (-0.1, -0.32, 0.0), (-1.0, 1.0), effort=5.0)]
+    draft = _drafted(tmp_path, urdfs.robot("stretcher", *parts))
+    assert any("the drafted strike, along [0, -1, 0]" in line for line in draft.said), draft.said
+    (tmp_path / "robot.toml").write_text(draft.text)
+    problem = load_problem(tmp_path / "robot.toml")
+    assert hopeless(problem) == [] and problem.point[1] < -0.3
+
+
 def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path) -> None:
     draft = _drafted(tmp_path, _two_arms(), planned=True)
     assert any("that have a whole motion" in line for line in draft.said)

@@ -66,7 +66,10 @@ def strongest(
     strength = Strength(robot=robot, striker=arm.name, law=hit.law, target=hit.target)
     found, unsolved = list[Strong](), list[SolverResult]()
     impacts = drawn_impacts(strength, q, hit.normals, with_face=with_face)
-    for problem, impact in _candidates(robot, arm, impacts, given):
+    candidates = list(_candidates(robot, arm, impacts, given)) or _candidates(
+        robot, arm, impacts, given, clipped=True
+    )
+    for problem, impact in candidates:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
             solved = optimize_strike(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
@@ -102,9 +105,17 @@ def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float
 
 
 def _candidates(
-    robot: Robot, arm: Arm, impacts: list[EstimatedImpact], given: Mapping[str, Any]
+    robot: Robot,
+    arm: Arm,
+    impacts: list[EstimatedImpact],
+    given: Mapping[str, Any],
+    *,
+    clipped: bool = False,
 ) -> Iterator[tuple[ImpactProblem, EstimatedImpact]]:
-    """Feasible problems of the best estimated impacts, with different hit points or normals."""
+    """Feasible problems of the best estimated impacts, with different hit points or normals.
+
+    clipped : joints with less range than their run-up begin at its end, as those of telescopes.
+    """
     impacts = [impact for impact in impacts if impact.point[2] > LOWEST / 2]
     reach = max((float(np.linalg.norm(impact.point)) for impact in impacts), default=0.0)
     taken: list[EstimatedImpact] = []
@@ -112,7 +123,7 @@ def _candidates(
         near = [b for b in taken if b.normal @ impact.normal > 0.9]
         if any(np.linalg.norm(b.point - impact.point) < MIN_DISTANCE * reach for b in near):
             continue
-        problem = _problem(robot, arm, impact, min(BEHIND[0], BEHIND[1] * reach), given)
+        problem = _problem(robot, arm, impact, min(BEHIND[0], BEHIND[1] * reach), given, clipped)
         if problem is None:
             continue
         taken.append(impact)
@@ -122,7 +133,7 @@ def _candidates(
 
 
 def _problem(
-    robot: Robot, arm: Arm, impact: EstimatedImpact, behind: float, given: Mapping[str, Any]
+    robot: Robot, arm: Arm, impact: EstimatedImpact, behind: float, given: Mapping[str, Any], clipped: bool
 ) -> ImpactProblem | None:
     """Problem of an estimated impact, with a start posture at least `behind` [m] behind the target's plane;
     None if no start posture is feasible.
@@ -135,7 +146,9 @@ def _problem(
         start = np.array(pin.integrate(robot.model, impact.q, -factor * way))
         angles = robot.joint_positions(start)
         edge = 0.02 * np.minimum(robot.upper - robot.lower, 1.0)
-        inside = np.all(angles > robot.lower + edge) and np.all(angles < robot.upper - edge)
+        within = np.clip(angles, robot.lower + edge, robot.upper - edge)
+        start = np.array(pin.integrate(robot.model, start, within - angles)) if clipped else start
+        inside = clipped or np.array_equal(angles, within)
         at = striking_point(robot, arm.name, start)
         if not inside or impact.normal @ (point - at) < behind or at[2] < LOWEST / 2:
             continue

@@ -262,6 +262,15 @@ def test_legs_of_five_and_seven_and_a_waist_stand(
     assert [leg.before.size for leg in problem.coordinates.legs] == [extra, extra]
 
 
+def test_a_leg_of_five_stands_whose_axes_have_rounded_decimals(tmp_path: Path) -> None:
+    """Five joints meet six constraints exactly only if all axes are."""
+    text = urdfs.biped(without="ankle_roll")
+    text, count = re.subn(r'(name="\w+_knee".*?<axis xyz=")0.0 1.0 0.0', r"\g<1>1e-6 1.0 1e-6", text)
+    assert count == 2
+    problem = _problem(tmp_path, text)
+    problem.robot.check_stance(problem.start_posture, tilt=2e-5)
+
+
 def test_toes_are_locked(tmp_path: Path) -> None:
     x, _ = urdfs.SOLE
     toes = [

@@ -289,19 +289,19 @@ def test_toes_are_locked(tmp_path: Path) -> None:
     assert set(_robot(tmp_path, text).locked) == {"left_toe", "right_toe"}
 
 
-def test_arms_that_hang_from_a_spine_are_no_legs(tmp_path: Path) -> None:
-    parts = [
-        urdfs.link("pelvis", 5.0, (0.2, 0.2, 0.1), (0.0, 0.0, 0.0)),
-        urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1)),
-        urdfs.joint("spine", "pelvis", "chest", "0 0 1", (0.0, 0.0, 0.05), (-1.0, 1.0)),
-    ]
+@pytest.mark.parametrize("spine", [True, False], ids=["spine", "torso"])
+def test_arms_that_hang_from_a_spine_or_end_in_wrists_are_no_legs(tmp_path: Path, spine: bool) -> None:
+    parts = [urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1))]
+    if spine:
+        parts.insert(0, urdfs.link("pelvis", 5.0, (0.2, 0.2, 0.1), (0.0, 0.0, 0.0)))
+        parts.append(urdfs.joint("spine", "pelvis", "chest", "0 0 1", (0.0, 0.0, 0.05), (-1.0, 1.0)))
     for side, y in (("left", 0.2), ("right", -0.2)):
         parent, chain = (
             "chest",
             (
                 ("shoulder_pitch", "0 1 0", (0.0, y, 0.2), 0.05),
                 ("shoulder_roll", "1 0 0", (0.0, 0.0, 0.0), 0.3),
-                ("elbow", "0 1 0", (0.0, 0.0, -0.3), 0.3),
+                ("elbow" if spine else "wrist", "0 1 0", (0.0, 0.0, -0.3), 0.3),
             ),
         )
         for name, axis, at, long in chain:

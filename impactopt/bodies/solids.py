@@ -157,6 +157,7 @@ def _sums(label: NDArray[np.intp], values: Array, n: int) -> Array:
     return np.stack([np.bincount(label, weights=column, minlength=n) for column in values.T], axis=1)
 
 
+NOT_FOUND = "not found"  # of a mesh
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 
 
@@ -202,7 +203,7 @@ def lack_of(name: str, urdf: Path) -> str:
         path = find_mesh(name, urdf)
         return _lack(path, path.stat().st_mtime_ns)
     except (OSError, ValueError):
-        return "is not found"
+        return NOT_FOUND
 
 
 @cache

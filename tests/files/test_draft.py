@@ -332,15 +332,6 @@ def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
     assert striker["frame"] == "wrist_link" and striker["point_m"] == [0.0, 0.0, 0.15]  # the claws' tips
 
 
-def _strike(problem: ImpactProblem) -> float:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        solved = optimize_strike(problem)
-    return solved.impulse if solved.status.usable else 0.0
-
-
-def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
-    """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
 @pytest.mark.parametrize("ball", [0.04, 0.2])
 def test_of_a_forearm_with_a_ball_for_a_collision_shape_the_drawn_end_strikes(
     tmp_path: Path, ball: float
@@ -358,6 +349,15 @@ def test_of_a_forearm_with_a_ball_for_a_collision_shape_the_drawn_end_strikes(
     assert striker["point_m"] == pytest.approx([0.0, 0.0, 0.3 if ball < 0.1 else ball], abs=1e-3)
 
 
+def _strike(problem: ImpactProblem) -> float:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        solved = optimize_strike(problem)
+    return solved.impulse if solved.status.usable else 0.0
+
+
+def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
+    """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
     problem = _problem(tmp_path, urdfs.arm())
     drafted, model = _strike(problem), problem.robot.model
     rng, data, elsewhere = np.random.default_rng(1), model.createData(), []
@@ -618,6 +618,13 @@ def test_joints_whose_range_is_left_out_get_one(tmp_path: Path) -> None:
     assert fixed.locked["wrist"] == "no range"
 
 
+def test_negative_limits_stand_for_none(tmp_path: Path) -> None:
+    """As in SDF; Pinocchio refuses them."""
+    robots = [_robot(tmp_path, urdfs.arm(effort=limit, velocity=limit)).robot for limit in (-1.0, 0.0)]
+    for key in ("armature", "torque_limit", "velocity_limit"):
+        np.testing.assert_array_equal(*(getattr(robot, key) for robot in robots))
+
+
 def test_numbers_that_the_file_has_are_not_guessed(tmp_path: Path) -> None:
     keys = read_toml(_drafted(tmp_path, urdfs.arm()).text)["robot"]
     assert "torque_limit_N_m" not in keys and "velocity_limit_rad_s" not in keys
@@ -666,13 +673,6 @@ def test_a_lift_that_cannot_carry_the_arm_is_locked(tmp_path: Path, effort: floa
     draft = _drafted(tmp_path, text.replace("</robot>", f"{lift}{rail}</robot>"))
     assert ("rise cannot lift what it carries" in "".join(draft.said)) == locked
     assert ("rise" in read_toml(draft.text)["robot"].get("locked_rad", {})) == locked
-def test_negative_limits_stand_for_none(tmp_path: Path) -> None:
-    """As in SDF; Pinocchio refuses them."""
-    robots = [_robot(tmp_path, urdfs.arm(effort=limit, velocity=limit)).robot for limit in (-1.0, 0.0)]
-    for key in ("armature", "torque_limit", "velocity_limit"):
-        np.testing.assert_array_equal(*(getattr(robot, key) for robot in robots))
-
-
 
 
 def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
@@ -788,7 +788,7 @@ def test_followers_of_their_own_leg_follow(tmp_path: Path) -> None:
     assert all(len(leg.joints) == 6 and not len(leg.before) for leg in problem.coordinates.legs)
 
 
-def test_check_tells_meshes_that_are_no_bodies(tmp_path: Path) -> None:
+def test_meshes_that_are_no_bodies_are_told(tmp_path: Path) -> None:
     lost = (
         ('"0.08 0.08 0.3"/>', '<mesh filename="cut.stl"/>'),
         ('"0.08 0.08 0.1"/>', '<mesh filename="gone.stl"/>'),
@@ -797,10 +797,12 @@ def test_check_tells_meshes_that_are_no_bodies(tmp_path: Path) -> None:
     for size, mesh in lost:
         text = text.replace(f"<box size={size}", mesh)
     (tmp_path / "cut.stl").write_bytes(b"version https://git-lfs.github.com/spec/v1")
-    (tmp_path / "robot.toml").write_text(_drafted(tmp_path, text).text)
-    told = " ".join(CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")]).output.split())
-    assert "2 are lost, and boxes of inertia stand for links without any: cut.stl cannot be read" in told
-    assert "git lfs pull" in told and "gone.stl is not found" in told
+    draft = _drafted(tmp_path, text)
+    (tmp_path / "robot.toml").write_text(draft.text)
+    checked = CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")]).output
+    for told in (" ".join(checked.split()), " ".join(draft.said)):
+        assert "2 meshes are lost, and boxes of inertia stand for links without any: cut.stl: cannot" in told
+        assert "git lfs pull" in told and "gone.stl: not found; put them into a folder above" in told
 
 
 def test_crossed_limits_are_a_mistake(tmp_path: Path) -> None:

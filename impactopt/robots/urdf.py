@@ -142,12 +142,14 @@ def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
 
 
 def _unranged(root: Any) -> Iterator[str]:
-    """Revolute joints with neither `lower` nor `upper`, whose default is 0, except followers."""
-    for joint in _children(root, "joint"):
-        limits = _children(joint, "limit")
-        given = any(limit.hasAttribute(key) for limit in limits for key in ("lower", "upper"))
-        if joint.getAttribute("type") == "revolute" and not given and not _children(joint, "mimic"):
-            yield joint.getAttribute("name")
+    """Revolute joints of a file that has neither `lower` nor `upper`, whose default is 0, except followers.
+
+    In a file that has some, those without are passive joints of loops, and fixed.
+    """
+    joints = [joint for joint in _children(root, "joint") if joint.getAttribute("type") == "revolute"]
+    limits = [limit for joint in joints for limit in _children(joint, "limit")]
+    if not any(limit.hasAttribute(key) for limit in limits for key in ("lower", "upper")):
+        yield from (joint.getAttribute("name") for joint in joints if not _children(joint, "mimic"))
 
 
 def _springs(root: Any, model: pin.Model) -> dict[str, tuple[float, float]]:

@@ -604,8 +604,8 @@ def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(drafted.robot, key), getattr(plain.robot, key))
 
 
-def test_joints_whose_range_is_left_out_get_one(tmp_path: Path) -> None:
-    """A range that is given as 0 to 0 is that of a fixed joint; onshape-to-robot leaves unknown ones out."""
+def test_joints_of_a_file_without_ranges_get_some(tmp_path: Path) -> None:
+    """As of onshape-to-robot's; beside joints with a range, one without is that of a loop, and fixed."""
     arm = urdfs.arm()
     text, count = re.subn(r'<limit lower="-\S+" upper="\S+" ', "<limit ", arm)
     assert count == 4

@@ -613,9 +613,20 @@ def test_joints_of_a_file_without_ranges_get_some(tmp_path: Path) -> None:
     problem = _problem(tmp_path, text)
     assert "guessed, as the URDF has none: position limits of 4 joints" in draft.said
     assert problem.robot.n == 4 and (problem.robot.upper > 3.1).all() and (problem.robot.lower < -3.1).all()
-    # the wrist is given 0 to 0
-    fixed = _robot(tmp_path, arm.replace('lower="-2.0" upper="2.0"', 'lower="0" upper="0"'))
-    assert fixed.locked["wrist"] == "no range"
+    for wrist in ("", 'lower="0" upper="0"'):
+        fixed = _robot(tmp_path, arm.replace('lower="-2.0" upper="2.0"', wrist))
+        assert fixed.locked["wrist"] == "no range"
+
+
+def test_a_rotor_without_its_gear_is_not_believed(tmp_path: Path) -> None:
+    """Some files give the rotor's own inertia, without the square of the gear's ratio."""
+    (tmp_path / "robot.urdf").write_text(urdfs.arm(effort=60.0))
+    model = read_urdf(tmp_path / "robot.urdf", floating=False).model
+    model.armature = np.array([5e-5, 7e-5, 0.0, 0.1, 0.0, 0.0])
+    drives = guess_drives(model, {})
+    assert drives.armature.keys() == {"turn", "elbow", "slide_0", "slide_1"}
+    assert drives.armature["turn"] == drives.armature["elbow"] > 0.01
+    assert drives.said == ["armature of turn, 5e-05 kg m2: hard to believe, and guessed"]
 
 
 def test_negative_limits_stand_for_none(tmp_path: Path) -> None:

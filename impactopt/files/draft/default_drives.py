@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from impactopt.robots.build import effort_limit, is_floating, joint_indices, joint_names, velocity_limit
 from impactopt.robots.couplings import couplings_of
-from impactopt.robots.gains import USUAL_ROTOR
+from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 
 # by joint type: True for a revolute joint, False for a prismatic one
 MIN_ARMATURE = {True: 1e-3, False: 0.05}  # [kg m2], [kg]
@@ -32,7 +32,7 @@ class Drives:
     """Guesses by joint: armature [kg m2], torque [N m], velocity [rad/s] and position [rad] limits that the
     file lacks, or that are too large to be meant.
 
-    said : messages about implausible limits of the file.
+    said : messages about implausible numbers of the file.
     """
 
     armature: dict[str, float] = field(default_factory=dict)
@@ -72,7 +72,10 @@ def guess_drives(
             out.velocity[joint] = SPEED[revolute]
         elif speed[k] > PLAUSIBLE_SPEED:
             out.said.append(f"velocity limit of {joint}, {speed[k]:g} rad/s: hard to believe")
-        if model.armature[base + k] == 0:
+        armature = float(model.armature[base + k])
+        if armature < LIGHTEST_ROTOR * limit:  # as of a rotor whose gear ratio is left out
+            if armature:
+                out.said.append(f"armature of {joint}, {armature:.2g} kg m2: hard to believe, and guessed")
             out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, MIN_ARMATURE[revolute]))
     return out
 

@@ -616,7 +616,7 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
         )
     yield from drafted.drives.said[:3]
     if len(drafted.drives.said) > 3:
-        yield f"... and {len(drafted.drives.said) - 3} more such limits: see the file's head"
+        yield f"... and {len(drafted.drives.said) - 3} more such numbers: see the file's head"
     if drafted.wrong:
         yield (
             f"{len(drafted.wrong)} inertias are not physical, listed at the file's head: correct them, or "

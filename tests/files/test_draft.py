@@ -398,6 +398,14 @@ def _two_arms() -> str:
     return urdfs.robot("two arms", *parts)
 
 
+def test_a_target_does_not_fly_into_the_base(tmp_path: Path) -> None:
+    """A wide plate below the arm: what is hit down lands on it within the follow-through."""
+    plate = urdfs.link("base", 10.0, (2.4, 2.4, 0.1), (0.0, 0.0, 0.25))
+    text = re.sub(r'<link name="base">.*?</link>', plate, urdfs.arm())
+    problem = _problem(tmp_path, text)
+    assert problem.normal[2] == 0 and not hopeless(problem)
+
+
 def test_a_telescope_that_reaches_to_a_side_strikes_there(tmp_path: Path) -> None:
     """Its slides are shorter than a usual run-up, and nothing is within reach ahead of its base."""
     slide = {"kind": "prismatic", "effort": 100.0, "velocity": 1.0}

@@ -12,6 +12,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Places
+from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.draft.hits import Hit
 from impactopt.files.draft.target_placement import LOWEST, Arm
@@ -35,6 +37,10 @@ TRAVEL_FACTORS = (1.0, 0.75, 0.55, 0.4)  # on the travel, tried while joint limi
 # least distance of the start behind the target's plane: the smaller of so many [m] and so much of the reach
 BEHIND = 0.06, 0.15
 DURATION_FACTORS = (0.8, 3.0)  # shortest and longest duration over the time at the velocity limits
+AFTER, AFTER_STEP = (
+    0.6,
+    0.03,
+)  # [s] in which a target that flies away may not meet the base, [m] between tests
 ITERATIONS, SECONDS = 150, 30.0  # limits of a trial strike or plan: most need a third of that
 
 
@@ -162,12 +168,24 @@ def _problem(
                 start=start,
                 **given,
             )
-            clear = not touches(problem, start, impact.q)
+            clear = not touches(problem, start, impact.q) and not _hits_base(problem, impact)
         except InputError:
             continue
         if clear and not hopeless(problem):
             return problem
     return None
+
+
+def _hits_base(problem: ImpactProblem, impact: EstimatedImpact) -> bool:
+    """True if the target, as fast as estimated, flies into a link that no joint moves."""
+    if not isinstance(problem.target, FreeMass):
+        return False
+    travel = np.arange(0.0, AFTER * impact.impulse / problem.target.mass, AFTER_STEP)
+    after = np.full(len(travel), 2)
+    at = Places.of(problem.robot, np.tile(impact.q, (len(travel), 1)), travel, after)
+    fixed = {piece.link for piece in bodies_of(problem.robot).pieces if piece.joint == 0}
+    found = problem.bodies.survey(travel, at).touches
+    return any("target" in (touch.one, touch.other) and {touch.one, touch.other} & fixed for touch in found)
 
 
 def touches(problem: ImpactProblem, *postures: Array) -> bool:

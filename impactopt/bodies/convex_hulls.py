@@ -24,6 +24,9 @@ ROD = 0.012  # [m] radius of a tool
 _SHORTEST_SIDE = 0.02  # [m] of a box of inertia
 # a shape is too large above both this size [m] and this multiple of the box of its inertia
 _LARGE, _LARGE_RATIO = 1.0, 8.0
+STAND_IN = (
+    0.5  # length of collision shapes, over that of the visual ones, below which they only stand for a link
+)
 _MAX_NEIGHBOURS = 200  # of a vertex: coal counts them in a byte
 _MERGE_DISTANCE = 1e-4  # [m] of vertices of hulls with more neighbours; doubled until there are few enough
 
@@ -112,9 +115,25 @@ def _from_mjcf(robot: Robot, mjcf: str) -> Iterator[Piece]:
 
 
 def seen_pieces(robot: Robot, joint: int) -> tuple[Piece, ...]:
-    """Hulls of the visual geoms of a joint's links in an MJCF, which Unitree's files have for hands."""
-    geoms = geoms_of(robot.model, robot.mjcf) if robot.mjcf is not None else []
-    return tuple(_hulls(geom for geom in geoms if geom.joint == joint and not geom.collides))
+    """Hulls of shapes of a joint's links that are only seen.
+
+    In an MJCF all visual geoms, which Unitree's files have for hands; in a URDF the visual shapes, if the
+    collision shapes are much smaller: files for reinforcement learning have a ball for a forearm.
+    """
+    model = robot.model
+    if robot.mjcf is not None:
+        geoms = geoms_of(model, robot.mjcf)
+        return tuple(_hulls(geom for geom in geoms if geom.joint == joint and not geom.collides))
+    others = {str(frame.name) for frame in model.frames if frame.parentJoint != joint}
+    solid, seen = (
+        tuple(_hulls(shapes_of(model, robot.urdf, kind, without=others))) for kind in ("collision", "visual")
+    )
+    return seen if solid and seen and _length(solid) < STAND_IN * _length(seen) else ()
+
+
+def _length(pieces: Sequence[Piece]) -> float:
+    """Diagonal [m] of the box around pieces of one joint."""
+    return float(np.linalg.norm(np.ptp(np.concatenate([piece.vertices for piece in pieces]), axis=0)))
 
 
 def _hulls(shapes: Iterable[LinkShape | Geom]) -> Iterator[Piece]:

@@ -157,13 +157,15 @@ def _sums(label: NDArray[np.intp], values: Array, n: int) -> Array:
     return np.stack([np.bincount(label, weights=column, minlength=n) for column in values.T], axis=1)
 
 
+NOT_FOUND = "not found"  # of a mesh
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 
 
 def find_mesh(name: str, urdf: Path) -> Path:
     """File of a mesh, by a path relative to the URDF, or package://NAME/... with NAME in a folder above it.
 
-    Packages are also searched in ROS_PACKAGE_PATH, AMENT_PREFIX_PATH, and the installed example-robot-data.
+    Without a file of this name, one whose name differs in case is taken, as Windows does. Packages are also
+    searched in ROS_PACKAGE_PATH, AMENT_PREFIX_PATH, and the installed example-robot-data.
 
     Raises
     ------
@@ -179,9 +181,15 @@ def find_mesh(name: str, urdf: Path) -> Path:
     if name.startswith("package://"):  # the folder's name may differ from the package's
         places += [folder.joinpath(*path.parts[1:]) for folder in above]
         places += [folder / path for folder in _package_folders()]
-    for place in places if not path.is_absolute() else [path]:
+    places = [path] if path.is_absolute() else places
+    for place in places:
         if place.is_file():
             return place
+    for place in places:
+        with contextlib.suppress(OSError):
+            for file in sorted(place.parent.iterdir()):
+                if file.name.lower() == place.name.lower() and file.is_file():
+                    return file
     raise FileNotFoundError(name)
 
 
@@ -202,7 +210,7 @@ def lack_of(name: str, urdf: Path) -> str:
         path = find_mesh(name, urdf)
         return _lack(path, path.stat().st_mtime_ns)
     except (OSError, ValueError):
-        return "is not found"
+        return NOT_FOUND
 
 
 @cache

@@ -12,7 +12,6 @@ from impactopt.report.plain_errors import BAD_INPUT, plain_errors, print_json
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
-    from impactopt.robots.robot import Robot
 
 Motion = Literal["punch", "kick", "chop", "nail"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -56,8 +55,6 @@ def check(
         for name, value in (problem.describe() | plain).items():
             for text in value if name in ("inertias", "notes", "followers") else [_as_text(value)]:
                 typer.echo(printable(f"  {name:<11} {text}"))
-        if lost := _lost_meshes(problem.robot):
-            typer.echo(printable(f"  {'meshes':<11} {lost}"))
         if strength := _strength(problem):
             typer.echo(printable(f"  {'strength':<11} {strength}"))
         for warning in warnings:
@@ -74,29 +71,6 @@ def _strength(problem: ImpactProblem) -> str:
     share, best = found
     where = f"point_m = {best.point.round(2).tolist()}, normal = {best.normal.tolist()}"
     return f"{100 * share:.0f} % of the hardest impact nearby, by a rough estimate; that one: {where}"
-
-
-def _lost_meshes(robot: Robot) -> str:
-    """Message about missing or unreadable meshes of a robot, and the consequences; "" if there are none."""
-    from impactopt.bodies.file_shapes import lost_meshes
-
-    found = lost_meshes(robot.model, robot.urdf)
-    reasons = dict(sorted(pair for meshes in found.values() for pair in meshes.items()))
-    if not reasons:
-        return ""
-    by_reason = {why: [name for name, other in reasons.items() if other == why] for why in reasons.values()}
-    each = (
-        f"{names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)} {why}"
-        for why, names in by_reason.items()
-    )
-    fix = (
-        "; put them into a folder above the URDF, or name the folder of their package in ROS_PACKAGE_PATH"
-        if "is not found" in by_reason
-        else ""
-    )
-    return (
-        f"{len(reasons)} are lost, and boxes of inertia stand for links without any: {'; '.join(each)}{fix}"
-    )
 
 
 def _with_units(thing: Any) -> str:

@@ -8,7 +8,9 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.bodies.convex_hulls import distance_to_link, is_far, size_of
+from impactopt.bodies.file_shapes import lost_meshes
 from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.bodies.solids import NOT_FOUND
 from impactopt.robots.gains import HEAVIEST_ROTOR, LIGHTEST_ROTOR
 from impactopt.robots.robot import Robot
 
@@ -91,9 +93,10 @@ def _sides(robot: Robot) -> Iterator[str]:
 
 
 def shape_doubts(robot: Robot) -> Iterator[str]:
-    """Messages about shapes far from their link or larger than the robot, and striking links without
-    shapes.
+    """Messages about missing meshes, shapes far from their link or larger than the robot, and striking links
+    without shapes.
     """
+    yield from _lost_meshes(robot)
     bodies = bodies_of(robot)
     for piece in bodies.too_large:
         yield (
@@ -114,6 +117,25 @@ def shape_doubts(robot: Robot) -> Iterator[str]:
                 f"{distance_to_link(robot.model, piece, same_link):.2g} m away from the link's joint, mass "
                 "and frames: correct its <origin>"
             )
+
+
+def _lost_meshes(robot: Robot) -> Iterator[str]:
+    """Message about missing or unreadable meshes, and the consequences."""
+    found = lost_meshes(robot.model, robot.urdf)
+    reasons = dict(sorted(pair for meshes in found.values() for pair in meshes.items()))
+    by_reason = {why: [name for name, other in reasons.items() if other == why] for why in reasons.values()}
+    each = "; ".join(
+        f"{names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {why}"
+        for why, names in by_reason.items()
+    )
+    if reasons:
+        where = (
+            "; put them into a folder above the URDF, or name the folder of their package in ROS_PACKAGE_PATH"
+        )
+        yield (
+            f"{len(reasons)} meshes are lost, and boxes of inertia stand for links without any: "
+            f"{each}{where * (NOT_FOUND in by_reason)}"
+        )
 
 
 def _counted(names: list[str]) -> str:

@@ -147,10 +147,11 @@ def _least_squares(matrix: Array, n: Array) -> Array:
 def drawn_impacts(
     strength: Strength, q: Array, normals: Sequence[Array] = NORMALS, *, with_face: bool = True
 ) -> list[EstimatedImpact]:
-    """Estimated impacts ahead of the base, the hardest first: in `POSTURES` postures, along each normal.
+    """Estimated impacts in `POSTURES` postures along each normal, the hardest first.
 
-    The joints that move the striker are drawn within their limits; the others are as in q (nq,). A single
-    joint strikes along its circle or line, if that is within 30 degrees of a normal.
+    They are ahead of the base, or elsewhere if the arm does not reach there. The joints that move the striker
+    are drawn within their limits; the others are as in q (nq,). A single joint strikes along its circle or
+    line, if that is within 30 degrees of a normal.
     with_face : a striker meets the target with its face if that is known, as `FirstTouch` requires by
     default.
     """
@@ -183,7 +184,9 @@ def drawn_impacts(
         if count == POSTURES:
             break
     reach = max((float(np.linalg.norm(impact.point[:2])) for impact in impacts), default=0.0)
-    front = [b for b in impacts if b.point[0] > MIN_AHEAD * reach and b.impulse > 0]
+    away = [b for b in impacts if np.linalg.norm(b.point[:2]) > MIN_AHEAD * reach and b.impulse > 0]
+    # an arm may only reach to a side of its base, as Stretch's does
+    front = [b for b in away if b.point[0] > MIN_AHEAD * reach] or away
     return sorted(front, key=lambda impact: -impact.impulse)
 
 

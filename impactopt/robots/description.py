@@ -76,6 +76,7 @@ class Description:
     kp, kd, torque : servo gains and torque limits of the file's actuators, by joint.
     springs : stiffness [N m/rad] and rest angle [rad] by joint.
     tendons : ranges of sums of joint angles.
+    unranged : revolute joints of a file without ranges: they have an empty one, from 0 to 0.
     sites : names of those on moving links.  driven : joints with an actuator.  idle : joints without one, in
         a file that has actuators.
     ties : constraints and forces for which joints have to be locked or coupled.
@@ -89,6 +90,7 @@ class Description:
     torque: dict[str, float] = field(default_factory=dict)
     springs: dict[str, tuple[float, float]] = field(default_factory=dict)
     tendons: list[Tendon] = field(default_factory=list)
+    unranged: list[str] = field(default_factory=list)
     sites: list[str] = field(default_factory=list)
     driven: list[str] = field(default_factory=list)
     idle: list[str] = field(default_factory=list)

@@ -8,9 +8,12 @@ read actuators.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from os import PathLike
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -297,7 +300,19 @@ def compile_mjcf(path: str | PathLike[str]) -> Any:
     try:
         return mujoco.MjModel.from_xml_path(file)
     except ValueError as error:
-        raise InputError(f"MJCF {file}: {error}") from error
+        whole = _including(Path(file))
+        fix = f"; {whole} includes this file: give that one" if whole else ""
+        raise InputError(f"MJCF {file}: {error}{fix}") from error
+
+
+def _including(file: Path) -> str:
+    """Name of a file beside an MJCF that includes it, and may have what it lacks; "" if there is none."""
+    for other in sorted(file.parent.glob("*.xml")):
+        with contextlib.suppress(OSError, ElementTree.ParseError):
+            included = (part.get("file") for part in ElementTree.parse(other).iter("include"))
+            if other != file and file.name in included:
+                return other.name
+    return ""
 
 
 def read_mjcf(path: str | PathLike[str], *, floating: bool | None = None) -> Description:

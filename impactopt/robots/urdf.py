@@ -50,7 +50,10 @@ def read_urdf(
             "robot.urdf"
         )
     try:
-        model = pin.buildModelFromUrdf(urdf, *joints)
+        if _without_negative_limits(root):
+            model = pin.buildModelFromXML(root.toxml(), *joints)
+        else:
+            model = pin.buildModelFromUrdf(urdf, *joints)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
     _check_links(root, urdf, moments=not repaired)
@@ -64,6 +67,7 @@ def read_urdf(
     out = Description(kind="URDF", model=model)
     out.ties += [*_mimics(root, model), *_of_gazebo(root, model), *_hollow(root, model)]
     out.springs |= _springs(root, model)
+    out.unranged += _unranged(root)
     out.notes += [*_weightless(root), *_rotors(root)]
     out.lead_from_root()
     return out
@@ -76,6 +80,23 @@ def _parsed(urdf: str) -> Any:
         return expatbuilder.parse(urdf, namespaces=False).documentElement
     except ExpatError as error:
         raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
+
+
+def _without_negative_limits(root: Any) -> bool:
+    """Set negative limits of torque and speed, which stand for none as in SDF, to 0; True if there are any.
+
+    Pinocchio refuses them.
+    """
+    negative = [
+        (limit, key)
+        for joint in _children(root, "joint")
+        for limit in _children(joint, "limit")
+        for key in ("effort", "velocity")
+        if _urdf_number(limit.getAttribute(key)) < 0
+    ]
+    for limit, key in negative:
+        limit.setAttribute(key, "0")
+    return bool(negative)
 
 
 def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:
@@ -118,6 +139,17 @@ def _hollow(root: Any, model: pin.Model) -> Iterator[Tie]:
                 free=0,
                 fix="give its <inertial> a mass > 0",
             )
+
+
+def _unranged(root: Any) -> Iterator[str]:
+    """Revolute joints of a file that has neither `lower` nor `upper`, whose default is 0, except followers.
+
+    In a file that has some, those without are passive joints of loops, and fixed.
+    """
+    joints = [joint for joint in _children(root, "joint") if joint.getAttribute("type") == "revolute"]
+    limits = [limit for joint in joints for limit in _children(joint, "limit")]
+    if not any(limit.hasAttribute(key) for limit in limits for key in ("lower", "upper")):
+        yield from (joint.getAttribute("name") for joint in joints if not _children(joint, "mimic"))
 
 
 def _springs(root: Any, model: pin.Model) -> dict[str, tuple[float, float]]:

@@ -45,7 +45,8 @@ from impactopt.simulation.target_dynamics import Push, TargetContact
 Array = NDArray[np.float64]
 AXES, NEXT_AXES, PREVIOUS_AXES = np.arange(3), [1, 2, 0], [2, 0, 1]
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where the body of a broken target goes
-# A robot has fallen beyond these errors of its base: tilt [rad], loss of height (fraction of the reference)
+# A robot has fallen beyond these errors of its base: tilt [rad], and loss of height, over the height of the
+# centre of mass at the start, as the base's own origin may lie on the ground
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3
 # A robot does not stand at the end beyond these: tilt [rad] and speed [m/s] of the base
 STANDING_TILT, STANDING_SPEED = 0.2, 0.05
@@ -150,6 +151,8 @@ class _Replay(MujocoRobot):
         self.mujoco.mj_kinematics(self.world, self.data)
         self.grips.put(self.data)
         self.mujoco.mj_forward(self.world, self.data)
+        # [m] of the centre of mass of all that the first joint, a floating base's, carries
+        self.start_height = float(self.data.subtree_com[self.world.jnt_bodyid[0], 2])
 
     # ---------------------------------------------------------------- parts of a step
     def hand_speeds(self) -> Array:
@@ -296,7 +299,7 @@ class _Replay(MujocoRobot):
         height, planned = self.data.qpos[2], float(self.reference_q[since : now + 1, 2].min())
         if lean > FALLEN_TILT:
             return f"fell: the base leans {lean:.1f} rad from where it should be"
-        if height < (1 - FALLEN_DROP) * planned:
+        if height < planned - FALLEN_DROP * self.start_height:
             return f"fell: the base is {height:.2f} m high where it should be {planned:.2f} m"
         return ""
 

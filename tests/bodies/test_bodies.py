@@ -550,7 +550,7 @@ MESHES = {
     "cut.stl": (b"\0" * 80 + (99).to_bytes(4, "little") + b"\0" * 60, "cannot be read"),
     "empty.stl": (b"\0" * 80 + (0).to_bytes(4, "little"), "no triangles"),
     "broken.obj": (b"f 1 2", "cannot be read"),
-    "gone.stl": (None, "is not found"),
+    "gone.stl": (None, "not found"),
 }
 
 

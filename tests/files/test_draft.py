@@ -262,6 +262,15 @@ def test_legs_of_five_and_seven_and_a_waist_stand(
     assert [leg.before.size for leg in problem.coordinates.legs] == [extra, extra]
 
 
+def test_a_leg_of_five_stands_whose_axes_have_rounded_decimals(tmp_path: Path) -> None:
+    """Five joints meet six constraints exactly only if all axes are."""
+    text = urdfs.biped(without="ankle_roll")
+    text, count = re.subn(r'(name="\w+_knee".*?<axis xyz=")0.0 1.0 0.0', r"\g<1>1e-6 1.0 1e-6", text)
+    assert count == 2
+    problem = _problem(tmp_path, text)
+    problem.robot.check_stance(problem.start_posture, tilt=2e-5)
+
+
 def test_toes_are_locked(tmp_path: Path) -> None:
     x, _ = urdfs.SOLE
     toes = [
@@ -280,19 +289,19 @@ def test_toes_are_locked(tmp_path: Path) -> None:
     assert set(_robot(tmp_path, text).locked) == {"left_toe", "right_toe"}
 
 
-def test_arms_that_hang_from_a_spine_are_no_legs(tmp_path: Path) -> None:
-    parts = [
-        urdfs.link("pelvis", 5.0, (0.2, 0.2, 0.1), (0.0, 0.0, 0.0)),
-        urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1)),
-        urdfs.joint("spine", "pelvis", "chest", "0 0 1", (0.0, 0.0, 0.05), (-1.0, 1.0)),
-    ]
+@pytest.mark.parametrize("spine", [True, False], ids=["spine", "torso"])
+def test_arms_that_hang_from_a_spine_or_end_in_wrists_are_no_legs(tmp_path: Path, spine: bool) -> None:
+    parts = [urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1))]
+    if spine:
+        parts.insert(0, urdfs.link("pelvis", 5.0, (0.2, 0.2, 0.1), (0.0, 0.0, 0.0)))
+        parts.append(urdfs.joint("spine", "pelvis", "chest", "0 0 1", (0.0, 0.0, 0.05), (-1.0, 1.0)))
     for side, y in (("left", 0.2), ("right", -0.2)):
         parent, chain = (
             "chest",
             (
                 ("shoulder_pitch", "0 1 0", (0.0, y, 0.2), 0.05),
                 ("shoulder_roll", "1 0 0", (0.0, 0.0, 0.0), 0.3),
-                ("elbow", "0 1 0", (0.0, 0.0, -0.3), 0.3),
+                ("elbow" if spine else "wrist", "0 1 0", (0.0, 0.0, -0.3), 0.3),
             ),
         )
         for name, axis, at, long in chain:
@@ -321,6 +330,23 @@ def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
     data = read_toml(_drafted(tmp_path, urdfs.arm()).text)
     (striker,) = data["robot"]["strikers"]
     assert striker["frame"] == "wrist_link" and striker["point_m"] == [0.0, 0.0, 0.15]  # the claws' tips
+
+
+@pytest.mark.parametrize("ball", [0.04, 0.2])
+def test_of_a_forearm_with_a_ball_for_a_collision_shape_the_drawn_end_strikes(
+    tmp_path: Path, ball: float
+) -> None:
+    """Files for reinforcement learning have a small ball there; a large one is the robot's own."""
+    box = '<geometry><box size="0.08 0.08 0.3"/></geometry>'
+    shapes = f'<collision><geometry><sphere radius="{ball}"/></geometry></collision>'
+    seen = f'<visual><origin xyz="0 0 0.15"/>{box}</visual>'
+    head, forearm, tail = urdfs.arm().partition('<link name="elbow_link">')
+    forearm = re.sub(r"<collision>.*?</collision>", shapes + seen, forearm + tail, count=1)
+    text = re.sub(r'<link name="(wrist_link|claw_\d)">.*?</link>', "", head + forearm)
+    text = re.sub(r'<joint name="(wrist|slide_\d)".*?</joint>', "", text)
+    (striker,) = read_toml(_drafted(tmp_path, text).text)["robot"]["strikers"]
+    assert striker["frame"] == "elbow_link"
+    assert striker["point_m"] == pytest.approx([0.0, 0.0, 0.3 if ball < 0.1 else ball], abs=1e-3)
 
 
 def _strike(problem: ImpactProblem) -> float:
@@ -370,6 +396,36 @@ def _two_arms() -> str:
     parts += [urdfs.link("head", 1.0, (0.1, 0.1, 0.1), (0.0, 0.0, 0.1))]
     parts += [urdfs.joint("head_pan", "base", "head", "0 0 1", (0.0, 0.0, 0.9), (-1.0, 1.0))]
     return urdfs.robot("two arms", *parts)
+
+
+def test_a_target_does_not_fly_into_the_base(tmp_path: Path) -> None:
+    """A wide plate below the arm: what is hit down lands on it within the follow-through."""
+    plate = urdfs.link("base", 10.0, (2.4, 2.4, 0.1), (0.0, 0.0, 0.25))
+    text = re.sub(r'<link name="base">.*?</link>', plate, urdfs.arm())
+    problem = _problem(tmp_path, text)
+    assert problem.normal[2] == 0 and not hopeless(problem)
+
+
+def test_a_telescope_that_reaches_to_a_side_strikes_there(tmp_path: Path) -> None:
+    """Its slides are shorter than a usual run-up, and nothing is within reach ahead of its base."""
+    slide = {"kind": "prismatic", "effort": 100.0, "velocity": 1.0}
+    parts = [
+        urdfs.link("mast", 15.0, (0.2, 0.2, 1.0), (0.0, 0.0, 0.5)),
+        urdfs.link("lift", 2.0, (0.08, 0.08, 0.08), (-0.1, -0.16, 0.0)),
+        urdfs.joint("rise", "mast", "lift", "0 0 1", (0.0, 0.0, 0.2), (0.0, 0.7), **slide),
+    ]
+    parent = "lift"
+    for k in range(3):
+        parts += [urdfs.link(f"tube_{k}", 0.3, (0.05, 0.02, 0.05), (-0.1, -0.22 - 0.03 * k, 0.0))]
+        parts += [urdfs.joint(f"slide_{k}", parent, f"tube_{k}", "0 -1 0", (0, 0, 0), (0.0, 0.13), **slide)]
+        parent = f"tube_{k}"
+    parts += [urdfs.link("hand", 0.3, (0.05, 0.1, 0.05), (0.0, -0.05, 0.0))]
+    parts += [urdfs.joint("wrist", parent, "hand", "0 0 1", (-0.1, -0.32, 0.0), (-1.0, 1.0), effort=5.0)]
+    draft = _drafted(tmp_path, urdfs.robot("stretcher", *parts))
+    assert any("the drafted strike, along [0, -1, 0]" in line for line in draft.said), draft.said
+    (tmp_path / "robot.toml").write_text(draft.text)
+    problem = load_problem(tmp_path / "robot.toml")
+    assert hopeless(problem) == [] and problem.point[1] < -0.3
 
 
 def test_of_two_arms_the_other_one_waits_where_its_motors_hold_it(tmp_path: Path) -> None:
@@ -548,6 +604,46 @@ def test_what_the_file_lacks_is_guessed_and_said_to_be(tmp_path: Path) -> None:
     assert sum("guessed" in line for line in draft.said) == 4  # and the gains
 
 
+def test_a_limit_that_no_motor_has_is_none(tmp_path: Path) -> None:
+    """Exporters write 1e9 where a model has no limit: as a torque, it would have a rotor of 1e6 kg m2."""
+    drafted = _robot(tmp_path, urdfs.arm(effort=1e9, velocity=1e9))
+    plain = _robot(tmp_path, urdfs.arm(effort=0.0, velocity=0.0))
+    for key in ("armature", "torque_limit", "velocity_limit"):
+        np.testing.assert_array_equal(getattr(drafted.robot, key), getattr(plain.robot, key))
+
+
+def test_joints_of_a_file_without_ranges_get_some(tmp_path: Path) -> None:
+    """As of onshape-to-robot's; beside joints with a range, one without is that of a loop, and fixed."""
+    arm = urdfs.arm()
+    text, count = re.subn(r'<limit lower="-\S+" upper="\S+" ', "<limit ", arm)
+    assert count == 4
+    draft = _drafted(tmp_path, text)
+    problem = _problem(tmp_path, text)
+    assert "guessed, as the URDF has none: position limits of 4 joints" in draft.said
+    assert problem.robot.n == 4 and (problem.robot.upper > 3.1).all() and (problem.robot.lower < -3.1).all()
+    for wrist in ("", 'lower="0" upper="0"'):
+        fixed = _robot(tmp_path, arm.replace('lower="-2.0" upper="2.0"', wrist))
+        assert fixed.locked["wrist"] == "no range"
+
+
+def test_a_rotor_without_its_gear_is_not_believed(tmp_path: Path) -> None:
+    """Some files give the rotor's own inertia, without the square of the gear's ratio."""
+    (tmp_path / "robot.urdf").write_text(urdfs.arm(effort=60.0))
+    model = read_urdf(tmp_path / "robot.urdf", floating=False).model
+    model.armature = np.array([5e-5, 7e-5, 0.0, 0.1, 0.0, 0.0])
+    drives = guess_drives(model, {})
+    assert drives.armature.keys() == {"turn", "elbow", "slide_0", "slide_1"}
+    assert drives.armature["turn"] == drives.armature["elbow"] > 0.01
+    assert drives.said == ["armature of turn, 5e-05 kg m2: hard to believe, and guessed"]
+
+
+def test_negative_limits_stand_for_none(tmp_path: Path) -> None:
+    """As in SDF; Pinocchio refuses them."""
+    robots = [_robot(tmp_path, urdfs.arm(effort=limit, velocity=limit)).robot for limit in (-1.0, 0.0)]
+    for key in ("armature", "torque_limit", "velocity_limit"):
+        np.testing.assert_array_equal(*(getattr(robot, key) for robot in robots))
+
+
 def test_numbers_that_the_file_has_are_not_guessed(tmp_path: Path) -> None:
     keys = read_toml(_drafted(tmp_path, urdfs.arm()).text)["robot"]
     assert "torque_limit_N_m" not in keys and "velocity_limit_rad_s" not in keys
@@ -711,7 +807,7 @@ def test_followers_of_their_own_leg_follow(tmp_path: Path) -> None:
     assert all(len(leg.joints) == 6 and not len(leg.before) for leg in problem.coordinates.legs)
 
 
-def test_check_tells_meshes_that_are_no_bodies(tmp_path: Path) -> None:
+def test_meshes_that_are_no_bodies_are_told(tmp_path: Path) -> None:
     lost = (
         ('"0.08 0.08 0.3"/>', '<mesh filename="cut.stl"/>'),
         ('"0.08 0.08 0.1"/>', '<mesh filename="gone.stl"/>'),
@@ -720,10 +816,12 @@ def test_check_tells_meshes_that_are_no_bodies(tmp_path: Path) -> None:
     for size, mesh in lost:
         text = text.replace(f"<box size={size}", mesh)
     (tmp_path / "cut.stl").write_bytes(b"version https://git-lfs.github.com/spec/v1")
-    (tmp_path / "robot.toml").write_text(_drafted(tmp_path, text).text)
-    told = " ".join(CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")]).output.split())
-    assert "2 are lost, and boxes of inertia stand for links without any: cut.stl cannot be read" in told
-    assert "git lfs pull" in told and "gone.stl is not found" in told
+    draft = _drafted(tmp_path, text)
+    (tmp_path / "robot.toml").write_text(draft.text)
+    checked = CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")]).output
+    for told in (" ".join(checked.split()), " ".join(draft.said)):
+        assert "2 meshes are lost, and boxes of inertia stand for links without any: cut.stl: cannot" in told
+        assert "git lfs pull" in told and "gone.stl: not found; put them into a folder above" in told
 
 
 def test_crossed_limits_are_a_mistake(tmp_path: Path) -> None:

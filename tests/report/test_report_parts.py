@@ -170,6 +170,15 @@ def test_a_mesh_is_found_where_its_file_has_a_slash_too_many(lamp: Path) -> None
     assert found == find_mesh("package://lamp_description/meshes/tip.stl", lamp)
 
 
+def test_a_mesh_is_found_whose_name_differs_in_case(lamp: Path) -> None:
+    """Exporters on Windows write .STL for a file .stl; one with the exact name comes first."""
+    found = find_mesh("package://lamp_description/meshes/tip.stl", lamp)
+    assert find_mesh("package://lamp_description/meshes/Tip.STL", lamp) == found
+    (found.parent / "Tip.STL").write_bytes(found.read_bytes())
+    assert find_mesh("package://lamp_description/meshes/Tip.STL", lamp).name == "Tip.STL"
+    assert find_mesh("package://lamp_description/meshes/tip.stl", lamp) == found
+
+
 def test_what_has_lost_its_meshes_is_a_box_and_bones(
     lamp: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -294,6 +294,25 @@ def test_a_file_without_joints_is_no_robot(tmp_path: Path) -> None:
         read_mjcf(tmp_path / "none.xml")
 
 
+def test_a_part_of_a_scene_is_told_where_the_whole_is(tmp_path: Path) -> None:
+    """Contact pairs, meshes' folders and defaults may be in the file that includes the robot's."""
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><worldbody><body name="arm"><joint name="hinge"/><geom name="hand" size=".1" pos="0 0 .3"/>'
+        '</body></worldbody><contact><pair geom1="hand" geom2="floor"/></contact></mujoco>'
+    )
+    (tmp_path / "broken.xml").write_text("<mujoco>")
+    with pytest.raises(InputError, match="'floor' not found") as alone:
+        read_mjcf(tmp_path / "robot.xml")
+    assert "includes" not in str(alone.value)
+    (tmp_path / "scene.xml").write_text(
+        '<mujoco><include file="robot.xml"/><worldbody><geom name="floor" type="plane" size="1 1 1"/>'
+        "</worldbody></mujoco>"
+    )
+    with pytest.raises(InputError, match=r"scene\.xml includes this file: give that one"):
+        read_mjcf(tmp_path / "robot.xml")
+    assert read_mjcf(tmp_path / "scene.xml").model.nv == 1
+
+
 def test_a_problem_file_can_name_an_mjcf(tree: Path) -> None:
     data: dict[str, Any] = {
         "problem": {

@@ -245,6 +245,30 @@ def test_a_robot_falls_when_its_centre_of_mass_is_not_over_its_soles() -> None:
             assert sim.time[-1] < 2.0, "the simulation ends with the fall"
 
 
+def test_a_robot_whose_base_has_its_origin_in_the_ground_stands_and_falls_as_another() -> None:
+    """A root link's origin may be anywhere: the base is at no height where the feet are."""
+    robot = biped()
+    motion, there, _ = standing(robot)
+    up = pin.SE3(np.eye(3), np.array([0.0, 0.0, motion.q[0, 2] + 0.07]))  # from the new origin to the old
+    model = robot.model.copy()
+    model.inertias[1] = model.inertias[1].se3Action(up)
+    for joint in range(2, model.njoints):
+        if model.parents[joint] == 1:
+            model.jointPlacements[joint] = up * model.jointPlacements[joint]
+    for frame in model.frames:
+        if frame.parentJoint == 1:
+            frame.placement = up * frame.placement
+    low = np.where(np.arange(model.nq) == 2, motion.q - up.translation[2], motion.q)
+    assert low[0, 2] < 0, "under the ground"
+    robot = replace(robot, model=model)
+    motion = reference([0.0, 1.0], low[0], torque=motion.torque[0], nv=robot.nv, n=robot.n, end=0.05)
+    for load, stands in ((2.0, True), (60.0, False)):
+        sim = simulate_mujoco(
+            robot, motion, there, step=5e-4, settle=2.0, perturbation=Perturbation(payload=load)
+        )
+        assert sim.standing == stands, sim.fall
+
+
 def test_a_summary_of_a_fall_and_a_report() -> None:
     robot = biped()
     motion, there, _ = standing(robot)

@@ -10,38 +10,51 @@ import pinocchio as pin
 
 from impactopt.robots.build import effort_limit, is_floating, joint_indices, joint_names, velocity_limit
 from impactopt.robots.couplings import couplings_of
-from impactopt.robots.gains import USUAL_ROTOR
+from impactopt.robots.gains import LIGHTEST_ROTOR, USUAL_ROTOR
 
 # by joint type: True for a revolute joint, False for a prismatic one
 MIN_ARMATURE = {True: 1e-3, False: 0.05}  # [kg m2], [kg]
 SPEED = {True: 3.0, False: 0.3}  # guessed velocity limit [rad/s], [m/s]
+RANGE = (-3.14, 3.14)  # [rad] guessed position limits
 MIN_TORQUE = {True: 2.0, False: 50.0}  # [N m], [N]
 PLAUSIBLE_TORQUE = {True: 500.0, False: 1e4}  # [N m], [N]: larger limits are reported
 GRAVITY_FACTOR = 3.0  # guessed torque limit over the largest gravity torque
 LEVER = 0.3  # [m]: weight x lever is the least torque limit of a leg's joints
 PLAUSIBLE_SPEED = 60.0  # [rad/s], [m/s]: larger limits are reported
+# Larger limits stand for none: no robot's motor reaches them
+LARGEST_TORQUE = {True: 1e5, False: 1e6}  # [N m], [N]
+LARGEST_SPEED = 1e3  # [rad/s], [m/s]
 DOUBT = "a GUESS"
 
 
 @dataclass(kw_only=True)
 class Drives:
-    """Guesses by joint: armature [kg m2], torque [N m] and velocity [rad/s] limits that the file lacks.
+    """Guesses by joint: armature [kg m2], torque [N m], velocity [rad/s] and position [rad] limits that the
+    file lacks, or that are too large to be meant.
 
-    said : messages about implausible limits of the file.
+    said : messages about implausible numbers of the file.
     """
 
     armature: dict[str, float] = field(default_factory=dict)
     torque: dict[str, float] = field(default_factory=dict)
     velocity: dict[str, float] = field(default_factory=dict)
+    position: dict[str, tuple[float, float]] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
 
 
-def guess_drives(model: pin.Model, known: Mapping[str, float], carrying: Collection[str] = ()) -> Drives:
+def guess_drives(
+    model: pin.Model,
+    known: Mapping[str, float],
+    carrying: Collection[str] = (),
+    unranged: Collection[str] = (),
+) -> Drives:
     """Guesses of the missing drive parameters of each joint.
 
     known : torque limits that are not in the model.  carrying : joints of legs, which carry the robot.
+    unranged : joints without position limits.
     """
     out, joints = Drives(), joint_names(model)
+    out.position = {joint: RANGE for joint in joints if joint in unranged}
     base, indices = model.nv - len(joints), joint_indices(model)
     torque, speed = effort_limit(model)[base:], velocity_limit(model)[base:]
     gravity = _largest_gravity(model)
@@ -49,17 +62,20 @@ def guess_drives(model: pin.Model, known: Mapping[str, float], carrying: Collect
     for k, joint in enumerate(joints):
         revolute = "JointModelP" not in model.joints[indices[k]].shortname()
         limit = known.get(joint, float(torque[k]))
-        if not 0 < limit < 1e15:
+        if not 0 < limit < LARGEST_TORQUE[revolute]:
             least = max(MIN_TORQUE[revolute], leg_torque * (joint in carrying))
             out.torque[joint] = limit = _rounded(max(GRAVITY_FACTOR * gravity[k], least))
         elif limit > PLAUSIBLE_TORQUE[revolute]:
             unit = "N m" if revolute else "N"
             out.said.append(f"torque limit of {joint}, {limit:g} {unit}: hard to believe")
-        if not 0 < speed[k] < 1e15:
+        if not 0 < speed[k] < LARGEST_SPEED:
             out.velocity[joint] = SPEED[revolute]
         elif speed[k] > PLAUSIBLE_SPEED:
             out.said.append(f"velocity limit of {joint}, {speed[k]:g} rad/s: hard to believe")
-        if model.armature[base + k] == 0:
+        armature = float(model.armature[base + k])
+        if armature < LIGHTEST_ROTOR * limit:  # as of a rotor whose gear ratio is left out
+            if armature:
+                out.said.append(f"armature of {joint}, {armature:.2g} kg m2: hard to believe, and guessed")
             out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, MIN_ARMATURE[revolute]))
     return out
 

@@ -446,6 +446,7 @@ def _data(
         ("armature", "armature_kg_m2"),
         ("torque_limit", "torque_limit_N_m"),
         ("velocity_limit", "velocity_limit_rad_s"),
+        ("position_limit", "position_limit_rad"),
     ):
         if options.get(option):
             keys[key] = dict(options[option])
@@ -521,6 +522,7 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
         "armature_kg_m2": f"{DOUBT}: {1e3 * USUAL_ROTOR:g} g m2 per N m; give rotor inertia x gear^2",
         "torque_limit_N_m": f"{DOUBT}: from the largest gravity torques; the file has none",
         "velocity_limit_rad_s": f"{DOUBT}; the file has none",
+        "position_limit_rad": f"{DOUBT}; the file has none",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
         "strikers": "found at the ends of the last links' shapes; move them to the striking points",
         "tools": f"{DOUBT}: a peg to be mounted, as the links before it would touch the target first",
@@ -602,6 +604,7 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
         ("armature_kg_m2", "rotor inertias"),
         ("torque_limit_N_m", "torque limits"),
         ("velocity_limit_rad_s", "velocity limits"),
+        ("position_limit_rad", "position limits"),
     ):
         if key in data["robot"]:
             count = len(data["robot"][key])
@@ -613,7 +616,7 @@ def _messages(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterat
         )
     yield from drafted.drives.said[:3]
     if len(drafted.drives.said) > 3:
-        yield f"... and {len(drafted.drives.said) - 3} more such limits: see the file's head"
+        yield f"... and {len(drafted.drives.said) - 3} more such numbers: see the file's head"
     if drafted.wrong:
         yield (
             f"{len(drafted.wrong)} inertias are not physical, listed at the file's head: correct them, or "

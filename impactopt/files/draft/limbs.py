@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _FINGERS = re.compile(r"finger|thumb|gripper|jaw|claw|knuckle|(?<![a-z])eyes?(?![a-z])", re.IGNORECASE)
 _WHEELS = re.compile(r"wheel|caster|roller", re.IGNORECASE)
 _ARMS = re.compile(r"shoulder|elbow|wrist", re.IGNORECASE)
+_WRISTS = re.compile(r"wrist", re.IGNORECASE)
 _HEADS = re.compile(r"head|neck|eye|camera|face", re.IGNORECASE)
 # largest mass of a finger, with all beyond it, over the robot's; its largest length [m]
 FINGER_MASS, FINGER_LENGTH = 0.03, 0.25
@@ -115,10 +116,11 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
     feet = (
         limb
         for limb in limbs_of(model)
-        # limbs on a common trunk are no legs if their joints' names are those of arms
+        # limbs on a common trunk are no legs if their joints' names are those of arms; on the root, legs of
+        # four-legged robots have shoulders and elbows, too
         if len(limb.own) > 1
         and not _is_head(model, limb)
-        and (limb.own == limb.path or not _named(model, limb, _ARMS))
+        and not _named(model, limb, _WRISTS if limb.own == limb.path else _ARMS)
     )
     highest = lowest + FOOT_HEIGHT * robot_height
     found = tuple(limb for limb in feet if heights(limb.tip).min() < highest)

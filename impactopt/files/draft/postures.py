@@ -19,7 +19,7 @@ from impactopt.robots.robot import Robot, Sole
 
 Array = NDArray[np.float64]
 SQUAT = 0.06  # lowering of the hips, over the length of the legs
-LEVEL = 1e-7  # [m], [rad]: tolerance of a sole's placement
+LEVEL = 1e-5  # [m], [rad]: tolerance of a sole's placement, to which angles are written and files have axes
 STARTS = 10  # random initial guesses
 # distances of the soles tried, over that in the zero posture: with splayed legs they may not be level
 WIDTHS = (1.0, 0.9, 0.8)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.convex_hulls import Piece, pieces_of
 from impactopt.errors import InputError
-from impactopt.files.draft.default_drives import Drives, guess_drives
+from impactopt.files.draft.default_drives import RANGE, Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, limbs_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints
 from impactopt.robots.checks import LEG, REPAIRED, check_inertias
@@ -167,7 +167,13 @@ def _check_bolted(first: Description, found: Drafted) -> None:
 def _read(path: Path, mjcf: bool, floating: bool | None) -> Description:
     if mjcf:
         return read_mjcf(path, floating=floating)
-    return read_urdf(path, floating=bool(floating), repaired=True)
+    out = read_urdf(path, floating=bool(floating), repaired=True)
+    lower, upper = out.model.lowerPositionLimit, out.model.upperPositionLimit
+    for joint in out.unranged:
+        k = out.model.joints[out.model.getJointId(joint)].idx_q
+        lower[k], upper[k] = RANGE
+    out.model.lowerPositionLimit, out.model.upperPositionLimit = lower, upper
+    return out
 
 
 def _locked(read: Description) -> dict[str, str]:
@@ -199,7 +205,7 @@ def _made(
         if tie.follower in locked:
             angles[tie.follower] = _followed(read.model, tie, angles)
     model = read.moving(angles)
-    drives = guess_drives(model, read.torque, carrying)
+    drives = guess_drives(model, read.torque, carrying, read.unranged)
     wrong: tuple[str, ...] = ()
     try:
         check_inertias(model)
@@ -210,6 +216,7 @@ def _made(
         ("armature", drives.armature),
         ("torque_limit", drives.torque),
         ("velocity_limit", drives.velocity),
+        ("position_limit", drives.position),
     ):
         options |= {key: values} if values else {}
     out = Drafted(

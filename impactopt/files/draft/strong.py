@@ -12,6 +12,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Places
+from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.draft.hits import Hit
 from impactopt.files.draft.target_placement import LOWEST, Arm
@@ -35,6 +37,10 @@ TRAVEL_FACTORS = (1.0, 0.75, 0.55, 0.4)  # on the travel, tried while joint limi
 # least distance of the start behind the target's plane: the smaller of so many [m] and so much of the reach
 BEHIND = 0.06, 0.15
 DURATION_FACTORS = (0.8, 3.0)  # shortest and longest duration over the time at the velocity limits
+AFTER, AFTER_STEP = (
+    0.6,
+    0.03,
+)  # [s] in which a target that flies away may not meet the base, [m] between tests
 ITERATIONS, SECONDS = 150, 30.0  # limits of a trial strike or plan: most need a third of that
 
 
@@ -66,7 +72,10 @@ def strongest(
     strength = Strength(robot=robot, striker=arm.name, law=hit.law, target=hit.target)
     found, unsolved = list[Strong](), list[SolverResult]()
     impacts = drawn_impacts(strength, q, hit.normals, with_face=with_face)
-    for problem, impact in _candidates(robot, arm, impacts, given):
+    candidates = list(_candidates(robot, arm, impacts, given)) or _candidates(
+        robot, arm, impacts, given, clipped=True
+    )
+    for problem, impact in candidates:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strike that fails is no candidate
             solved = optimize_strike(problem, options={"max_iterations": ITERATIONS}, time_limit=SECONDS)
@@ -102,9 +111,17 @@ def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float
 
 
 def _candidates(
-    robot: Robot, arm: Arm, impacts: list[EstimatedImpact], given: Mapping[str, Any]
+    robot: Robot,
+    arm: Arm,
+    impacts: list[EstimatedImpact],
+    given: Mapping[str, Any],
+    *,
+    clipped: bool = False,
 ) -> Iterator[tuple[ImpactProblem, EstimatedImpact]]:
-    """Feasible problems of the best estimated impacts, with different hit points or normals."""
+    """Feasible problems of the best estimated impacts, with different hit points or normals.
+
+    clipped : joints with less range than their run-up begin at its end, as those of telescopes.
+    """
     impacts = [impact for impact in impacts if impact.point[2] > LOWEST / 2]
     reach = max((float(np.linalg.norm(impact.point)) for impact in impacts), default=0.0)
     taken: list[EstimatedImpact] = []
@@ -112,7 +129,7 @@ def _candidates(
         near = [b for b in taken if b.normal @ impact.normal > 0.9]
         if any(np.linalg.norm(b.point - impact.point) < MIN_DISTANCE * reach for b in near):
             continue
-        problem = _problem(robot, arm, impact, min(BEHIND[0], BEHIND[1] * reach), given)
+        problem = _problem(robot, arm, impact, min(BEHIND[0], BEHIND[1] * reach), given, clipped)
         if problem is None:
             continue
         taken.append(impact)
@@ -122,7 +139,7 @@ def _candidates(
 
 
 def _problem(
-    robot: Robot, arm: Arm, impact: EstimatedImpact, behind: float, given: Mapping[str, Any]
+    robot: Robot, arm: Arm, impact: EstimatedImpact, behind: float, given: Mapping[str, Any], clipped: bool
 ) -> ImpactProblem | None:
     """Problem of an estimated impact, with a start posture at least `behind` [m] behind the target's plane;
     None if no start posture is feasible.
@@ -135,7 +152,9 @@ def _problem(
         start = np.array(pin.integrate(robot.model, impact.q, -factor * way))
         angles = robot.joint_positions(start)
         edge = 0.02 * np.minimum(robot.upper - robot.lower, 1.0)
-        inside = np.all(angles > robot.lower + edge) and np.all(angles < robot.upper - edge)
+        within = np.clip(angles, robot.lower + edge, robot.upper - edge)
+        start = np.array(pin.integrate(robot.model, start, within - angles)) if clipped else start
+        inside = clipped or np.array_equal(angles, within)
         at = striking_point(robot, arm.name, start)
         if not inside or impact.normal @ (point - at) < behind or at[2] < LOWEST / 2:
             continue
@@ -149,12 +168,24 @@ def _problem(
                 start=start,
                 **given,
             )
-            clear = not touches(problem, start, impact.q)
+            clear = not touches(problem, start, impact.q) and not _hits_base(problem, impact)
         except InputError:
             continue
         if clear and not hopeless(problem):
             return problem
     return None
+
+
+def _hits_base(problem: ImpactProblem, impact: EstimatedImpact) -> bool:
+    """True if the target, as fast as estimated, flies into a link that no joint moves."""
+    if not isinstance(problem.target, FreeMass):
+        return False
+    travel = np.arange(0.0, AFTER * impact.impulse / problem.target.mass, AFTER_STEP)
+    after = np.full(len(travel), 2)
+    at = Places.of(problem.robot, np.tile(impact.q, (len(travel), 1)), travel, after)
+    fixed = {piece.link for piece in bodies_of(problem.robot).pieces if piece.joint == 0}
+    found = problem.bodies.survey(travel, at).touches
+    return any("target" in (touch.one, touch.other) and {touch.one, touch.other} & fixed for touch in found)
 
 
 def touches(problem: ImpactProblem, *postures: Array) -> bool:

@@ -6,6 +6,7 @@ import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
+from textwrap import fill
 from typing import IO, Any, ParamSpec, TypeVar
 
 import matplotlib
@@ -48,6 +49,7 @@ PHASES = ("swing", "collision", "follow-through")
 # [in] widths of a paper's column and page; pictures of these widths are printed unscaled
 COLUMN, PAGE = 3.5, 7.2
 DPI = 200
+LETTERS = 14  # of a title that fit an inch
 
 STYLE: Any = {
     "text.usetex": False,  # safety: a matplotlibrc in the working directory could have LaTeX run commands
@@ -138,7 +140,8 @@ class RecordPicture:
             figure = Picture(self.width, self.height(record) if callable(self.height) else self.height)
             self.draw(figure, record)
             if self.title:
-                figure.suptitle(title(record, self.title(record) if callable(self.title) else self.title))
+                text = title(record, self.title(record) if callable(self.title) else self.title)
+                figure.suptitle(fill(text, round(LETTERS * self.width)))
         return figure
 
 

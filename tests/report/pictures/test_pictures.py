@@ -91,6 +91,15 @@ def test_nothing_is_cut_or_lies_over_anything_else(records: dict[str, Record], w
     assert any(axes.get_xlabel() for axes in picture.axes)
 
 
+def test_a_long_title_takes_two_lines(punch_record: Record) -> None:
+    """As of a robot with a long name that fell, for a reason with numbers."""
+    name = "first strike of a robot with quite a long name, as its exporter wrote it, and of its friends"
+    long = dataclasses.replace(punch_record, summary={**punch_record.summary, "problem": {"name": name}})
+    picture = PICTURES["replay"](long)
+    assert picture is not None and name in picture.get_suptitle().replace("\n", " ")
+    assert frowns(picture) == []
+
+
 def test_frowns_are_found() -> None:
     picture = Picture(3.0, 2.0)
     axes = picture.subplots()

@@ -227,6 +227,10 @@ def check_collision(problem: Any) -> None:
             f'friction: the model {problem.collision!r} of the collision has none: take collision="full", or '
             "leave friction out"
         )
+    if problem.friction is not None and problem.friction.stiffness:
+        raise InputError(
+            "friction: plans have no bristles: leave its stiffness out; the models of one collision have them"
+        )
     instant = problem.collision in INSTANT
     if instant and not isinstance(problem.target, (FreeMass, RigidWall)):
         raise InputError(

@@ -340,7 +340,7 @@ class MujocoRobot:
     normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `speeds_along`
     force_map (h, nv) : generalized forces of a unit of normal force at each, friction included;
         without friction the same array; that of bristles is set by `bend`
-    deflections (h, 3) : of the bristles [m]
+    deflections (h, 3), normal_forces (h,) : of the bristles [m], and the last forces [N] of `bend`
     """
 
     def __init__(
@@ -360,7 +360,7 @@ class MujocoRobot:
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._jacobian, self.normal_jacobian = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
         self.sliding = None if friction is None else SlidingPoints(friction)
-        self.deflections = np.zeros((len(strikers), 3))
+        self.deflections, self.normal_forces = np.zeros((len(strikers), 3)), np.zeros(len(strikers))
         self.force_map = self.normal_jacobian if friction is None else np.zeros_like(self.normal_jacobian)
 
     def put(self, q: Array, v: Array | None = None) -> None:
@@ -404,7 +404,7 @@ class MujocoRobot:
     def speeds_along(self, normal: Array) -> Array:
         """Speeds (h,) [m/s] of the striking points along a normal (3,).
 
-        Updates `normal_jacobian` and, but for bristles, `force_map`.
+        Updates `normal_jacobian` and `force_map`, that of bristles for the last normal forces.
         """
         J, jacobians = self._jacobian, []
         for k, site in enumerate(self.sites):
@@ -414,14 +414,14 @@ class MujocoRobot:
                 jacobians.append(J.copy())
         if self.sliding is not None:
             self.sliding.update(normal, jacobians, self.data.qvel)
-            self.bend(np.zeros(len(jacobians)), 0.0)
+            self.force_map = self.sliding.force_map(self.deflections, self.normal_forces)
         return np.asarray(self.normal_jacobian @ self.data.qvel)
 
     def bend(self, forces: Array, step: float) -> None:
         """Advances the bristles by a step [s] under normal forces (h,) [N], and sets `force_map`."""
-        if self.sliding is not None:
-            if step:
-                self.deflections = self.sliding.deflected(self.deflections, forces, step)
+        if self.sliding is not None and self.sliding.bristles:
+            self.normal_forces = forces
+            self.deflections = self.sliding.deflected(self.deflections, forces, step)
             self.force_map = self.sliding.force_map(self.deflections, forces)
 
     def apply(self, torque: Array, forces: Array | float) -> None:

@@ -109,12 +109,17 @@ class Body(ABC):
         self.normal_jacobian = self.force_map = np.array([self.normal @ J for J in jacobians])
         if self.sliding is not None:
             self.sliding.update(self.normal, jacobians, v)
-            self.bend(np.zeros((len(jacobians), 3)), np.zeros(len(jacobians)))
+            unbent = np.zeros((len(jacobians), 3)), np.zeros(len(jacobians))
+            self.force_map = self.sliding.force_map(*unbent)
 
     def bend(self, deflections: Array, forces: Array) -> None:
         """Sets `force_map` for bristles with deflections (h, 3) [m] under normal forces (h,) [N]."""
-        if self.sliding is not None:
+        if self.sliding is not None and self.sliding.bristles:
             self.force_map = self.sliding.force_map(deflections, forces)
+
+    def deflected(self, deflections: Array, forces: Array, step: float) -> Array:
+        """Deflections (h, 3) [m] of bristles after a step [s] from the current state under normal forces."""
+        return deflections if self.sliding is None else self.sliding.deflected(deflections, forces, step)
 
     def _generalized_forces(self, torque: Array, force: float | Array) -> Array:
         """Generalized forces (nv,) of joint torques (n,), springs and contact forces (h,)."""

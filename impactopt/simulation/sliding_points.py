@@ -16,11 +16,11 @@ class SlidingPoints:
     """Striking points with friction on the target, in the state that `update` sets.
 
     Deflections (h, 3) [m] of the h points' bristles and normal forces (h,) [N] are given to each method;
-    friction without bristles does not depend on them.
+    friction without `bristles` does not depend on them.
     """
 
     def __init__(self, friction: ContactFriction) -> None:
-        self.friction = friction
+        self.friction, self.bristles = friction, friction.stiffness > 0
         self._normal, self._jacobians, self._velocities = np.zeros(3), [np.zeros((3, 0))], [np.zeros(3)]
 
     def update(self, normal: Array, jacobians: Sequence[Array], v: Array) -> None:

@@ -12,7 +12,8 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.small_plans import arm_problem
+from support.derivative_checks import check_derivatives
+from support.small_plans import BODILESS, arm_problem, biped_problem, transcribed
 from support.small_robots import arm, biped, disc, table
 
 from impactopt import (
@@ -20,15 +21,22 @@ from impactopt import (
     ContactFriction,
     FreeMass,
     FullDynamics,
+    Incidence,
     KelvinVoigt,
     MujocoDynamics,
+    Nail,
     RigidWall,
     SpringDamper,
     VirtualMass,
 )
 from impactopt.errors import InputError
+from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.stance import FixedBase, Free
+from impactopt.problem.terms import GearLoad
+from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
+from impactopt.solvers.ipm import solve_ipm
+from impactopt.transcription.initial_guess import first_iterate
 
 STIFFNESS = 2e4  # [N/m] along the normal
 BENDING = ContactFriction(coefficient=0.6, stiffness=0.8 * STIFFNESS)
@@ -237,6 +245,38 @@ def test_derivatives_are_those_of_differences() -> None:
         assert float(slopes[name] @ way) == pytest.approx(slope, rel=1e-6)
 
 
+def test_derivatives_of_plans_are_those_of_differences() -> None:
+    # gears are there from the start: with the first instant of a damped contact
+    terms = (*BODILESS, GearLoad())
+    t = transcribed(dataclasses.replace(biped_problem(), friction=BENDING, terms=terms))
+    x = first_iterate(t)
+    check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
+
+
+def test_a_plan_with_bristles_is_what_both_engines_replay() -> None:
+    friction, sliding = ContactFriction(coefficient=0.4, stiffness=8e3), (*BODILESS, Incidence(speed=0.5))
+    problem = dataclasses.replace(arm_problem(), friction=friction, terms=sliding)
+    t = transcribed(problem)
+    result = solve_ipm(t.program, first_iterate(t))
+    assert result.status.usable, result.message
+    plan = t.decode(result.x)
+    way = plan.trajectory()
+    until = float(way.contact_end) + 0.02
+    for engine in (simulate_pinocchio, simulate_mujoco):
+        done = engine(problem.robot, way, scene_of(problem), until=until)
+        assert done.impulse == pytest.approx(plan.impulse, rel=2e-3)
+    smooth = scene_of(dataclasses.replace(problem, friction=None))
+    done = simulate_pinocchio(problem.robot, way, smooth, until=until)
+    assert abs(done.impulse / plan.impulse - 1) > 4e-3
+
+
+def test_a_file_has_bristles() -> None:
+    rough = dataclasses.replace(load_problem("arm_planar"), friction=BENDING)
+    again = problem_from_data(problem_data(rough), where="again.toml")
+    assert again.friction == BENDING and again.hash == rough.hash
+    assert rough.hash != dataclasses.replace(rough, friction=ContactFriction(coefficient=0.6)).hash
+
+
 def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match=r"ContactFriction: stiffness \[N/m\]: -1"):
         ContactFriction(coefficient=0.5, stiffness=-1.0)
@@ -244,7 +284,10 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match=r"friction_stiffness: has 0; all must be > 0"):
         model.collide(*at, friction_stiffness=0.0)
     rigid = dataclasses.replace(model, contact_friction=ContactFriction(coefficient=0.6))
-    with pytest.raises(InputError, match=r"friction: plans have no bristles"):
-        dataclasses.replace(arm_problem(), friction=BENDING)
+    nail = {"target": Nail(mass=0.2, resistance=500.0), "law": KelvinVoigt(stiffness=1e5, damping=50.0)}
+    with pytest.raises(InputError, match=r"touches is 2, but the friction's bristles are for one touch"):
+        dataclasses.replace(arm_problem(), friction=BENDING, touches=2, **nail)
+    with pytest.raises(InputError, match=r"the model 'sdc' of the collision has none"):
+        dataclasses.replace(arm_problem(), friction=BENDING, collision="sdc")
     with pytest.raises(InputError, match=r"no setting 'friction_stiffness'"):
         rigid.collide(*at, friction_stiffness=1e4)

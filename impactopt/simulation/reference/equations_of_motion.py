@@ -159,7 +159,7 @@ class Motion:
         self._floating, self._evaluations = body.nv > body.n, 0
         # signs of the target's switches that evaluations must not leave; None: they are not checked
         self._watched: Array | None = None
-        self._bristles = 3 if body.sliding is not None and body.sliding.friction.stiffness else 0
+        self._bristles = 3 if body.sliding is not None and body.sliding.bristles else 0
         end = 2 * body.nv + 1 + forces.target.n_states
         self.target_part = slice(2 * body.nv + 1, end)  # of the state
         self._bristle_part = slice(end, end + self._bristles)

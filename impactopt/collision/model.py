@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from impactopt.collision.frozen import FrozenDynamics
 from impactopt.collision.settings import Effects, Settings
 from impactopt.contact import ContactLaw, Target
-from impactopt.contact.friction import pushed_way
+from impactopt.contact.friction import deflection_rate, lean, pushed_way
 
 _DIFFERENCE_STEP = 1e-9  # [s] for the target's acceleration, by a difference of velocities
 
@@ -44,7 +44,7 @@ class JointSpaceModel:
         time [s], penetration [m], impulse [N s] = integral of f, target's state; and if requested or needed
         peak force [N], left_out [N s] = estimated error of the impulse,
         torque (n) [N m s] = integral of tau - F, deviation (n) [rad] = phi_ref - phi,
-        sliding (3) [N s] = integral of the friction on the target,
+        sliding (3) [N s] = integral of the friction on the target, bristles (3) [m] = their deflection,
         torque2 (n), impulse2, sliding2 (3) = second integrals.
 
     Attributes
@@ -87,7 +87,7 @@ class JointSpaceModel:
         if self.effects.stiffness:
             sizes["deviation"] = self.n
         if self.slides:
-            sizes["sliding"] = 3
+            sizes |= {"sliding": 3} | ({"bristles": 3} if self.bristles else {})
         if self.second_integrals:
             sizes |= {"torque2": self.n, "impulse2": 1} | ({"sliding2": 3} if self.slides else {})
         ends = np.cumsum(list(sizes.values()))
@@ -95,6 +95,11 @@ class JointSpaceModel:
             name: slice(int(end) - size, int(end))
             for (name, size), end in zip(sizes.items(), ends, strict=True)
         }
+
+    @property
+    def bristles(self) -> bool:
+        """True if the friction at the striking point has bristles."""
+        return "friction_stiffness" in self.settings
 
     @property
     def n_states(self) -> int:
@@ -203,12 +208,24 @@ class JointSpaceModel:
             velocity += ca.mtimes(data["s_point"].T, self.part(y, "torque"))
         return velocity + ca.mtimes(data["e_point"], self.part(y, "time")) if "e_point" in data else velocity
 
-    def friction_on_target(self, velocity: Any, force: Any, data: dict[str, Any]) -> Any:
-        """Friction (3) [N] at one instant, from the striking point's velocity (3) [m/s] and force [N]."""
-        direction = pushed_way(
-            data["normal"], velocity, data["friction_coefficient"], data["friction_slip_speed"]
-        )
-        return force * (direction - data["normal"])
+    def friction_on_target(
+        self, velocity: Any, force: Any, deflection: Any, data: dict[str, Any]
+    ) -> tuple[Any, Any]:
+        """Friction (3) [N] at one instant, and rate (3) [m/s] of the bristles' deflection.
+
+        velocity (3) [m/s] : of the striking point.  deflection (3) [m] : of bristles, if there are any.
+        """
+        normal, coefficient = data["normal"], data["friction_coefficient"]
+        slip_speed = data["friction_slip_speed"]
+        if not self.bristles:
+            return force * (pushed_way(normal, velocity, coefficient, slip_speed) - normal), ca.SX(0, 1)
+        leaning = lean(deflection, force, coefficient, data["friction_stiffness"])
+        rate = deflection_rate(normal, velocity, leaning, slip_speed)
+        return force * coefficient * leaning, rate
+
+    def deflection(self, y: Any) -> Any:
+        """Deflection of the bristles (3) [m], if there are any, else (0)."""
+        return self.part(y, "bristles") if self.bristles else y[:0, :]
 
     def target_state(self, y: Any) -> list[Any]:
         states = self.part(y, "target")
@@ -237,7 +254,8 @@ class JointSpaceModel:
         force = self.law.force(self.part(y, "penetration"), 0.0, self.law_numbers(data))
         hand = -data["m"] * force
         if self.slides:
-            friction = self.friction_on_target(self.point_velocity(y, data), force, data)
+            velocity, deflection = self.point_velocity(y, data), self.deflection(y)
+            friction, _ = self.friction_on_target(velocity, force, deflection, data)
             hand -= ca.mtimes(ca.mtimes(data["normal"].T, data["m_point"]), friction)
         if self.n:
             tau = self.saturate(self.with_feedforward(self.servo(y, u, data), data), data)
@@ -473,7 +491,7 @@ class SegmentedCollision:
 
     def _next_start(self, y: Any) -> Any:
         """State at the start of a segment, from the end of the one before; integrals restart at zero."""
-        kept = ("penetration", "target", "peak", "left_out", "deviation")
+        kept = ("penetration", "target", "peak", "left_out", "deviation", "bristles")
         parts = {name: self.model.part(y, name) for name in self.model.layout}
         return self.model.join({k: x if k in kept else ca.MX.zeros(*x.shape) for k, x in parts.items()})
 

@@ -194,14 +194,15 @@ class Instants:
     def friction_on_target(self) -> Any:
         """Friction on the target (3, k) [N]."""
         model, velocity, force = self._model, ca.SX.sym("velocity", 3), ca.SX.sym("force")
-        names = ("normal", "friction_coefficient", "friction_slip_speed")
+        names = [name for name in model.data if name == "normal" or name.startswith("friction_")]
         data = {name: ca.SX.sym(name, *model.data[name]) for name in names}
-        found = model.friction_on_target(velocity, force, data)
-        function = ca.Function("friction", [velocity, force, *data.values()], [found])
+        deflection = ca.SX.sym("deflection", 3 * model.bristles)
+        found, _ = model.friction_on_target(velocity, force, deflection, data)
+        function = ca.Function("friction", [velocity, force, deflection, *data.values()], [found])
         columns = self._states.size2()
         values = [ca.repmat(self._data[name], 1, columns) for name in names]
         velocities = model.point_velocity(self._states, self._data)
-        return function.map(columns)(velocities, self.force, *values)
+        return function.map(columns)(velocities, self.force, model.deflection(self._states), *values)
 
     @cached_property
     def hand_speed(self) -> Any:

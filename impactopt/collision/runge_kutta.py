@@ -110,7 +110,8 @@ def rate_of_change(model: JointSpaceModel, y: Any, u: Any, data: dict[str, Any])
         "deviation": -u,
     }
     if model.slides:
-        rates["sliding"] = model.friction_on_target(model.point_velocity(y, data), force, data)
+        velocity, deflection = model.point_velocity(y, data), model.deflection(y)
+        rates["sliding"], rates["bristles"] = model.friction_on_target(velocity, force, deflection, data)
     if model.second_integrals:
         once = ("torque", "impulse", *(("sliding",) if model.slides else ()))
         rates |= {f"{name}2": model.part(y, name) for name in once}

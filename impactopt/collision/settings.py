@@ -97,6 +97,7 @@ Array = NDArray[np.float64]
 
 # permitted signs of the servo's settings
 _SIGN = {
+    "friction_stiffness": "> 0",
     "kp": ">= 0",
     "kd": ">= 0",
     "torque_limit": "> 0",
@@ -119,10 +120,10 @@ class Settings(Mapping[str, Array]):
     """Parameters of a collision with their default values, by input name, in the order of the inputs.
 
     There are only those that the model's effects need: normal (3); contact_<parameter of the law>;
-    target_<parameter of the target>; with friction at the striking point friction_coefficient and
-    friction_slip_speed [m/s]; and with a servo (`servo_settings`) kd; kp with servo stiffness; torque_limit
-    (n) with saturation; viscous, coulomb (n) with friction. kp and kd are (n), or (n, n) if the model was
-    given matrices.
+    target_<parameter of the target>; with friction at the striking point friction_coefficient,
+    friction_slip_speed [m/s] and, of bristles, friction_stiffness [N/m]; and with a servo
+    (`servo_settings`) kd; kp with servo stiffness; torque_limit (n) with saturation; viscous, coulomb (n)
+    with friction. kp and kd are (n), or (n, n) if the model was given matrices.
 
     With dJ/dt v, and without friction, there are reference (n, 10) [rad/s^(k + 1)], coefficients of t^k in
     column k - 1 of the change of the joint velocities of the servo's reference, and reference_until [s],
@@ -144,7 +145,8 @@ class Settings(Mapping[str, Array]):
             "target_": (type(target), target.parameters),
         }
         if friction is not None:
-            self._owners["friction_"] = ContactFriction, asdict(friction)
+            names = asdict(friction)  # in the order of `parameters`, whose last one only bristles have
+            self._owners["friction_"] = (ContactFriction, dict(zip(names, friction.parameters, strict=False)))
         values: dict[str, Any] = {"normal": normal}
         for prefix, (_, parameters) in self._owners.items():
             values |= {prefix + key: number for key, number in parameters.items()}

@@ -215,6 +215,7 @@ class _Replay(MujocoRobot):
         else:
             state, travel = contact.untouched_step(self.target, self.travel, step)
             push = Push(forces=zero, first_half=zero, peaks=zero, state=state, travel=travel, depths=depths)
+        self.bend(push.forces, step)
         self.last_step = (speeds, push.forces)
         self.target, self.travel = push.state, push.travel
         return push

@@ -19,6 +19,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
+from impactopt.simulation.sliding_points import SlidingPoints
 
 Array = NDArray[np.float64]
 # hardest equality that MuJoCo accepts: impedance, and time constant in steps
@@ -338,7 +339,8 @@ class MujocoRobot:
     sites : of the h striking points
     normal_jacobian (h, nv) : of their speeds along the normal, at the last call of `speeds_along`
     force_map (h, nv) : generalized forces of a unit of normal force at each, friction included;
-        without friction the same array
+        without friction the same array; that of bristles is set by `bend`
+    deflections (h, 3), normal_forces (h,) : of the bristles [m], and the last forces [N] of `bend`
     """
 
     def __init__(
@@ -357,7 +359,8 @@ class MujocoRobot:
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in models])
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._jacobian, self.normal_jacobian = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
-        self.friction = friction
+        self.sliding = None if friction is None else SlidingPoints(friction)
+        self.deflections, self.normal_forces = np.zeros((len(strikers), 3)), np.zeros(len(strikers))
         self.force_map = self.normal_jacobian if friction is None else np.zeros_like(self.normal_jacobian)
 
     def put(self, q: Array, v: Array | None = None) -> None:
@@ -401,15 +404,25 @@ class MujocoRobot:
     def speeds_along(self, normal: Array) -> Array:
         """Speeds (h,) [m/s] of the striking points along a normal (3,).
 
-        Updates `normal_jacobian` and `force_map`.
+        Updates `normal_jacobian` and `force_map`, that of bristles for the last normal forces.
         """
-        J = self._jacobian
+        J, jacobians = self._jacobian, []
         for k, site in enumerate(self.sites):
             self.mujoco.mj_jacSite(self.world, self.data, J, None, site)
             self.normal_jacobian[k] = normal @ J
-            if self.friction is not None:
-                self.force_map[k] = self.friction.way(normal, J @ self.data.qvel) @ J
+            if self.sliding is not None:
+                jacobians.append(J.copy())
+        if self.sliding is not None:
+            self.sliding.update(normal, jacobians, self.data.qvel)
+            self.force_map = self.sliding.force_map(self.deflections, self.normal_forces)
         return np.asarray(self.normal_jacobian @ self.data.qvel)
+
+    def bend(self, forces: Array, step: float) -> None:
+        """Advances the bristles by a step [s] under normal forces (h,) [N], and sets `force_map`."""
+        if self.sliding is not None and self.sliding.bristles:
+            self.normal_forces = forces
+            self.deflections = self.sliding.deflected(self.deflections, forces, step)
+            self.force_map = self.sliding.force_map(self.deflections, forces)
 
     def apply(self, torque: Array, forces: Array | float) -> None:
         """Applies torques (n,) [N m] at the joints, and contact forces (h,) [N] against the normal."""

@@ -41,6 +41,7 @@ class _State:
     target: Array  # its state
     impulses: Array  # (h,) of each striker on the target [N s]
     drive: Array  # (n,) torque of the motors [N m]
+    deflections: Array  # (h, 3) of the strikers' bristles [m]
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,8 @@ class _World:
         """State before any contact."""
         commanded = np.array(self.servo.torque(t, self.servo.angles(q), v[self.base :]))
         drive = self.motors.cut(commanded[1], v[self.base :])
-        return _State(q, v, travel, self.contact.untouched, np.zeros(len(self.scene.strikers)), drive)
+        h = len(self.scene.strikers)
+        return _State(q, v, travel, self.contact.untouched, np.zeros(h), drive, np.zeros((h, 3)))
 
     def depths(self, s: _State) -> Array:
         """Depths (h,) [m] of the striking points in the target, in the current state; -inf without one."""
@@ -145,19 +147,19 @@ class _World:
         demand, saturated = self.delay.at(t, commanded)
         cut = self.motors.cut(saturated, joints)
         torque = self.motors.now(s.drive, cut)
-        push, contact = None, self.contact
-        if forces is None:
-            forces = contact.forces(depths, speeds, s.target)
-            if contact.near(depths, speeds, s.target, step):
-                units = np.eye(len(speeds))
-                a = body.accelerate(torque, 0.0 * speeds)
-                # Accelerations are affine in the contact forces: differences with unit forces give the
-                # response, and with it J P J', whatever is fixed, without inverting H.
-                response = np.column_stack([a - body.accelerate(torque, unit) for unit in units])
-                inverse_mass = body.normal_jacobian @ response
-                push = contact.pushed(
-                    depths, speeds, body.normal_accelerations(a), inverse_mass, s.target, s.travel, step
-                )
+        push, contact, inside = None, self.contact, forces is None
+        forces = contact.forces(depths, speeds, s.target) if forces is None else forces
+        body.bend(s.deflections, forces)
+        if inside and contact.near(depths, speeds, s.target, step):
+            units = np.eye(len(speeds))
+            a = body.accelerate(torque, 0.0 * speeds)
+            # Accelerations are affine in the contact forces: differences with unit forces give the
+            # response, and with it J P J', whatever is fixed, without inverting H.
+            response = np.column_stack([a - body.accelerate(torque, unit) for unit in units])
+            inverse_mass = body.normal_jacobian @ response
+            push = contact.pushed(
+                depths, speeds, body.normal_accelerations(a), inverse_mass, s.target, s.travel, step
+            )
         return _Rates(
             v=s.v.copy(),
             a=body.accelerate(torque, forces),
@@ -198,6 +200,8 @@ class _World:
         a = first.a
         if push is not None and np.any(push.first_half != first.forces):
             a = self.body.accelerate(first.torque, push.first_half)
+        bent = first.forces if push is None else push.first_half
+        deflections = self.body.deflected(s.deflections, bent, h / 2)
         half = _State(
             # explicit midpoint rule: half a step by the rates at the start, then a whole one by the rates in
             # its middle
@@ -207,6 +211,7 @@ class _World:
             target=s.target,
             impulses=s.impulses,
             drive=self.motors.after(s.drive, first.cut, h / 2),
+            deflections=deflections,
         )
         # mean forces of the whole step, so that momentum is exchanged exactly as the target's integration has
         # it
@@ -222,6 +227,7 @@ class _World:
             target=target,
             impulses=s.impulses + h * middle.forces,
             drive=self.motors.after(s.drive, middle.cut, h),
+            deflections=self.body.deflected(s.deflections, middle.forces, h),
         )
         if push is None:
             return after

@@ -17,6 +17,7 @@ from impactopt.contact.friction import ContactFriction
 from impactopt.errors import InputError
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
+from impactopt.simulation.sliding_points import SlidingPoints
 
 Array = NDArray[np.float64]
 _AXES = pin.LOCAL_WORLD_ALIGNED
@@ -36,7 +37,7 @@ class Body(ABC):
 
     `normal_jacobian` (h, nv) gives the speeds of the h striking points along the normal. `force_map` (h, nv)
     maps a unit of normal force at each, friction included, to generalized forces; without friction both are
-    the same.
+    the same. That of bristles is set by `bend`.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class Body(ABC):
         self.compliance, self.normal = np.tile(compliance, len(frames)), normal
         strikers = (striker,) if isinstance(striker, str) else striker
         self.strikers = [self.model.getFrameId(name) for name in strikers]
-        self.friction = friction
+        self.sliding = None if friction is None else SlidingPoints(friction)
         self.normal_jacobian = self.force_map = np.zeros((len(strikers), self.nv))
 
     @abstractmethod
@@ -106,8 +107,19 @@ class Body(ABC):
             self._springs = self.robot.spring_torque(q)
         jacobians = [self._jacobian(i)[:3] for i in self.strikers]
         self.normal_jacobian = self.force_map = np.array([self.normal @ J for J in jacobians])
-        if self.friction is not None:
-            self.force_map = np.array([self.friction.way(self.normal, J @ v) @ J for J in jacobians])
+        if self.sliding is not None:
+            self.sliding.update(self.normal, jacobians, v)
+            unbent = np.zeros((len(jacobians), 3)), np.zeros(len(jacobians))
+            self.force_map = self.sliding.force_map(*unbent)
+
+    def bend(self, deflections: Array, forces: Array) -> None:
+        """Sets `force_map` for bristles with deflections (h, 3) [m] under normal forces (h,) [N]."""
+        if self.sliding is not None and self.sliding.bristles:
+            self.force_map = self.sliding.force_map(deflections, forces)
+
+    def deflected(self, deflections: Array, forces: Array, step: float) -> Array:
+        """Deflections (h, 3) [m] of bristles after a step [s] from the current state under normal forces."""
+        return deflections if self.sliding is None else self.sliding.deflected(deflections, forces, step)
 
     def _generalized_forces(self, torque: Array, force: float | Array) -> Array:
         """Generalized forces (nv,) of joint torques (n,), springs and contact forces (h,)."""
@@ -209,6 +221,7 @@ class PinocchioBody(Body):
     def accelerate(self, torque: Array, force: float | Array) -> Array:
         if self._dense is not None:
             self._dense.update(*self._state)
+            self._dense.force_map = self.force_map
             return self._dense.accelerate(torque, force)
         tau, model = self._generalized_forces(torque, force), self.model
         if not self.frames:

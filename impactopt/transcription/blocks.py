@@ -56,21 +56,28 @@ __all__ = [
 
 
 def sizes(
-    c: StanceCoordinates, target: Target, block: str, *, frozen: bool = False, second: bool = False
+    c: StanceCoordinates,
+    target: Target,
+    block: str,
+    *,
+    frozen: bool = False,
+    second: bool = False,
+    bristles: bool = False,
 ) -> dict[str, int]:
     """Lengths of the named slices of a block's output, in order.
 
-    frozen : of a model with frozen dynamics.  second : with a second striker.
+    frozen : of a model with frozen dynamics.  second : with a second striker.  bristles : of friction.
     """
     n, base, soles = c.robot.n, c.base, len(c.legs)
     legs = {"legs": c.nl, "lag": c.nl, "hand": 1} if frozen else {}
+    bent = {"bristles": 3 + 3 * second} if bristles else {}
     coasting = {"rate": c.nl, "acceleration": c.nl} if frozen else {"twist": 6 * soles}
     return {
         "node": {"closure": 6 * soles, "base": base, "torque": n, "leg_rate": c.nl, "extension": soles},
         "contact": {"point": 3, "velocity": 3},
         "approach": {"along": 1},
         "coasting": {"closure": 6 * soles, **coasting},
-        "collision": {"closure": 6 * soles, "base": base, "joints": n, "torque": n, **legs},
+        "collision": {"closure": 6 * soles, "base": base, "joints": n, "torque": n, **bent, **legs},
         "moved": {"y": c.ny, "speed": 1},
         "carried": {"base": base},
         "force": {
@@ -264,7 +271,7 @@ def builders(
     first: bool = False,
     second: str = "",
     gain_groups: JointGroups = (),
-    friction: bool = False,
+    friction: int = 0,
 ) -> dict[str, Callable[[], BlockExpression]]:
     """Functions that build the expressions of the blocks, by name.
 
@@ -273,7 +280,8 @@ def builders(
     edges : of the support polygon.  instant : for an impact without duration.
     frozen, freezes : terms of a model with frozen dynamics, and its number of freezes during contact.
     first : with the first instant of contact.  second : another striker.
-    gain_groups : joints that share a gain factor.  friction : striking points have friction.
+    gain_groups : joints that share a gain factor.  friction : number of parameters of the
+        striking points' friction.
     """
     lasting: dict[str, Callable[[], BlockExpression]] = {
         "collision": lambda: collision(c, striker, frozen, second, gain_groups, friction),
@@ -352,7 +360,7 @@ def own_blocks(
         first=problem.first_instant,
         second="" if problem.second is None else problem.second.striker,
         gain_groups=problem.gain_joints,
-        friction=problem.friction is not None,
+        friction=0 if problem.friction is None else len(problem.friction.parameters),
     )
 
 

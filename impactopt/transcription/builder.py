@@ -157,7 +157,14 @@ class Builder:
     def parts(self, block: str) -> dict[str, Any]:
         """Indices of the named slices of a block's output, within an instance."""
         frozen = self.problem.frozen is not None
-        second = self.problem.second is not None
-        size = symbolic.sizes(self.coordinates, self.problem.target, block, frozen=frozen, second=second)
+        second, friction = self.problem.second is not None, self.problem.friction
+        size = symbolic.sizes(
+            self.coordinates,
+            self.problem.target,
+            block,
+            frozen=frozen,
+            second=second,
+            bristles=friction is not None and friction.stiffness > 0,
+        )
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}

@@ -117,7 +117,7 @@ class FirstInstant:
 
 
 def friction_parameters(problem: ImpactProblem) -> Array:
-    """Parameters of the striking points' friction (2,); (0,) without friction."""
+    """Parameters of the striking points' friction (2,); (3,) with bristles; (0,) without friction."""
     return np.array(() if problem.friction is None else problem.friction.parameters, dtype=float)
 
 
@@ -419,6 +419,8 @@ class Collision(ContactParameters, Collocated):
         self.f = add("contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
         self.xt = add("target travel", 1, labels=["target"])
+        bent = 3 * len(p.strikers) if len(friction_parameters(p)) > 2 else 0
+        self.bristles = add("bristle deflection", bent, scale=DEPTH_SCALE)
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
         # from the third phase on: before the second one the mean rate is the d of the first
@@ -489,7 +491,8 @@ class Collision(ContactParameters, Collocated):
         y, u0, ff = self.contact.state.y, self.contact.u0[0], self._feedforward()
         reference = [self.coast_legs[i], self.coast_rates[i]]
         motion = [*self._travel(i), *self._slots(self.u, i, u0), self.legs[i]]
-        return [y, u0, *reference, ff, *motion, self.f[i], self.w[i], self.contact.gains[0]]
+        bent = self._slots(self.bristles, i, Affine.zeros(self.bristles.size))
+        return [y, u0, *reference, ff, *motion, self.f[i], self.w[i], *bent, self.contact.gains[0]]
 
     def _hand_slots(self, i: int) -> list[Affine]:
         """Slots of the block ``force`` that determine the hand's position and speed."""
@@ -505,7 +508,7 @@ class Collision(ContactParameters, Collocated):
 
     def states(self) -> tuple[Group, ...]:
         """Collocated variables whose value at contact is known, beside those of `integrated`."""
-        return self.state, self.xt, self.p
+        return self.state, self.xt, self.p, self.bristles
 
     def kept_groups(self) -> list[Group]:
         """Variables that are not at stages: a mesh of finer elements keeps their values."""
@@ -617,6 +620,10 @@ class Collision(ContactParameters, Collocated):
         base, joint = first["collision"] + part["base"], first["collision"] + part["joints"]
         b.equal("collision dynamics", place, DIRECTIONS[: c.base], base, b.limits.unbalanced)
         b.equal("collision dynamics", place, joints, joint, percent("of the joint's limit off"))
+        if self.bristles.size:
+            bristles = [f"bristle {k}" for k in range(self.bristles.size)]
+            outputs = first["collision"] + part["bristles"]
+            b.equal("bristles", place, bristles, outputs, Measure("mm", 1e3 * DEPTH_SCALE, "off"))
         self._bound_torques(place, first["collision"] + part["torque"], self.torque_fraction)
         if self.cone_margin is not None:
             minimum = b.limits.cone.minimum_force if self.scenario is None else 0.0

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.collision.settings import Effects
-from impactopt.contact.friction import pushed_way
+from impactopt.contact.friction import deflection_rate, lean, pushed_way
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.kinematics.coordinates import StanceCoordinates, striker_kinematics
@@ -69,7 +69,7 @@ def collision(
     frozen: Effects | None = None,
     second: str = "",
     gain_groups: JointGroups = (),
-    friction: bool = False,
+    friction: int = 0,
 ) -> BlockExpression:
     """Equation of motion (6) at one collocation point of the collision.
 
@@ -80,12 +80,14 @@ def collision(
     tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
 
     frozen : terms of the frozen model; None: full dynamics.  second : another striker.
-    gain_groups : joints whose gains have a factor each.  friction : the striking point has friction.
+    gain_groups : joints whose gains have a factor each.  friction : number of its parameters; 3 with
+        bristles.
 
     z = y0; u0 (ydot at contact);
         not frozen: legs and leg rates of the coasting reference;
         feed-forward over torque limit (n,); d1; T1; d; T; u (ydot); u'; legs; f [N], one a striker; w (6 a
         sole);
+        bristles: deflections z [m], z', three a striker;
         frozen: y, ydot and legs of the freeze; rates of the reference's legs at the beginning of the segment,
         their accelerations at the freeze; rates r of the legs, r'; lag of the legs behind the reference,
         lag'; time [s] since the beginning of the segment; slope of the hand's speed; without bias, wrenches
@@ -93,7 +95,8 @@ def collision(
     p = normal (3,); s (place in the phase); Kp, Kd, torque limits (n, each); weight [N]; lever [m]; with
         friction the parameters of `ContactFriction`.
     out = closure [m, rad]; base equations over weight and weight x lever; joint equations over torque limit;
-        servo torque over limit; frozen: residuals of r', of lag' and of the slope of the hand's speed.
+        servo torque over limit; residuals of z' over 1 cm; frozen: residuals of r', of lag' and of the slope
+        of the hand's speed.
     """
     ny, n, nl, nw = c.ny, c.robot.n, c.nl, 6 * len(c.legs)
     y0, u0, d1, d, u, u1 = (ca.SX.sym(s, ny) for s in ("y0", "u0", "d1", "d", "u", "u1"))
@@ -103,7 +106,8 @@ def collision(
     normal, s = ca.SX.sym("n", 3), ca.SX.sym("s")
     kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
     weight, lever, logs = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("logs", len(gain_groups))
-    of_friction = ca.SX.sym("friction", 2 * friction)
+    of_friction = ca.SX.sym("friction", friction)
+    bent, bent1 = (ca.SX.sym(s, 3 * len(strikers) * (friction > 2)) for s in ("bent", "bent1"))
     t = T1 + T * s  # since contact
     y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
     through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
@@ -125,9 +129,18 @@ def collision(
     q = c.configuration(at[0], at[2])
     # equation (6): H a + bias + j' f - J_c' w = S' tau
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
+    bristles = ca.SX(0, 1)  # residuals of z'
     for k, name in enumerate(strikers):
-        J = _striker_jacobian(c, name, q)
-        way = pushed_way(normal, ca.mtimes(J, v), *ca.vertsplit(of_friction)) if friction else normal
+        J, way = _striker_jacobian(c, name, q), normal
+        if friction > 2:
+            mu, slip_speed, bristle_stiffness = ca.vertsplit(of_friction)
+            z, z1 = bent[3 * k : 3 * k + 3], bent1[3 * k : 3 * k + 3]
+            leaning = lean(z, f[k], mu, bristle_stiffness)
+            way = normal + mu * leaning
+            slope = T * deflection_rate(normal, ca.mtimes(J, v), leaning, slip_speed)
+            bristles = ca.vertcat(bristles, (z1 - slope) / DEPTH_SCALE)
+        elif friction:
+            way = pushed_way(normal, ca.mtimes(J, v), *ca.vertsplit(of_friction))
         tau += ca.mtimes(J.T, way) * f[k]
     # Without bias H a has no weight, so the part of w that carries it must not stand in the balance either.
     tau -= c.sole_wrench_map(at[0], at[2], w - carried)
@@ -157,9 +170,10 @@ def collision(
         # what the motion needs, less what the servo gives: the limit (12) itself is a bound of "torque"
         "joints": tau[c.base :] / limit - servo,
         "torque": servo,
+        "bristles": bristles,
         **slopes,
     }
-    z = [y0, u0, *(own if frozen is None else []), ff, d1, T1, d, T, u, u1, legs, f, w]
+    z = [y0, u0, *(own if frozen is None else []), ff, d1, T1, d, T, u, u1, legs, f, w, bent, bent1]
     z += [*(own if frozen is not None else []), logs]
     p = [normal, s, kp, kd, limit, weight, lever, of_friction]
     return make_block(z, p, out, through, lanes=4, stages=stages)
@@ -360,14 +374,12 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     return make_block([y, legs, u0, du, w, impulse], p, out, lanes=2)
 
 
-def first_instant(
-    c: StanceCoordinates, striker: str, law: ContactLaw, friction: bool = False
-) -> BlockExpression:
+def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw, friction: int = 0) -> BlockExpression:
     """First instant of contact: a damped contact has a force at once, so accelerations jump.
 
     The jump is linear in the force: H da = J_c' dw - j' f, the frozen part of equation (6).
 
-    friction : the striking point has friction.
+    friction : number of its parameters; 3 with bristles, which are not bent yet: there is no friction.
 
     z = y, legs, u0 (ydot) at contact; change of yddot; of the sole wrenches (6 a sole); f [N].
     p = normal (3,); parameters of the law; the target's speed before [m/s]; armature (n,); torque limits
@@ -387,8 +399,8 @@ def first_instant(
     # acceleration just before contact, where the swing ends with yddot = 0
     v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
     j = push = ca.mtimes(J.T, normal)  # (nv, 1)
-    of_friction = ca.SX.sym("friction", 2 * friction)
-    if friction:
+    of_friction = ca.SX.sym("friction", friction)
+    if friction == 2:
         speed = striker_kinematics(c, striker)(q, v, 0 * v)[1]
         push = ca.mtimes(J.T, pushed_way(normal, speed, *ca.vertsplit(of_friction)))
     balance = _inertia(c)(q, da) + push * f - c.sole_wrench_map(y, legs, w)

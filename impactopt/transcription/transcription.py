@@ -84,7 +84,7 @@ def block_functions(
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
     springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
-    rubs = () if problem.friction is None else ("rubs",)
+    rubs = () if problem.friction is None else ("rubs", len(problem.friction.parameters))
     keys = {"force": (*contact, *second), "first": (*contact[:1], *rubs), "coasting": frozen}
     keys |= {"collision": (*frozen, *springs, *second, *rubs), **dict.fromkeys(SECOND_BLOCKS, second)}
     if chosen := problem.gain_joints:

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 from support.derivative_checks import check_derivatives
 from support.small_plans import BODILESS, arm_problem, biped_problem, transcribed
-from support.small_robots import arm, biped, table
+from support.small_robots import arm, biped, disc, table
 
 from impactopt import (
     SDC,
@@ -31,7 +31,6 @@ from impactopt.files.problem_file import load_problem, problem_data, problem_fro
 from impactopt.kinematics.operational_space import ConstrainedDynamics, holding_torque, striking_velocity
 from impactopt.kinematics.stance import BothSoles, FixedBase, Free
 from impactopt.problem.terms import GearLoad
-from impactopt.robots.robot import Robot, Striker
 from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.transcription.initial_guess import first_iterate
@@ -179,29 +178,6 @@ def test_many_frozen_collisions_have_friction_of_their_own() -> None:
     alone = [model.collide(q, v, torque, friction_coefficient=mu).impulse for mu in coefficients]
     np.testing.assert_allclose(many["impulse"], alone, rtol=1e-12)
     assert np.ptp(alone) > 1e-2 * np.mean(alone)
-
-
-def disc(mass: float, radius: float) -> Robot:
-    """A disc in the plane, of inertia 0.4 m R^2, that strikes with the point of its rim ahead along x."""
-    model = pin.Model()
-    model.name = "disc"
-    joint = 0
-    for kind, name in ((pin.JointModelPX, "x"), (pin.JointModelPY, "y"), (pin.JointModelRZ, "turn")):
-        joint = model.addJoint(joint, kind(), pin.SE3.Identity(), name)
-        model.addJointFrame(joint)
-        light = pin.Inertia(1e-9, np.zeros(3), 1e-12 * np.eye(3))
-        model.appendBodyToJoint(joint, light, pin.SE3.Identity())
-    body = pin.Inertia(mass, np.zeros(3), 0.4 * mass * radius**2 * np.eye(3))
-    model.appendBodyToJoint(joint, body, pin.SE3.Identity())
-    return Robot.from_model(
-        model,
-        kp=0.0,
-        kd=0.0,
-        torque_limit=200.0,
-        velocity_limit=50.0,
-        position_limit=dict.fromkeys(("x", "y", "turn"), (-5.0, 5.0)),
-        strikers=[Striker(name="rim", frame="turn", point=np.array([radius, 0.0, 0.0]))],
-    )
 
 
 @pytest.mark.parametrize(

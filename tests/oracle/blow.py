@@ -147,6 +147,7 @@ class Blow:
         out = {
             f"{p}contact force": np.array([FORCE]),
             f"{p}target state": self.typical,
+            f"{p}bristle deflection": np.array([DEPTH]),
             f"{p}collision sole wrench": self.robot.wrench_scale,
         }
         return out | {name: np.array([0.01]) for name in self.durations}
@@ -254,6 +255,7 @@ class Blow:
         # a spring's rest does not move
         driven = np.concatenate([np.ones(robot.base), np.where(r.sprung, 0.0, 1.0)[robot.independent]])
         lifted = self.torque(i) if self.torque(i) in self.lifted else None
+        bristles = robot.friction is not None and robot.friction.stiffness > 0
 
         def value(v: Variables) -> Array:
             y0, u0, ff = self._start(v), v.get("rate at contact"), v.get("feed-forward at contact")
@@ -261,14 +263,20 @@ class Blow:
             u, legs = self.get(v, "collision rate", i), self.get(v, "collision legs", i)
             w, f = self.get(v, "collision sole wrench", i), self.get(v, "contact force", i)
             q, qd, qdd = self.motion(v, i)
-            tau = robot.torque(q, qd, qdd, w, f)
+            bent = self.get(v, "bristle deflection", i).reshape(-1, 3) if bristles else np.zeros((0, 3))
+            tau = robot.torque(q, qd, qdd, w, f, bent)
             lag = self.get(v, "coasting legs", i) - legs
             slower = self.get(v, "coasting leg rates", i) - qd[robot.base + dependent]
             ahead, faster = joints(y0 + driven * u0 * time - y, lag), joints(u0 - u, slower)
             servo = ff + (r.kp * ahead + r.kd * faster) / r.torque_limit
             found = [robot.closure(q), tau[: robot.base] / robot.base_scale]
             bounded = servo if lifted is None else servo - v.get(lifted)
-            return np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, bounded, inside(w)])
+            out = np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, bounded, inside(w)])
+            if not bristles:
+                return out
+            slope = self.slope(v, "bristle deflection", i, np.zeros(bent.size))
+            T = v.one(self.durations[self.stages[i].phase])
+            return np.concatenate([out, (slope - T * robot.bending(q, qd, f, bent)) / DEPTH])
 
         closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
         inside, cone = limits.cone_rows(robot, place, self.margin or 0.0, self.least)
@@ -280,6 +288,9 @@ class Blow:
             ("collision dynamics", place, [*DIRECTIONS[: robot.base], *r.joint_names], 0.0, 0.0),
             (f"{limits.torque.name} in collision", place, r.joint_names, -most, most),
         ]
+        if bristles:
+            each = [f"bristle {k}" for k in range(3 * len(robot.hands))]
+            cone = [*cone, ("bristles", place, each, 0.0, 0.0)]
         return Piece.of(value, [*rows, *cone])
 
     def torque(self, i: int) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -183,7 +183,15 @@ class RobotMotion:
         found = [np.linalg.det(jac[:, columns]) for (_, _, columns, _), jac in legs]
         return np.array(found) / self._determinants if found else np.zeros(0)
 
-    def torque(self, q: Array, v: Array, a: Array, wrenches: Array, forces: Iterable[float] = ()) -> Array:
+    def torque(
+        self,
+        q: Array,
+        v: Array,
+        a: Array,
+        wrenches: Array,
+        forces: Iterable[float] = (),
+        bent: Sequence[Array] = (),
+    ) -> Array:
         """Generalized force (nv,) that this motion needs, under wrenches (6 a sole) in the soles' frames and
         the contact's normal forces [N] at the hands.
         """
@@ -196,23 +204,47 @@ class RobotMotion:
                 tau[joint.idx_v] += drive.spring_stiffness * (q[joint.idx_q] - drive.spring_rest)
         if self.soles:
             self.relieve(tau, q, wrenches)
-        return tau + self.pushed(q, v, forces)
+        return tau + self.pushed(q, v, forces, bent)
 
-    def pushed(self, q: Array, v: Array, forces: Iterable[float]) -> Array:
-        """Generalized force (nv,) against normal forces [N] on the hands, and against their friction."""
+    def pushed(self, q: Array, v: Array, forces: Iterable[float], bent: Sequence[Array] = ()) -> Array:
+        """Generalized force (nv,) against normal forces [N] on the hands, and against their friction.
+
+        bent : deflections (3,) [m] of each hand's bristles; (): not bent.
+        """
         out = np.zeros(self.model.nv)
-        for hand, force in zip(self.hands, forces, strict=False):
-            self._seen = None
-            frame = pin.computeFrameJacobian(self.model, self.data, q, hand, _AXES)
-            jac = np.reshape(frame, (6, self.model.nv))[:3]
+        for k, (hand, force) in enumerate(zip(self.hands, forces, strict=False)):
+            jac, slide, full = self._slide(q, v, hand)
             push = self.normal * force
-            if self.friction is not None:
-                fast = jac @ v
-                slide = fast - (fast @ self.normal) * self.normal
-                full = np.hypot(np.linalg.norm(slide), self.friction.slip_speed)
+            if self.friction is not None and self.friction.stiffness:
+                push = push + (self.leaning(force, bent[k])[0] if len(bent) else 0.0)
+            elif self.friction is not None:
                 push = push + self.friction.coefficient * force * slide / full
             out += jac.T @ push
         return out
+
+    def _slide(self, q: Array, v: Array, hand: int) -> tuple[Array, Array, float]:
+        """Jacobian (3, nv) of a hand, its velocity (3,) across the normal, and that speed with the slip's."""
+        self._seen = None
+        frame = pin.computeFrameJacobian(self.model, self.data, q, hand, _AXES)
+        jac = np.reshape(frame, (6, self.model.nv))[:3]
+        fast = jac @ v
+        slide = fast - (fast @ self.normal) * self.normal
+        slip = 0.0 if self.friction is None else self.friction.slip_speed
+        return jac, slide, float(np.hypot(np.linalg.norm(slide), slip))
+
+    def leaning(self, force: float, bent: Array) -> tuple[Array, float]:
+        """Force (3,) [N] of bristles under a normal force, and the limit [N] that it cannot exceed."""
+        limit, stiffness = self.friction.coefficient * force, self.friction.stiffness
+        elastic = stiffness * float(np.hypot(np.linalg.norm(bent), 1e-9))  # bent by a nanometre at least
+        return limit * stiffness * bent / max(limit, elastic), limit
+
+    def bending(self, q: Array, v: Array, forces: Iterable[float], bent: Sequence[Array]) -> Array:
+        """Rates (3 hands,) [m/s] of the deflections of the hands' bristles."""
+        rates = []
+        for hand, force, each in zip(self.hands, forces, bent, strict=False):
+            (pull, limit), (_, slide, full) = self.leaning(force, each), self._slide(q, v, hand)
+            rates.append(slide - full * pull / limit)
+        return np.concatenate(rates)
 
     def resting(self) -> Array:
         """Torques (n,) [N m] at rest in the start posture, on the least sole wrenches that carry it.

@@ -293,13 +293,13 @@ def test_of_tendons_while_soles_change() -> None:
     check_rows(t)
 
 
+@pytest.mark.parametrize("stiffness", [0.0, 8e3])
 @pytest.mark.parametrize("robot", ["arm", "biped"])
-def test_of_friction_at_the_hit(robot: str) -> None:
+def test_of_friction_at_the_hit(robot: str, stiffness: float) -> None:
     """In the contact and at its first instant, where the servo's torques are variables."""
+    rough = ContactFriction(coefficient=0.6, stiffness=stiffness)
     p = {"arm": arm_problem, "biped": biped_problem}[robot]()
-    t = _drawn(
-        dataclasses.replace(p, friction=ContactFriction(coefficient=0.6), terms=(*p.terms, GearLoad()))
-    )
+    t = _drawn(dataclasses.replace(p, friction=rough, terms=(*p.terms, GearLoad())))
     check_rows(t)
 
 

@@ -203,6 +203,29 @@ def table(mass: float, **options: Any) -> Robot:
     return Robot.from_model(model, **settings)
 
 
+def disc(mass: float, radius: float) -> Robot:
+    """A disc in the plane, of inertia 0.4 m R^2, that strikes with the point of its rim ahead along x."""
+    model = pin.Model()
+    model.name = "disc"
+    joint = 0
+    for kind, name in ((pin.JointModelPX, "x"), (pin.JointModelPY, "y"), (pin.JointModelRZ, "turn")):
+        joint = model.addJoint(joint, kind(), pin.SE3.Identity(), name)
+        model.addJointFrame(joint)
+        light = pin.Inertia(1e-9, np.zeros(3), 1e-12 * np.eye(3))
+        model.appendBodyToJoint(joint, light, pin.SE3.Identity())
+    body = pin.Inertia(mass, np.zeros(3), 0.4 * mass * radius**2 * np.eye(3))
+    model.appendBodyToJoint(joint, body, pin.SE3.Identity())
+    return Robot.from_model(
+        model,
+        kp=0.0,
+        kd=0.0,
+        torque_limit=200.0,
+        velocity_limit=50.0,
+        position_limit=dict.fromkeys(("x", "y", "turn"), (-5.0, 5.0)),
+        strikers=[Striker(name="rim", frame="turn", point=np.array([radius, 0.0, 0.0]))],
+    )
+
+
 def striking_point(robot: Robot, posture: str, striker: str) -> Any:
     """World position (3,) [m] of a striking point in a named posture."""
     model = robot.model

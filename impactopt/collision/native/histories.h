@@ -65,8 +65,8 @@ static void write_column(const Data *d, const State *y, const Instant *now, cons
 #endif
 #if HELD_HISTORY
   vec held[VC];
-  double friction[3];
-  friction_at(d, y, force, friction);
+  double friction[3], rate[3];
+  friction_at(d, y, force, friction, rate);
   wrench_of(d->frozen, (const double *)now->net, force, friction, 1.0, held);
   const double *w = (const double *)held;
 #ifdef OUT_sole_wrench

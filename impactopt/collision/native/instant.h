@@ -6,6 +6,7 @@ typedef struct {
   double target[NZ1];
 #if SLIDES
   double sliding[3], sliding2[3]; /* first and second integral of the friction on the target */
+  double bristles[AT_LEAST_1(3 * BRISTLES)]; /* their deflection */
 #endif
 } State;
 #if SLIDES
@@ -35,7 +36,7 @@ typedef struct {
 #endif
   double law[AT_LEAST_1(N_LAW)], target[AT_LEAST_1(N_TARGET)];
 #if SLIDES
-  double coefficient, slip_speed, normal[3], point_velocity[3];
+  double coefficient, slip_speed, stiffness, normal[3], point_velocity[3];
 #endif
 } Data;
 
@@ -134,9 +135,9 @@ INLINE void torques(const Data *d, Instant *now) {
 #endif
 }
 
-/* Friction on the target (3) under a contact force; see contact/friction.py. Sets nothing in models without friction.
-   */
-INLINE void friction_at(const Data *d, const State *y, double force, double *out) {
+/* Friction on the target (3) under a contact force, and rate of the bristles' deflection (3); see contact/friction.py.
+   Sets nothing in models without friction, nor `rate` without bristles. */
+INLINE void friction_at(const Data *d, const State *y, double force, double *out, double *rate) {
 #if SLIDES
   const Frozen *F = d->frozen;
   double velocity[3], along = 0.0, square = d->slip_speed * d->slip_speed, slide[3];
@@ -146,8 +147,17 @@ INLINE void friction_at(const Data *d, const State *y, double force, double *out
   }
   FOR(k, 3) along += d->normal[k] * velocity[k];
   FOR(k, 3) slide[k] = velocity[k] - d->normal[k] * along, square += slide[k] * slide[k];
+#if BRISTLES
+  double length = TINY * TINY;
+  FOR(k, 3) length += y->bristles[k] * y->bristles[k];
+  const double limit = force * d->coefficient, elastic = d->stiffness * sqrt(length);
+  const double lean = d->stiffness / (limit > elastic ? limit : elastic);
+  FOR(k, 3) out[k] = limit * lean * y->bristles[k];
+  FOR(k, 3) rate[k] = slide[k] - sqrt(square) * lean * y->bristles[k];
+#else
   const double scale = force * d->coefficient / sqrt(square);
   FOR(k, 3) out[k] = scale * slide[k];
+#endif
 #endif
 }
 
@@ -188,8 +198,8 @@ static int will_approach(const Data *d, const State *y, const Instant *now) {
   target_rates(in, out, 0, 0, 0);
   FOR(i, NZ) then[i] = y->target[i] + 1e-9 * rates[i];
   const double gained = (call(target_velocity, then, d->target, 0) - now->target_speed) / 1e-9;
-  double friction[3];
-  friction_at(d, y, force, friction);
+  double friction[3], rate[3];
+  friction_at(d, y, force, friction, rate);
   return velocity(d, now->net, force, friction, 1.0, u) > gained;
 }
 

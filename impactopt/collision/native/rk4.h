@@ -4,7 +4,7 @@ typedef struct {
   vec torque[V], deviation[V], torque2[V];
   double penetration, impulse, impulse2, target[NZ1];
 #if SLIDES
-  double sliding[3], sliding2[3];
+  double sliding[3], sliding2[3], bristles[AT_LEAST_1(3 * BRISTLES)];
 #endif
 } Slope;
 
@@ -21,7 +21,7 @@ INLINE void slope_at(const Data *d, const State *y, const Instant *now, Slope *s
   }
   s->impulse2 = y->impulse;
 #if SLIDES
-  friction_at(d, y, s->impulse, s->sliding);
+  friction_at(d, y, s->impulse, s->sliding, s->bristles);
   memcpy(s->sliding2, y->sliding, sizeof s->sliding2);
 #endif
 }
@@ -43,6 +43,7 @@ INLINE void add_slope(const State *x, const Slope *s, double h, State *y) {
     y->sliding[k] = x->sliding[k] + h * s->sliding[k];
     y->sliding2[k] = x->sliding2[k] + h * s->sliding2[k];
   }
+  FOR(k, 3 * BRISTLES) y->bristles[k] = x->bristles[k] + h * s->bristles[k];
 #endif
 }
 
@@ -76,6 +77,7 @@ INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
   FOR(i, NZ) k1.target[i] = MEAN(target[i]);
 #if SLIDES
   FOR(i, 3) k1.sliding[i] = MEAN(sliding[i]), k1.sliding2[i] = MEAN(sliding2[i]);
+  FOR(i, 3 * BRISTLES) k1.bristles[i] = MEAN(bristles[i]);
 #endif
   add_slope(y, &k1, h, y);
 }

@@ -47,6 +47,9 @@ static void load_data(const double **arg, Data *d) {
 #if SLIDES
   copy_or_zero(arg[ARG_friction_coefficient], &d->coefficient, 1);
   copy_or_zero(arg[ARG_friction_slip_speed], &d->slip_speed, 1);
+#if BRISTLES
+  copy_or_zero(arg[ARG_friction_stiffness], &d->stiffness, 1);
+#endif
   copy_or_zero(arg[ARG_normal], d->normal, 3);
 #endif
   FOR(i, N_LAW) copy_or_zero(arg[ARG_law + i], d->law + i, 1);

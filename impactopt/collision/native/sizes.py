@@ -32,6 +32,7 @@ from impactopt.collision.stepped import (
     target_is_linear,
 )
 from impactopt.contact import ContactLaw
+from impactopt.contact.friction import TINY
 from impactopt.kinematics.stance import Stance
 
 
@@ -419,6 +420,8 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         "KD_MATRIX": int(n > 0 and settings["kd"].ndim == 2),
         "KP_MATRIX": int(n > 0 and effects.stiffness and settings["kp"].ndim == 2),
         "SLIDES": int(model.slides),
+        "BRISTLES": int(model.bristles),
+        "TINY": repr(TINY),
         "PEAK": int(model.peak),
         "STEP_ERROR": int(model.error),
         "LEFT_OUT_BY_RK4": repr(LEFT_OUT_BY_RK4),

@@ -150,7 +150,7 @@ def _last_step(solver: DOP853, at: Any, phase: Phase) -> _Step:
 class Motion:
     """Motion from contact at q (nq,), v (nv,) on.
 
-    The state is y = (u (nv), v (nv), penetration, target's state, impulse).
+    The state is y = (u (nv), v (nv), penetration, target's state, deflection of bristles (3,), impulse).
     """
 
     def __init__(self, body: Body, forces: Forces, q: Array, v: Array, horizon: float) -> None:
@@ -159,7 +159,11 @@ class Motion:
         self._floating, self._evaluations = body.nv > body.n, 0
         # signs of the target's switches that evaluations must not leave; None: they are not checked
         self._watched: Array | None = None
-        self._start = np.concatenate([np.zeros(body.nv), v, np.zeros(2 + forces.target.n_states)])
+        self._bristles = 3 if body.sliding is not None and body.sliding.bristles else 0
+        end = 2 * body.nv + 1 + forces.target.n_states
+        self.target_part = slice(2 * body.nv + 1, end)  # of the state
+        self._bristle_part = slice(end, end + self._bristles)
+        self._start = np.concatenate([np.zeros(body.nv), v, np.zeros(end - 2 * body.nv + self._bristles + 1)])
         begin = self._state(0.0, self._start)
         self._scales = contact_scales(body, forces, begin.rate, horizon)
 
@@ -262,6 +266,7 @@ class Motion:
                 np.full(nv, v),
                 [scales.speed * scales.time],
                 scales.target,
+                np.full(self._bristles, scales.speed * scales.time),
                 [scales.impulse],
             ]
         )
@@ -312,7 +317,7 @@ class Motion:
         """Values of the target's switches."""
         _, _, penetration, rate = self._of(state)
         force = self.forces.contact(penetration, rate, phase.compressing) if phase.touching else 0.0
-        return self.forces.switches(state.y[2 * self._nv + 1 : -1], force)
+        return self.forces.switches(state.y[self.target_part], force)
 
     # ------------------------------------------------------------ one instant
     def _state(self, time: float, y: Array) -> _State:
@@ -321,7 +326,7 @@ class Motion:
         nv, n = self._nv, self._n
         u, v = y[:nv], y[nv : 2 * nv]
         speed = self.body.update(pin.integrate(self.body.model, self._q, u), v)
-        rate = speed - self.forces.target_speed(y[2 * nv + 1 : -1])
+        rate = speed - self.forces.target_speed(y[self.target_part])
         return _State(time, y, speed, rate, self.forces.demand(time, u[-n:], v[-n:]))
 
     def _of(self, state: _State) -> tuple[Array, Array, float, float]:
@@ -339,7 +344,7 @@ class Motion:
         return self._phase_at(self._state(state.time + ahead, state.y + ahead * slope))
 
     def _phase_at(self, state: _State) -> Phase:
-        return self.forces.phase(*self._of(state), state.y[2 * self._nv + 1 : -1])
+        return self.forces.phase(*self._of(state), state.y[self.target_part])
 
     def _slope(self, time: float, y: Array, phase: Phase) -> Array:
         """dy/dt with the forces of a phase.
@@ -360,14 +365,18 @@ class Motion:
         demand, velocity, penetration, rate = self._of(state)
         force = forces.contact(penetration, rate, phase.compressing) if phase.touching else 0.0
         torque = forces.torque(demand, phase)
-        a = self.body.accelerate(torque - forces.friction(velocity, phase), force)
         slope = np.empty_like(y)
+        if self._bristles and self.body.sliding is not None:
+            bent = y[self._bristle_part][None], np.array([force])
+            self.body.bend(*bent)
+            slope[self._bristle_part] = self.body.sliding.rates(*bent)[0]
+        a = self.body.accelerate(torque - forces.friction(velocity, phase), force)
         slope[:nv] = y[nv : 2 * nv]
         if self._floating:  # du/dt = J_log(u) v; the other joints' coordinates are Euclidean
             slope[:6] = pin.Jlog6(pin.exp6(y[:6])) @ y[nv : nv + 6]
         slope[nv : 2 * nv] = a
         slope[2 * nv], slope[-1] = rate, force
-        slope[2 * nv + 1 : -1] = forces.target_rates(y[2 * nv + 1 : -1], force)
+        slope[self.target_part] = forces.target_rates(y[self.target_part], force)
         return slope, torque, force
 
     # ------------------------------------------------------------ histories

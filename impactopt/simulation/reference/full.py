@@ -76,7 +76,7 @@ class FullDynamics(ReferenceModel):
             run.final[nv : 2 * nv].copy(),
             run.impulse,
             peak,
-            run.final[2 * nv + 1 : -1],
+            run.final[motion.target_part],
             len(self.held_by.sole_names(self.robot)),
             forces,
             run.separated,

@@ -215,6 +215,7 @@ def march(
         ends = (not phase.touching and (k > 0 or rate != 0)) or time >= horizon * (1 - 1e-9)
         if ends:
             end = world.state()
+        world.bend(np.array([force]), step)
         world.apply(torque - forces.friction(velocity, phase), force)
         world.mujoco.mj_step2(world.world, data)
         peak = max(peak, force)

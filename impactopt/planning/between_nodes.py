@@ -60,7 +60,7 @@ class BetweenNodes:
             return outcome.checked()
         with contextlib.suppress(InputError):
             # Only penetration refuses a solution; a part of a margin may be lost.
-            found = clearance_violations(outcome.program, outcome.result.x, self._margins, share=1.0)
+            found = clearance_violations(outcome.at, self._margins, share=1.0)
             if found is not None and found.depth > 0:
                 if self._clear is not None:
                     result = with_effort_of(self._clear.result, outcome.result)
@@ -76,7 +76,7 @@ class BetweenNodes:
             return None
         with contextlib.suppress(InputError):  # legs out of reach: completing the motion reports it
             if self._margins is not None:
-                violated = clearance_violations(t, x, self._margins)
+                violated = clearance_violations(outcome.at, self._margins)
                 if violated is None or violated.depth <= 0:
                     self._clear = outcome
         if self._rounds >= self._most_for(outcome):

@@ -24,7 +24,7 @@ from impactopt.bodies.clearance import DEEPEST, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.bodies.separation import ROUNDING, Looked, Placed
 from impactopt.planning.budget import Budget, one_after_the_other
-from impactopt.planning.refinement import Guess, Outcome, Program
+from impactopt.planning.refinement import Evaluation, Guess, Outcome, Program
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import SolverResult
@@ -367,26 +367,29 @@ class _Approach(NamedTuple):
 
 
 def clearance_violations(
-    t: Transcription, x: Array, margins: Margins, *, share: float = LOST_BETWEEN_NODES
+    solution: Evaluation[Transcription], margins: Margins, *, share: float = LOST_BETWEEN_NODES
 ) -> ClearanceViolations | None:
     """Clearance violations of a solution, at its nodes or between them; None if there are none.
 
     share : part of its margin that a pair loses, by exact geometry, in a violation.
     """
-    plan, bodies, nodes = t.decode(x), margins.bodies, node_placements(t, x)
-    worst, depth = dict[tuple[tuple[int, ...], Pair], _Approach](), -np.inf
+    t, plan, bodies = solution.program, solution.planned, margins.bodies
+    approaches = list[tuple[Pair, _Approach]]()
     # The motion after a missed target exists only with an abort motion.
     for missed in (False, True) if plan.abort is not None else (False,):
         motion = plan.motion(SAMPLE_STEP, missed=missed)
         at = Places.of(t.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
-        for k, pair, distance in _near(margins, at, share):
-            depth = max(depth, -distance)
-            approach = _Approach(distance, float(motion.time[k]), missed)
-            # One node for all instants of an interval: the deepest of a pair counts.
-            key = tuple(_adjacent_nodes(nodes, approach.time, missed)), pair
-            worst[key] = min(worst.get(key, approach), approach)
-    if not worst:
+        approaches += [
+            (pair, _Approach(distance, float(motion.time[k]), missed))
+            for k, pair, distance in _near(margins, at, share)
+        ]
+    if not approaches:
         return None
+    nodes, worst = node_placements(t, solution.x), dict[tuple[tuple[int, ...], Pair], _Approach]()
+    for pair, approach in approaches:
+        # One node for all instants of an interval: the deepest of a pair counts.
+        key = tuple(_adjacent_nodes(nodes, approach.time, approach.missed)), pair
+        worst[key] = min(worst.get(key, approach), approach)
     raised, added = _RaisedClearances(t, nodes, margins), _AddedNodes(t, plan)
     # The deepest first: its node may serve the others of the interval.
     for (adjacent, pair), approach in sorted(worst.items(), key=lambda item: item[1].distance):
@@ -401,6 +404,7 @@ def clearance_violations(
         normals = [bodies.closest(nodes.at, k, pair).normal for k in adjacent]
         if not added.add(approach, bool(normals[0] @ normals[-1] < 0)):
             raised.add(adjacent, pair, approach.distance)
+    depth = max(-approach.distance for _, approach in approaches)
     return ClearanceViolations(raised.constraints, depth, frozenset(pair for _, pair in worst), added.all)
 
 
@@ -414,16 +418,19 @@ def _near(margins: Margins, at: Places, share: float) -> list[tuple[int, Pair, f
     """Instants and pairs that lose more than a share of their margin, with their exact distances [m]."""
     bodies, shapes, out = margins.bodies, margins.bodies.shapes, list[tuple[int, Pair, float]]()
     directions = np.zeros((len(at), len(shapes), 3))
+
+    def allowed(pair: Pair) -> float:
+        return (1 - share) * margins.of(pair) + DEEPEST
+
     # Smooth distances may exceed the exact ones by the thinning; what is near by them is checked exactly.
-    found = shapes.look(bodies.placed(at), margins.most + SLACK, directions, margins.wanted)
-    candidates = {
-        (k, tuple(pair))
-        for k, pair in zip(found.spot.tolist(), shapes.pairs[found.pair].tolist(), strict=True)
-    }
-    for k, (a, b) in sorted(candidates):
-        distance = bodies.exact(at, k, (a, b))
-        if distance < (1 - share) * margins.of((a, b)) + DEEPEST:
-            out.append((k, (a, b), distance))
+    within = (1 - share) * margins.most + DEEPEST + SLACK
+    found = shapes.look(bodies.placed(at), within, directions, margins.wanted)
+    places = zip(found.spot.tolist(), map(tuple, shapes.pairs[found.pair].tolist()), found.gap, strict=True)
+    candidates = {(k, pair) for k, pair, gap in places if gap < allowed(pair) + SLACK}
+    for k, pair in sorted(candidates):
+        distance = bodies.exact(at, k, pair)
+        if distance < allowed(pair):
+            out.append((k, pair, distance))
     return out
 
 

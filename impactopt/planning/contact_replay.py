@@ -136,7 +136,7 @@ class PlannedContact:
     def reference(self) -> Trajectory:
         """Reference of the servo; a strike's coasts."""
         if isinstance(self.planned, Plan):
-            return self.planned.reference
+            return self.planned.coarse_reference
         return _coasting(self.problem, self.planned)
 
     @cached_property

@@ -96,7 +96,7 @@ def reference_beyond(term: ReferenceRange, plan: Plan) -> str:
     """Message with the joint whose reference is farthest beyond its range in contact; "" if none is by more
     than a tolerance.
     """
-    reference, robot = plan.reference, plan.problem.robot
+    reference, robot = plan.coarse_reference, plan.problem.robot
     # it coasts at constant rates during contact, so it is farthest at the end
     angles = robot.joint_positions(reference.q[reference.phase == 1][-1:])
     lower, upper = term.limits(robot)

@@ -149,8 +149,9 @@ class TargetContact:
             method="RK45",  # Newton's method, of implicit ones, does not converge across a target's switches
             rtol=RELATIVE_TOLERANCE,
             atol=ABSOLUTE_TOLERANCE,
-            # a touch that begins within the step would else be stepped over, as there is no force before it
+            # A touch that begins within the step would else be stepped over, as there is no force before it.
             max_step=0.5 * step,
+            first_step=0.5 * step,  # SciPy's own begins far too small
             dense_output=True,
         )
         if not found.success or found.t.size > MAX_POINTS or not np.isfinite(found.y).all():

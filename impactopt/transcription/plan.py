@@ -34,6 +34,7 @@ from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
+LOAD_STEP, CONTACT_STEP = 5e-3, 1e-3  # [s] of the coarse reference, and of all references in contact, at most
 MOMENT_COST = 10.0  # [1/m] weight of a wrench correction's moments relative to its forces
 
 
@@ -400,6 +401,13 @@ class Plan:
         return self.trajectory()
 
     @cached_property
+    def coarse_reference(self) -> Trajectory:
+        """The servo's reference every `LOAD_STEP`, in contact every millisecond; InputError as of
+        `reference`.
+        """
+        return self.trajectory(step=LOAD_STEP, hold=LOAD_STEP)
+
+    @cached_property
     def missed_reference(self) -> Trajectory:
         """The servo's reference if nothing is hit; InputError if the plan has no abort motion."""
         return self.trajectory(missed=True, known=self.reference if self.abort is not None else None)
@@ -496,6 +504,8 @@ class Plan:
     ) -> Trajectory:
         """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
 
+        In contact, which is short, it is sampled every millisecond at least.
+
         missed : nothing is hit: the same reference until the robot detects that, then the abort motion.
         known : the reference of this plan with this step and the other ``missed``, if already computed. Both
             have the same swing.
@@ -523,7 +533,7 @@ class Plan:
             parts.append((0, *(getattr(known, name)[own] for name in ("time", *Completed._fields))))
             stance = known.stance[own] if known.stance.size else np.zeros(own.sum(), dtype=np.intp)
             q = parts[-1][2][-1]
-        contact = sampled(t0, t1, step)
+        contact = sampled(t0, t1, min(step, CONTACT_STEP))
         legs = self.coordinates.split(q)[1]
         if self.coordinates.drifts:
             coasting = drifting_reference(problem, partial(self.independent, 1), contact, backward=False)
@@ -794,7 +804,6 @@ class Plan:
 
 # [s] Sampling of motions for loads. These change no faster than the nodes are apart, and inverse kinematics
 # and dynamics of every millisecond would be slow.
-LOAD_STEP = 5e-3
 
 
 def motion_loads(robot: Robot, reference: Trajectory, hit: PlannedCollision) -> DriveLoads:
@@ -813,7 +822,7 @@ def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> li
     hits : with the expected target, then with those of scenarios.
     """
     expected, *others = hits
-    references = [plan.trajectory(step=LOAD_STEP, hold=LOAD_STEP)]
+    references = [plan.coarse_reference]
     if plan.abort is not None:
         missed = plan.trajectory(step=LOAD_STEP, hold=LOAD_STEP, missed=True, known=references[0])
         references.append(missed)

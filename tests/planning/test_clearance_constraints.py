@@ -16,7 +16,7 @@ from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import Margins, Watch, clearance_violations, node_placements
-from impactopt.planning.refinement import Guess, Outcome
+from impactopt.planning.refinement import Evaluation, Guess, Outcome
 from impactopt.planning.solve import PlanSolver
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status, max_violation
@@ -68,7 +68,7 @@ def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share
         x, _, z = hammer(free, first + share * (last - first))
         problem = with_peg(free.problem, x, z)
         margins, t = Margins(problem), program_of(free, problem)
-        violated = clearance_violations(t, free.result.x, margins)
+        violated = clearance_violations(Evaluation(t, free.result.x), margins)
         assert violated is not None and violated.depth > 0
         if violated.nodes == t.nodes:
             rows = {**Watch(t, margins, free.result.x).constraints(), **violated.constraints}

@@ -29,7 +29,7 @@ from impactopt.planning.clearance_constraints import (
     solve_with_clearance,
 )
 from impactopt.planning.parameter_changes import parameter_of
-from impactopt.planning.refinement import Guess
+from impactopt.planning.refinement import Evaluation, Guess
 from impactopt.planning.solution import program_on
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
@@ -364,11 +364,11 @@ def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
 def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, barred: Solution) -> None:
     problem, x = barred.problem, free.result.x
     margins, t = Margins(problem), program_of(free, problem)
-    violated = clearance_violations(t, x, margins)
+    violated = clearance_violations(Evaluation(t, x), margins)
     assert violated is not None and 0.02 < violated.depth < 0.1
     bar = -1 - [body.name for body in problem.bodies.world].index("bar")
     assert {other for _, other in violated.pairs} == {bar}
-    assert clearance_violations(program_of(barred, problem), barred.result.x, margins) is None
+    assert clearance_violations(Evaluation(program_of(barred, problem), barred.result.x), margins) is None
     depth, pairs = deepest_penetration(t, x, margins)
     assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}
     budget = Budget(solver="ipm", options=None, time_limit=None, callback=None)

@@ -24,11 +24,13 @@ from impactopt import (
     GearLoad,
     GroundForce,
     KelvinVoigt,
+    Phase,
     ReferenceRange,
     Scenario,
     Slide,
     SoftGrip,
     SpringDamper,
+    StancePhase,
     TargetSpeed,
     Trajectory,
     load_problem,
@@ -141,11 +143,15 @@ ENDS = {"C": "end of compression", "S": "separation", "T": "touch", "B": "break"
 @pytest.mark.parametrize(
     ("law", "touches"),
     [
-        *((KelvinVoigt, each) for each in (3, "BS", "STSB", "SBTS")),
-        *((SpringDamper, each) for each in (2, "BCS", "CBCCSTCS")),
+        *((KelvinVoigt, each) for each in (2, 3, "SB", "BS", "STSB", "SBTS")),
+        *((SpringDamper, each) for each in (2, "CSB", "BCS", "CBCCSTCS")),
     ],
 )
-def test_of_a_board_whose_events_have_an_order(law: Any, touches: int | str) -> None:
+def test_of_a_board_whose_events_have_an_order(
+    law: Any, touches: int | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # any point will do: no speed is sought with which a point mass has this order
+    monkeypatch.setattr("impactopt.transcription.contact_guess.SPEED_STEPS", 0)
     board = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
     order = touches if isinstance(touches, int) else tuple(ENDS[letter] for letter in touches)
     stiff = law(stiffness=1e6, damping=50.0)
@@ -193,9 +199,9 @@ def test_all_that_a_problem_states_is_known(name: str) -> None:
     assert unknown(load_problem(PROBLEMS / f"{name}.toml")) == []
 
 
-def test_of_a_head_that_looks_at_the_hit_point() -> None:
-    problem = load_problem(PROBLEMS / "nailing.toml")
-    t = transcribed(problem)
+def test_of_a_frame_that_looks_at_the_hit_point() -> None:
+    p = biped_problem()
+    t = transcribed(dataclasses.replace(p, terms=(*p.terms, Gaze(frame="elbow", axis=[1, 0, 0], since=0.0))))
     assert any(row.term == Gaze.name for row in t.constraints.origins)
     check_rows(t)
 
@@ -270,20 +276,26 @@ def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned)
         assert off["reference normal force of a sole"] < 0
 
 
-@pytest.mark.parametrize("name", ["punch_step", "kick"])
-def test_of_soles_that_change(name: str) -> None:
-    """Before and after the blow, and where nothing is hit; with a tendon of an arm and a leg in the kick."""
-    problem = load_problem(PROBLEMS / f"{name}.toml")
-    if name == "kick":
-        pull = {"left_knee": 0.5, "right_elbow": 1.0}
-        tendon = Tendon(name="t", coefficients=pull, lower=-3, upper=2)
-        robot = dataclasses.replace(problem.robot, tendons=(tendon,))
-        problem = dataclasses.replace(problem, robot=robot)
+@pytest.mark.parametrize("blow", [1, 2], ids=["on one foot", "after a step"])
+def test_of_soles_that_change(blow: int) -> None:
+    """Before and after the blow, and where nothing is hit; with a tendon of an arm and a leg."""
+    p, phase = biped_problem(), Phase(duration=(0.4, 0.9), intervals=6, grading=1.0)
+    both = StancePhase(soles=("left", "right"), phase=phase)
+    ahead = dataclasses.replace(both, steps={"right": (0.06, -0.02)})
+    stances = [both, StancePhase(soles=("left",), phase=phase), ahead]
+    stances[blow] = dataclasses.replace(stances[blow], phase=None)
+    pull = {"left knee": 0.5, "elbow": 1.0}
+    tendon = Tendon(name="t", coefficients=pull, lower=-3, upper=2)
+    problem = dataclasses.replace(
+        p,
+        robot=dataclasses.replace(p.robot, tendons=(tendon,)),
+        stances=tuple(stances),
+        scenarios=(Scenario(name="nothing", missing=True, abort_after=0.02),),
+    )
     t = transcribed(problem)
-    rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).constraints(0.05)
+    rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).constraints(0.15)
     assert any(row.place.startswith("on ") for row in rows)
-    pulled = [o.place.name for o in t.program.origins if "tendon t" in str(o)]
-    assert any(place.startswith("on ") for place in pulled) == (name == "kick")
+    assert any(o.place.name.startswith("on ") for o in t.program.origins if "tendon t" in str(o))
     check_rows(t.with_clearance(rows))
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from support.small_plans import OPTIONS, Planned, arm_problem, biped_problem, planned, transcribed
 
-from impactopt import Solution, solve
-from impactopt.files.problem_file import load_problem
+from impactopt import Solution, load_problem, solve
 from impactopt.transcription.transcription import Transcription
 
 os.environ.setdefault("IMPACTOPT_COMPILE", "quick")  # `as_shipped` takes it away
@@ -24,7 +23,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture
 def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Collisions compiled as users have them."""
+    """Functions compiled as users have them."""
     monkeypatch.delenv("IMPACTOPT_COMPILE")
 
 

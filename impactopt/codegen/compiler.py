@@ -89,9 +89,9 @@ def _forbidden() -> bool:
 
 
 def quick_to_compile() -> bool:
-    """True if IMPACTOPT_COMPILE is "quick": collisions compile three times sooner, and run slower.
+    """True if IMPACTOPT_COMPILE is "quick": functions compile three times sooner, and run slower.
 
-    Tests of mathematics set it: there a collision runs a few times only.
+    Tests of mathematics set it: there a function runs a few times only.
     """
     return os.environ.get("IMPACTOPT_COMPILE", "") == "quick"
 
@@ -269,7 +269,7 @@ def source_of(function: Buildable) -> Source:
         return Source(function.code, function.level, function.shared)
     generator = ca.CodeGenerator(f"{function.name()}.c", {"with_header": False})
     generator.add(function)
-    level = "-O1" if longest_body(function) <= MAX_OPTIMIZED else "-O0"
+    level = "-O0" if quick_to_compile() or longest_body(function) > MAX_OPTIMIZED else "-O1"
     return Source(str(generator.dump()), level)
 
 

@@ -348,18 +348,7 @@ def speed_that_leaves(
 
 
 def natural_durations(law: ContactLaw, target: Target, mass: float, order: tuple[str, ...] = ()) -> Array:
-    """Duration [s] of each contact phase of a point mass [kg] that hits at 1 m/s.
-
-    Cached, as successive programs mostly have the same law, target and mass.
-    """
-    try:
-        return _natural_durations(law, target, mass, order)
-    except TypeError:  # a user's law or target without a hash
-        return _natural_durations.__wrapped__(law, target, mass, order)
-
-
-@lru_cache(maxsize=64)
-def _natural_durations(law: ContactLaw, target: Target, mass: float, order: tuple[str, ...]) -> Array:
+    """Duration [s] of each contact phase of a point mass [kg] that hits at 1 m/s."""
     phases = len(contact_phases(target, order))
     at = np.arange(phases, dtype=np.intp)
     return guessed_contact(law, target, mass, 1.0, at, np.ones(phases), order).durations
@@ -409,7 +398,18 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
 
     touches : 0: up to the first separation. Else up to the last of the target's events and the separation
         after it, or after this number of touches.
+
+    Cached, as searches for an order of events, for durations and for guesses try the same speeds.
     """
+    try:
+        return _history(law, target, mass, speed, touches)
+    except TypeError:  # a user's law or target without a hash
+        return _history.__wrapped__(law, target, mass, speed, touches)
+
+
+@lru_cache(maxsize=256)
+def _history(law: ContactLaw, target: Target, mass: float, speed: float, touches: int) -> _History:
+    """See `_integrated`."""
     of_law, of_target = law.parameters, target.parameters
 
     # y = position and speed of the mass, travel and state of the target
@@ -475,6 +475,8 @@ def _integrated(law: ContactLaw, target: Target, mass: float, speed: float, touc
         complete = not touches or (over and (end == SEPARATION or rate(0.0, start) <= 0))
     y = np.hstack(values)
     history = _History(np.concatenate(times), np.vstack([y, [force(each) for each in y.T]]))
+    for array in (history.time, history.values):  # shared
+        array.flags.writeable = False
     return history._replace(order=tuple(order), ends=tuple(ends), complete=complete) if touches else history
 
 

@@ -22,6 +22,7 @@ import pinocchio as pin
 import pytest
 from support.one_joint import model
 
+from impactopt import CacheWarning, InputError, NoCompilerWarning
 from impactopt.codegen import cache as codegen
 from impactopt.codegen import compiler as library
 from impactopt.codegen import files as directory
@@ -29,7 +30,6 @@ from impactopt.codegen import files as private_files
 from impactopt.codegen.cache import FunctionGroup, cached, cached_groups, canonical, model_hash
 from impactopt.codegen.compiler import Compiler, find_compiler
 from impactopt.codegen.files import cache_directory
-from impactopt.errors import CacheWarning, InputError, NoCompilerWarning
 
 ROOT = Path(__file__).parents[2]
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -156,6 +156,7 @@ def test_flags_of_the_compiler_are_in_the_key(
 
 
 @needs_compiler
+@pytest.mark.usefixtures("as_shipped")
 def test_long_functions_are_compiled_without_optimization(
     cache: Path, monkeypatch: pytest.MonkeyPatch, compilations: list[str]
 ) -> None:

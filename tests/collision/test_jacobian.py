@@ -16,12 +16,9 @@ import pytest
 from support.implicit_cases import exact, gradient, implicit
 from support.native_cases import FRICTION, call, situation
 
+from impactopt import Board, BothSoles, Effects, InputError, KelvinVoigt, Nail, RigidWall, VirtualMass
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import Effects, VirtualMass
 from impactopt.collision.outputs import HISTORIES, SCALARS
-from impactopt.contact import Board, KelvinVoigt, Nail, RigidWall
-from impactopt.errors import InputError
-from impactopt.kinematics.stance import BothSoles
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
@@ -111,6 +108,7 @@ def test_each_column_is_that_of_differences(case):
     assert_slopes(stepped(model, outputs, values), found, model, values, np.eye(2 * model.robot.nv))
 
 
+@pytest.mark.usefixtures("as_shipped")
 def test_joints_that_saturate_and_slide_on_the_way():
     model, limit = implicit("arm", **SHORT | SLIDING | {"step": 5e-4}), np.array([30.0, 36.0, 8.0, 3.5])
     values, names = situation("arm", model), ["q", "v", "feedforward", *model.settings]
@@ -130,7 +128,6 @@ def test_a_stand_in_in_random_directions():
 
 
 # ------------------------------------------------------------ against exact collisions
-@pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("case", [case for case in CASES if "biped" in case])
 def test_columns_are_those_of_exact_collisions(case):
     model = implicit("biped", **SHORT | CASES[case][1])

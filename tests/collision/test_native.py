@@ -26,22 +26,24 @@ from support.native_cases import (
     situation,
 )
 
-from impactopt.codegen.cache import cached
-from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Effects, VirtualMass
-from impactopt.collision.graph import collision_graph, gradient_graph
-from impactopt.collision.native import native_gradient
-from impactopt.contact import (
+from impactopt import (
+    SDC,
     Board,
+    BothSoles,
+    Effects,
     HuntCrossley,
     KelvinVoigt,
     Nail,
+    OneSole,
     RigidWall,
+    VirtualMass,
 )
-from impactopt.kinematics.stance import BothSoles, OneSole
+from impactopt.codegen.cache import cached
+from impactopt.codegen.compiler import find_compiler
+from impactopt.collision.graph import collision_graph, gradient_graph
+from impactopt.collision.native import native_gradient
 
 pytestmark = [
-    pytest.mark.usefixtures("as_shipped"),
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
     pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning"),
 ]
@@ -84,6 +86,7 @@ ARMS = {
 }
 
 
+@pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("name", ARMS)
 def test_an_arm_in_c_is_the_graph(name):
     model = sdc("arm", **ARMS[name])
@@ -170,6 +173,7 @@ def assert_same_gradient(model: Any, values: list[Any], output: str) -> dict[str
     return found
 
 
+@pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("name", GRADIENTS)
 def test_an_arms_gradient_in_c_is_the_graphs(name):
     output, options = GRADIENTS[name]

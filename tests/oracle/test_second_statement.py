@@ -12,30 +12,35 @@ import numpy as np
 import pytest
 from support.small_plans import Planned, arm_problem, biped_problem, changed, transcribed
 
-from impactopt.contact import Board, ContactFriction, FreeMass, KelvinVoigt, SpringDamper
-from impactopt.files.problem_file import load_problem
-from impactopt.planning.clearance_constraints import Margins, Watch
-from impactopt.problem.objectives import Effort
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import (
+from impactopt import (
+    Actuator,
+    Board,
+    ContactFriction,
     ContactWrenchCone,
+    Effort,
     FirstTouch,
+    FreeMass,
     Gaze,
     GearLoad,
     GroundForce,
+    KelvinVoigt,
+    Phase,
     ReferenceRange,
+    Scenario,
     Slide,
+    SoftGrip,
+    SpringDamper,
+    StancePhase,
     TargetSpeed,
+    Trajectory,
+    load_problem,
+    space_arm,
 )
-from impactopt.robots.actuators import Actuator
-from impactopt.robots.attachments import SoftGrip
-from impactopt.robots.presets import space_arm
+from impactopt.planning.clearance_constraints import Margins, Watch
 from impactopt.robots.tendons import Tendon
 from impactopt.transcription.contact_refinement import contact_error
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.plan import Trajectory
-from impactopt.transcription.transcription import Transcription, block_functions, statement_of
+from impactopt.transcription.transcription import Transcription, statement_of
 from oracle.kkt import lagrangian_gradient
 from oracle.program import Program, unknown
 from oracle.recorded import off_in_record
@@ -79,9 +84,10 @@ def check_rows(t: Transcription) -> None:
             if np.isfinite(low) or np.isfinite(high):
                 found.setdefault(name, []).append((g - low, high - g))
     g, lower, upper = t.program.constraints(x), t.program.g_lower, t.program.g_upper
-    for row, below, above in zip(t.constraints.origins, g - lower, upper - g, strict=True):
-        own = found[row.term, row.place.name, row.component].pop(0)
-        assert own == pytest.approx((below, above), abs=1e-9, rel=1e-9), str(row)
+    origins = t.constraints.origins
+    own = np.array([found[row.term, row.place.name, row.component].pop(0) for row in origins])
+    near = np.isclose(own, np.stack([g - lower, upper - g], axis=1), rtol=5e-10, atol=5e-10).all(axis=1)
+    assert near.all(), str(origins[int(np.argmin(near))])
     assert not any(found.values())
     worth = sum(float(part.value(v)[0]) for part in program.worth)
     assert worth == pytest.approx(t.program.objective(x), rel=1e-10)
@@ -141,7 +147,11 @@ ENDS = {"C": "end of compression", "S": "separation", "T": "touch", "B": "break"
         *((SpringDamper, each) for each in (2, "CSB", "BCS", "CBCCSTCS")),
     ],
 )
-def test_of_a_board_whose_events_have_an_order(law: Any, touches: int | str) -> None:
+def test_of_a_board_whose_events_have_an_order(
+    law: Any, touches: int | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # any point will do: no speed is sought with which a point mass has this order
+    monkeypatch.setattr("impactopt.transcription.contact_guess.SPEED_STEPS", 0)
     board = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
     order = touches if isinstance(touches, int) else tuple(ENDS[letter] for letter in touches)
     stiff = law(stiffness=1e6, damping=50.0)
@@ -173,7 +183,7 @@ def test_of_the_ground_s_force_and_the_first_touch(biped_transcription: Transcri
 def test_of_a_striking_link_with_corners() -> None:
     p = load_problem(PROBLEMS / "arm7.toml")
     kept = tuple(term for term in p.terms if not isinstance(term, FirstTouch))
-    t = _drawn(dataclasses.replace(p, terms=(*kept, FirstTouch())))
+    t = transcribed(dataclasses.replace(p, terms=(*kept, FirstTouch())))
     assert any(row.term == FirstTouch.name for row in t.constraints.origins)
     check_rows(t)
 
@@ -181,8 +191,7 @@ def test_of_a_striking_link_with_corners() -> None:
 @pytest.mark.parametrize("name", ["strike_holding_on", "push_two_hands"])
 def test_of_two_hands(name: str) -> None:
     problem = load_problem(PROBLEMS / f"{name}.toml")
-    functions = block_functions(problem, problem.coordinates)
-    check_rows(Transcription(problem, problem.coordinates, functions))
+    check_rows(transcribed(problem))
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in PROBLEMS.glob("*.toml")))
@@ -190,9 +199,9 @@ def test_all_that_a_problem_states_is_known(name: str) -> None:
     assert unknown(load_problem(PROBLEMS / f"{name}.toml")) == []
 
 
-def test_of_a_head_that_looks_at_the_hit_point() -> None:
-    problem = load_problem(PROBLEMS / "nailing.toml")
-    t = _drawn(problem)
+def test_of_a_frame_that_looks_at_the_hit_point() -> None:
+    p = biped_problem()
+    t = transcribed(dataclasses.replace(p, terms=(*p.terms, Gaze(frame="elbow", axis=[1, 0, 0], since=0.0))))
     assert any(row.term == Gaze.name for row in t.constraints.origins)
     check_rows(t)
 
@@ -207,8 +216,7 @@ def test_of_a_robot_that_nothing_holds(gravity: float) -> None:
 @pytest.mark.parametrize("name", ["arm_planar", "chop_arm"])
 def test_of_targets_with_events(name: str) -> None:
     problem = load_problem(PROBLEMS / f"{name}.toml")
-    functions = block_functions(problem, problem.coordinates)
-    check_rows(Transcription(problem, problem.coordinates, functions))
+    check_rows(transcribed(problem))
 
 
 def test_slopes_are_those_of_the_program(arm_transcription: Transcription) -> None:
@@ -227,10 +235,6 @@ def test_slopes_are_those_of_the_program(arm_transcription: Transcription) -> No
     assert np.abs(found - wanted).max() <= 10 * doubt.max() + 1e-7 * np.abs(wanted).max()
 
 
-def _drawn(problem: ImpactProblem) -> Transcription:
-    return Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
-
-
 @pytest.mark.parametrize("limit", [None, 1.5, {"elbow": 2.0}], ids=["default", "one", "by joint"])
 def test_of_gears_in_a_damped_contact(limit: Any) -> None:
     """With the first instant, at which a damper has its force already, and in scenarios too."""
@@ -240,7 +244,7 @@ def test_of_gears_in_a_damped_contact(limit: Any) -> None:
         Scenario(name="nothing", missing=True, abort_after=0.02),
     )
     terms = (*(t for t in p.terms if not isinstance(t, GearLoad)), GearLoad(limit=limit))
-    check_rows(_drawn(dataclasses.replace(p, terms=terms, scenarios=others)))
+    check_rows(transcribed(dataclasses.replace(p, terms=terms, scenarios=others)))
 
 
 def test_of_a_tool_in_a_soft_grip() -> None:
@@ -248,12 +252,12 @@ def test_of_a_tool_in_a_soft_grip() -> None:
     p = load_problem(PROBLEMS / "arm_planar.toml")
     grip = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.05])
     robot = p.robot.with_grip(p.robot.tools[-1].name, grip)
-    check_rows(_drawn(dataclasses.replace(p, robot=robot, terms=(*p.terms, GearLoad()))))
+    check_rows(transcribed(dataclasses.replace(p, robot=robot, terms=(*p.terms, GearLoad()))))
 
 
 def test_of_effort() -> None:
     p = load_problem(PROBLEMS / "arm_planar.toml")
-    check_rows(_drawn(dataclasses.replace(p, objectives=(*p.objectives, Effort(weight=0.02)))))
+    check_rows(transcribed(dataclasses.replace(p, objectives=(*p.objectives, Effort(weight=0.02)))))
 
 
 def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned) -> None:
@@ -272,25 +276,27 @@ def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned)
         assert off["reference normal force of a sole"] < 0
 
 
-@pytest.mark.parametrize("name", ["punch_step", "kick"])
-def test_of_soles_that_change(name: str) -> None:
-    """Before and after the blow, and where nothing is hit."""
-    problem = load_problem(PROBLEMS / f"{name}.toml")
-    t = _drawn(problem)
-    rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).constraints(0.05)
-    assert any(row.place.startswith("on ") for row in rows)
-    check_rows(t.with_clearance(rows))
-
-
-def test_of_tendons_while_soles_change() -> None:
-    p = load_problem(PROBLEMS / "kick_talos.toml")
-    tendon = Tendon(
-        name="t", coefficients={"leg_left_4_joint": 0.5, "arm_right_4_joint": 1.0}, lower=-3, upper=2
+@pytest.mark.parametrize("blow", [1, 2], ids=["on one foot", "after a step"])
+def test_of_soles_that_change(blow: int) -> None:
+    """Before and after the blow, and where nothing is hit; with a tendon of an arm and a leg."""
+    p, phase = biped_problem(), Phase(duration=(0.4, 0.9), intervals=6, grading=1.0)
+    both = StancePhase(soles=("left", "right"), phase=phase)
+    ahead = dataclasses.replace(both, steps={"right": (0.06, -0.02)})
+    stances = [both, StancePhase(soles=("left",), phase=phase), ahead]
+    stances[blow] = dataclasses.replace(stances[blow], phase=None)
+    pull = {"left knee": 0.5, "elbow": 1.0}
+    tendon = Tendon(name="t", coefficients=pull, lower=-3, upper=2)
+    problem = dataclasses.replace(
+        p,
+        robot=dataclasses.replace(p.robot, tendons=(tendon,)),
+        stances=tuple(stances),
+        scenarios=(Scenario(name="nothing", missing=True, abort_after=0.02),),
     )
-    t = _drawn(dataclasses.replace(p, robot=dataclasses.replace(p.robot, tendons=(tendon,))))
-    own = [o.place.name for o in t.program.origins if "tendon t" in str(o)]
-    assert any(place.startswith("on ") for place in own)
-    check_rows(t)
+    t = transcribed(problem)
+    rows = Watch(t, Margins(dataclasses.replace(problem, terms=())), first_iterate(t)).constraints(0.15)
+    assert any(row.place.startswith("on ") for row in rows)
+    assert any(o.place.name.startswith("on ") for o in t.program.origins if "tendon t" in str(o))
+    check_rows(t.with_clearance(rows))
 
 
 @pytest.mark.parametrize("stiffness", [0.0, 8e3])
@@ -299,7 +305,7 @@ def test_of_friction_at_the_hit(robot: str, stiffness: float) -> None:
     """In the contact and at its first instant, where the servo's torques are variables."""
     rough = ContactFriction(coefficient=0.6, stiffness=stiffness)
     p = {"arm": arm_problem, "biped": biped_problem}[robot]()
-    t = _drawn(dataclasses.replace(p, friction=rough, terms=(*p.terms, GearLoad())))
+    t = transcribed(dataclasses.replace(p, friction=rough, terms=(*p.terms, GearLoad())))
     check_rows(t)
 
 

@@ -12,30 +12,29 @@ from support.derivative_checks import check_derivatives
 from support.small_plans import BODILESS, biped_problem, transcribed
 from support.small_robots import arm, biped
 
-from impactopt.errors import InputError
+from impactopt import (
+    FixedBase,
+    ImpactProblem,
+    InputError,
+    Perturbation,
+    Phase,
+    Plan,
+    Scenario,
+    StancePhase,
+    Trajectory,
+    load_problem,
+)
 from impactopt.files.export.motion import motion_at
-from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
+from impactopt.files.problem_file import problem_data, problem_from_data
 from impactopt.files.record import Record
 from impactopt.files.verify import motion_of_record
-from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.bounds import bounds_of
 from impactopt.planning.diagnosis import with_reason
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.stances import StancePhase
 from impactopt.report.histories import soles_standing, zmp_margins
-from impactopt.simulation import (
-    ControllerSettings,
-    Perturbation,
-    Simulation,
-    scene_of,
-    simulate_mujoco,
-    simulate_pinocchio,
-)
+from impactopt.simulation import ControllerSettings, Simulation, scene_of, simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
-from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.transcription import Transcription
 
 BOTH = StancePhase(soles=("left", "right"), phase=Phase(duration=(0.4, 0.9), intervals=6, grading=1.0))
@@ -98,7 +97,8 @@ def test_a_step_without_the_time_for_it_names_its_phase() -> None:
     """The search has to lengthen stance phases, too: with 0.2 s the foot does not come 6 cm ahead."""
     step = StancePhase(soles=("left",), phase=Phase(duration=0.2, intervals=6, grading=1.0))
     landed = StancePhase(soles=("left", "right"), steps=AHEAD)
-    t, result, found = searched(stepping(stances=(BOTH, step, landed), scenarios=()))
+    swing = Phase(duration=(0.4, 0.8), intervals=6)  # no bound that a cause would have to move
+    t, result, found = searched(stepping(stances=(BOTH, step, landed), scenarios=(), swing=swing))
     message = with_reason(t, result, found.causes).message
     assert message.startswith("Infeasible: time. stance phase 2: ")
     longer = found.causes[0].problem

@@ -43,14 +43,14 @@ def slider(mass):
     )
 
 
-def situation(robot, *, seed=0, speed=1.0, soles=None, striker="right_hand", normal=X):
-    """(q, v, torque): a random posture about half sitting, a motion that holds the soles and hits at
-    `speed`."""
+def situation(robot, *, seed=0, speed=1.0, soles=None, striker="right_hand", normal=X, moved=18):
+    """(q, v, torque): a random posture about half sitting, by the last `moved` velocities, and a motion that
+    holds the soles and hits at `speed`."""
     rng = np.random.default_rng(seed)
     soles = robot.soles if soles is None and robot.floating else (soles or ())
     q = robot.posture("half_sitting") if robot.floating else pin.neutral(robot.model)
     dq = np.zeros(robot.nv)
-    upper_body = np.arange(robot.nv - 18, robot.nv)
+    upper_body = np.arange(robot.nv - moved, robot.nv)
     dq[upper_body] = rng.uniform(-0.3, 0.3, upper_body.size)
     q = pin.integrate(robot.model, q, dq)
     k = Kinematics(robot, q, np.zeros(robot.nv), [s.frame for s in soles], striker, normal)

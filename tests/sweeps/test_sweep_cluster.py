@@ -16,17 +16,18 @@ import pyarrow.parquet as pq
 import pytest
 from support.sweep_workers import unlucky
 
-from impactopt.errors import InputError
-from impactopt.sweeps import SweepProgress, sweep, sweep_from_data
+from impactopt import InputError, sweep
+from impactopt.sweeps import SweepProgress, sweep_from_data
 from impactopt.sweeps.cluster import on_cluster
 from impactopt.sweeps.design import Unit, Work
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.sections import SweepSection
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")
-RESISTANCES = [500.0, 650.0, 9e3, 600.0, 800.0]
+RESISTANCES = [500.0, 650.0, 700.0, 600.0, 800.0]
 SWEEP = {
     "sweep": {"problem": "arm_planar", "case_kind": "strike"},
+    "set": {"solver.ipm.max_iterations": 34},  # too few for some
     "grid": {"target.resistance": RESISTANCES},
 }
 

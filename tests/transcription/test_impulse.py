@@ -14,18 +14,13 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from support.small_plans import LAW, OPTIONS, Planned, changed, planned
 
-from impactopt import Solution
+from impactopt import ImpactProblem, Plan, Solution, Status, TorqueLimit, load_record
 from impactopt.files.output import record_of, save_record
-from impactopt.files.record import load_record
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import TorqueLimit
 from impactopt.report.console import result_table
 from impactopt.report.pictures import PICTURES, save_pictures
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status
 from impactopt.transcription.contact_blocks import impact, two_mass_restitution
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
@@ -258,6 +253,9 @@ def test_it_is_kept_shown_and_drawn(solved: Planned, tmp_path: Path) -> None:
         assert record.summary["peak_force_N"] is None
         assert record.summary["problem"]["collision"].startswith(solved.problem.collision)
         assert result_table(record.summary).row_count > 4
+        # drawing is slow: one plan's pictures are without its replay
+        if (simulation is None) != (solved.problem.collision == "rigid"):
+            continue
         names = {path.stem for path in save_pictures(record, folder)}
         assert names == set(PICTURES) - {"replay"} - ({"zmp"} if not len(solved.plan.polygon) else set())
 

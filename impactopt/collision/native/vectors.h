@@ -13,7 +13,11 @@ typedef double vec __attribute__((vector_size(8 * LANES), may_alias));
 typedef long long bits __attribute__((vector_size(8 * LANES), may_alias));
 #define VECTORS(n) (((n) + LANES - 1) / LANES)
 #define AT_LEAST_1(n) ((n) > 0 ? (n) : 1)
+#ifdef __OPTIMIZE__
 #define INLINE static inline __attribute__((always_inline))
+#else /* code that is compiled in a hurry: copies would take time, and gain nothing */
+#define INLINE static inline
+#endif
 
 /* vectors of the joints, then the hand */
 #define V VECTORS(N + 1)

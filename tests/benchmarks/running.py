@@ -29,12 +29,10 @@ def show_reports(
     out : directory where numbers and pictures are kept.
     """
     with plain_errors(interrupted) as console:
-        from rich.console import Console
-
         from benchmarks.report import save_report
         from impactopt.files.output import make_directory
         from impactopt.files.record import plain
-        from impactopt.report.console import SolveConsole
+        from impactopt.report.console import SolveConsole, output
 
         directory = make_directory(out) if out is not None else None
         found = {}
@@ -45,7 +43,7 @@ def show_reports(
             found[name] = plain(report.numbers)
             if as_json:
                 continue
-            screen = Console()
+            screen = output()
             for table in report.tables:
                 screen.print(table)
             if written:

@@ -44,7 +44,6 @@ class ContactFriction(Described):
             "slide at which friction is 0.7 of the full one; less is stiffer", unit="m/s", above=0
         ),
     )
-
     stiffness: float = field(
         default=0.0,
         metadata=about("stiffness of the bristles across the normal; 0: none", unit="N/m", least=0),

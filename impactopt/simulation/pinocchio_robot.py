@@ -55,6 +55,7 @@ class Body(ABC):
         self.frames = [self.model.getFrameId(frame) for frame in frames]
         self.compliance, self.normal = np.tile(compliance, len(frames)), normal
         strikers = (striker,) if isinstance(striker, str) else striker
+        self._unbent = np.zeros((len(strikers), 3)), np.zeros(len(strikers))
         self.strikers = [self.model.getFrameId(name) for name in strikers]
         self.sliding = None if friction is None else SlidingPoints(friction)
         self.normal_jacobian = self.force_map = np.zeros((len(strikers), self.nv))
@@ -109,8 +110,7 @@ class Body(ABC):
         self.normal_jacobian = self.force_map = np.array([self.normal @ J for J in jacobians])
         if self.sliding is not None:
             self.sliding.update(self.normal, jacobians, v)
-            unbent = np.zeros((len(jacobians), 3)), np.zeros(len(jacobians))
-            self.force_map = self.sliding.force_map(*unbent)
+            self.force_map = self.sliding.force_map(*self._unbent)
 
     def bend(self, deflections: Array, forces: Array) -> None:
         """Sets `force_map` for bristles with deflections (h, 3) [m] under normal forces (h,) [N]."""
@@ -119,7 +119,9 @@ class Body(ABC):
 
     def deflected(self, deflections: Array, forces: Array, step: float) -> Array:
         """Deflections (h, 3) [m] of bristles after a step [s] from the current state under normal forces."""
-        return deflections if self.sliding is None else self.sliding.deflected(deflections, forces, step)
+        if self.sliding is None or not self.sliding.bristles:
+            return deflections
+        return self.sliding.deflected(deflections, forces, step)
 
     def _generalized_forces(self, torque: Array, force: float | Array) -> Array:
         """Generalized forces (nv,) of joint torques (n,), springs and contact forces (h,)."""

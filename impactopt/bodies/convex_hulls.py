@@ -27,6 +27,7 @@ _LARGE, _LARGE_RATIO = 1.0, 8.0
 STAND_IN = (
     0.5  # length of collision shapes, over that of the visual ones, below which they only stand for a link
 )
+MAX_PIECES = 8  # of a link; more, as of one that is exported screw by screw, become one
 _MAX_NEIGHBOURS = 200  # of a vertex: coal counts them in a byte
 _MERGE_DISTANCE = 1e-4  # [m] of vertices of hulls with more neighbours; doubled until there are few enough
 
@@ -72,8 +73,9 @@ def pieces_of(robot: Robot, known: Sequence[Piece] | None = None) -> tuple[tuple
     """Pieces of a robot, and a description of their source; known : its `file_pieces`, if already read.
 
     They are hulls of the collision shapes in its URDF or MJCF, or of the visual shapes of links without
-    collision shapes. Rounded boxes of the links' inertia replace shapes that are too large or whose meshes
-    are missing, and all shapes of a robot without any. Tools are rods to their heads.
+    collision shapes; one hull for a link of many shapes. Rounded boxes of the links' inertia replace shapes
+    that are too large or whose meshes are missing, and all shapes of a robot without any. Tools are rods to
+    their heads.
     """
     known = file_pieces(robot) if known is None else known
     found = [piece for piece in known if not is_too_large(robot.model, piece.joint, piece.vertices)]
@@ -87,8 +89,21 @@ def pieces_of(robot: Robot, known: Sequence[Piece] | None = None) -> tuple[tuple
         found += [piece for piece in _from_inertia(robot) if piece.joint in bare | large]
         source += f", and boxes of the inertia of {len(bare)} that have lost their meshes" if bare else ""
         source += f", and boxes of the inertia of {len(large)} whose shapes are too large" if large else ""
-    found += [piece for tool in robot.tools for piece in _of_tool(robot, tool)]
+    found = [*_few(found), *(piece for tool in robot.tools for piece in _of_tool(robot, tool))]
     return tuple(found), source
+
+
+def _few(pieces: Iterable[Piece]) -> Iterator[Piece]:
+    """The pieces, with one hull for a link of more than `MAX_PIECES`."""
+    of_links: dict[tuple[str, int], list[Piece]] = {}
+    for piece in pieces:
+        of_links.setdefault((piece.link, piece.joint), []).append(piece)
+    for (link, joint), several in of_links.items():
+        whole = None
+        if len(several) > MAX_PIECES:
+            vertices = np.concatenate([piece.vertices for piece in several])
+            whole = _hull(link, joint, Solid(vertices=vertices, triangles=np.zeros((0, 3), dtype=np.intp)))
+        yield from several if whole is None else [whole]
 
 
 def file_pieces(robot: Robot) -> tuple[Piece, ...]:

@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from impactopt.bodies.convex_hulls import Piece, file_pieces, pieces_of
+from impactopt.bodies.convex_hulls import Piece, file_pieces, is_too_large, pieces_of
 from impactopt.robots.build import parent_body
 from impactopt.robots.robot import Robot
 
@@ -114,7 +114,7 @@ def bodies_of(robot: Robot) -> RobotBodies:
     if robot not in _KNOWN:
         known = file_pieces(robot)
         pieces, source = pieces_of(robot, known)
-        too_large = tuple(piece for piece in known if piece not in pieces)
+        too_large = tuple(p for p in known if is_too_large(robot.model, p.joint, p.vertices))
         _KNOWN[robot] = RobotBodies(robot=robot, pieces=pieces, source=source, too_large=too_large)
     return _KNOWN[robot]
 

@@ -545,6 +545,22 @@ def test_a_robots_bodies_are_made_once() -> None:
     assert bodies_of(dataclasses.replace(robot)) is not found
 
 
+@pytest.mark.parametrize("count", [8, 12])
+def test_a_link_of_many_shapes_has_one_hull(tmp_path: Path, count: int) -> None:
+    """Of all their corners; a few shapes stay apart."""
+    shape = '<collision><origin xyz="{} 0 0.1"/><geometry><box size="0.01 0.02 0.03"/></geometry></collision>'
+    shapes = "".join(shape.format(0.02 * k) for k in range(count))
+    text = re.sub(r'(<link name="elbow_link">.*?)<collision>.*?</collision>', rf"\1{shapes}", urdfs.arm())
+    (tmp_path / "robot.urdf").write_text(text)
+    robot = Robot.from_urdf(tmp_path / "robot.urdf", floating=False, locked=["slide_0", "slide_1"])
+    own = [piece for piece in bodies_of(robot).pieces if piece.link == "elbow_link"]
+    assert bodies_of(robot).too_large == ()
+    assert len(own) == (1 if count > 8 else 8)
+    corners = np.concatenate([piece.vertices for piece in own])
+    np.testing.assert_allclose(corners.min(axis=0), [-0.005, -0.01, 0.085], atol=1e-9)
+    np.testing.assert_allclose(corners.max(axis=0), [0.02 * count - 0.015, 0.01, 0.115], atol=1e-9)
+
+
 MESHES = {
     "pointer.stl": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
     "cut.stl": (b"\0" * 80 + (99).to_bytes(4, "little") + b"\0" * 60, "cannot be read"),

@@ -26,6 +26,7 @@ from impactopt.files.draft.default_drives import guess_drives
 from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.draft.robot import Drafted, draft_robot
+from impactopt.files.draft.soles import sides
 from impactopt.files.draft.strikers import find_striker
 from impactopt.files.problem_file import load_problem
 from impactopt.files.toml import read_toml
@@ -269,6 +270,19 @@ def test_a_leg_of_five_stands_whose_axes_have_rounded_decimals(tmp_path: Path) -
     assert count == 2
     problem = _problem(tmp_path, text)
     problem.robot.check_stance(problem.start_posture, tilt=2e-5)
+
+
+def test_two_hands_beside_a_tail_are_a_left_and_a_right_one(tmp_path: Path) -> None:
+    ends = {"l_palm": 0.2, "r_palm": -0.2, "tail": 0.0}
+    parts = [urdfs.link("torso", 5.0, (0.2, 0.3, 0.4), (0.0, 0.0, 0.2))]
+    for name, y in ends.items():
+        parts += [urdfs.link(name, 1.0, (0.05, 0.05, 0.3), (0.0, 0.0, -0.15))]
+        parts += [urdfs.joint(f"swing_{name}", "torso", name, "0 1 0", (0.0, y, 0.3), (-1.0, 1.0))]
+    (tmp_path / "robot.urdf").write_text(urdfs.robot("monkey", *parts))
+    model = read_urdf(tmp_path / "robot.urdf", floating=False).model
+    tips = [model.getJointId(f"swing_{name}") for name in ends]
+    assert sides(model, tips) == ["left", "right", "tail"]
+    assert sides(model, [tips[0], tips[0], tips[1]]) == ["l_palm", "l_palm", "r_palm"]
 
 
 def test_toes_are_locked(tmp_path: Path) -> None:

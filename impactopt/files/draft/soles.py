@@ -143,15 +143,15 @@ def _hinge(model: pin.Model, leg: Limb, own: Sequence[int], place: Any) -> str:
 
 
 def sides(model: pin.Model, tips: Sequence[int]) -> list[str]:
-    """Names of limbs: "left" and "right" for two on both sides of the robot, else those of the last links."""
+    """Names of limbs: "left" and "right" for one on each side of the robot, else those of the last links."""
     data = model.createData()
     pin.forwardKinematics(model, data, neutral(model))
     links = [first_link(model, tip)[0] for tip in tips]
+    words = [_side(link) for link in links]
+    if words.count("left") == words.count("right") == 1:
+        return words
     if len(tips) != 2:
         return links
-    words = [_side(link) for link in links]
-    if set(words) == {"left", "right"}:
-        return words
     y = [float(data.oMi[tip].translation[1]) for tip in tips]
     if min(y) < 0 < max(y):
         return ["left" if y[0] > y[1] else "right", "left" if y[1] > y[0] else "right"]

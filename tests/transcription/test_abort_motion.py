@@ -9,13 +9,9 @@ import pinocchio as pin
 import pytest
 from support.small_plans import Planned, changed
 
-from impactopt import Solution
-from impactopt.errors import InputError
+from impactopt import InputError, Perturbation, Scenario, Solution, load_record
 from impactopt.files.output import record_of, save_record
-from impactopt.files.record import load_record
 from impactopt.files.replay import load_planned
-from impactopt.problem.scenario import Scenario
-from impactopt.simulation import Perturbation
 from impactopt.transcription.transcription import Transcription
 
 PROBLEM = Path(__file__).resolve().parents[2] / "problems" / "punch.toml"

@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 import impactopt
-from impactopt import InputError, load_problem
+from impactopt import ImpactProblem, InputError, load_problem
 from impactopt import api as by_file
 from impactopt.files.named_problems import problem_file
-from impactopt.problem.problem import ImpactProblem
 
 FILE = """
 [solver]

@@ -13,8 +13,7 @@ import pinocchio as pin
 import pytest
 
 from benchmarks.crocoddyl_peer import _against_target, _reference, _task, crocoddyl_plan
-from impactopt import FreeMass, ImpactProblem, load_problem
-from impactopt.errors import InputError
+from impactopt import FreeMass, ImpactProblem, InputError, load_problem
 from impactopt.simulation.motors import Servo
 
 

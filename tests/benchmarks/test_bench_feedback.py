@@ -16,10 +16,16 @@ from benchmarks import feedback
 from benchmarks.__main__ import app
 from benchmarks.pictures.feedback import COLOURS
 from benchmarks.report import Report
-from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
+from impactopt import (
+    Balance,
+    ContactWrenchCone,
+    PerturbationRanges,
+    Robustness,
+    Status,
+    TorqueLimit,
+    draw_perturbations,
+)
 from impactopt.simulation import ControllerSettings
-from impactopt.simulation.robustness import PerturbationRanges, Robustness, draw_perturbations
-from impactopt.solvers.program import Status
 
 IMPULSES = {"stated": 14.0, "loosened": 15.0}
 SLIP = np.array([1e-3, 0.5, 3e-3, 4e-3])  # [m] of four draws; with the servo the second falls

@@ -20,11 +20,7 @@ from benchmarks.pictures.fidelity import fidelity_picture
 from benchmarks.pictures.virtual_base import virtual_base_picture
 from benchmarks.report import Report
 from benchmarks.virtual_base import _body, exact_inverse_mass
-from impactopt.collision import effective_mass
-from impactopt.errors import InputError
-from impactopt.kinematics.stance import BothSoles
-from impactopt.robots.presets import standin
-from impactopt.robots.robot import Robot
+from impactopt import BothSoles, InputError, Robot, effective_mass, standin
 
 runner = CliRunner()
 

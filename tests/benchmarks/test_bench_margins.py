@@ -17,15 +17,22 @@ from benchmarks.__main__ import app
 from benchmarks.margins import OPTIONS, Option
 from benchmarks.pictures.margins import margins_picture
 from benchmarks.report import Report
-from impactopt import Solution
-from impactopt.errors import InputError
+from impactopt import (
+    Balance,
+    ContactWrenchCone,
+    ImpactProblem,
+    InputError,
+    Perturbation,
+    PerturbationRanges,
+    Robustness,
+    Scenario,
+    Solution,
+    Status,
+    TorqueLimit,
+    draw_perturbations,
+)
 from impactopt.files.problem_file import ProblemFile
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
-from impactopt.simulation import Perturbation, Simulation
-from impactopt.simulation.robustness import PerturbationRanges, Robustness, draw_perturbations
-from impactopt.solvers.program import Status
+from impactopt.simulation import Simulation
 
 VALUES = [(option, value) for option in OPTIONS for value in option.values]
 EXPECTED_SLIP = np.array([1e-3, 0.5, 3e-3, 2e-3])  # [m] of four draws; the second falls

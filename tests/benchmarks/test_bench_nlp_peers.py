@@ -14,8 +14,8 @@ from support.textbook import Textbook, assert_optimal, infeasible
 
 from benchmarks.attempts import judged
 from benchmarks.solvers import SOLVERS
-from impactopt.errors import InputError
-from impactopt.solvers.program import Status, max_violation
+from impactopt import InputError, Status
+from impactopt.solvers.program import max_violation
 
 PEERS = {"uno-filtersqp": "unopy", "uno-ipopt": "unopy", "pounce": "pounce"}  # and what they are imported as
 

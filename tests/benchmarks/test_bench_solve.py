@@ -24,8 +24,7 @@ from benchmarks.attempts import Attempt, attempt, judged
 from benchmarks.casadi_peer import solve_sqpmethod
 from benchmarks.scipy_peer import solve_slsqp, solve_trust_constr
 from benchmarks.solvers import SOLVERS
-from impactopt.errors import InputError
-from impactopt.solvers.program import Status
+from impactopt import InputError, Status
 from impactopt.solvers.sqp import QP_SOLVERS
 from impactopt.transcription.transcription import Transcription
 

@@ -20,12 +20,10 @@ from benchmarks.pictures.scaling import scaling_picture
 from benchmarks.pictures.skip import skip_picture
 from benchmarks.registry import run_bench
 from benchmarks.setup import Setup
+from impactopt import SDC, Effects, InputError, VirtualMass, standin
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Effects, VirtualMass
 from impactopt.collision.graph import independent_joints
-from impactopt.errors import InputError
 from impactopt.report.pictures.style import STYLE
-from impactopt.robots.presets import standin
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 unwarned = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")

@@ -23,14 +23,9 @@ from typer.testing import CliRunner
 from benchmarks import zoo
 from benchmarks.__main__ import app
 from benchmarks.zoo import BASES, cleanliness, draw, drawn_problem, row, run
-from impactopt import Solution, load_problem
-from impactopt.contact import FreeMass
-from impactopt.errors import InputError
+from impactopt import FreeMass, ImpactProblem, InputError, Solution, Status, load_problem, standin
 from impactopt.files.problem_file import ProblemFile
 from impactopt.problem.feasibility import hopeless
-from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.presets import standin
-from impactopt.solvers.program import Status
 
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
 

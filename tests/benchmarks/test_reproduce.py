@@ -29,8 +29,7 @@ from benchmarks.paper import (
 )
 from benchmarks.paper.__main__ import app
 from benchmarks.trees import random_robot, tip_speed
-from impactopt.collision import SDC
-from impactopt.errors import InputError
+from impactopt import SDC, InputError
 
 HEADS = {"seconds", "versions", "machine"}
 TABLE_2 = {

@@ -17,25 +17,29 @@ from scipy.spatial import ConvexHull
 from support import urdfs
 from support.small_plans import arm_problem, biped_problem
 
-from impactopt import KeepOut, TargetBody, load_problem
+from impactopt import (
+    Board,
+    FreeMass,
+    ImpactProblem,
+    InputError,
+    KeepOut,
+    Nail,
+    Obstacle,
+    RigidWall,
+    Robot,
+    TargetBody,
+    Tool,
+    g1,
+    load_problem,
+    planar_arm,
+    standin,
+    talos,
+)
 from impactopt.bodies.clearance import FAR, MISSED, SLACK, Bodies, Places
 from impactopt.bodies.convex_hulls import inertia_box, pieces_of
 from impactopt.bodies.file_shapes import lost_meshes
 from impactopt.bodies.robot_bodies import bodies_of, distance
-from impactopt.bodies.world import (
-    BEHIND,
-    Obstacle,
-    WorldBody,
-    face_axes,
-    ground_body,
-    obstacle_bodies,
-    target_bodies,
-)
-from impactopt.contact import Board, FreeMass, Nail, RigidWall
-from impactopt.errors import InputError
-from impactopt.problem.problem import ImpactProblem
-from impactopt.robots.presets import g1, planar_arm, standin, talos
-from impactopt.robots.robot import Robot, Tool
+from impactopt.bodies.world import BEHIND, WorldBody, face_axes, ground_body, obstacle_bodies, target_bodies
 
 Array = NDArray[np.float64]
 EXACT = 1e-6  # [m] of coal's distances

@@ -7,9 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from impactopt import g1, talos
+from impactopt import Robot, g1, talos
 from impactopt.bodies.robot_bodies import striker_face
-from impactopt.robots.robot import Robot
 
 
 def moved(robot: Robot, name: str, by: np.ndarray) -> Robot:

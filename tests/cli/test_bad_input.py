@@ -25,18 +25,20 @@ from impactopt import (
     Perturbation,
     Robot,
     Tool,
+    effective_mass,
+    holding_torque,
+    load_problem,
     load_robot,
     optimize_strike,
     solve,
+    striking_velocity,
 )
 from impactopt.codegen.compiler import CompileError, Compiler, find_compiler
-from impactopt.collision import effective_mass
 from impactopt.errors import printable
 from impactopt.files.named_problems import problem_file
-from impactopt.files.problem_file import load_problem, read_problem_file
+from impactopt.files.problem_file import read_problem_file
 from impactopt.files.sections.diagnostics import key_lines
 from impactopt.files.sections.reading import parse_settings
-from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.problem.scenario import FINEST
 from impactopt.report.page import html_page
 from impactopt.simulation import simulate

@@ -18,15 +18,14 @@ from support.fake_solution import PROBLEM_FILE, FakeSolution, MissingSolution, s
 from typer.testing import CliRunner
 
 import impactopt
-from impactopt import Solution
+from impactopt import ImpactProblem, Solution, Status, load_record
 from impactopt.cli.app import app
 from impactopt.files.problem_file import ProblemFile
-from impactopt.files.record import Record, load_record
+from impactopt.files.record import Record
 from impactopt.planning.refinement import Attempt
-from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures import PICTURES
 from impactopt.simulation.workers import Died
-from impactopt.solvers.program import IterationRecord, Status, Violation
+from impactopt.solvers.program import IterationRecord, Violation
 
 GOOD = f"""\
 {PROBLEM_FILE.replace("still", "[still]")}

@@ -19,23 +19,15 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import impactopt
+from impactopt import FullDynamics, Robot, load_problem, problem_names
 from impactopt.cli.app import app
 from impactopt.cli.options import complete_problem
 from impactopt.collide.single_collision import collide_once
 from impactopt.files.named_problems import problem_file
 from impactopt.files.output import save_record
-from impactopt.files.problem_file import (
-    key_place,
-    load_problem,
-    problem_names,
-    read_problem_file,
-    read_toml,
-    write_toml,
-)
+from impactopt.files.problem_file import key_place, read_problem_file, read_toml, write_toml
 from impactopt.files.problem_file.reading import key_paths
 from impactopt.report.console import output
-from impactopt.robots.robot import Robot
-from impactopt.simulation.reference import FullDynamics
 
 ROOT = Path(__file__).parents[2]
 DATA: dict[str, Any] = {

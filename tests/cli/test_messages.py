@@ -11,11 +11,9 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import changed
 
-from impactopt.problem.problem import Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
+from impactopt import ContactWrenchCone, Phase, Scenario, Status, TorqueLimit
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import DescribedProgram, Status, Violation, explain, worst_violations
+from impactopt.solvers.program import DescribedProgram, Violation, explain, worst_violations
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.layout import Layout, Measure, Place, along, degrees, millimetres, percent
 from impactopt.transcription.transcription import Transcription

@@ -9,8 +9,8 @@ from typing import IO
 
 import pytest
 
+from impactopt import InputError
 from impactopt.codegen.files import open_own, write_atomically
-from impactopt.errors import InputError
 from impactopt.files.output import write_file
 from impactopt.sweeps.store import Journal
 

@@ -18,10 +18,9 @@ import numpy as np
 import pytest
 from support.native_cases import ROBOTS, robot_named, situation
 
+from impactopt import SDC, Board, ContactFriction, Effects, FreeMass, HuntCrossley, Nail, SpringDamper
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Effects
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
-from impactopt.contact import Board, ContactFriction, FreeMass, HuntCrossley, Nail, SpringDamper
 
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-g1")
 BRANCHES = {"widest": (), "AVX2": ("-mno-avx512f",), "SSE2": ("-mno-avx",)}

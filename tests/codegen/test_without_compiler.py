@@ -10,21 +10,24 @@ import pytest
 from scipy.integrate import solve_ivp
 from support import small_robots
 
-from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
-from impactopt.contact import (
+from impactopt import (
+    SDC,
     Board,
     ContactLaw,
+    Effects,
     FreeMass,
     HuntCrossley,
+    InputError,
+    JointFriction,
     KelvinVoigt,
     Nail,
     RigidWall,
     SpringDamper,
     Target,
+    VirtualMass,
+    collide_many,
 )
-from impactopt.errors import InputError
-from impactopt.sweeps.collisions import collide_many
+from impactopt.codegen.compiler import find_compiler
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

@@ -15,22 +15,27 @@ from support.small_robots import arm, biped, disc, table
 
 from impactopt import (
     SDC,
+    BothSoles,
     ContactFriction,
+    Effects,
+    FixedBase,
+    Free,
     FreeMass,
     FullDynamics,
+    GearLoad,
     Incidence,
+    InputError,
     JointFriction,
     MujocoDynamics,
     RigidWall,
     SpringDamper,
     VirtualMass,
+    holding_torque,
+    load_problem,
+    striking_velocity,
 )
-from impactopt.collision import Effects
-from impactopt.errors import InputError
-from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
-from impactopt.kinematics.operational_space import ConstrainedDynamics, holding_torque, striking_velocity
-from impactopt.kinematics.stance import BothSoles, FixedBase, Free
-from impactopt.problem.terms import GearLoad
+from impactopt.files.problem_file import problem_data, problem_from_data
+from impactopt.kinematics.operational_space import ConstrainedDynamics
 from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.transcription.initial_guess import first_iterate

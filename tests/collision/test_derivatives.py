@@ -11,10 +11,8 @@ import pytest
 from support.implicit_cases import gradient, implicit
 from support.native_cases import FRICTION, situation
 
+from impactopt import SDC, Effects, FreeMass, InputError, SpringDamper, VirtualMass
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Effects, VirtualMass
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.errors import InputError
 from impactopt.robots.link_tables import planar_arm
 
 pytestmark = [

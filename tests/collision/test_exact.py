@@ -13,10 +13,18 @@ from support.exact import ExactCollision
 from support.exact_reference import Case, random_case, robot_named
 from support.small_robots import slider
 
-from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
+from impactopt import (
+    SDC,
+    Effects,
+    FreeMass,
+    HuntCrossley,
+    InputError,
+    JointFriction,
+    KelvinVoigt,
+    SpringDamper,
+    VirtualMass,
+)
 from impactopt.collision.implicit import bernstein_matrix, first_negative, largest
-from impactopt.contact import FreeMass, HuntCrossley, KelvinVoigt, SpringDamper
-from impactopt.errors import InputError
 
 X = np.array([1.0, 0.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=2.0)

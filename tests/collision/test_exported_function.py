@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from support import small_robots
 
-from impactopt.collision import SDC
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.errors import InputError
+from impactopt import SDC, FreeMass, InputError, SpringDamper
 
 MASS, SPEED = 2.0, 1.3
 ELASTIC = SpringDamper(stiffness=1e4, damping=0.0)

@@ -23,9 +23,9 @@ from impactopt import (
     Striker,
     effective_mass,
     planar_arm,
+    striking_velocity,
 )
 from impactopt.cli.app import app
-from impactopt.kinematics.operational_space import striking_velocity
 
 NORMAL = np.array([0.0, 1.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0)

@@ -10,14 +10,19 @@ import pytest
 from benchmarks import freezes as bench
 from benchmarks.stability_robots import make_robot
 
-from impactopt.collision import SDC, VirtualMass
+from impactopt import (
+    SDC,
+    FreeMass,
+    FullDynamics,
+    InputError,
+    SpringDamper,
+    VirtualMass,
+    collide_many,
+    holding_torque,
+    striking_velocity,
+)
 from impactopt.collision.checks import freeze_error, more_often
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.errors import InputError
-from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.report.console import collision_table
-from impactopt.simulation.reference import FullDynamics
-from impactopt.sweeps.collisions import collide_many
 
 X = np.array([1.0, 0.0, 0.0])
 Q, SPEED = np.array([0.4, 0.9, 0.5]), 1.0

@@ -14,9 +14,8 @@ from support.frozen_cases import two_masses
 from support.implicit_cases import exact, gradient, implicit
 from support.native_cases import FRICTION, LAW, TARGET, X, call, inputs, situation
 
+from impactopt import SDC, Board, Effects, KelvinVoigt, Nail, RigidWall, VirtualMass
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Effects, VirtualMass
-from impactopt.contact import Board, KelvinVoigt, Nail, RigidWall
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),

@@ -13,8 +13,7 @@ import pytest
 from benchmarks.gains import LAW, ONLY_SERVO, TARGET, impulse_of
 from numpy.typing import NDArray
 
-from impactopt import SDC, BothSoles, FixedBase, Robot, Sole, Striker, arm7
-from impactopt.kinematics.operational_space import striking_velocity
+from impactopt import SDC, BothSoles, FixedBase, Robot, Sole, Striker, arm7, striking_velocity
 
 Array = NDArray[np.float64]
 NORMAL = np.array([0.6, 0.0, -0.8])

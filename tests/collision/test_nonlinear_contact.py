@@ -12,12 +12,11 @@ import pytest
 from support.frozen_by_scipy import FrozenCollision
 from support.native_cases import FRICTION, HARDENING, ROBOTS, X, robot_named, situation
 
+from impactopt import SDC, Effects, FreeMass, HertzDamped, HuntCrossley, Nail, SpringDamper
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Effects
 from impactopt.collision.graph import collision_graph
 from impactopt.collision.implicit import NODES, STAGES, Contact, gamma, node_tables
 from impactopt.collision.stepped import law_is_linear
-from impactopt.contact import FreeMass, HertzDamped, HuntCrossley, Nail, SpringDamper
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 

@@ -9,11 +9,20 @@ import pinocchio as pin
 import pytest
 from support.small_robots import arm, biped
 
-from impactopt import SDC, BothSoles, FreeMass, Nail, RigidImpact, RigidWall, SpringDamper
-from impactopt.errors import InputError
-from impactopt.kinematics.operational_space import striking_velocity
-from impactopt.kinematics.stance import FixedBase, Stance
-from impactopt.robots.robot import Robot
+from impactopt import (
+    SDC,
+    BothSoles,
+    FixedBase,
+    FreeMass,
+    InputError,
+    Nail,
+    RigidImpact,
+    RigidWall,
+    Robot,
+    SpringDamper,
+    striking_velocity,
+)
+from impactopt.kinematics.stance import Stance
 
 NORMAL = np.array([0.6, 0.0, 0.8])
 

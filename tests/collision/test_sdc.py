@@ -27,10 +27,19 @@ from support.frozen_cases import (
     with_heavy_feet,
 )
 
-from impactopt.collision import SDC, Effects, effective_mass
-from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
-from impactopt.errors import InputError
-from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
+from impactopt import (
+    SDC,
+    BothSoles,
+    ContactLaw,
+    Effects,
+    FixedBase,
+    FreeMass,
+    InputError,
+    OneSole,
+    SpringDamper,
+    Target,
+    effective_mass,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

@@ -9,10 +9,19 @@ import numpy as np
 import pytest
 from support import small_robots
 
-from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
-from impactopt.contact import FreeMass, Nail, SpringDamper, Target
+from impactopt import (
+    SDC,
+    Effects,
+    FreeMass,
+    FullDynamics,
+    JointFriction,
+    MujocoDynamics,
+    Nail,
+    SpringDamper,
+    Target,
+    VirtualMass,
+)
 from impactopt.contact.fields import about, choose
-from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

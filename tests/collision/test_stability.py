@@ -17,10 +17,7 @@ from benchmarks.stability_robots import make_robot
 from support import small_robots
 from typer.testing import CliRunner
 
-from impactopt.collision import SDC
-from impactopt.contact import FreeMass, RigidWall, SpringDamper
-from impactopt.errors import InputError
-from impactopt.kinematics.operational_space import striking_velocity
+from impactopt import SDC, FreeMass, InputError, RigidWall, SpringDamper, striking_velocity
 
 X = np.array([1.0, 0.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=5.0)

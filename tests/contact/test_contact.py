@@ -16,19 +16,22 @@ from scipy.optimize import brentq
 from scipy.special import gamma
 from support.frozen_cases import X, slider
 
-from impactopt.collision import SDC
-from impactopt.contact import (
+from impactopt import (
+    SDC,
+    BothSoles,
     ContactLaw,
     CustomLaw,
+    FixedBase,
     FreeMass,
     HertzDamped,
     HuntCrossley,
+    InputError,
     KelvinVoigt,
+    OneSole,
     SpringDamper,
+    g1,
+    talos,
 )
-from impactopt.errors import InputError
-from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
-from impactopt.robots.presets import g1, talos
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

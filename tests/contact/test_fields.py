@@ -11,10 +11,10 @@ import pytest
 from pydantic import ValidationError
 
 import impactopt
+from impactopt import InputError
 from impactopt.contact.fields import About, Described, about, abouts, snake_case
 from impactopt.contact.laws import LAWS
 from impactopt.contact.targets import TARGETS
-from impactopt.errors import InputError
 from impactopt.files.sections.values import section_of
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.terms import TERMS

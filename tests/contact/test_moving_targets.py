@@ -16,10 +16,19 @@ from support.frozen_cases import X, slider
 from support.implicit_cases import exact, gradient, implicit
 from support.native_cases import call, situation
 
+from impactopt import (
+    SDC,
+    Board,
+    FreeMass,
+    FullDynamics,
+    HuntCrossley,
+    Nail,
+    RigidWall,
+    SpringDamper,
+    Target,
+    VirtualMass,
+)
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, VirtualMass
-from impactopt.contact import Board, FreeMass, HuntCrossley, Nail, RigidWall, SpringDamper, Target
-from impactopt.simulation.reference import FullDynamics
 from impactopt.simulation.result import travelled
 
 pytestmark = [

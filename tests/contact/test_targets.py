@@ -12,18 +12,18 @@ import pytest
 from scipy.integrate import solve_ivp
 from support.frozen_cases import X, slider
 
-from impactopt.collision import SDC
-from impactopt.contact import (
+from impactopt import (
+    SDC,
     Board,
     FreeMass,
     HuntCrossley,
+    InputError,
     KelvinVoigt,
     Nail,
     RigidWall,
     SpringDamper,
     Target,
 )
-from impactopt.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

@@ -16,27 +16,35 @@ import pytest
 from support import urdfs
 from typer.testing import CliRunner
 
-from impactopt import Board, Nail, Robot, Tool, optimize_strike, solve
+from impactopt import (
+    Board,
+    ImpactProblem,
+    InputError,
+    Nail,
+    Robot,
+    Slide,
+    Striker,
+    Target,
+    Tool,
+    TorqueLimit,
+    load_problem,
+    optimize_strike,
+    solve,
+)
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import visuals_of
 from impactopt.cli.app import app
-from impactopt.contact.targets import Target
-from impactopt.errors import InputError
 from impactopt.files.draft.default_drives import guess_drives
 from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import sides
 from impactopt.files.draft.strikers import find_striker
-from impactopt.files.problem_file import load_problem
 from impactopt.files.toml import read_toml
 from impactopt.kinematics.operational_space import striking_point
 from impactopt.problem.feasibility import hopeless, sticks_out, too_weak
 from impactopt.problem.plausibility import doubts
-from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import best_share
-from impactopt.problem.terms import Slide, TorqueLimit
-from impactopt.robots.attachments import Striker
 from impactopt.robots.urdf import read_urdf
 
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'

@@ -25,25 +25,36 @@ from support.small_plans import BODILESS, rod_hammer
 from typer.testing import CliRunner
 
 import impactopt
-from impactopt import Solution, solve
+from impactopt import (
+    Board,
+    CustomLaw,
+    FirstTouch,
+    FreeMass,
+    HertzDamped,
+    HuntCrossley,
+    ImpactProblem,
+    InputError,
+    KelvinVoigt,
+    Perturbation,
+    RigidWall,
+    Robot,
+    SoftGrip,
+    Solution,
+    SpringDamper,
+    Status,
+    load_problem,
+    solve,
+)
 from impactopt.cli.app import app
 from impactopt.cli.export import Target as Choice
-from impactopt.contact import Board, FreeMass, HertzDamped, HuntCrossley, KelvinVoigt, RigidWall, SpringDamper
-from impactopt.contact.laws import LAWS, CustomLaw
-from impactopt.errors import InputError
+from impactopt.contact.laws import LAWS
 from impactopt.files.export import FORMATS, export_planned
 from impactopt.files.export import player as formulas
 from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
-from impactopt.files.problem_file import load_problem
 from impactopt.files.replay import Planned
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import FirstTouch
-from impactopt.robots.attachments import SoftGrip
-from impactopt.robots.robot import Robot
-from impactopt.simulation import Perturbation, Simulation, scene_of, simulate_mujoco
+from impactopt.simulation import Simulation, scene_of, simulate_mujoco
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world
-from impactopt.solvers.program import Status
 
 Array = np.ndarray
 SERVO = Perturbation(period=1e-3)  # a servo at 1 kHz

@@ -14,16 +14,13 @@ import numpy as np
 import pytest
 from support.fake_solution import MissingSolution, simulation_of, still_problem, still_solution
 
-from impactopt.errors import InputError
+from impactopt import ImpactProblem, InputError, Plan, Status, load_record
 from impactopt.files.output import record_of, save_record, write_file
-from impactopt.files.record import FORMAT, Record, load_record
+from impactopt.files.record import FORMAT, Record
 from impactopt.files.record_schema import check_summary
 from impactopt.kinematics.support import margin
-from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures import PICTURES, save_pictures
 from impactopt.report.pictures.torque import _binned
-from impactopt.solvers.program import Status
-from impactopt.transcription.plan import Plan
 
 
 @pytest.fixture(scope="module")

@@ -15,29 +15,34 @@ from support.problem_texts import ARM, write
 
 import impactopt.files.problem_file.sections as sections
 import impactopt.files.sections.robot as robot_sections
-from impactopt.bodies.world import Obstacle, TargetBody
-from impactopt.contact import (
+from impactopt import (
     Board,
+    FixedBase,
     FreeMass,
     HertzDamped,
     HuntCrossley,
+    ImpactProblem,
+    InputError,
     KelvinVoigt,
     Nail,
+    Obstacle,
+    OneSole,
+    Phase,
     RigidWall,
+    Scenario,
     SpringDamper,
+    TargetBody,
+    Tool,
+    load_problem,
+    talos,
 )
 from impactopt.contact.laws import LAWS
 from impactopt.contact.targets import TARGETS
-from impactopt.errors import InputError
-from impactopt.files.problem_file import load_problem, read_problem_file
+from impactopt.files.problem_file import read_problem_file
 from impactopt.files.sections.diagnostics import key_lines
 from impactopt.files.sections.values import Section, attribute_docs
-from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem import objectives, terms
-from impactopt.problem.problem import COLLISIONS, ImpactProblem, Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.robots.presets import talos
-from impactopt.robots.robot import Tool
+from impactopt.problem.problem import COLLISIONS
 from impactopt.solvers.sqp import SQPOptions
 
 PUNCH = Path(__file__).parents[2] / "problems" / "punch.toml"

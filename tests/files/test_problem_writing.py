@@ -17,25 +17,29 @@ from support.small_robots import arm
 from support.term_cases import CASES
 
 import impactopt
-from impactopt import contact
-from impactopt.bodies.world import Ground, Obstacle, TargetBody
-from impactopt.errors import InputError
-from impactopt.files.problem_file import (
-    SolverSettings,
+from impactopt import (
+    FixedBase,
+    Ground,
+    ImpactProblem,
+    InputError,
+    Obstacle,
+    OneSole,
+    Phase,
+    Robot,
+    Scenario,
+    Sole,
+    Striker,
+    TargetBody,
+    Tool,
+    contact,
     load_problem,
-    parse_problem_file,
     problem_names,
-    read_problem_file,
-    read_toml,
     write_problem,
 )
+from impactopt.files.problem_file import SolverSettings, parse_problem_file, read_problem_file, read_toml
 from impactopt.files.problem_file.reference import problem_template, reference
 from impactopt.files.sections.values import Section
-from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem import objectives, terms
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 ROOT = Path(__file__).parents[2]
 

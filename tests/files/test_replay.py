@@ -14,16 +14,14 @@ from PIL import Image
 from support.fake_solution import still_problem, still_solution
 from typer.testing import CliRunner
 
-from impactopt import Solution
+from impactopt import InputError, Perturbation, Solution, load_record
 from impactopt.cli.app import app
 from impactopt.cli.validate import validate
-from impactopt.errors import InputError
 from impactopt.files.output import record_of, save_record
-from impactopt.files.record import Record, load_record
+from impactopt.files.record import Record
 from impactopt.files.replay import Planned, Replay, load_planned, replay
 from impactopt.report.console import touch_message
 from impactopt.report.pictures.animation import AROUND, FPS, SLOW, _Drawing, save_animation, shown_times
-from impactopt.simulation import Perturbation
 from impactopt.simulation.result import REPORT
 
 FLAT = REPORT[:13]  # numbers for the whole motion; after them, what is by phase or by sole

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from impactopt import InputError, Status, load_record
 from impactopt.cli.show import PAGE
-from impactopt.errors import InputError
 from impactopt.files.output import (
     DERIVED,
     keep_record,
@@ -21,9 +21,8 @@ from impactopt.files.output import (
     set_aside,
     write_file,
 )
-from impactopt.files.record import Record, load_record
+from impactopt.files.record import Record
 from impactopt.report.pictures import PICTURES
-from impactopt.solvers.program import Status
 
 NOT_SOLVED = [s for s in Status if not s.usable]
 

@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from impactopt import Solution, load_solution, sensitivity_of
+from impactopt import InputError, Solution, load_solution, sensitivity_of
 from impactopt.cli.app import app
-from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.record import NUMBERS
 from impactopt.files.solution_library import SolvedFolder

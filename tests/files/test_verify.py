@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from impactopt import load_problem, load_record
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
-from impactopt.files.problem_file import load_problem
-from impactopt.files.record import Record, load_record
+from impactopt.files.record import Record
 from impactopt.files.verify import motion_of_record
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve

@@ -15,6 +15,15 @@ import pytest
 from support.small_plans import planned, transcribed
 
 from impactopt import (
+    FixedBase,
+    FreeMass,
+    ImpactProblem,
+    Impulse,
+    InputError,
+    OneSole,
+    Phase,
+    Robot,
+    SpringDamper,
     Tool,
     arm7,
     load_problem,
@@ -24,15 +33,9 @@ from impactopt import (
     robot_names,
     standin,
 )
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.errors import InputError
 from impactopt.files import named_problems
 from impactopt.files.problem_file import read_problem_file
-from impactopt.kinematics.stance import FixedBase, OneSole
-from impactopt.problem.objectives import Impulse
-from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.link_tables import ARM7, arm_model
-from impactopt.robots.robot import Robot
 from impactopt.simulation import simulate
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -29,21 +29,25 @@ from fuzz.attack_replays import LIGHTEST, drawn, follow, replay_one
 from fuzz.attack_sound import wrong_with_problem, wrong_with_robot
 from fuzz.attack_urdfs import URDFS, attack_urdf
 from impactopt import (
+    SDC,
     Balance,
+    Board,
+    FreeMass,
     Incidence,
     InputError,
     JointFriction,
+    Nail,
     Phase,
+    RigidWall,
     Robot,
     TargetBody,
     collide_many,
     draw_perturbations,
+    load_problem,
     load_robot,
 )
 from impactopt.cli.app import app
-from impactopt.collision import SDC
-from impactopt.contact import Board, FreeMass, Nail, RigidWall
-from impactopt.files.problem_file import load_problem, read_problem_file
+from impactopt.files.problem_file import read_problem_file
 
 SEED = 20
 # odd numbers overflow, and NumPy says so

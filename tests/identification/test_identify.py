@@ -16,6 +16,7 @@ from support.measured_blows import TRUE, TrueBlow, log_of
 from typer.testing import CliRunner
 
 from impactopt import (
+    ContactLaw,
     CustomLaw,
     FreeMass,
     HuntCrossley,
@@ -31,7 +32,7 @@ from impactopt import (
 )
 from impactopt.cli.app import app
 from impactopt.contact.fields import about
-from impactopt.contact.laws import LAWS, ContactLaw
+from impactopt.contact.laws import LAWS
 from impactopt.files.named_problems import problem_file
 from impactopt.files.problem_file import problem_data, problem_from_data, read_toml
 from impactopt.identification.fitting import TwoMassModel

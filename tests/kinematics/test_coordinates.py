@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.small_robots import arm, biped
 
-from impactopt.errors import InputError
+from impactopt import InputError, Robot, load_robot
 from impactopt.kinematics.coordinates import (
     StanceCoordinates,
     base_motion,
@@ -24,8 +24,6 @@ from impactopt.kinematics.coordinates import (
 )
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.operational_space import static_wrenches
-from impactopt.robots.presets import load_robot
-from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from support.small_robots import arm, biped
 
-from impactopt.errors import InputError
+from impactopt import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 
 Array = NDArray[np.float64]

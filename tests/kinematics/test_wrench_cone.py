@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from impactopt.errors import InputError
+from impactopt import InputError
 from impactopt.kinematics.support import contact_wrench_cone, margin, shrink, support_polygon, zmp
 
 Array = NDArray[np.float64]

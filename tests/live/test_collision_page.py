@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impactopt import SDC, load_problem
-from impactopt.errors import InputError
-from impactopt.kinematics.operational_space import holding_torque, striking_velocity
+from impactopt import SDC, InputError, holding_torque, load_problem, striking_velocity
 from impactopt.live.collision_page import CollisionPage
 
 FILE = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"

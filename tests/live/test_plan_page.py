@@ -26,12 +26,18 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from impactopt import Solution, load_problem, moved_solution, solve
+from impactopt import (
+    InputError,
+    RigidWall,
+    Solution,
+    Status,
+    load_problem,
+    load_record,
+    moved_solution,
+    solve,
+)
 from impactopt.cli.app import app
-from impactopt.contact.targets import RigidWall
-from impactopt.errors import InputError
 from impactopt.files.output import record_of, save_record
-from impactopt.files.record import load_record
 from impactopt.files.replay import problem_of, resumed
 from impactopt.live import plan_page as look_module
 from impactopt.live.drawing import moment_of
@@ -39,7 +45,7 @@ from impactopt.live.plan_page import PlanPage
 from impactopt.live.replanning import Replanning
 from impactopt.live.requests import PlanRequest, request_of, slider_parameters
 from impactopt.report.tracks import planned_track, tracks_of
-from impactopt.solvers.program import SolverResult, Status
+from impactopt.solvers.program import SolverResult
 
 FILE = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
 LONG = 60.0  # [s]

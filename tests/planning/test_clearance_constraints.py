@@ -11,15 +11,14 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import rod_hammer
 
-from impactopt import Obstacle, Solution, load_problem, solve
+from impactopt import ImpactProblem, Obstacle, Solution, Status, load_problem, solve
 from impactopt.planning import between_nodes
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import Margins, Watch, clearance_violations, node_placements
 from impactopt.planning.refinement import Evaluation, Guess, Outcome
 from impactopt.planning.solve import PlanSolver
-from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.program import Status, max_violation
+from impactopt.solvers.program import max_violation
 from impactopt.transcription.initial_guess import warm_start
 from impactopt.transcription.transcription import Transcription, block_functions
 

@@ -24,6 +24,7 @@ from impactopt import (
     SelfCollision,
     Solution,
     SpringDamper,
+    Status,
     Striker,
     VelocityLimit,
     load_problem,
@@ -35,7 +36,6 @@ from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.verify import verify
 from impactopt.planning.minimum_jerk import minimum_jerk_baseline
-from impactopt.solvers.program import Status
 
 BASE, ARM, ROTOR, BALL = 6.0, 2.0, 0.5, 1.0  # [kg]
 FASTEST = 1.0  # [m/s]

@@ -14,11 +14,9 @@ import pytest
 from support import urdfs
 from typer.testing import CliRunner
 
-from impactopt import Solution, solve
+from impactopt import Solution, Status, load_problem, solve
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
-from impactopt.files.problem_file import load_problem
-from impactopt.solvers.program import Status
 
 PROBLEM = """
 [problem]

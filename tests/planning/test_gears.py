@@ -16,15 +16,16 @@ from impactopt import (
     GearLoad,
     ImpactProblem,
     NotSolvedWarning,
+    Perturbation,
     Scenario,
     Solution,
     load_problem,
     optimize_strike,
     solve,
+    write_problem,
 )
 from impactopt.cli.app import app
 from impactopt.files.output import record_of, save_record
-from impactopt.files.problem_file.writing import write_problem
 from impactopt.files.replay import load_planned, resumed
 from impactopt.planning.lazy_constraints import (
     gear_caution,
@@ -33,7 +34,6 @@ from impactopt.planning.lazy_constraints import (
     with_lazy_constraints,
 )
 from impactopt.report.report import report_of
-from impactopt.simulation import Perturbation
 from impactopt.solvers.program import IterationRecord
 
 OFF = GearLoad(enabled=False)

@@ -11,12 +11,11 @@ from oracle.verdict import verify_record
 from support.small_plans import biped_problem
 from support.small_robots import biped
 
-from impactopt import Solution, coasting_reference, solve
+from impactopt import FullDynamics, Solution, coasting_reference, solve
 from impactopt.codegen.compiler import find_compiler
 from impactopt.files.output import record_of
 from impactopt.simulation import scene_of, simulate_mujoco
 from impactopt.simulation.collision_geometry import Solids
-from impactopt.simulation.reference import FullDynamics
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 ROBOTS = {"seven and a waist": lambda: biped(7, waist=True), "five": lambda: biped(5)}

@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 from support.small_robots import arm, biped, striking_point
 
-from impactopt.contact.laws import SpringDamper
-from impactopt.contact.targets import FreeMass
-from impactopt.errors import InputError
-from impactopt.kinematics.stance import FixedBase
+from impactopt import (
+    ContactWrenchCone,
+    FixedBase,
+    FreeMass,
+    ImpactProblem,
+    InputError,
+    Phase,
+    SpringDamper,
+    TorqueLimit,
+)
 from impactopt.planning.minimum_jerk import _keeps_limits, _profile, _wrenches_exist, minimum_jerk_baseline
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 from support.small_plans import Planned
 
+from impactopt import Status
 from impactopt.planning.budget import Budget
 from impactopt.planning.multistart import best_of
 from impactopt.planning.refinement import Guess, Outcome
-from impactopt.solvers.program import Status
 from impactopt.transcription.transcription import Transcription
 
 DEEP = "Bodies penetrate each other by {:.1f} mm, and no motion was found in which they do not: {}."

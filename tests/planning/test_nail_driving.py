@@ -13,15 +13,11 @@ import pytest
 from support.small_robots import arm, striking_point
 from typer.testing import CliRunner
 
+from impactopt import FixedBase, FreeMass, ImpactProblem, InputError, KelvinVoigt, Nail, Status
 from impactopt.cli.app import app
-from impactopt.contact import FreeMass, KelvinVoigt, Nail
-from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile
-from impactopt.kinematics.stance import FixedBase
 from impactopt.planning import nail_driving as blows
 from impactopt.planning.nail_driving import drive_nail
-from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.program import Status
 
 NAIL = Nail(mass=0.05, resistance=1000.0, hardening=2e4, depth=0.01)
 WORK = 10.0  # [J] of each made-up blow

@@ -6,15 +6,21 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impactopt import FreeMass, Robot, SpringDamper, Striker
-from impactopt.collision.frozen import effective_mass
-from impactopt.kinematics.stance import FixedBase
+from impactopt import (
+    FixedBase,
+    FreeMass,
+    ImpactProblem,
+    Phase,
+    Robot,
+    SpringDamper,
+    Status,
+    Striker,
+    VelocityLimit,
+    effective_mass,
+)
 from impactopt.planning.solve import solve
 from impactopt.planning.strike import optimize_strike
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.terms import VelocityLimit
 from impactopt.simulation import scene_of, simulate_pinocchio
-from impactopt.solvers.program import Status
 from impactopt.transcription.contact_guess import fastest_at_contact
 
 MASS, ARMATURE = 2.0, 0.1  # [kg], [kg] or [kg m2]

@@ -10,12 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt import ImpactProblem, load_problem, optimize_strike, solve
-from impactopt.errors import InputError
+from impactopt import ImpactProblem, InputError, Status, StrikeSolution, load_problem, optimize_strike, solve
 from impactopt.planning import multistart
-from impactopt.planning.strike import StrikeSolution
 from impactopt.simulation.workers import Died
-from impactopt.solvers.program import Status
 
 
 @pytest.fixture(scope="module")

@@ -15,37 +15,42 @@ from numpy.typing import NDArray
 from support.small_plans import arm_problem, transcribed
 from support.small_robots import arm, table
 
-from impactopt.collision import SDC, Collision
-from impactopt.contact import (
+from impactopt import (
+    SDC,
     Board,
     ContactLaw,
     CustomLaw,
+    FixedBase,
     FreeMass,
     HertzDamped,
     HuntCrossley,
+    ImpactProblem,
+    InputError,
     KelvinVoigt,
     Nail,
+    PeakForce,
+    Penetration,
+    Phase,
+    Plan,
     RigidWall,
+    Scenario,
+    Slide,
     SpringDamper,
+    Status,
     Target,
-    power,
+    TargetSpeed,
 )
-from impactopt.errors import InputError
+from impactopt.collision import Collision
+from impactopt.contact import power
 from impactopt.kinematics.splines import Radau
-from impactopt.kinematics.stance import FixedBase
-from impactopt.problem.objectives import PeakForce, Penetration
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import Slide, TargetSpeed
 from impactopt.solvers.elimination.condense import Condenser, find_eliminations
 from impactopt.solvers.elimination.kernels import Kernels
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Determined, Status, check_program
+from impactopt.solvers.program import Determined, check_program
 from impactopt.transcription.contact_conditions import CLEARANCE, CLEARANCE_RATE
 from impactopt.transcription.contact_guess import speed_that_leaves
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import contact_mesh
-from impactopt.transcription.plan import Plan
 
 Array = NDArray[np.float64]
 MASS = 2.0  # [kg] of the hammer

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from support.small_plans import Planned, arm_problem
 
-from impactopt import solve
+from impactopt import GearLoad, ReferenceRange, solve
 from impactopt.planning import lazy_constraints
 from impactopt.planning.lazy_constraints import reference_beyond
 from impactopt.problem import problem as problems
-from impactopt.problem.terms import GearLoad, ReferenceRange
 from impactopt.transcription import mesh
 from impactopt.transcription.mesh import NO_MORE, nodes_to_add
 

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from impactopt import Status
 from impactopt.planning.budget import Budget, rank_of
 from impactopt.planning.refinement import Additions, Guess, Outcome, refine
-from impactopt.solvers.program import SolverResult, Status
+from impactopt.solvers.program import SolverResult
 
 FAILS = -1.0  # a guess from which there is no solution
 

@@ -10,17 +10,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt import Solution, solve
-from impactopt.errors import InputError
-from impactopt.files.problem_file import load_problem
+from impactopt import (
+    GearLoad,
+    HitRegion,
+    Impulse,
+    InputError,
+    Scenario,
+    Slide,
+    Solution,
+    Status,
+    TargetSpeed,
+    load_problem,
+    solve,
+)
 from impactopt.planning.budget import Budget
 from impactopt.planning.parameter_changes import changed, parameter_of
 from impactopt.planning.replanning import parametric_program
 from impactopt.planning.solution import program_on
-from impactopt.problem.objectives import Impulse
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import GearLoad, HitRegion, Slide, TargetSpeed
-from impactopt.solvers.program import SolverResult, Status
+from impactopt.solvers.program import SolverResult
 
 TIGHT: dict[str, Any] = {"kkt_tolerance": 1e-8, "complementarity_tolerance": 1e-8}
 

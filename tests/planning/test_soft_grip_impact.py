@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impactopt import GearLoad, ImpactProblem, SoftGrip, Solution, load_problem, solve
-from impactopt.simulation import ControllerSettings, Perturbation, Simulation
+from impactopt import GearLoad, ImpactProblem, Perturbation, SoftGrip, Solution, load_problem, solve
+from impactopt.simulation import ControllerSettings, Simulation
 
 GRIP = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.08])
 

@@ -6,18 +6,28 @@ import numpy as np
 import pytest
 from support.causes import searched
 
-from impactopt import Solution, optimize_strike, solve
-from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, SpringDamper
-from impactopt.errors import NotSolvedWarning
-from impactopt.files.problem_file import load_problem
+from impactopt import (
+    Board,
+    FreeMass,
+    FullDynamics,
+    GearLoad,
+    ImpactProblem,
+    Impulse,
+    KelvinVoigt,
+    Nail,
+    NotSolvedWarning,
+    PeakForce,
+    Solution,
+    SpringDamper,
+    Status,
+    load_problem,
+    optimize_strike,
+    solve,
+)
 from impactopt.planning.budget import VIOLATED, Budget
 from impactopt.planning.contact_replay import SOLVED_WITHIN, PlannedContact, checked
 from impactopt.planning.diagnosis import ipopt_retry, with_reason
-from impactopt.problem.objectives import Impulse, PeakForce
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import GearLoad
-from impactopt.simulation.reference.full import FullDynamics
-from impactopt.solvers.program import SolverResult, Status
+from impactopt.solvers.program import SolverResult
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_guess import effective_mass, fastest_at_contact, parting
 from impactopt.transcription.contact_refinement import TOLERANCE_PCT

@@ -16,26 +16,31 @@ from support.fake_solution import PROBLEM_FILE
 from support.small_plans import BODILESS, Planned, arm_problem, changed
 from typer.testing import CliRunner
 
-from impactopt.cli.app import app
-from impactopt.errors import InputError
-from impactopt.files.problem_file import ProblemFile
-from impactopt.files.record import load_record
-from impactopt.kinematics.support import support_polygon
-from impactopt.planning.solve import solve
-from impactopt.planning.strike import StrikeSolution, optimize_strike
-from impactopt.problem.objectives import AngularMomentum, Effort, Impulse, PeakForce
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import (
+from impactopt import (
+    AngularMomentum,
     Balance,
+    Effort,
+    FullDynamics,
     HitCone,
     HitRegion,
+    Impulse,
     Incidence,
+    InputError,
+    PeakForce,
+    Scenario,
+    Status,
+    StrikeSolution,
     TorqueLimit,
     TorqueRate,
     VelocityLimit,
+    load_record,
 )
-from impactopt.simulation.reference import FullDynamics
-from impactopt.solvers.program import Status, check_program
+from impactopt.cli.app import app
+from impactopt.files.problem_file import ProblemFile
+from impactopt.kinematics.support import support_polygon
+from impactopt.planning.solve import solve
+from impactopt.planning.strike import optimize_strike
+from impactopt.solvers.program import check_program
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription

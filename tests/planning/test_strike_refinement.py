@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import changed
 
-from impactopt.bodies.world import Obstacle
+from impactopt import Obstacle, Status
 from impactopt.planning import strike as strikes
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import Margins, deepest_penetration
 from impactopt.planning.refinement import Guess, Outcome
-from impactopt.solvers.program import SolverResult, Status
+from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription

@@ -10,17 +10,23 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impactopt import Solution, coasting_reference, load_problem, solve
+from impactopt import (
+    BothSoles,
+    FullDynamics,
+    Grip,
+    ImpactProblem,
+    InputError,
+    OneSole,
+    Solution,
+    coasting_reference,
+    load_problem,
+    load_robot,
+    solve,
+    write_problem,
+)
 from impactopt.codegen.compiler import find_compiler
-from impactopt.errors import InputError
 from impactopt.files.problem_file import parse_problem_file
-from impactopt.files.problem_file.writing import write_problem
 from impactopt.kinematics.operational_space import static_wrenches
-from impactopt.kinematics.stance import BothSoles, OneSole
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import Grip
-from impactopt.robots.presets import load_robot
-from impactopt.simulation.reference import FullDynamics
 
 HAND = "striker:left_hand"
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -9,14 +9,12 @@ import pinocchio as pin
 import pytest
 from support.small_plans import arm_problem, transcribed
 
-from impactopt import solve
+from impactopt import GearLoad, Plan, Slide, solve
 from impactopt.planning import lazy_constraints
 from impactopt.planning.lazy_constraints import FAR, slide, slide_caution, slides_beyond
 from impactopt.problem import problem as problems
-from impactopt.problem.terms import GearLoad, Slide
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.plan import Plan
 
 
 @pytest.fixture(scope="module")

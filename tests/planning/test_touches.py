@@ -9,21 +9,30 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt import Solution, optimize_strike, solve
-from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, SpringDamper
+from impactopt import (
+    Board,
+    FreeMass,
+    GearLoad,
+    ImpactProblem,
+    InputError,
+    KelvinVoigt,
+    Nail,
+    NotSolvedWarning,
+    Penetration,
+    Scenario,
+    Solution,
+    SpringDamper,
+    Status,
+    load_problem,
+    optimize_strike,
+    solve,
+)
 from impactopt.contact.targets.base import SEPARATION, TOUCH, contact_phases, order_of_touches
-from impactopt.errors import InputError, NotSolvedWarning
 from impactopt.files.output import record_of, save_record
-from impactopt.files.problem_file import load_problem
 from impactopt.files.replay import load_planned
 from impactopt.planning.models import largest_force
-from impactopt.problem.objectives import Penetration
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import GearLoad
 from impactopt.simulation.engines import scene_of
 from impactopt.simulation.pinocchio_engine import follow_contact
-from impactopt.solvers.program import Status
 from impactopt.transcription.contact_guess import (
     contact_order,
     guessed_contact,

@@ -11,16 +11,23 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from impactopt import Solution, load_problem, optimize_strike, solve
+from impactopt import (
+    Board,
+    FreeMass,
+    HitCone,
+    ImpactProblem,
+    InputError,
+    PeakForce,
+    SecondStriker,
+    Solution,
+    SpringDamper,
+    load_problem,
+    optimize_strike,
+    solve,
+    write_problem,
+)
 from impactopt.codegen.compiler import find_compiler
-from impactopt.contact import Board, FreeMass, SpringDamper
-from impactopt.errors import InputError
 from impactopt.files.problem_file import parse_problem_file
-from impactopt.files.problem_file.writing import write_problem
-from impactopt.problem.objectives import PeakForce
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.scenario import SecondStriker
-from impactopt.problem.terms import HitCone
 from impactopt.simulation.result import Scene
 from impactopt.simulation.target_dynamics import TargetContact
 

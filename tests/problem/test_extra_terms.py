@@ -14,20 +14,21 @@ from numpy.typing import NDArray
 from support.small_plans import changed
 from support.term_cases import CASES, MILD, Solved
 
-from impactopt.bodies.world import face_axes
-from impactopt.errors import InputError
-from impactopt.problem.problem import Phase
-from impactopt.problem.terms import (
+from impactopt import (
     Gaze,
     HandOrientation,
     HitCone,
     HitRegion,
     Incidence,
+    InputError,
+    Phase,
+    Status,
     Term,
     TorqueRate,
 )
+from impactopt.bodies.world import face_axes
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import SolverResult, Status
+from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription
 

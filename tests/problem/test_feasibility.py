@@ -12,16 +12,12 @@ from support import urdfs
 from support.small_robots import arm, biped
 from typer.testing import CliRunner
 
+from impactopt import FixedBase, FreeMass, ImpactProblem, SpringDamper, load_problem
 from impactopt.cli.app import app
-from impactopt.contact.laws import SpringDamper
-from impactopt.contact.targets import FreeMass
 from impactopt.files.draft.drafting import draft_problem
-from impactopt.files.problem_file import load_problem
-from impactopt.kinematics.stance import FixedBase
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.feasibility import hopeless, sticks_out
 from impactopt.problem.plausibility import doubts
-from impactopt.problem.problem import ImpactProblem
 
 LAW, BALL = SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0)
 

@@ -12,14 +12,24 @@ from numpy.typing import NDArray
 from support.small_motions import strike
 from support.small_plans import changed, struck
 
-from impactopt import Actuator, Scenario, Solution, load_problem, solve
-from impactopt.contact.targets import Nail
-from impactopt.errors import InputError
-from impactopt.problem.terms import GearLoad, HandOrientation, MotorCurve, PowerLimit, VelocityJump
+from impactopt import (
+    Actuator,
+    GearLoad,
+    HandOrientation,
+    InputError,
+    MotorCurve,
+    Nail,
+    PowerLimit,
+    Scenario,
+    Solution,
+    Status,
+    VelocityJump,
+    load_problem,
+    solve,
+)
 from impactopt.robots.loads import motor_power, motor_use
 from impactopt.simulation import simulate_mujoco, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status
 from impactopt.transcription.collision import jump_at_contact
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
 from impactopt.transcription.plan import motion_loads

@@ -9,12 +9,11 @@ import pinocchio as pin
 import pytest
 from support.small_plans import arm_problem, biped_problem
 
-from impactopt import Ground, InputError, planar_arm
+from impactopt import Ground, InputError, Perturbation, planar_arm
 from impactopt.bodies.clearance import Places
 from impactopt.simulation import scene_of
 from impactopt.simulation.collision_geometry import FLOOR
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world
-from impactopt.simulation.perturbation import Perturbation
 
 
 def test_a_fixed_base_has_no_floor_unless_the_problem_says_so() -> None:

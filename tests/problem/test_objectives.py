@@ -14,23 +14,23 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 from support.small_plans import OPTIONS, Planned, changed
 
-from impactopt.errors import InputError
-from impactopt.kinematics.splines import Radau
-from impactopt.problem.objectives import (
+from impactopt import (
     AngularMomentum,
+    Balance,
     Effort,
     Impulse,
+    InputError,
     Objective,
     PeakForce,
     Penetration,
+    Plan,
+    Status,
     TargetEnergy,
 )
-from impactopt.problem.terms import Balance
+from impactopt.kinematics.splines import Radau
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status
 from impactopt.transcription.blocks import extra_blocks
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

@@ -13,15 +13,11 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 from support.small_plans import changed
 
-from impactopt.errors import InputError
-from impactopt.files.problem_file import write_problem
+from impactopt import Effort, Gaze, Impulse, InputError, Objective, Status, Term, TorqueLimit, write_problem
 from impactopt.planning.bounds import bounds_of
 from impactopt.planning.strike import optimize_strike
-from impactopt.problem.objectives import Effort, Impulse, Objective
-from impactopt.problem.terms import Gaze, Term, TorqueLimit
 from impactopt.solvers.ipm import solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status
 from impactopt.transcription.blocks import key_of, make_block
 from impactopt.transcription.initial_guess import first_iterate, strike_iterate
 from impactopt.transcription.layout import millimetres

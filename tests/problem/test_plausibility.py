@@ -14,9 +14,8 @@ from support.small_plans import biped_problem
 from support.small_robots import biped
 from typer.testing import CliRunner
 
-from impactopt import Robot, Striker, arm7, load_problem, planar_arm
+from impactopt import Robot, Striker, arm7, load_problem, planar_arm, write_problem
 from impactopt.cli.app import app
-from impactopt.files.problem_file import write_problem
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import doubts
 

@@ -12,31 +12,36 @@ import pytest
 from numpy.typing import NDArray
 from support.small_robots import arm, biped
 
-from impactopt.codegen import cache as codegen
-from impactopt.contact.laws import ContactLaw, SpringDamper
-from impactopt.contact.targets import FreeMass
-from impactopt.errors import InputError
-from impactopt.files.problem_file import load_problem
-from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
-from impactopt.planning.solve import solve
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import (
-    DEFAULT_TERMS,
+from impactopt import (
     Balance,
+    BothSoles,
+    ContactLaw,
     ContactWrenchCone,
     FirstTouch,
+    FixedBase,
+    FreeMass,
     GroundForce,
+    ImpactProblem,
     Incidence,
+    InputError,
     KeepOut,
     LegExtension,
+    OneSole,
+    Phase,
     PositionLimit,
+    Robot,
+    Scenario,
     SelfCollision,
+    SpringDamper,
+    Striker,
     Term,
     TorqueLimit,
     VelocityLimit,
+    load_problem,
 )
-from impactopt.robots.robot import Robot, Striker
+from impactopt.codegen import cache as codegen
+from impactopt.planning.solve import solve
+from impactopt.problem.terms import DEFAULT_TERMS
 
 Array = NDArray[np.float64]
 

@@ -13,12 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impactopt.contact import CustomLaw, FreeMass
-from impactopt.errors import InputError
+from impactopt import CustomLaw, FreeMass, ImpactProblem, InputError, Phase, Striker, load_problem
 from impactopt.files.problem_file import (
     change_data,
     key_place,
-    load_problem,
     parse_settings,
     problem_from_data,
     read_problem_file,
@@ -27,8 +25,6 @@ from impactopt.files.problem_file import (
 )
 from impactopt.problem import objectives, terms
 from impactopt.problem.hashing import problem_hash
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.robots.robot import Striker
 
 DATA: dict[str, Any] = {
     "problem": {

@@ -12,14 +12,19 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import LAW, OPTIONS, Planned, changed, planned
 
-from impactopt import Solution
-from impactopt.contact import FreeMass, SpringDamper
+from impactopt import (
+    Balance,
+    ContactWrenchCone,
+    FreeMass,
+    Scenario,
+    Solution,
+    SpringDamper,
+    Status,
+    TorqueLimit,
+)
 from impactopt.kinematics.support import margin, zmp
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
 from impactopt.simulation import scene_of
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status
 from impactopt.transcription import contact_conditions as nlp
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.plan import PlannedCollision, PlannedScenario

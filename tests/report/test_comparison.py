@@ -17,8 +17,8 @@ from support.picture_checks import frowns
 from support.small_robots import arm
 from typer.testing import CliRunner
 
+from impactopt import InputError
 from impactopt.cli.app import app
-from impactopt.errors import InputError
 from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
 from impactopt.report.comparison import compare, histories_of

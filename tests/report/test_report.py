@@ -16,24 +16,19 @@ from support.fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_so
 from support.small_robots import biped
 from typer.testing import CliRunner
 
-from impactopt import Solution
+from impactopt import Board, ImpactProblem, InputError, KelvinVoigt, Obstacle, Solution, load_robot
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.visuals import surroundings_of, visuals_of
-from impactopt.bodies.world import Obstacle
 from impactopt.cli.app import app
-from impactopt.contact import Board, KelvinVoigt
-from impactopt.errors import InputError
 from impactopt.files.named_problems import problem_file
 from impactopt.files.output import record_of, save_record
 from impactopt.files.record import Record
-from impactopt.problem.problem import ImpactProblem
 from impactopt.report.animation import animation_of
 from impactopt.report.page import unpack
 from impactopt.report.report import report_of
 from impactopt.report.robot_page import bodies_page
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
-from impactopt.robots.presets import load_robot
 
 NASTY = '# a problem <script>alert("no")</script> & more\n'
 

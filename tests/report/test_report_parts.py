@@ -13,7 +13,20 @@ import pytest
 from scipy.integrate import trapezoid
 from support.fake_solution import still_problem, still_solution
 
-from impactopt import Solution
+from impactopt import (
+    Board,
+    FreeMass,
+    InputError,
+    KelvinVoigt,
+    Nail,
+    Obstacle,
+    RigidWall,
+    Robot,
+    Solution,
+    Target,
+    TargetBody,
+    load_robot,
+)
 from impactopt.bodies.convex_hulls import pieces_of
 from impactopt.bodies.solids import (
     Solid,
@@ -28,10 +41,6 @@ from impactopt.bodies.solids import (
     sphere,
 )
 from impactopt.bodies.visuals import surroundings_of, visuals_of
-from impactopt.bodies.world import Obstacle, TargetBody
-from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
-from impactopt.contact.targets import Target
-from impactopt.errors import InputError
 from impactopt.files.output import BITS, record_of
 from impactopt.files.record import Record
 from impactopt.report.charts import charts_of
@@ -39,8 +48,6 @@ from impactopt.report.histories import thinned
 from impactopt.report.page import pack, unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import FAR, tracks_of
-from impactopt.robots.presets import load_robot
-from impactopt.robots.robot import Robot
 
 
 @pytest.fixture(scope="module")

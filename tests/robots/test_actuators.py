@@ -11,12 +11,8 @@ import pytest
 from support import urdfs
 from support.small_robots import arm
 
-from impactopt import Actuator, Robot, load_problem, write_problem
-from impactopt.errors import InputError
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import GearLoad
+from impactopt import Actuator, GearLoad, ImpactProblem, InputError, Robot, g1, load_problem, write_problem
 from impactopt.robots.loads import DriveLoads, gear_torque, motor_power, motor_use
-from impactopt.robots.presets import g1
 
 FILE = """
 [problem]

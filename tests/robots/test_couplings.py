@@ -20,13 +20,23 @@ from support import urdfs
 from support.rigid_body_cases import random_tree
 from support.small_robots import arm, parallelogram, slider
 
-from impactopt import SDC, FreeMass, RigidBody, Robot, SoftGrip, SpringDamper, Striker, Tool
+from impactopt import (
+    SDC,
+    FreeMass,
+    FullDynamics,
+    InputError,
+    MujocoDynamics,
+    RigidBody,
+    Robot,
+    SoftGrip,
+    SpringDamper,
+    Striker,
+    Tool,
+)
 from impactopt.codegen.cache import model_hash
-from impactopt.errors import InputError
 from impactopt.robots.couplings import Coupling, coupled, couplings_of, with_followers
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.simulation.mujoco_world import MujocoOptions, MujocoRobot, mujoco_module, robot_bodies, spec_of
-from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 
 Array = NDArray[np.float64]
 RATIOS = st.floats(0.2, 2.0) | st.floats(-2.0, -0.2) | st.sampled_from([-1.0, 1.0])

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support import urdfs
 
-from impactopt import Robot
+from impactopt import InputError, Robot
 from impactopt.codegen.cache import model_hash
-from impactopt.errors import InputError
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -12,8 +12,7 @@ import pytest
 from support import urdfs
 from support.small_robots import biped
 
-from impactopt.errors import InputError
-from impactopt.robots.robot import Robot, Sole
+from impactopt import InputError, Robot, Sole
 
 PLACE = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.02, 0.01, -0.05]))
 

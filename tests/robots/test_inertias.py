@@ -9,8 +9,7 @@ import pinocchio as pin
 import pytest
 from support import urdfs
 
-from impactopt import Robot
-from impactopt.errors import InputError
+from impactopt import InputError, Robot
 from impactopt.files.problem_file import problem_file_from_data
 from impactopt.robots.checks import repair_inertias
 

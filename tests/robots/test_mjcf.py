@@ -13,11 +13,9 @@ import pytest
 from numpy.typing import NDArray
 from support import urdfs
 
-from impactopt import FreeMass, Robot, Sole, SpringDamper, Striker
+from impactopt import FreeMass, ImpactProblem, InputError, Robot, Sole, SpringDamper, Striker
 from impactopt.bodies.robot_bodies import bodies_of
-from impactopt.errors import InputError
 from impactopt.files.problem_file import problem_from_data
-from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.mjcf import read_mjcf
 from impactopt.simulation.mujoco_world import robot_bodies
 

@@ -17,9 +17,9 @@ import pytest
 from scipy.spatial import ConvexHull
 
 import impactopt
-from impactopt import Robot, Sole, Striker, g1, load_robot, talos
+from impactopt import InputError, Robot, Sole, Striker, g1, load_robot, talos
 from impactopt.codegen.cache import model_hash
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import check_array, did_you_mean
 from impactopt.robots import presets
 
 LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>

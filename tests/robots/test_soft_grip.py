@@ -13,6 +13,7 @@ from support.meshes import Meshes
 from impactopt import (
     SDC,
     Actuator,
+    Effects,
     FreeMass,
     InputError,
     Robot,
@@ -25,7 +26,6 @@ from impactopt import (
     striking_velocity,
     talos,
 )
-from impactopt.collision import Effects
 from impactopt.robots.tools import extended
 from impactopt.simulation.motors import Servo
 

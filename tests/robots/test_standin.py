@@ -13,13 +13,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from impactopt import load_problem, load_robot, standin
-from impactopt.errors import InputError
+from impactopt import InputError, Robot, load_problem, load_robot, standin
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.robots import presets
 from impactopt.robots.link_tables import LINKS, PELVIS
-from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 LEG = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")

@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 from support.small_plans import Planned, planned, transcribed
 
-from impactopt import Robot
-from impactopt.errors import InputError
+from impactopt import ImpactProblem, InputError, PositionLimit, Robot
 from impactopt.files.verify import motion_of_record
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import PositionLimit
 from impactopt.robots.tendons import Tendon
 from impactopt.simulation import simulate
 

@@ -11,14 +11,20 @@ import pytest
 from benchmarks.cases import Case, paper_motions
 from support.small_robots import arm, biped, slider
 
-from impactopt.collision import SDC, Collision, VirtualMass
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.errors import InputError
-from impactopt.kinematics.operational_space import striking_velocity
+from impactopt import (
+    SDC,
+    FreeMass,
+    InputError,
+    Robot,
+    SpringDamper,
+    VirtualMass,
+    posture_of_effective_mass,
+    standin,
+    striking_velocity,
+)
+from impactopt.collision import Collision
 from impactopt.kinematics.support import margin
-from impactopt.robots.presets import standin
-from impactopt.robots.robot import Robot
-from impactopt.simulation.cases import errors_against, posture_of_effective_mass
+from impactopt.simulation.cases import errors_against
 
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=5.0)
 

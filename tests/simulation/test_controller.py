@@ -15,17 +15,9 @@ from scipy.optimize import minimize
 from support.small_motions import scene, standing
 from support.small_robots import arm, biped
 
-from impactopt.errors import InputError
+from impactopt import InputError, Perturbation, Robot
 from impactopt.files.problem_file import read_problem_file
-from impactopt.robots.robot import Robot
-from impactopt.simulation import (
-    ControllerSettings,
-    Perturbation,
-    Scene,
-    Simulation,
-    collision_geometry,
-    simulate_mujoco,
-)
+from impactopt.simulation import ControllerSettings, Scene, Simulation, collision_geometry, simulate_mujoco
 from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.controller.clearance import Clearance

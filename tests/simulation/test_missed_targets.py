@@ -8,10 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt import FixedBase, FreeMass, ImpactProblem, Scenario, Solution, SpringDamper, planar_arm, solve
-from impactopt.robots.robot import Robot
+from impactopt import (
+    FixedBase,
+    FreeMass,
+    ImpactProblem,
+    Robot,
+    Scenario,
+    Solution,
+    SpringDamper,
+    Trajectory,
+    planar_arm,
+    solve,
+)
 from impactopt.simulation.result import FollowedReference
-from impactopt.transcription.plan import Trajectory
 
 LATE = 0.06  # [s] after the planned contact that the robot notices
 MOST = 0.05  # [rad/s] that the reference may jump by

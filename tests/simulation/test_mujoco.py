@@ -16,20 +16,9 @@ from numpy.typing import NDArray
 from support.small_motions import blow_motion, given_until, reference, scene, standing, strike
 from support.small_robots import arm, biped, slider
 
-from impactopt import Solution
-from impactopt.contact import FreeMass
-from impactopt.errors import InputError
+from impactopt import FreeMass, InputError, Perturbation, Robot, Solution, load_robot
 from impactopt.kinematics.support import margin
-from impactopt.robots.presets import load_robot
-from impactopt.robots.robot import Robot
-from impactopt.simulation import (
-    Perturbation,
-    Scene,
-    Simulation,
-    simulate,
-    simulate_mujoco,
-    simulate_pinocchio,
-)
+from impactopt.simulation import Scene, Simulation, simulate, simulate_mujoco, simulate_pinocchio
 from impactopt.simulation.collision_geometry import Solid, Solids
 from impactopt.simulation.mujoco_engine import _Replay
 from impactopt.simulation.mujoco_world import MujocoOptions

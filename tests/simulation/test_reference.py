@@ -11,12 +11,24 @@ from scipy.integrate import solve_ivp, trapezoid
 from support import small_robots
 from support.frozen_cases import Kinematics, robot_named, two_masses, with_heavy_feet
 
-from impactopt.collision import SDC, Effects, JointFriction
-from impactopt.contact import Board, FreeMass, HuntCrossley, KelvinVoigt, Nail, RigidWall, SpringDamper
-from impactopt.errors import InputError
-from impactopt.kinematics.operational_space import holding_torque
-from impactopt.kinematics.stance import BothSoles, OneSole
-from impactopt.simulation.reference import FullDynamics, MujocoDynamics
+from impactopt import (
+    SDC,
+    Board,
+    BothSoles,
+    Effects,
+    FreeMass,
+    FullDynamics,
+    HuntCrossley,
+    InputError,
+    JointFriction,
+    KelvinVoigt,
+    MujocoDynamics,
+    Nail,
+    OneSole,
+    RigidWall,
+    SpringDamper,
+    holding_torque,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

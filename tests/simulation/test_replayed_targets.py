@@ -16,35 +16,28 @@ from support.small_motions import given_until, reference, scene
 from support.small_plans import BODILESS, arm_problem, transcribed
 from support.small_robots import arm, slider
 
-from impactopt.contact import (
+from impactopt import (
     Board,
     ContactLaw,
     CustomLaw,
     FreeMass,
     HertzDamped,
     HuntCrossley,
+    InputError,
     KelvinVoigt,
     Nail,
+    Perturbation,
+    PerturbationRanges,
     RigidWall,
+    Robot,
     SpringDamper,
+    Status,
     Target,
 )
-from impactopt.errors import InputError
 from impactopt.report.console import replay_table
-from impactopt.robots.robot import Robot
-from impactopt.simulation import (
-    Perturbation,
-    Scene,
-    Simulation,
-    robustness,
-    simulate,
-    simulate_mujoco,
-    simulate_pinocchio,
-)
+from impactopt.simulation import Scene, Simulation, robustness, simulate, simulate_mujoco, simulate_pinocchio
 from impactopt.simulation.engines import check_steps, with_step_error
-from impactopt.simulation.robustness import PerturbationRanges
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status
 from impactopt.transcription.initial_guess import first_iterate
 
 Array = NDArray[np.float64]

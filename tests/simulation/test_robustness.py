@@ -15,17 +15,18 @@ import numpy as np
 import pytest
 from support.fake_solution import still_problem, still_solution
 
-from impactopt.contact import CustomLaw, RigidWall, SpringDamper
-from impactopt.errors import InputError
-from impactopt.simulation import Perturbation
-from impactopt.simulation import workers as _workers
-from impactopt.simulation.robustness import (
-    LOGARITHMIC,
+from impactopt import (
+    CustomLaw,
+    InputError,
+    Perturbation,
     PerturbationRanges,
+    RigidWall,
     Robustness,
+    SpringDamper,
     draw_perturbations,
-    robustness,
 )
+from impactopt.simulation import workers as _workers
+from impactopt.simulation.robustness import LOGARITHMIC, robustness
 from impactopt.simulation.workers import map_on_workers
 
 STEP = 1e-3

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from support.small_motions import blow_motion, given_until, reference, scene, standing, strike
 from support.small_robots import arm, biped, slider
 
-from impactopt.errors import InputError
+from impactopt import InputError, Robot, load_robot
 from impactopt.kinematics.support import margin
-from impactopt.robots.presets import load_robot
-from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, simulate_pinocchio
 
 Array = NDArray[np.float64]

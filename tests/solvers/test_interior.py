@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from support.small_plans import changed, transcribed
 from support.textbook import CASES, INF, Textbook, assert_optimal
 
-from impactopt import load_problem
+from impactopt import Status, load_problem
 from impactopt.solvers.ipm import IPMOptions, interior_point, solve_ipm
-from impactopt.solvers.program import Status
 from impactopt.transcription.initial_guess import first_iterate
 
 

@@ -10,9 +10,8 @@ import pytest
 import scipy.sparse as sp
 from support.textbook import CASES, Textbook, assert_optimal, infeasible
 
-from impactopt.errors import InputError
+from impactopt import InputError, Status
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status
 
 
 def overriding(case, **methods):

@@ -7,11 +7,10 @@ import pytest
 import scipy.sparse as sp
 from support.textbook import CASES, Textbook, infeasible
 
-from impactopt.errors import InputError
+from impactopt import InputError, Status
 from impactopt.solvers.program import (
     BestIterate,
     NonlinearProgram,
-    Status,
     Violation,
     check_program,
     complementarity,

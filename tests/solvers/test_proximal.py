@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from support.textbook import INF, Textbook
 
+from impactopt import Status
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.solvers.program import Status
 
 
 def test_directions_that_nothing_decides_are_left_alone():

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impactopt.errors import InputError
+from impactopt import InputError
 from impactopt.solvers.options import SQPOptions
 from impactopt.solvers.qp.osqp_solver import OsqpSolver
 from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, QuadraticProgram, make_qp_solver

@@ -11,9 +11,10 @@ from benchmarks.solve import planning_program, strike_program
 from support.textbook import INF, Textbook, assert_optimal
 
 import impactopt.solvers.sqp.reduced_qp as reduced_qp_module
+from impactopt import Status
 from impactopt.files.named_problems import problem_file
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.solvers.program import Determined, Status, TimedProgram
+from impactopt.solvers.program import Determined, TimedProgram
 from impactopt.solvers.qp.registry import make_qp_solver
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
 from impactopt.solvers.sqp.reduced_qp import QPStep, ReducedQP, Reduction, make_model

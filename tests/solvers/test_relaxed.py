@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.textbook import INF, Textbook
 
+from impactopt import Status
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.solvers.program import Status
 from impactopt.solvers.relaxed import Relaxation, RelaxedProgram
 
 NONE = np.zeros(0, dtype=np.intp)

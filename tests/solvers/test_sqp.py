@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from support.textbook import CASES, INF, Textbook, assert_optimal, infeasible, solve_by
 
-from impactopt.errors import InputError
+from impactopt import InputError, Status
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
-from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import QP_SOLVERS, QPSolution, QPStatus, SQPOptions, solve_sqp
 
 WAYS = {

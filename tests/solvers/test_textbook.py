@@ -12,9 +12,9 @@ from support.hock_schittkowski import BOOK, OUT_OF_SCALE
 from support.maros_meszaros import QPS, quadratic
 from support.textbook import assert_optimal, solve_by
 
+from impactopt import Status
 from impactopt.solvers.ipm import IPMOptions, solve_ipm
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, SQPOptions, make_qp_solver
 
 # bounds as they are: relaxed by 1e-8, as IPOPT does, optima with large multipliers change in the fifth digit

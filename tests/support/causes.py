@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from impactopt import ImpactProblem
 from impactopt.planning.budget import Budget
 from impactopt.planning.causes import Search, search
-from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.transcription import Transcription, block_functions

@@ -16,11 +16,21 @@ import pinocchio as pin
 from scipy.integrate import DOP853, solve_ivp
 from scipy.optimize import brentq
 
-from impactopt.collision import SDC, Effects, JointFriction
-from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall, SpringDamper
-from impactopt.kinematics.stance import BothSoles
-from impactopt.robots.presets import standin, talos
-from impactopt.robots.robot import Robot
+from impactopt import (
+    SDC,
+    Board,
+    BothSoles,
+    Effects,
+    FreeMass,
+    JointFriction,
+    KelvinVoigt,
+    Nail,
+    RigidWall,
+    Robot,
+    SpringDamper,
+    standin,
+    talos,
+)
 from support import small_robots
 from support.exact import ExactCollision
 

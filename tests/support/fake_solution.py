@@ -8,18 +8,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt import Solution
-from impactopt.contact import FreeMass, SpringDamper
+from impactopt import FreeMass, ImpactProblem, Impulse, Phase, Plan, Robot, Solution, SpringDamper, Status
 from impactopt.files.record import Record
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.planning.refinement import Attempt
-from impactopt.problem.objectives import Impulse
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.robots.robot import Robot
 from impactopt.simulation import Simulation
-from impactopt.solvers.program import IterationRecord, SolverResult, Status, Violation
-from impactopt.transcription.plan import Plan, PlannedCollision
+from impactopt.solvers.program import IterationRecord, SolverResult, Violation
+from impactopt.transcription.plan import PlannedCollision
 from support.small_robots import biped
 
 # a problem file, for tests whose solver is made up

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from impactopt.collision import SDC
+from impactopt import SDC
 from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
 
 

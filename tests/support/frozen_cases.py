@@ -7,10 +7,7 @@ import functools
 import numpy as np
 import pinocchio as pin
 
-from impactopt.collision import JointFriction
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.robots.presets import g1, talos
-from impactopt.robots.robot import Robot, Striker
+from impactopt import FreeMass, JointFriction, Robot, SpringDamper, Striker, g1, talos
 
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=1.0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from impactopt.collision import SDC
+from impactopt import SDC
 from support.exact import ExactCollision
 from support.native_cases import LAW, ROBOTS, TARGET, X, call, robot_named
 

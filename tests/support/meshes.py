@@ -14,8 +14,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt import Robot
 from impactopt.robots.checks import reduced
-from impactopt.robots.robot import Robot
 
 
 class Meshes:

@@ -10,15 +10,9 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
+from impactopt import SDC, CustomLaw, FreeMass, JointFriction, SpringDamper, standin
 from impactopt.codegen.cache import cached
-from impactopt.collision import SDC, JointFriction
 from impactopt.collision.native import native_collision
-from impactopt.contact import (
-    CustomLaw,
-    FreeMass,
-    SpringDamper,
-)
-from impactopt.robots.presets import standin
 from support import small_robots
 from support.frozen_cases import Kinematics
 

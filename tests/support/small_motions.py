@@ -12,11 +12,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from impactopt.contact import FreeMass, SpringDamper
+from impactopt import FreeMass, Robot, SpringDamper
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.support import support_polygon
-from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, simulate_pinocchio
 from support.small_robots import biped, slider
 

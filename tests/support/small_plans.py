@@ -8,18 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact.laws import SpringDamper
-from impactopt.contact.targets import FreeMass
+from impactopt import (
+    FixedBase,
+    FreeMass,
+    ImpactProblem,
+    KeepOut,
+    Phase,
+    Plan,
+    Robot,
+    SelfCollision,
+    SpringDamper,
+    Term,
+    Trajectory,
+)
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.stance import FixedBase
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.terms import KeepOut, SelfCollision, Term
-from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 from support.small_robots import arm, biped, striking_point

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt.robots.actuators import Actuator
+from impactopt import Actuator, Robot, Sole, Striker
 from impactopt.robots.couplings import Coupling, coupled
-from impactopt.robots.robot import Robot, Sole, Striker
 
 HALF_SITTING = {"hip pitch": -0.4, "knee": 0.8, "ankle pitch": -0.4}
 

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.problem.terms import (
+from impactopt import (
     Gaze,
     GearLoad,
     HandOrientation,
@@ -21,6 +21,7 @@ from impactopt.problem.terms import (
     HitRegion,
     JointAcceleration,
     MotorCurve,
+    Plan,
     PowerLimit,
     ReferenceRange,
     Slide,
@@ -30,7 +31,6 @@ from impactopt.problem.terms import (
     VelocityJump,
 )
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

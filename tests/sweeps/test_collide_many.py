@@ -12,17 +12,23 @@ import pytest
 from support.fake_solution import strike_record
 from support.small_robots import arm, biped
 
+from impactopt import (
+    SDC,
+    BothSoles,
+    FixedBase,
+    FreeMass,
+    InputError,
+    SpringDamper,
+    collide_many,
+    holding_torque,
+    load_robot,
+    striking_velocity,
+)
 from impactopt.collide.contact_states import ContactStates, Posture
-from impactopt.collision import SDC
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.errors import InputError
 from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
-from impactopt.kinematics.operational_space import holding_torque, striking_velocity
-from impactopt.kinematics.stance import BothSoles, FixedBase
 from impactopt.kinematics.support import margin
-from impactopt.robots.presets import load_robot
-from impactopt.sweeps.collisions import Collisions, collide_many
+from impactopt.sweeps.collisions import Collisions
 
 POINT, NORMAL = [0.7, 0.0, 0.75], np.array([0.0, 0.0, -1.0])
 

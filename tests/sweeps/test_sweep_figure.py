@@ -10,8 +10,8 @@ import pytest
 from support.picture_checks import frowns
 from typer.testing import CliRunner
 
+from impactopt import InputError
 from impactopt.cli.app import app
-from impactopt.errors import InputError
 from impactopt.report.pictures.style import model_colour
 from impactopt.report.pictures.sweep import sweep_picture
 from impactopt.report.pictures.sweep_columns import Columns

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from impactopt.errors import InputError
+from impactopt import InputError
 from impactopt.sweeps import Sweep, read_sweep_file, sweep_from_data
 from impactopt.sweeps.design import Axis, Design, Draws, Span
 

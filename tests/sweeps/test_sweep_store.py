@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.sweep_entries import entry
 
-from impactopt.errors import InputError
+from impactopt import InputError
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.design import Found
 from impactopt.sweeps.store import Entry, Journal, Store

@@ -9,13 +9,10 @@ import pinocchio as pin
 import pytest
 from support.small_plans import Planned, changed
 
-from impactopt import Solution
-from impactopt.errors import InputError
+from impactopt import InputError, Perturbation, Scenario, Solution, load_record
 from impactopt.files.output import record_of, save_record
-from impactopt.files.record import load_record
 from impactopt.files.replay import load_planned
-from impactopt.problem.scenario import Scenario
-from impactopt.simulation import Perturbation
+from impactopt.simulation import scene_of, simulate_mujoco
 from impactopt.transcription.transcription import Transcription
 
 PROBLEM = Path(__file__).resolve().parents[2] / "problems" / "punch.toml"
@@ -86,9 +83,18 @@ def test_the_punch_into_the_air_stands(punch: Solution) -> None:
 
 
 def test_a_robot_that_hits_does_not_abort(punch: Solution) -> None:
-    with_abort = punch.validate(engine="mujoco", step=5e-4, settle=0.0)
-    without = punch.validate(engine="mujoco", step=5e-4, settle=0.0, missed=None)
+    until = punch.missed_trajectory.contact_end + 0.1  # [s] an abort motion would begin 0.1 s earlier
+    motion, scene = (punch.problem.robot, punch.trajectory), scene_of(punch.problem)
+    with_abort, without, missing = (
+        simulate_mujoco(*motion, scene, step=5e-4, until=until, missed=missed, perturbation=world)
+        for missed, world in (
+            (punch.missed_trajectory, None),
+            (None, None),
+            (punch.missed_trajectory, Perturbation(missing=True)),
+        )
+    )
     np.testing.assert_array_equal(with_abort.q, without.q)
+    assert np.abs(missing.q[-1] - without.q[-1]).max() > 1e-3
 
 
 def test_the_record_keeps_it(punch: Solution, tmp_path: Path) -> None:

@@ -15,7 +15,22 @@ from support.derivative_checks import check_derivatives
 from support.small_plans import BODILESS, changed, rod_hammer
 from support.small_robots import arm, biped, parallelogram, table
 
-from impactopt import KeepOut, Obstacle, SelfCollision, Solution, load_problem, solve
+from impactopt import (
+    ImpactProblem,
+    KeepOut,
+    Obstacle,
+    Plan,
+    Robot,
+    SelfCollision,
+    Solution,
+    Status,
+    Term,
+    g1,
+    load_problem,
+    solve,
+    standin,
+    talos,
+)
 from impactopt.bodies.clearance import Places
 from impactopt.bodies.separation import THIN
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -31,14 +46,8 @@ from impactopt.planning.clearance_constraints import (
 from impactopt.planning.parameter_changes import parameter_of
 from impactopt.planning.refinement import Evaluation, Guess
 from impactopt.planning.solution import program_on
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import Term
-from impactopt.robots.presets import g1, standin, talos
-from impactopt.robots.robot import Robot
-from impactopt.solvers.program import Status
 from impactopt.transcription.clearance import Chain, ClearanceKey, chain_between
 from impactopt.transcription.initial_guess import first_iterate
-from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]

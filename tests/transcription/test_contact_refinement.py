@@ -13,15 +13,10 @@ from scipy.integrate import solve_ivp
 from support.small_plans import BODILESS, Planned, changed, transcribed
 from support.small_robots import table
 
-from impactopt import Solution
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.kinematics.stance import FixedBase
+from impactopt import FixedBase, FreeMass, ImpactProblem, Phase, Scenario, Solution, SpringDamper, Status
 from impactopt.planning import solution as solutions
 from impactopt.planning.solve import solve
-from impactopt.problem.problem import ImpactProblem, Phase
-from impactopt.problem.scenario import Scenario
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.solvers.program import Status
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_refinement import (
     ContactError,

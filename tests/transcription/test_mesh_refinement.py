@@ -12,44 +12,43 @@ from numpy.typing import NDArray
 from support.small_plans import BODILESS, Planned, changed
 from support.term_cases import MILD
 
-from impactopt.bodies.world import Obstacle, TargetBody
-from impactopt.errors import InputError
+from impactopt import (
+    AngularMomentum,
+    ContactWrenchCone,
+    Effort,
+    FirstTouch,
+    Grip,
+    GroundForce,
+    HitRegion,
+    Impulse,
+    InputError,
+    Objective,
+    Obstacle,
+    PeakForce,
+    Penetration,
+    Phase,
+    Plan,
+    Scenario,
+    Status,
+    TargetBody,
+    TargetEnergy,
+    Term,
+    TorqueLimit,
+    TorqueRate,
+)
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.planning import between_nodes
 from impactopt.planning import solution as solutions
 from impactopt.planning.solve import solve
-from impactopt.problem.objectives import (
-    OBJECTIVES,
-    AngularMomentum,
-    Effort,
-    Impulse,
-    Objective,
-    PeakForce,
-    Penetration,
-    TargetEnergy,
-)
-from impactopt.problem.problem import Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import (
-    DEFAULT_TERMS,
-    TERMS,
-    ContactWrenchCone,
-    FirstTouch,
-    Grip,
-    GroundForce,
-    HitRegion,
-    Term,
-    TorqueLimit,
-    TorqueRate,
-)
+from impactopt.problem.objectives import OBJECTIVES
+from impactopt.problem.terms import DEFAULT_TERMS, TERMS
 from impactopt.simulation.result import distance_inside
 from impactopt.solvers.ipm import solve_ipm
-from impactopt.solvers.program import Status
 from impactopt.transcription import mesh as between
 from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.mesh import NO_MORE, MoreNodes, nodes_to_add
-from impactopt.transcription.plan import Plan, complete_reference
+from impactopt.transcription.plan import complete_reference
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]

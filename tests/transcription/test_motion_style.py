@@ -11,11 +11,9 @@ from scipy.integrate import cumulative_trapezoid, quad, trapezoid
 from scipy.signal import find_peaks
 from support.small_plans import Planned, changed
 
-from impactopt.errors import InputError
+from impactopt import GroundForce, InputError, talos
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.problem.motion_style import STYLES, MotionPrices
-from impactopt.problem.terms import GroundForce
-from impactopt.robots.presets import talos
 from impactopt.transcription.motion_measures import ground_force_share, motion_measures
 from impactopt.transcription.objective import cost_of_motion
 from impactopt.transcription.transcription import Transcription

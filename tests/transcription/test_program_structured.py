@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from impactopt import InputError, Status
 from impactopt.codegen.batched import pattern
-from impactopt.errors import InputError
 from impactopt.kinematics.stages import Stage
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import NonlinearProgram, Status
+from impactopt.solvers.program import NonlinearProgram
 from impactopt.transcription.batched import Block
 from impactopt.transcription.layout import Affine, Constraints, Layout, select, stack
 from impactopt.transcription.structured import StructuredProgram, derivative_functions

@@ -15,10 +15,10 @@ import pytest
 from numpy.typing import NDArray
 from support.small_plans import arm_problem, transcribed
 
+from impactopt import NoCompilerWarning
 from impactopt.codegen.batched import BatchedFunction
 from impactopt.codegen.cache import cached
 from impactopt.codegen.compiler import NativeCode, find_compiler
-from impactopt.errors import NoCompilerWarning
 from impactopt.transcription import simd
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.simd import LANES, in_lanes

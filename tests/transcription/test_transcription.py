@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from support.derivative_checks import check_derivatives
 from support.small_plans import LAW, Planned, changed
 
+from impactopt import ContactWrenchCone, Incidence, Phase, Scenario, Status, TorqueLimit, VelocityLimit
 from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.support import contact_wrench_cone, zmp
-from impactopt.problem.problem import Phase
-from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import ContactWrenchCone, Incidence, TorqueLimit, VelocityLimit
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status, check_program
+from impactopt.solvers.program import check_program
 from impactopt.transcription.contact_conditions import rotation_rows
 from impactopt.transcription.initial_guess import first_iterate
 from impactopt.transcription.mesh import collision_mesh, with_middles

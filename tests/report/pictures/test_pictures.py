@@ -22,10 +22,7 @@ from support.picture_checks import frowns
 from support.small_plans import Planned
 from typer.testing import CliRunner
 
-from impactopt import Solution
-from impactopt.bodies.world import Ground
-from impactopt.collision import effective_mass
-from impactopt.errors import InputError
+from impactopt import Ground, InputError, Solution, effective_mass
 from impactopt.files.output import record_of
 from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp

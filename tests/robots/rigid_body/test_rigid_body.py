@@ -23,9 +23,7 @@ from support.rigid_body_cases import (
 )
 from support.small_robots import biped
 
-from impactopt.errors import InputError
-from impactopt.robots.actuators import Actuator
-from impactopt.robots.rigid_body import RigidBody
+from impactopt import Actuator, InputError, RigidBody
 
 VALUES, DERIVATIVES = 1e-12, 1e-10
 

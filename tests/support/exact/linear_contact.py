@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact import Board, ContactLaw, Nail, Target
-from impactopt.errors import InputError
+from impactopt import Board, ContactLaw, InputError, Nail, Target
 
 Array = NDArray[np.float64]
 _INSTEAD = "the exact solution: {} is not linear between events; measure by SciPy"

@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
+from impactopt import InputError
 from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
 from impactopt.collision.implicit import bernstein_matrix, first_negative, largest
 from impactopt.collision.interface import Collision
 from impactopt.collision.model import Segment, relative_to
 from impactopt.collision.outputs import Outputs, frozen_for
 from impactopt.collision.stepped import SteppedModel
-from impactopt.errors import InputError, check_array
+from impactopt.errors import check_array
 from support.exact.linear_contact import force_coefficients, target_modes
 from support.exact.modes import Modes, Phase
 

@@ -11,7 +11,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.clearance import Places
 from impactopt.errors import InputError
 from impactopt.files.draft.hits import Hit
 from impactopt.files.draft.target_placement import LOWEST, Arm
@@ -20,7 +19,7 @@ from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.strength import EstimatedImpact, Strength, drawn_impacts
+from impactopt.problem.strength import EstimatedImpact, Strength, drawn_impacts, touches
 from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
@@ -155,10 +154,3 @@ def _problem(
         if clear and not hopeless(problem):
             return problem
     return None
-
-
-def touches(problem: ImpactProblem, *postures: Array) -> bool:
-    """True if bodies touch in one of these configurations (nq,), with the target as before contact."""
-    none: Array = np.zeros(len(postures))
-    at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
-    return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)

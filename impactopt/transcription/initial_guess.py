@@ -93,7 +93,7 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     """
     p, c = t.problem, t.coordinates
     rng = np.random.default_rng(seed)
-    y, legs = c.split(strongest_posture(p, seed))
+    y, legs = c.split(strongest_posture(p, seed if noise else None))
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)

@@ -15,6 +15,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates, independent_rate
 from impactopt.kinematics.operational_space import static_wrenches
 from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.strength import strongest_posture
 from impactopt.problem.terms import TargetSpeed
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -82,16 +83,17 @@ class ReachedState:
 
 
 def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> ReachedState:
-    """State at contact by inverse kinematics.
+    """State at contact by inverse kinematics, in the `strongest_posture` of a robot on a fixed base.
 
     speed : of the striking points [m/s]; less if joints are not that fast. If the target's speed after the
         impact is bounded, or the contact's events have an order of their own, the nearest speed with which a
         point mass meets the bounds, or has the order.
-    noise, seed : standard deviation [rad] and seed of a perturbation of the joints, for several guesses.
+    noise, seed : standard deviation [rad] and seed of a perturbation of the joints, for several guesses; the
+        seed is also that of the postures to choose from.
     """
     p, c = t.problem, t.coordinates
     rng = np.random.default_rng(seed)
-    y, legs = c.split(p.contact_posture)
+    y, legs = c.split(strongest_posture(p, seed if noise else None))
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)

@@ -26,7 +26,7 @@ from impactopt.files.draft.postures import eased, half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, sides
 from impactopt.files.draft.strikers import find_edge, find_striker, find_toe
-from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest, touches
+from impactopt.files.draft.strong import ITERATIONS, SECONDS, Strong, duration, strongest
 from impactopt.files.draft.target_placement import STRIKE_DIRECTIONS, Arm, aims, ready
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.sections import comment_at
@@ -38,7 +38,7 @@ from impactopt.planning.strike import StrikeSolution, optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.plausibility import shape_doubts
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.strength import DOWN
+from impactopt.problem.strength import DOWN, touches
 from impactopt.problem.terms import Slide
 from impactopt.robots.attachments import Sole, Striker, Tool
 from impactopt.robots.build import default_kd, default_kp

@@ -22,7 +22,7 @@ from impactopt.kinematics.stance import FixedBase
 from impactopt.planning.strike import optimize_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.strength import EstimatedImpact, Strength, drawn_impacts
+from impactopt.problem.strength import EstimatedImpact, Strength, drawn_impacts, touches
 from impactopt.problem.terms import FirstTouch
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
@@ -186,10 +186,3 @@ def _hits_base(problem: ImpactProblem, impact: EstimatedImpact) -> bool:
     fixed = {piece.link for piece in bodies_of(problem.robot).pieces if piece.joint == 0}
     found = problem.bodies.survey(travel, at).touches
     return any("target" in (touch.one, touch.other) and {touch.one, touch.other} & fixed for touch in found)
-
-
-def touches(problem: ImpactProblem, *postures: Array) -> bool:
-    """True if bodies touch in one of these configurations (nq,), with the target as before contact."""
-    none: Array = np.zeros(len(postures))
-    at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
-    return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)

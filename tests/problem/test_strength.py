@@ -1,0 +1,48 @@
+"""Postures at contact that are chosen for initial guesses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impactopt import HandOrientation, load_problem, solve
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.strength import strongest_posture, touches
+
+
+def _off(problem: ImpactProblem, q: np.ndarray) -> tuple[float, float]:
+    """Distance [m] of the striking point from the hit point, and angle [rad] of the hand's axis to the
+    normal.
+    """
+    model, data = problem.robot.model, problem.robot.model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    at = data.oMf[model.getFrameId(f"striker:{problem.striker}")]
+    hand = problem.extra(HandOrientation)
+    assert hand is not None
+    cosine = (at.rotation @ np.array(hand.axis)) @ problem.normal
+    return float(np.linalg.norm(at.translation - problem.point)), float(np.arccos(np.clip(cosine, -1, 1)))
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2])
+def test_the_chosen_posture_reaches_and_faces_the_target(seed: int | None) -> None:
+    """That of inverse kinematics from the start posture is turned away from it."""
+    problem = load_problem("arm7")
+    hand = problem.extra(HandOrientation)
+    assert hand is not None and _off(problem, problem.contact_posture)[1] > hand.angle
+    q = strongest_posture(problem, seed)
+    distance, angle = _off(problem, q)
+    assert distance < 1e-6 and angle <= hand.angle + 1e-9 and not touches(problem, q)
+    angles = problem.robot.joint_positions(q)
+    assert np.all(angles >= problem.robot.lower) and np.all(angles <= problem.robot.upper)
+
+
+def test_robots_on_soles_have_the_nearest_posture() -> None:
+    problem = load_problem("punch_standin")
+    assert np.array_equal(strongest_posture(problem, 1), problem.contact_posture)
+
+
+def test_one_initial_guess_is_as_good_as_several() -> None:
+    problem = load_problem("arm7")
+    plain, several = solve(problem), solve(problem, starts=3)
+    assert plain.status.usable and plain.impulse > 0.98 * several.impulse

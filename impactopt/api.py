@@ -65,7 +65,8 @@ class Solution(solution.Solution):
         of the active set. These are quick; constraints then hold to a thousandth if the status is
         "acceptable", and with another status the result is not usable. ``refine=True`` also refines the mesh,
         as `impactopt.solve` does. ``callback``, ``options`` and ``time_limit`` are those of
-        `impactopt.solve`.
+        `impactopt.solve`, but for looser tolerances of the optimum, with which the impulse is within 0.1 %;
+        constraints are met as usual.
 
         Raises
         ------

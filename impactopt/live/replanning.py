@@ -8,25 +8,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from impactopt.errors import InputError
 from impactopt.live.requests import PlanRequest
 from impactopt.planning.parameter_changes import moved_problem
-from impactopt.planning.replanning import moved_solution
+from impactopt.planning.replanning import REPLANNING_TOLERANCES, moved_solution
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.report.tracks import Track, planned_track
 from impactopt.solvers.program import IterationRecord, Status
-from impactopt.transcription.plan import Plan, Trajectory
 
 TIME_LIMIT = 20.0  # [s] of each of the two solves
-_STEP_RANGE = 3e-3, 1e-2  # [s] between the instants of the motion that is drawn
-_CONTACT_SAMPLES = 6  # instants of the contact, within that range
 MAX_VIOLATIONS = 5  # that are reported
-# Solver tolerances with which impulses are within 0.15 %, after two thirds of the iterations. A looser
-# complementarity would keep plans off their bounds: 1e-3 took a tenth of the impulse of a blow on a nail.
-_LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-5}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,7 +48,7 @@ class Replanning:
         self.time_limit = time_limit
         # builds what re-planning needs now, and not when the first slider moves
         with contextlib.suppress(InputError):
-            moved_solution(first, point=first.problem.point, options=_LOOSE)
+            moved_solution(first, point=first.problem.point)
 
     def __call__(self, request: PlanRequest, stale: Callable[[], bool]) -> Answer:
         began = time.perf_counter()
@@ -64,7 +56,7 @@ class Replanning:
             solution = self._plan(request.changes(self.first.problem), stale)
             if not solution.status.usable:
                 return Answer(seconds=time.perf_counter() - began, why=failure_reason(solution))
-            reference = _reference(solution.plan)
+            reference = solution.plan.coarse_reference
             track = planned_track(solution, reference)
         except InputError as error:
             return Answer(seconds=time.perf_counter() - began, why=str(error))
@@ -81,7 +73,7 @@ class Replanning:
         def stop(_: IterationRecord) -> bool:
             return stale()
 
-        common: dict[str, Any] = {"callback": stop, "time_limit": self.time_limit, "options": _LOOSE}
+        common: dict[str, Any] = {"callback": stop, "time_limit": self.time_limit}
         try:
             moved = moved_solution(self.first, **changes, **common)
         except InputError:
@@ -90,13 +82,7 @@ class Replanning:
         if moved is not None and (moved.status.usable or stale()):
             return moved
         problem = moved_problem(self.first.problem, **changes)
-        return solve(problem, start=self.latest, **common)
-
-
-def _reference(plan: Plan) -> Trajectory:
-    """Reference of a plan with few instants, for a picture: computing it costs as much as some iterations."""
-    duration = plan.compression + plan.restitution
-    return plan.trajectory(step=float(np.clip(duration / _CONTACT_SAMPLES, *_STEP_RANGE)), hold=0.2)
+        return solve(problem, start=self.latest, options=REPLANNING_TOLERANCES, **common)
 
 
 def failure_reason(solution: Solution) -> str:

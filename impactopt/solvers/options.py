@@ -70,8 +70,8 @@ class IPMOptions(SolverOptions):
     complementarity_tolerance : largest product of a multiplier and the distance to its bound at a solution.
     barrier : initial barrier parameter for an initial guess without multipliers.
     barrier_warm : the same with multipliers; below 5e-3 it falls at once near a solution.
-    push : distance by which the initial guess is moved inside its bounds; with multipliers at most the
-        barrier.
+    push : distance by which the initial guess is moved inside its bounds.
+    push_warm : the same with multipliers, at most, over the barrier.
     """
 
     # Iterations of seven plans: 457 with these values; 583 and 483 with barriers of 0.1 and 3e-3; 508, 355,
@@ -80,6 +80,7 @@ class IPMOptions(SolverOptions):
     barrier: float = 3e-2
     barrier_warm: float = 1e-5
     push: float = 1e-2
+    push_warm: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)

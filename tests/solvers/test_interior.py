@@ -14,6 +14,7 @@ from support.textbook import CASES, INF, Textbook, assert_optimal
 
 from impactopt import Status, load_problem
 from impactopt.solvers.ipm import IPMOptions, interior_point, solve_ipm
+from impactopt.solvers.program import max_violation
 from impactopt.transcription.initial_guess import first_iterate
 
 
@@ -164,3 +165,12 @@ def test_elastic_constraints_that_are_met_become_hard_again():
         t = changed(base, target=dataclasses.replace(problem.target, resistance=resistance))
         result = solve_ipm(t.program, first_iterate(t))
         assert result.status is Status.SOLVED and result.iterations < 200, resistance
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_loose_stationarity_leaves_constraints_met(name):
+    case = CASES[name]
+    program = case.build()
+    result = solve_ipm(program, case.x0, options=IPMOptions(kkt_tolerance=1e-2, violation_tolerance=1e-7))
+    assert result.status is Status.SOLVED
+    assert max_violation(program, result.x, program.constraints(result.x)) <= 1e-7

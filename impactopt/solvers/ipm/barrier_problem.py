@@ -440,8 +440,8 @@ class BarrierProblem:
         self._unequal = np.flatnonzero(lower < upper)  # into c.remaining: those with a slack
         push = options.push if state is None else _PUSH_CONTINUED
         if warm and state is None:
-            # the slack of a bound whose multiplier is one: moving farther would violate constraints
-            push = min(push, self.mu)
+            # mu is the slack of a bound whose multiplier is one: moving farther violates constraints
+            push = min(push, options.push_warm * self.mu)
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
         kept = state is not None
         self.x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self.mu, kept=kept)
@@ -541,6 +541,7 @@ class BarrierProblem:
         off /= max(_S_MAX, bounds / count) / _S_MAX  # s_c
         if not mu:
             off *= self.options.kkt_tolerance / self.options.complementarity_tolerance
+            violation *= max(1.0, self.options.kkt_tolerance / self.options.violation_tolerance)
         return max(max(self._dual, slack_dual) / s_d, violation, off)
 
     def lower_barrier(self, residual: Vector) -> bool:

@@ -18,7 +18,6 @@ from impactopt.contact.targets import FreeMass, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.terms import FirstTouch, HandOrientation, TorqueLimit
-from impactopt.problem.terms.first_touch import face_of
 from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 
@@ -32,8 +31,8 @@ LIMIT_MARGIN = 0.05  # of a joint's range, between a posture at contact and the 
 POSTURES, MAX_DRAWN = 600, 6000
 POINT_POSTURES = 8  # postures at the hit point of a problem
 NEARBY = 0.4  # [m] from a problem's point
-# Attempts of `strongest_posture`. Measured on 17 targets of five arms: of 10 attempts the best one leads to a
-# motion for 16, of 6 for 14; inverse kinematics from the start posture for 12.
+# Attempts of `strongest_posture`. Measured on 17 targets of five arms: the best of 10 leads to a motion for
+# 16 of them, that of 6 for 14.
 ATTEMPTS = 12
 # Decay of an estimate with the time that joints need to a posture, over the longest swing. 2 to 5 choose
 # alike; with 1 or less, postures are chosen that no swing reaches.
@@ -198,40 +197,33 @@ def drawn_impacts(
     return sorted(front, key=lambda impact: -impact.impulse)
 
 
-def strongest_posture(problem: ImpactProblem, seed: int | None = None) -> Array:
-    """Posture at contact (nq,) of a robot on a fixed base, for the initial guess of a motion.
+def strongest_posture(problem: ImpactProblem, seed: int = 0) -> Array:
+    """Posture at contact (nq,) for the initial guess of a motion.
 
-    From `ATTEMPTS` random postures, inverse kinematics turns the striker's face to the target. Of the results
-    that face it without penetration, the posture with the largest estimated impulse is taken, decreased with
-    the time that the joints need from the start posture. If there is none, or the robot has soles or two
-    strikers, it is the problem's `contact_posture`.
+    It is the problem's `contact_posture`, unless the robot has a fixed base and that posture violates
+    `HandOrientation`. Then inverse kinematics starts from `ATTEMPTS` random postures. Of the results that
+    have the orientation without penetration, the posture with the largest estimated impulse is taken,
+    decreased with the time that the joints need from the start posture.
 
-    seed : of the random postures. None: the `contact_posture` unless that violates `HandOrientation`, as the
-        solver often finds the same or a better motion from the nearest posture.
+    seed : of the random postures.
     """
-    p, robot = problem, problem.robot
-    if robot.floating or p.second is not None:
+    p, robot, hand = problem, problem.robot, problem.extra(HandOrientation)
+    if hand is None or robot.floating or p.second is not None:
         return p.contact_posture
     model, data = robot.model, robot.model.createData()
     frame, first = model.getFrameId(robot.striker(p.striker).model_frame), robot.nv - robot.n
-    facing, max_angle = None, 0.0
-    if (hand := p.extra(HandOrientation)) is not None:
-        direction = p.normal if hand.direction is None else np.array(hand.direction)
-        facing, max_angle = (np.array(hand.axis), direction), hand.angle
-    elif p.term(FirstTouch).enabled and (face := face_of(p, p.striker)) is not None:
-        facing, max_angle = (face.normal, p.normal), p.term(FirstTouch).angle
+    facing = np.array(hand.axis), p.normal if hand.direction is None else np.array(hand.direction)
+    min_cosine = float(np.cos(hand.angle))
 
     def faces(q: Array) -> bool:
-        if facing is None:
-            return True
         pin.framesForwardKinematics(model, data, q)
-        return bool((data.oMf[frame].rotation @ facing[0]) @ facing[1] >= np.cos(max_angle))
+        return bool((data.oMf[frame].rotation @ facing[0]) @ facing[1] >= min_cosine)
 
-    if seed is None and (hand is None or faces(p.contact_posture)):
+    if faces(p.contact_posture):
         return p.contact_posture
     strength = Strength(robot=robot, striker=p.striker, law=p.law, target=p.target)
     limb = np.array(robot.limb(robot.striker(p.striker).model_frame))
-    rng, start = np.random.default_rng(seed or 0), robot.joint_positions(p.start_posture)
+    rng, start = np.random.default_rng(seed), robot.joint_positions(p.start_posture)
     low, high = np.maximum(robot.lower, -np.pi)[limb], np.minimum(robot.upper, np.pi)[limb]
     best, chosen = 0.0, p.contact_posture
     for _ in range(ATTEMPTS):

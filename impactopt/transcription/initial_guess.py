@@ -83,7 +83,7 @@ class ReachedState:
 
 
 def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> ReachedState:
-    """State at contact by inverse kinematics, in the `strongest_posture` of a robot on a fixed base.
+    """State at contact by inverse kinematics (`strongest_posture`).
 
     speed : of the striking points [m/s]; less if joints are not that fast. If the target's speed after the
         impact is bounded, or the contact's events have an order of their own, the nearest speed with which a
@@ -93,7 +93,7 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     """
     p, c = t.problem, t.coordinates
     rng = np.random.default_rng(seed)
-    y, legs = c.split(strongest_posture(p, seed if noise else None))
+    y, legs = c.split(strongest_posture(p, seed))
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)

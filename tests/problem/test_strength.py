@@ -24,8 +24,8 @@ def _off(problem: ImpactProblem, q: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(at.translation - problem.point)), float(np.arccos(np.clip(cosine, -1, 1)))
 
 
-@pytest.mark.parametrize("seed", [None, 1, 2])
-def test_the_chosen_posture_reaches_and_faces_the_target(seed: int | None) -> None:
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_chosen_posture_reaches_and_faces_the_target(seed: int) -> None:
     """That of inverse kinematics from the start posture is turned away from it."""
     problem = load_problem("arm7")
     hand = problem.extra(HandOrientation)

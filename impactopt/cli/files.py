@@ -131,10 +131,9 @@ def new(
             urdf, name = name, None
         elif name is not None and Path(name).suffix.lower() == ".xml":
             mjcf, name = Path(name), None
-        if bolted and urdf is None and mjcf is None:
-            raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint="--bolted")
-        if motion is not None and urdf is None and mjcf is None:
-            raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint="--motion")
+        for option, given in (("--bolted", bolted), ("--motion", motion)):
+            if given and urdf is None and mjcf is None:
+                raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint=option)
         if reference and as_json:
             raise typer.BadParameter("the reference is Markdown; leave --json out", param_hint="--json")
         if reference:

@@ -173,6 +173,6 @@ def command_line(context: typer.Context) -> str:
             words.append((parameter.opts if value else parameter.secondary_opts)[0])
             continue
         option = max(parameter.opts, key=len)
-        words += [option] if option.startswith("-") else []
-        words.append(str(value))
+        for each in value if isinstance(value, (list, tuple)) else [value]:
+            words += [option, str(each)] if option.startswith("-") else [str(each)]
     return shlex.join(words)

@@ -319,7 +319,7 @@ def keep_series(done: dict[str, Any], directory: Path) -> Path:
     """
     place = _place(directory, done["done"], bool(read_json(directory / SERIES).get("done")), done)
     text = f"{json.dumps(plain(done), indent=2)}\n".encode()
-    place.mkdir(exist_ok=True)
+    make_directory(place)
     write_file(place / SERIES, lambda file: file.write(text))
     if done["done"]:
         _remove(directory / FAILED, SERIES)

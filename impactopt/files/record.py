@@ -134,16 +134,9 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     except PermissionError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     # errors of NumPy and zipfile for files that are truncated, overwritten or of another kind
-    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, NotImplementedError) as error:
-        raise InputError(f"{path} is damaged ({error}); {fix}") from error
     except (
-        zipfile.BadZipFile,
-        zlib.error,
-        tokenize.TokenError,
-        MemoryError,
-        OverflowError,
-        RecursionError,
-        RuntimeError,
+        *(OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError, OverflowError),
+        *(RuntimeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
     ) as error:
         raise InputError(f"{path} is damaged ({error}); {fix}") from error
     problem_path = Path(os.path.normpath(path.parent.resolve() / relative)) if relative else None

@@ -59,7 +59,6 @@ _TEXT: _Kinds = (str,)
 _NUMBER: _Kinds = (int, float, type(None))  # null for numbers that are not finite
 _YES: _Kinds = (bool, type(None))
 _NUMBERS: _Kinds = ({"*": _NUMBER},)
-_PHASES: _Kinds = ({"*": _NUMBER},)
 _TOUCHES: _Kinds = (
     [
         {
@@ -96,8 +95,8 @@ _LOADS: dict[str, _Kinds] = {
     "motor_cuts?": ([_CUT],),
 }
 _SOLES: dict[str, _Kinds] = {
-    **dict.fromkeys(("sole_cop_margin_mm?", "sole_force_N?"), ({"*": _PHASES}, type(None))),
-    "sole_cop_margin_asked_mm?": _PHASES,
+    **dict.fromkeys(("sole_cop_margin_mm?", "sole_force_N?"), ({"*": _NUMBERS}, type(None))),
+    "sole_cop_margin_asked_mm?": _NUMBERS,
     "sole_force_asked_N?": _NUMBER,
     "landing_speed_m_s?": (*_NUMBERS, type(None)),
 }
@@ -111,11 +110,11 @@ _ANY_REPLAY: dict[str, _Kinds] = {
     "standing?": _YES,
     **_SOLES,
 }
-_SIMULATED = {**_ANY_REPLAY, "torque_ratio?": _PHASES, "zmp_margin_m?": _PHASES}
+_SIMULATED = {**_ANY_REPLAY, "torque_ratio?": _NUMBERS, "zmp_margin_m?": _NUMBERS}
 _REPLAYED = {
     **_ANY_REPLAY,
     **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBER),
-    **dict.fromkeys(("torque_ratio_by_phase?", "zmp_margin_by_phase_m?"), (*_PHASES, type(None))),
+    **dict.fromkeys(("torque_ratio_by_phase?", "zmp_margin_by_phase_m?"), (*_NUMBERS, type(None))),
 }
 _START = {
     **dict.fromkeys(("start", "status"), _TEXT),
@@ -154,7 +153,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     **_SOLES,
     **_LOADS,
     **dict.fromkeys(("objectives?", "posture_rad?", "velocity_rad_s?"), _NUMBERS),
-    **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _PHASES),
+    **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBERS),
     **dict.fromkeys(
         (
             "duration_s?",

@@ -20,10 +20,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import SURVEYED
-from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError
 from impactopt.files.output import record_of
-from impactopt.files.record import LARGEST, NUMBERS, SUMMARY, Record, load_record
+from impactopt.files.record import NUMBERS, SUMMARY, Record, load_record, read_json
 from impactopt.files.replay import problem_of, program_of_record, solution_of_record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import weight_of
@@ -90,7 +89,7 @@ def verify(result: str | os.PathLike[str], *, problem_file: str | os.PathLike[st
     record, path = load_record(result), Path(result)
     problem = problem_of(record, path, problem_file)
     summary_file = (path.parent if path.name == NUMBERS and not path.is_dir() else path) / SUMMARY
-    other_summary = summary_file.exists() and _read(summary_file) != record.summary
+    other_summary = summary_file.exists() and read_json(summary_file) != record.summary
     return verify_record(record, problem, other_summary=other_summary)
 
 
@@ -125,13 +124,6 @@ def verify_record(record: Record, problem: ImpactProblem, *, other_summary: bool
     for name, amount, where in _deviations(made, record):
         found.note(name, amount, where)
     return found.verdict(kkt, objective)
-
-
-def _read(path: Path) -> Any:
-    try:
-        return json.loads(read_plain(path, LARGEST))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} is damaged ({error}); solve again with `impactopt solve`") from error
 
 
 def _same_program(t: Transcription, record: Record) -> bool:

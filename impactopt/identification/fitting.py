@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
@@ -129,8 +130,7 @@ def _history(time: Array, force: Array, impulse: Array) -> ContactHistory:
         return ContactHistory(np.array([0.0, 1e-9]), zero, zero, zero, zero)
     last = int(np.searchsorted(time, time[-1])) + 1  # padding repeats the last instant
     t, f, J = time[:last], force[:last], impulse[:last]
-    steps = np.diff(t, prepend=0.0)
-    integral = np.cumsum(steps * (J + np.concatenate([J[:1], J[:-1]])) / 2)
+    integral = cumulative_trapezoid(J, t, initial=0.0)
     return ContactHistory(t, f, np.gradient(f, t) if last > 1 else 0.0 * f, J, integral)
 
 

@@ -186,7 +186,7 @@ def _hand(
     n, frame = check_direction("normal", normal), robot.striker(striker).model_frame
     model, data = robot.model, robot.model.createData()
     angles = np.column_stack([_joint(columns, robot, k, name) for k in range(robot.n)])
-    travel, mass = np.empty(len(angles)), np.empty(len(angles))
+    travel, mass = np.empty((2, len(angles)))
     for k, q in enumerate(_configurations(robot, angles)):
         pin.framesForwardKinematics(model, data, q)
         travel[k] = n @ data.oMf[model.getFrameId(frame)].translation
@@ -199,7 +199,7 @@ def _joint(columns: Mapping[str, Array], robot: Robot, k: int, name: str) -> Arr
     joint, slides = robot.joint_names[k], not _turns(robot, k)
     values = _column(columns, f"{joint}_{'m' if slides else 'rad'}", name)
     low, high = robot.lower[k], robot.upper[k]
-    values = check_array(f"{name}: {joint}", values, (None,))
+    values = check_array(f"{name}: {joint}", values, (np.size(columns[TIME]),), most=MOST)
     far = np.maximum(values - high, low - values).max(initial=0.0)
     if not slides and far > _MAX_BEYOND:
         raise InputError(

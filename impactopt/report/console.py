@@ -136,8 +136,8 @@ def touch_message(report: Mapping[str, Any]) -> str:
     return f"contact of the link's hull: {hull}; of the striking point: {point}"
 
 
-def _early(ms: float) -> str:
-    return f"{abs(ms):.2f} ms {'late' if ms < 0 else 'early'}"
+def _early(ms: float | None) -> str:
+    return "no touch" if ms is None else f"{abs(ms):.2f} ms {'late' if ms < 0 else 'early'}"
 
 
 def verdict_table(verdict: Mapping[str, Any]) -> Table:
@@ -219,7 +219,7 @@ def identified_table(found: Mapping[str, Any]) -> Table:
     for law in found["laws"]:
         more = law["aic"] - found["laws"][0]["aic"]
         fit = f"residual {law['force_left_pct']:.2g} % of the peak force, AIC {more:+.0f}"
-        table.add_row(_plain(f"{law['law']}: {fit}"), end_section=False)
+        table.add_row(_plain(f"{law['law']}: {fit}"))
         for name, each in law["estimates"].items():
             ends = [f"{x:.4g}" if x is not None else "?" for x in (each["low"], each["high"])]
             label = f"  {name} [{each['unit']}]" if each["unit"] else f"  {name}"

@@ -14,6 +14,7 @@ from impactopt.files.record import Record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.histories import footprints
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
+from impactopt.robots.loads import weight_of
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -40,7 +41,7 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
         "normal": problem.normal,
         "point": problem.point,
         "side": middle(arrays["track0_places"]),
-        "weight": 9.81 * float(sum(i.mass for i in problem.robot.model.inertias)),
+        "weight": max(weight_of(problem.robot), 1.0),
         "around": AROUND,
         "far": FAR,
         "floor": problem.ground_height,

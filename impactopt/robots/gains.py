@@ -75,7 +75,7 @@ def scaled_gains(robot: Robot, factors: Mapping[str, float]) -> Robot:
             raise InputError(
                 f"gains of {pattern!r}: the factor {factor:g}; give {MIN_FACTOR:g} to {MAX_FACTOR:g}"
             )
-        each[list(fitting(pattern, robot.joint_names, "gains"))] = factor
+        each[fitting(pattern, robot.joint_names, "gains")] = factor
     kp, kd, limit = robot.kp * each, robot.kd * np.sqrt(each), np.array(robot.torque_limit)
     grips = {}
     for tool in robot.tools:

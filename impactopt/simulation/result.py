@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 from impactopt.contact.friction import ContactFriction
 from impactopt.contact.laws import ContactLaw
@@ -70,8 +71,7 @@ REPORT = (
 
 def travelled(time: Array, speed: Array, contact_start: float) -> Array:
     """Travel (k,) [m] since contact began, from speeds (k,) [m/s]; without contact (nan), since the start."""
-    # trapezoidal rule
-    gone = np.concatenate([[0.0], np.cumsum(np.diff(time) * (speed[1:] + speed[:-1]) / 2)])
+    gone = cumulative_trapezoid(speed, time, initial=0.0)
     return gone - np.interp(contact_start, time, gone) if np.isfinite(contact_start) else gone
 
 
@@ -289,6 +289,8 @@ class Simulation:
         }
         if len(self.impulses) > 1:
             out["impulses_Ns"] = self.impulses.tolist()
+        if self.grip_force.size:
+            out["grip_force_N"] = float(self.grip_force.max())
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {
             n: float(ratio[phase == k].max()) for k, n in enumerate(names) if (phase == k).any()
@@ -310,8 +312,6 @@ class Simulation:
             if self.stance.size:
                 speeds = zip(self.soles, self.landing_speed, strict=True)
                 out["landing_speed_m_s"] = {name: float(v) for name, v in speeds if np.isfinite(v)}
-            if self.grip_force.size:
-                out["grip_force_N"] = float(self.grip_force.max())
             out["sole_slip_mm"] = 1e3 * float(self.slip.max())
             out["sole_lift_mm"] = 1e3 * float(self.lift.max())
             collision = self.lift[phase == 1]

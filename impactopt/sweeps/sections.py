@@ -36,9 +36,11 @@ def _listed(value: Any) -> Any:
 
 
 Names = Annotated[list[str], BeforeValidator(_listed)]
-Named = Annotated[dict[str, Any], BeforeValidator(lambda table: dict(flat(table)))]
-Levels = Annotated[dict[str, float], BeforeValidator(lambda table: dict(flat(table)))]
-Texts = Annotated[dict[str, str], BeforeValidator(lambda table: dict(flat(table)))]
+# what is no table is refused by its type
+_FLAT = BeforeValidator(lambda table: dict(flat(table)) if isinstance(table, Mapping) else table)
+Named = Annotated[dict[str, Any], _FLAT]
+Levels = Annotated[dict[str, float], _FLAT]
+Texts = Annotated[dict[str, str], _FLAT]
 
 
 class Figure(Section):

@@ -228,7 +228,7 @@ class Store:
             write_file(self.path / "sweep.toml", lambda file: file.write(sweep.text.encode()))
             write_file(place, lambda file: file.write(json.dumps(now, indent=1).encode()))
             return
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{place} cannot be read ({error}); give another directory") from error
         if not isinstance(before, dict) or before.get("format") != FORMAT:
             raise InputError(
@@ -241,11 +241,10 @@ class Store:
                 f"{self.path} holds another sweep{_changes(before, now)}; give another --out, or change the "
                 "sweep back to resume it"
             )
-        if before["versions"] != now["versions"]:
-            names = [n for n, v in now["versions"].items() if before["versions"].get(n) != v]
-            old, new = (
-                ", ".join(f"{n} {of[n]}" for n in names) for of in (before["versions"], now["versions"])
-            )
+        if before.get("versions") != now["versions"]:
+            known = before["versions"] if isinstance(before.get("versions"), dict) else {}
+            names = [n for n in {**known, **now["versions"]} if known.get(n) != now["versions"].get(n)]
+            old, new = (", ".join(f"{n} {of.get(n)}" for n in names) for of in (known, now["versions"]))
             raise InputError(
                 f"the rows in {self.path} were computed with {old}, and this is {new}; rows of both would "
                 "mix: install the same again, or give another --out"

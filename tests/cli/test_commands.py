@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from rich.table import Table
 from support.fake_solution import strike_record
 from typer.main import get_command
@@ -21,7 +23,7 @@ from typer.testing import CliRunner
 import impactopt
 from impactopt import FullDynamics, Robot, load_problem, problem_names
 from impactopt.cli.app import app
-from impactopt.cli.options import complete_problem
+from impactopt.cli.options import Quiet, Settings, command_line, complete_problem
 from impactopt.collide.single_collision import collide_once
 from impactopt.files.named_problems import problem_file
 from impactopt.files.output import save_record
@@ -309,13 +311,15 @@ def test_completion_offers_names_and_files(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_completion_offers_the_keys_of_the_problem_that_is_named() -> None:
-    def offered(problem: str, incomplete: str) -> list[str]:
-        line = f"impactopt solve {problem} --set {incomplete}"
+    def offered(problem: str, incomplete: str, command: str = "solve") -> list[str]:
+        line = f"impactopt {command} {problem} --set {incomplete}"
         at = len(line.split()) - bool(incomplete)
         shell = {"_IMPACTOPT_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(at)}
         return runner.invoke(app, [], prog_name="impactopt", env=shell).stdout.split()
 
     assert offered("nailing", "target.res") == ["target.resistance_N="], "only a nail has one"
+    for other in ("drive", "collide"):
+        assert offered("punch", "target.res", other) == [], other
     assert offered("punch", "target.res") == [] and "target.mass_kg=" in offered("punch", "target.")
     assert "scenarios.missing.abort_after_s=" in offered("punch", "scenarios.")
     assert "swing.duration_s=" in offered("", "swing.") and "swing.duration_s=" in offered(
@@ -323,6 +327,18 @@ def test_completion_offers_the_keys_of_the_problem_that_is_named() -> None:
     )
     for key in offered("punch", ""):
         assert key_place(read_toml(problem_file("punch").read_text()), key.removesuffix("=")), key
+
+
+def test_a_record_keeps_the_command_as_it_can_be_given_again() -> None:
+    again = typer.Typer(add_completion=False)
+
+    @again.command()
+    def solve(context: typer.Context, file: str, settings: Settings = None, quiet: Quiet = False) -> None:
+        typer.echo(command_line(context))
+
+    words = ["punch", "--set", "target.mass=8", "--set", "problem.name=a b", "--quiet"]
+    told = shlex.split(runner.invoke(again, words, prog_name="solve").stdout)
+    assert told == ["impactopt", "solve", *words]
 
 
 def test_python_m_impactopt_is_the_command_line() -> None:

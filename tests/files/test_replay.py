@@ -159,6 +159,8 @@ def test_the_links_hull_is_told_beside_the_striking_point(hammered: Solution) ->
     assert abs(report["first_touch_ms"]) < 1.0 and abs(report["point"]["first_touch_ms"]) < 0.3
     assert touch_message(report).startswith(f"contact of the link's hull: {report['impulse_Ns']:.2f} N s")
     assert touch_message({}) == ""
+    missed = {"impulse_Ns": 0.0, "first_touch_ms": None}
+    assert "striking point: 0.00 N s, no touch" in touch_message({**report, "point": missed})
     with pytest.raises(InputError, match="take engine 'mujoco'"):
         replay(planned, engine="pinocchio", contact="link")
 

@@ -193,6 +193,9 @@ def test_a_series_that_ends_early_leaves_a_whole_one_alone(tmp_path: Path) -> No
     assert json.loads((tmp_path / "blows.json").read_text(encoding="utf-8")) == whole
     keep_series(dict(whole), tmp_path)
     assert names(tmp_path) == {"blows.json"}
+    (tmp_path / "failed").write_text("a file of the user's", encoding="utf-8")
+    with pytest.raises(InputError, match="cannot make the directory"):
+        keep_series(dict(early), tmp_path)
 
 
 def test_what_cannot_be_removed_is_told_before_anything_is_lost(tmp_path: Path) -> None:

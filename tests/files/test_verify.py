@@ -167,6 +167,8 @@ def test_the_summary_beside_is_the_one_inside(record: Record, tmp_path: Path) ->
     path = tmp_path / "summary.json"
     path.write_text(path.read_text().replace('"impulse_Ns"', '"impulse_Ns_too"'))
     assert "summary.json" in verified(tmp_path, code=1)["reason"]
+    path.write_text("[" * 100_000, encoding="utf-8")
+    assert "summary.json" in verified(tmp_path, code=1)["reason"], "nested too deeply to be read"
 
 
 def test_multipliers_of_other_rows_do_not_fit(record: Record, tmp_path: Path) -> None:

@@ -194,6 +194,10 @@ def test_joint_positions_are_as_good_as_a_speed(tmp_path: Path) -> None:
     np.savez(path, time_s=t, force_N=force, **{name: np.rad2deg(x) for name, x in joints.items()})
     with pytest.raises(InputError, match="degrees"):
         read_log(path, robot=arm, striker=problem.striker, normal=n)
+    last = arm.joint_names[-1]
+    np.savez(path, time_s=t, force_N=force, **{**joints, f"{last}_rad": angles[:-1, -1]})
+    with pytest.raises(InputError, match=rf"joints\.npz: {last}: "):
+        read_log(path, robot=arm, striker=problem.striker, normal=n)
 
 
 # ---------------------------------------------------------------- bad logs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -240,8 +241,13 @@ def test_a_fixed_base_has_no_zmp() -> None:
     out = sim.summary(
         torque_limit=np.array([1e4]), polygon=np.zeros((0, 2)), planned_impulse=exact["impulse"]
     )
-    assert "zmp_margin_m" not in out
+    assert "zmp_margin_m" not in out and "grip_force_N" not in out
     assert abs(out["impulse_error_pct"]) < 0.2
+    held = dataclasses.replace(sim, grip_force=np.array([[3.0, 1.0], [2.0, 7.0]]))
+    out = held.summary(
+        torque_limit=np.array([1e4]), polygon=np.zeros((0, 2)), planned_impulse=exact["impulse"]
+    )
+    assert out["grip_force_N"] == 7.0, "of a robot that hangs on its hands too"
 
 
 # ---- what cannot be simulated

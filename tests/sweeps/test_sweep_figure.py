@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from support.picture_checks import frowns
 from typer.testing import CliRunner
 
@@ -87,6 +89,30 @@ def test_a_contour_is_where_the_level_is() -> None:
     axes = picture(columns, **given, contour={"zmp_margin_m": 0.0}).axes[0]
     path = axes.collections[-1].get_paths()[0].vertices
     np.testing.assert_allclose(path[:, 0], 1.75)
+
+
+@pytest.mark.parametrize("log", [[], ["colour"]])
+def test_a_column_without_numbers_is_drawn_empty(log: list[str]) -> None:
+    columns = {**grid_columns(), "zmp_margin_m": [None] * 6}
+    empty = {"x": SPEED, "y": MASS, "colour": "zmp_margin_m", "log": log}
+    drawn = sweep_picture(
+        Figure.model_validate({"kind": "heatmap", "contour": {"zmp_margin_m": 0.0}, **empty}), columns
+    )
+    assert not drawn.axes[0].collections[1:], "no contour of nothing"
+    drawn.write(io.BytesIO())
+    sweep_picture(Figure.model_validate({"kind": "scatter", **empty}), columns).write(io.BytesIO())
+
+
+def test_a_logarithmic_colour_leaves_out_what_has_no_logarithm() -> None:
+    columns = {**grid_columns(), "energy_J": [0.0, -1.0, 1.0, 10.0, 5.0, 2.0]}
+    drawn = picture(columns, kind="scatter", x=SPEED, y=MASS, colour="energy_J", log=["colour"])
+    assert drawn.axes[0].collections[0].norm.vmin == 1.0 and drawn.axes[0].collections[0].norm.vmax == 10.0
+
+
+@pytest.mark.parametrize("table", ["against", "contour", "labels"])
+def test_what_is_no_table_is_a_mistake(table: str) -> None:
+    with pytest.raises(ValidationError, match=rf"{table}\n.*dictionary"):
+        Figure.model_validate({"kind": "lines", "x": SPEED, "y": MASS, table: 3})
 
 
 def test_a_heatmap_needs_a_grid() -> None:

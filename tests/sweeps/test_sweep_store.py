@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import sqlite3
@@ -208,9 +209,15 @@ def test_results_of_an_older_journal_are_left_as_they_are(tmp_path: Path) -> Non
 def test_a_lost_or_damaged_name_plate_is_said(tmp_path: Path) -> None:
     Store(sweep(), tmp_path).close()
     plate = tmp_path / "sweep.json"
-    plate.write_text("{", encoding="utf-8")
-    with pytest.raises(InputError, match=r"sweep\.json cannot be read"):
-        Store(sweep(), tmp_path)
+    whole = json.loads(plate.read_text(encoding="utf-8"))
+    for damaged in ("{", "[" * 100_000):
+        plate.write_text(damaged, encoding="utf-8")
+        with pytest.raises(InputError, match=r"sweep\.json cannot be read"):
+            Store(sweep(), tmp_path)
+    for versions in (None, {}, {**whole["versions"], "lost": "1.0"}):
+        plate.write_text(json.dumps({**whole, "versions": versions}), encoding="utf-8")
+        with pytest.raises(InputError, match="were computed with"):
+            Store(sweep(), tmp_path)
     plate.unlink()
     with pytest.raises(InputError, match="which identifies it, is missing"):
         Store(sweep(), tmp_path)

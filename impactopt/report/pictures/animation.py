@@ -24,6 +24,7 @@ from impactopt.kinematics.support import corners_at
 from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
 from impactopt.robots.loads import MIN_LOAD_FRACTION, weight_of
 from impactopt.simulation import scene_of
+from impactopt.simulation.reference.poses import bones
 from impactopt.simulation.result import centre_of_pressure
 
 FPS, SLOW = 20, 10  # frames a second; factor by which time is slower around contact
@@ -65,11 +66,9 @@ class _Drawing:
         self.scene = done.perturbation.scene(self.scene)
         model = self.robot.model
         self.data = model.createData()
-        weight = 9.81 * float(sum(i.mass for i in model.inertias))
-        self.per_newton = ARROW / weight
+        self.per_newton = ARROW / max(weight_of(self.robot), 1.0)
         self.per_push = ARROW / max(float(self.sim.force.max()), 1e-9)
-        first = 2 if self.robot.nv > self.robot.n else 1
-        self.links = [(int(model.parents[j]), j) for j in range(first, model.njoints)]
+        self.links = bones(self.robot)
         self.striker = model.getFrameId(self.scene.striker)
         ends = [model.frames[model.getFrameId(name)].parentJoint for name in self.scene.strikers]
         chain = {joint for end in ends for joint in model.supports[end]}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
+from scipy.integrate import cumulative_trapezoid
 
 from impactopt.collision import Collision
 from impactopt.errors import InputError
@@ -84,9 +85,7 @@ def _difference(hit: Collision, true: Collision) -> tuple[Array, Array]:
 
 def _delivered(hit: Collision, time: Array) -> Array:
     """Impulse [N s] until each time, for a piecewise linear force."""
-    force = np.interp(time, hit.time, hit.force, right=0.0)
-    steps = np.diff(time) * (force[1:] + force[:-1]) / 2
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return cumulative_trapezoid(np.interp(time, hit.time, hit.force, right=0.0), time, initial=0.0)
 
 
 def _error(hit: Collision, true: Collision) -> str:

@@ -12,18 +12,15 @@ from impactopt.files.record import Record
 from impactopt.kinematics.support import zmp
 from impactopt.report.pictures.style import (
     BLACK,
-    BLUE,
     GREEN,
     ORANGE,
     PHASES,
-    VERMILION,
     Array,
     picture,
 )
 from impactopt.report.pictures.zmp import draw_soles
 from impactopt.robots.loads import MIN_LOAD_FRACTION
 
-SOLE_COLOURS = (BLUE, VERMILION)
 PHASE_COLOURS = (ORANGE, BLACK, GREEN)
 
 
@@ -40,7 +37,8 @@ def replay(figure: FigureBase, record: Record) -> None:
     _centres(figure, places["cop"], record)
     time, start = a["replayed_time"], float(a["replayed_contact_start"])
     names = [str(name).replace("_", " ") for name in a["replayed_soles"]]
-    for k, (name, colour) in enumerate(zip(names, SOLE_COLOURS, strict=False)):
+    for k, name in enumerate(names):
+        colour = f"C{k}"
         places["force"].plot(
             time, a["replayed_sole_ground"][:, k, 2], color=colour, label=name, linewidth=1.1
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -93,17 +94,13 @@ def _around(track: Track, k: int, world: list[Part], normal: Array) -> list[Show
     for part in world:
         corners = part.placed(float(track.travel[k]), normal)[part.solid.triangles]
         if abs(track.travel[k]) < MAX_TRAVEL or not part.moves:
-            shown.append((corners, _normals(corners), np.tile(_rgb(PARTS[part.kind]), (len(corners), 1))))
+            shown.append((corners, _normals(corners), np.tile(to_rgb(PARTS[part.kind]), (len(corners), 1))))
     return shown
 
 
 def _joined(shown: list[Shown]) -> Shown:
     triangles, normals, colours = (np.concatenate(parts) for parts in zip(*shown, strict=True))
     return triangles, normals, colours
-
-
-def _rgb(colour: str) -> Array:
-    return np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
 
 
 def _chosen(track: Track) -> list[int]:
@@ -123,7 +120,7 @@ def _solids(problem: ImpactProblem) -> list[Drawn]:
     for body in bodies_drawn(robot):
         solid = simplified(body.solid, CELL) if len(body.solid.triangles) > 500 else body.solid
         corners = _corners(solid)
-        own = _rgb(BLUE) if body.joint in striking - standing else np.asarray(body.colour[:3], dtype=float)
+        own = to_rgb(BLUE) if body.joint in striking - standing else body.colour[:3]
         out.append((body.joint, corners, _normals(corners), np.tile(own, (len(corners), 1))))
     return out
 

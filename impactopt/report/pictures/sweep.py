@@ -113,10 +113,9 @@ def _heatmap(section: Section, data: SweepColumns) -> Picture:
         table[j, i] = data.results(name)
         table[~np.isfinite(table)] = np.nan
         axes.set_facecolor(NO_RESULT)
-        logarithmic = "colour" in section.log
         mesh = axes.pcolormesh(
             across, up, np.ma.masked_invalid(table), shading="nearest", cmap=SCALE, rasterized=True,
-            norm=LogNorm() if logarithmic else None,
+            norm=LogNorm() if "colour" in section.log and (table > 0).any() else None,
         )  # fmt: skip
         axes.grid(visible=False)
         bar = figure.colorbar(mesh, ax=axes, format=_PLAIN)
@@ -144,8 +143,8 @@ def _contour(
 ) -> None:
     table = np.full((len(y), len(x)), np.nan)
     table[at[1], at[0]] = values
-    finite = np.isfinite(table)
-    if min(table.shape) < 2 or not (table[finite].min() < level < table[finite].max()):
+    known = table[np.isfinite(table)]
+    if min(table.shape) < 2 or not known.min(initial=np.inf) < level < known.max(initial=-np.inf):
         return
     masked = np.ma.masked_invalid(table)
     for colour, width, style in (("white", 3.2, "-"), (BLACK, 1.4, dashes)):
@@ -217,9 +216,10 @@ def _scatter(section: Section, data: SweepColumns) -> Picture:
     numeric = colour is not None and data.values(colour).dtype != object
     norm: Any = None
     if numeric and colour is not None:
+        scale, least = (LogNorm, 0.0) if "colour" in section.log else (Normalize, -np.inf)
         levels = data.numbers(colour)[drawn]
-        ends = (np.nanmin(levels), np.nanmax(levels)) if len(levels) else (0.0, 1.0)
-        norm = (LogNorm if "colour" in section.log else Normalize)(*ends)
+        levels = levels[levels > least]
+        norm = scale(levels.min(), levels.max()) if len(levels) else scale(0.1, 1.0)
     groups, names = combined(section.colour[:1] if not numeric else [], data)
     marks: Any = None
     for k, (axes, title) in enumerate(zip(grid, titles, strict=True)):

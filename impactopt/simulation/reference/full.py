@@ -46,7 +46,6 @@ class FullDynamics(ReferenceModel):
     """
 
     form: str = "lagrange"
-    tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
         super().__post_init__()

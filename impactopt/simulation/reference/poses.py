@@ -58,7 +58,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
     names, visible = problem.strikers, [b for b in problem.world if not (b.core or b.ground)]
     links = [_links(robot, names, reference.q[k]) for k in chosen]
     strikes = {j for name in names for j in robot.model.supports[_striker(robot, name).parentJoint]}
-    of_limb = [j in strikes for _, j in _bones(robot)]
+    of_limb = [j in strikes for _, j in bones(robot)]
     return Poses(
         time=reference.time[chosen],
         links=np.array(links),
@@ -82,7 +82,7 @@ def inverse_mass(problem: ImpactProblem, q: Array) -> Array:
     ).inverse_mass()
 
 
-def _bones(robot: Robot) -> list[tuple[int, int]]:
+def bones(robot: Robot) -> list[tuple[int, int]]:
     """Pairs of joints with a link between them; a free-flyer is no link."""
     first = 2 if robot.floating else 1
     return [(int(robot.model.parents[j]), j) for j in range(first, robot.model.njoints)]
@@ -98,7 +98,7 @@ def _links(robot: Robot, strikers: Sequence[str], q: Array) -> list[Array]:
     pin.framesForwardKinematics(model, data, q)
     hands = [_striker(robot, name) for name in strikers]
     ends = [(data.oMi[hand.parentJoint].translation, _point(data, model, hand)) for hand in hands]
-    ends += [(data.oMi[a].translation, data.oMi[b].translation) for a, b in _bones(robot)]
+    ends += [(data.oMi[a].translation, data.oMi[b].translation) for a, b in bones(robot)]
     for sole in robot.soles:
         frame = model.getFrameId(sole.frame)
         place, ankle = data.oMf[frame], data.oMi[model.frames[frame].parentJoint].translation

@@ -278,6 +278,18 @@ def test_a_solution_draws_itself() -> None:
         solution.plot("replay")
 
 
+def test_a_replay_draws_every_sole() -> None:
+    solution = still_solution()
+    record = record_of(solution, replay=solution.validate(engine="mujoco"))
+    arrays = {name: record.arrays[f"replayed_{name}"] for name in ("soles", "sole_ground", "slip", "lift")}
+    both = {f"replayed_{name}": np.concatenate([x, x], axis=min(x.ndim - 1, 1)) for name, x in arrays.items()}
+    drawn = PICTURES["replay"](dataclasses.replace(record, arrays={**record.arrays, **both}))
+    assert drawn is not None
+    _, force, move = drawn.axes
+    assert len(force.lines) == len(both["replayed_soles"]) == 4 and len(move.lines) == 8
+    assert len({line.get_color() for line in force.lines}) == 4
+
+
 def test_poses_of_an_instant_impact_have_no_end_of_contact(biped_plan: Planned) -> None:
     import dataclasses
 

@@ -30,7 +30,7 @@ from impactopt.planning.lazy_constraints import (
     with_lazy_constraints,
 )
 from impactopt.planning.models import carried_start, overloaded, with_order, with_order_of
-from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
+from impactopt.planning.motion_price import MotionPrice, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
     best_of,
@@ -330,7 +330,7 @@ def _diagnosed(
     # Prices exclude no motion, but with them the solver may stall on the way to one.
     if outcome.origin.program.problem.style_prices != MotionPrices():
         budget.say("no motion was found: solving again without prices on motion")
-        free = unpriced(outcome.origin.program)
+        free = outcome.origin.program.repriced(0.0)
         both = outcome.then(
             solver.from_guess(Guess(program=free, start=outcome.origin.x)), "no prices on motion"
         )

@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
+from impactopt.planning.bounds import Cause
 from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
-from impactopt.planning.causes import Cause, search
+from impactopt.planning.causes import search
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solve_with_clearance
 from impactopt.planning.diagnosis import ended_with_violations, ipopt_retry, with_reason, with_soles_kept
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains

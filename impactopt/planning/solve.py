@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
 from impactopt.planning.bounds import Cause
-from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
+from impactopt.planning.budget import VIOLATED, Budget, with_effort_of
 from impactopt.planning.causes import search
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solve_with_clearance
 from impactopt.planning.diagnosis import ended_with_violations, ipopt_retry, with_reason, with_soles_kept
@@ -135,9 +135,7 @@ def solve(
     if problem.floats and isinstance(start, str) and start == "strike":
         raise InputError(f"robot {problem.robot.name!r} floats freely, and has no strike: start from 'reach'")
     one = partial(_planned, seed, refine)
-    with stopping() as stop:
-        budget = replace(budget, stop=stop)
-        return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
+    return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
 
 
 def _planned(

@@ -38,8 +38,6 @@ from impactopt.solvers.relaxed import RelaxedProgram
 from impactopt.transcription.initial_guess import first_iterate, warm_start
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["Cause", "Search", "search"]
-
 Array = NDArray[np.float64]
 # In the search durations may be so many times longer or shorter, or typical.
 _DURATION_FACTOR = 4.0

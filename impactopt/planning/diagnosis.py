@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.planning.bounds import Cause
 from impactopt.planning.budget import VIOLATED, Budget
-from impactopt.planning.causes import Cause
 from impactopt.planning.solution import Solution
 from impactopt.problem.checks import met_once
 from impactopt.problem.feasibility import too_weak

@@ -123,9 +123,7 @@ def window_caution(t: Transcription, result: SolverResult) -> str:
     The gain of a window twice as long is, to first order, the multiplier of the bound times the bound.
     """
     longest = t.problem.contact_duration[1]
-    objective = abs(
-        float(sum(o.weight * t.achieved(result.x).get(o.name, 0.0) for o in t.problem.objectives))
-    )
+    objective = abs(t.objective_sum(result.x))
     price, named = 0.0, list[str]()
     for hit in t.hit.collisions:
         if not isinstance(hit, Collision):

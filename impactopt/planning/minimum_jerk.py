@@ -165,14 +165,14 @@ def _profile(
     return out[0], out[1], out[2]
 
 
-def _keeps_limits(problem: ImpactProblem, swing_duration: float, speed: float, nodes: int = 25) -> bool:
-    """True if the reach without contact keeps the limits at ``nodes`` instants of each of its two motions."""
+def _keeps_limits(problem: ImpactProblem, swing_duration: float, speed: float) -> bool:
+    """True if the reach without contact keeps the limits at 25 instants of each of its two motions."""
     c, r = problem.coordinates, problem.robot
     lower, upper = inside(r, problem.term(PositionLimit).margin)
     legs0 = c.start_legs
     for duration, ends in _phases(problem, swing_duration, speed):
         # Without the first instant: the start posture at rest.
-        y, yd, ydd = _profile(duration, ends, np.linspace(0, duration, nodes)[1:])
+        y, yd, ydd = _profile(duration, ends, np.linspace(0, duration, 25)[1:])
         wrench = np.tile(static_wrenches(c, ends[0], legs0), (len(y), 1))
         try:
             q, v, a, *_ = complete_reference(problem, y, yd, ydd, wrench, legs0)

@@ -7,7 +7,6 @@ state at contact, which take microseconds. The often frozen SDC stands for full 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -165,14 +164,14 @@ def climbed(
 
     run : solves a problem from a solution with another model; None: from the user's initial guess.
     """
-    began, limit = time.perf_counter(), budget.time_limit
+    limit = budget.time_limit
     models = _MODELS[1:] if _skips_first(problem, budget.say) else _MODELS
     done: AnySolution | None = None
     for model in models:
-        # One time limit for both models; 0 would be refused.
-        left = None if limit is None else max(limit - (time.perf_counter() - began), 1e-3)
-        new = run(replace(problem, collision=model), done, replace(budget, time_limit=left))
+        new = run(replace(problem, collision=model), done, replace(budget, time_limit=limit))
         done = new if done is None else _both(done, new)
+        # One time limit for both models, of which compiling takes nothing; 0 would be refused.
+        limit = None if limit is None else max(limit - new.solve_seconds, 1e-3)
         error = done.model_error
         if (
             not done.status.usable

@@ -37,11 +37,6 @@ def with_first_scale(t: Transcription) -> Transcription:
     return t.repriced(scale)
 
 
-def unpriced(t: Transcription) -> Transcription:
-    """Program without prices of the motion style."""
-    return t.repriced(0.0)
-
-
 class MotionPrice:
     """Oracle that reduces the prices of the motion style if their share of the objective is larger than
     `ImpactProblem.motion_price`.

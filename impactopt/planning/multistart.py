@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.planning.budget import Budget, rank_of
+from impactopt.planning.budget import Budget, rank_of, stopping
 from impactopt.planning.gain_selection import with_room_for_gains
 from impactopt.planning.models import climbed
 from impactopt.planning.refinement import Guess, Outcome, Program, Solve
@@ -101,12 +101,14 @@ def best_of_starts(
             given, count = (start, starts) if other is None else (other, 1)
             return best_of_starts(one, chosen, given, left, starts=count, workers=workers)
 
-        return climbed(problem, run, budget)
+        with stopping() as stop:
+            return climbed(problem, run, replace(budget, stop=stop))
     if workers > 1 and starts > 1:
         # compiled here, not by each worker
         block_functions(with_room_for_gains(problem), problem.coordinates, budget.report)
         return _best_on_workers(partial(one, problem, start), budget, starts=starts, workers=workers)
-    return one(problem, start, budget, range(starts), starts + EXTRA_STARTS)
+    with stopping() as stop:
+        return one(problem, start, replace(budget, stop=stop), range(starts), starts + EXTRA_STARTS)
 
 
 def best_of(

@@ -12,6 +12,7 @@ from impactopt.errors import InputError, check_array
 from impactopt.planning.solution import Solution
 from impactopt.planning.solve import solve
 from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import Status
 
 MIN_ADVANCE = 1e-4  # [m] a blow that drives the nail less is the last
 
@@ -100,7 +101,8 @@ def drive_nail(
             target=dataclasses.replace(nail, depth=at),
         )
         solution = solve(here, start=x, report=report, **options)
-        if not isinstance(x, str) and not solution.status.usable:
+        stopped = solution.status is Status.INTERRUPTED
+        if not (isinstance(x, str) or solution.status.usable or stopped):
             solution = solve(here, start="reach", report=report, **options)
         if not solution.status.usable:
             why = f"blow {len(blows) + 1} has no plan: {solution.result.message}"

@@ -153,7 +153,8 @@ def parametric_program(solution: Solution) -> ParametricProgram:
             f"this plan is not a solution ({solution.status.value}) and has no sensitivities: solve it first"
         )
     if solution not in _known:
-        _known[solution] = ParametricProgram(solution)
+        # of a copy: an entry that refers to its own key is never freed
+        _known[solution] = ParametricProgram(replace(solution))
     return _known[solution]
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
-from impactopt.planning.causes import Cause
+from impactopt.planning.bounds import Cause
 from impactopt.planning.contact_replay import SOLVED_WITHIN, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gain_selection import ChosenGains
 from impactopt.planning.lazy_constraints import gear_caution, lazy_terms_of, slide, slide_caution

@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.between_nodes import BetweenNodes
-from impactopt.planning.budget import VIOLATED, Budget, stopping, with_effort_of
-from impactopt.planning.causes import Cause, search
+from impactopt.planning.bounds import Cause
+from impactopt.planning.budget import VIOLATED, Budget, with_effort_of
+from impactopt.planning.causes import search
 from impactopt.planning.clearance_constraints import Margins, same_bodies, solve_with_clearance
 from impactopt.planning.diagnosis import ended_with_violations, ipopt_retry, with_reason, with_soles_kept
 from impactopt.planning.gain_selection import chosen_gains, with_gains_fixed, with_room_for_gains
@@ -30,7 +31,7 @@ from impactopt.planning.lazy_constraints import (
     with_lazy_constraints,
 )
 from impactopt.planning.models import carried_start, overloaded, with_order, with_order_of
-from impactopt.planning.motion_price import MotionPrice, unpriced, with_first_scale
+from impactopt.planning.motion_price import MotionPrice, with_first_scale
 from impactopt.planning.multistart import (
     Guesses,
     best_of,
@@ -134,9 +135,7 @@ def solve(
     if problem.floats and isinstance(start, str) and start == "strike":
         raise InputError(f"robot {problem.robot.name!r} floats freely, and has no strike: start from 'reach'")
     one = partial(_planned, seed, refine)
-    with stopping() as stop:
-        budget = replace(budget, stop=stop)
-        return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
+    return best_of_starts(one, problem, start, budget, starts=starts, workers=workers)
 
 
 def _planned(
@@ -330,7 +329,7 @@ def _diagnosed(
     # Prices exclude no motion, but with them the solver may stall on the way to one.
     if outcome.origin.program.problem.style_prices != MotionPrices():
         budget.say("no motion was found: solving again without prices on motion")
-        free = unpriced(outcome.origin.program)
+        free = outcome.origin.program.repriced(0.0)
         both = outcome.then(
             solver.from_guess(Guess(program=free, start=outcome.origin.x)), "no prices on motion"
         )

@@ -30,7 +30,7 @@ from impactopt.planning.solution import Solved, impact_summary, versions
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, Status
 from impactopt.transcription.initial_guess import strike_iterate
-from impactopt.transcription.mesh import contact_elements
+from impactopt.transcription.mesh import Elements, Shares, contact_elements
 from impactopt.transcription.plan import PlannedStrike
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
@@ -139,13 +139,13 @@ def _optimized(
         problem = with_order_of(start, problem)
     else:
         problem = with_order(problem, budget.say)
-    mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()
-    functions = block_functions(problem, problem.coordinates, budget.report, *mesh[:1])
+    mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ((), ())
+    t = _program_on(problem, *mesh, budget.report)
     budget = budget.started()
-    t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
         # Only its variables: clearance constraints enter by themselves.
-        start = carried_start(t, partial(_program_of, start), start, start.clearance_constraints).x
+        old = partial(_program_on, start.problem, *mesh)
+        start = carried_start(t, old, start, start.clearance_constraints).x
     budget.say(f"program of {t.program.n} variables and {t.program.m} constraints; {budget.solver} starts")
     solve = partial(_clean_strike, budget, Margins(problem) if problem.keeps_apart else None)
 
@@ -182,11 +182,12 @@ def _optimized(
     )
 
 
-def _program_of(solution: StrikeSolution) -> StrikeTranscription:
-    """Program of a strike's solution, without clearance constraints."""
-    p, elements = solution.problem, solution.elements
-    functions = block_functions(p, p.coordinates, None, elements)
-    return StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
+def _program_on(
+    problem: ImpactProblem, elements: Elements, shares: Shares, report: Callable[[str], None] | None = None
+) -> StrikeTranscription:
+    """Program of a strike on a given mesh of the contact, without clearance constraints."""
+    functions = block_functions(problem, problem.coordinates, report, elements)
+    return StrikeTranscription(problem, problem.coordinates, functions, elements, shares)
 
 
 def clear_strike(

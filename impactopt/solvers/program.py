@@ -283,9 +283,10 @@ def complementarity(
     return float(np.max(np.abs(y[y != 0]) * gap[y != 0], initial=0.0))
 
 
-def is_stationary_violation(
-    program: NonlinearProgram, x: Vector, g: Vector, jacobian: Matrix, tolerance: float = 1e-3
-) -> bool:
+_STATIONARY = 1e-3  # slope of a stationary violation, over what it would be without opposed constraints
+
+
+def is_stationary_violation(program: NonlinearProgram, x: Vector, g: Vector, jacobian: Matrix) -> bool:
     """True if no small step reduces the violation 1/2 |v|^2 of the constraints: a locally infeasible point.
 
     The criterion: the gradient J' v, projected on the variables' bounds, is small relative to |J||v|.
@@ -303,7 +304,7 @@ def is_stationary_violation(
     slope = np.where(at_bound, 0.0, slope)
     # With the rows J_i, |J' v| <= sum |J_i| |v_i|: what the slope would be if no two constraints opposed each
     # other. Without a violation the point counts as stationary (0 <= 1e-300).
-    return bool(np.linalg.norm(slope) <= tolerance * max(float(row_norms(jacobian) @ np.abs(v)), 1e-300))
+    return bool(np.linalg.norm(slope) <= _STATIONARY * max(float(row_norms(jacobian) @ np.abs(v)), 1e-300))
 
 
 def row_norms(matrix: Any) -> Vector:

@@ -166,185 +166,12 @@ def jump_at_contact(
     return float(forces.sum()), independent, dw, np.asarray((a + da)[c.base :])
 
 
-class Collocated:
-    """Collocation of a collision's motion; `Collision` adds the variables.
+class Collision(ContactParameters):
+    """Variables and constraints of the collision with one target.
 
     Time in a phase of duration T is s T, with s in [0, 1]. The integral of a rate u over the phase so far is
     T d, with d = integral of u ds. The contact begins at y0, so the position in a phase is
     y = y0 + T1 d1 + T d, where T1 is the time of all phases before and d1 the mean rate in that time.
-
-    Attributes
-    ----------
-    stages : collocation points of all phases.
-    end : index of the last stage of each phase.
-    T : durations of the phases [s].
-    u, d : rates ydot of the robot, and their integrals.
-    xt : integral of the target's speed, as d is of u.
-    joined, joined_x : d1 of the first two phases, of the first three, and so on to all but the last; of the
-        robot and of the target.
-    suffix : appended to the names of places.
-    legs, w : joint angles of the constrained legs and sole wrenches, at the stages.
-    contact : state at contact, from which the collision begins.
-    torques : torques over limit at the stages, as variables if a term is about drives; else empty.
-    """
-
-    _b: Builder
-    stages: Sequence[CollocationPoint]
-    end: list[int]
-    T: list[Group]
-    u: Group
-    d: Group
-    xt: Group
-    joined: Group
-    joined_x: Group
-    suffix: str
-    legs: Group
-    w: Group
-    contact: Contact
-    torques: list[Affine]
-
-    def _before(self, phase: int) -> tuple[Affine, Affine, Affine]:
-        """T1 [s], d1 of the robot and d1 of the target."""
-        time = Affine.zeros(1)
-        for T in self.T[:phase]:
-            time = time + T[0]
-        return (
-            time,
-            self._mean_before(self.d, self.joined, phase),
-            self._mean_before(self.xt, self.joined_x, phase),
-        )
-
-    def _mean_before(self, integral: Group, joined: Group, phase: int) -> Affine:
-        """Mean rate in the phases before one; zero before the first."""
-        if phase == 0:
-            return Affine.zeros(integral.size)
-        return integral[self.end[0]] if phase == 1 else joined[phase - 2]
-
-    def _time(self, phase: int, place: float) -> Affine:
-        """Time [s] since contact."""
-        return self._before(phase)[0] + self.T[phase][0] * place
-
-    def _integrals(self) -> list[tuple[Group, Group]]:
-        """Integrals over the phase so far, each with its mean rates over several phases (`joined`)."""
-        return [(self.d, self.joined), (self.xt, self.joined_x)]
-
-    def _join(self) -> list[list[Affine]]:
-        """Slots of the block ``join``, which determines `joined` phase by phase, component by component."""
-        out = []
-        for phase in range(1, len(self.end) - 1):
-            times = self._before(phase)[0], self.T[phase][0]
-            for integral, joined in self._integrals():
-                parts = (
-                    self._mean_before(integral, joined, phase),
-                    integral[self.end[phase]],
-                    joined[phase - 1],
-                )
-                out += [[*times, *(part[k : k + 1] for part in parts)] for k in range(integral.size)]
-        return out
-
-    def _slots(
-        self, group: Group, i: int, start: Affine, *, each_phase: bool = False
-    ) -> tuple[Affine, Affine]:
-        """Value and slope d/ds of a collocated group at stage i.
-
-        start : value at contact.  each_phase : the group has this value at the beginning of each phase.
-        """
-        s = self.stages[i]
-        # Slope of the polynomial through the element's beginning and its stages, by the inverse of Radau's A:
-        # `weights` of the stages' values, weight `start` of the beginning's.
-        slope = Affine.zeros(group.size)
-        for m, w in zip(s.members, s.weights, strict=True):
-            slope = slope + group[m] * w
-        begins = s.previous < 0 or (each_phase and s.new_phase)
-        before = start if begins else group[s.previous]
-        return group[i], slope + before * s.start
-
-    def _place(self, s: CollocationPoint) -> Place:
-        time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
-        # a scenario's name may have braces, and the text is a format for the time
-        suffix = self.suffix.replace("{", "{{").replace("}", "}}")
-        return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
-
-    def _travel(self, i: int) -> list[Affine]:
-        """Slots d1, T1, d, T of y = y0 + T1 d1 + T d at a stage."""
-        s = self.stages[i]
-        T1, d1, _ = self._before(s.phase)
-        return [d1, T1, self.d[i], self.T[s.phase][0]]
-
-    def _bound_torques(self, place: Place, outputs: Index, most: float) -> None:
-        """Bound servo torques over limit (n) at a stage; add them as variables if a term is about drives."""
-        b, term = self._b, f"{self._b.limits.torque.name} in collision"
-        common: dict[str, Any] = {"term": term, "place": place, "lower": -most, "upper": most}
-        common["measure"] = percent("over its limit", of=most)
-        if b.problem.of_drives:
-            # terms use these torques again, and an output of a block may be in one constraint only
-            name = f"torque in collision, {place.name}"
-            self.torques.append(b.lift(name, outputs, labels=b.robot.joint_names, **common)[0])
-        else:
-            b.constraints.add(components=b.robot.joint_names, outputs=outputs, **common)
-
-    def drives(self) -> list[DrivePoint]:
-        """Torques and joint motions at each stage, if a term is about drives.
-
-        Call it after `Collision.add_constraints`.
-        """
-        pairs = zip(self.stages, self.torques, strict=True)
-        return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
-
-    def wrenches(self) -> list[tuple[Place, Affine]]:
-        """Wrenches on soles and supporting hands at each stage."""
-        return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
-
-    def _motion(self, i: int) -> list[Affine]:
-        """Slots of `impactopt.problem.block.joint_motion` at a stage."""
-        # value and slope of u, which is ydot already: so the S of ydot = r/S is one
-        rates = self._slots(self.u, i, self.contact.u0[0])
-        return [self.contact.state.y, *self._travel(i), *rates, Affine.constant(1.0), self.legs[i]]
-
-    def contact_end(self) -> ContactEnd:
-        state, u0, last = self.contact.state, self.contact.u0[0], self.end[-1]
-        before = joint_motion_slots(state.y, u0, u0 * 0.0, Affine.constant(1.0), state.legs)
-        place = Place.plain(f"after contact{self.suffix}")
-        return ContactEnd(place, before, self._motion(last), self.u[last] - u0)
-
-    def _joints(self, x: Array, law: ContactLaw) -> dict[str, Array]:
-        """Joint velocities and accelerations (1 + stages, n), the first just after contact, for solver
-        variables.
-        """
-        b, c, state = self._b, self._b.coordinates, self.contact.state
-        y, rates, legs = (e.evaluate(x) for e in (state.y, self.contact.u0[0], state.legs))
-        velocity = [c.complete_motion(y, rates, 0 * rates, legs)[1][c.base :]]
-        acceleration = [jump_at_contact(b.problem, c, law, y, rates, legs)[3]]
-        for i in range(len(self.stages)):
-            # slots of `_motion`; the S among them is one
-            y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
-            _, v, a = c.complete_motion(y0 + T1 * d1 + T * d, u, slope / T, legs_there)
-            velocity.append(v[c.base :])
-            acceleration.append(a[c.base :])
-        return {"velocity": np.array(velocity), "acceleration": np.array(acceleration)}
-
-    def _add_integral(self, i: int, place: Place, integrals: Group, rate: Group) -> None:
-        """Add the constraints of integrals over the phase so far: Radau quadrature of the rates' values."""
-        s, labels = self.stages[i], integrals.labels
-        integral = integrals[i]
-        for m, w in zip(s.members, s.quadrature, strict=True):
-            # d_i = d_start + h sum_j a_ij u_j, with the A whose inverse gives the slopes of u
-            integral = integral - rate[m] * w
-        if not s.new_phase:
-            integral = integral - integrals[s.previous]
-        self._b.constraints.add(
-            term="collision kinematics",
-            place=place,
-            components=labels,
-            affine=integral,
-            lower=0,
-            upper=0,
-            measure=rates(labels),
-        )
-
-
-class Collision(ContactParameters, Collocated):
-    """Variables and constraints of the collision with one target.
 
     contact : state at contact, which all collisions of a program share.
     stages : collocation points of the contact phases.
@@ -357,6 +184,15 @@ class Collision(ContactParameters, Collocated):
 
     Attributes
     ----------
+    end : index of the last stage of each phase.
+    T : durations of the phases [s].
+    u, d : rates ydot of the robot, and their integrals.
+    xt : integral of the target's speed, as d is of u.
+    joined, joined_x : d1 of the first two phases, of the first three, and so on to all but the last; of the
+        robot and of the target.
+    suffix : appended to the names of places.
+    legs, w : joint angles of the constrained legs and sole wrenches, at the stages.
+    torques : torques over limit at the stages, as variables if a term is about drives; else empty.
     forceless (stages,) : mask of the stages at which the contact force is zero.
     holds : the force may pull while a nail is driven.
     coast_legs, coast_rates : joint angles and rates of the legs of the coasting reference.
@@ -379,7 +215,8 @@ class Collision(ContactParameters, Collocated):
         after: dict[str, Any] | None,
     ) -> None:
         self._b, self.contact, self.stages = b, contact, stages
-        self.number, self.scenario, self.torques = number, scenario, []
+        self.number, self.scenario = number, scenario
+        self.torques: list[Affine] = []
         self._prefixes = ["", "second "][: len(b.problem.strikers)]  # of the block's outputs, by striker
         p, c, limits = b.problem, b.coordinates, b.limits
         self.phases = p.contact_phases
@@ -566,6 +403,146 @@ class Collision(ContactParameters, Collocated):
         if self.scenario is not None:
             out.append(determined(Turn.AFTER, self.after.index(0)))
         return out
+
+    # ------------------------------------------------------------------ collocation
+    def _before(self, phase: int) -> tuple[Affine, Affine, Affine]:
+        """T1 [s], d1 of the robot and d1 of the target."""
+        time = Affine.zeros(1)
+        for T in self.T[:phase]:
+            time = time + T[0]
+        return (
+            time,
+            self._mean_before(self.d, self.joined, phase),
+            self._mean_before(self.xt, self.joined_x, phase),
+        )
+
+    def _mean_before(self, integral: Group, joined: Group, phase: int) -> Affine:
+        """Mean rate in the phases before one; zero before the first."""
+        if phase == 0:
+            return Affine.zeros(integral.size)
+        return integral[self.end[0]] if phase == 1 else joined[phase - 2]
+
+    def _time(self, phase: int, place: float) -> Affine:
+        """Time [s] since contact."""
+        return self._before(phase)[0] + self.T[phase][0] * place
+
+    def _integrals(self) -> list[tuple[Group, Group]]:
+        """Integrals over the phase so far, each with its mean rates over several phases (`joined`)."""
+        return [(self.d, self.joined), (self.xt, self.joined_x)]
+
+    def _join(self) -> list[list[Affine]]:
+        """Slots of the block ``join``, which determines `joined` phase by phase, component by component."""
+        out = []
+        for phase in range(1, len(self.end) - 1):
+            times = self._before(phase)[0], self.T[phase][0]
+            for integral, joined in self._integrals():
+                parts = (
+                    self._mean_before(integral, joined, phase),
+                    integral[self.end[phase]],
+                    joined[phase - 1],
+                )
+                out += [[*times, *(part[k : k + 1] for part in parts)] for k in range(integral.size)]
+        return out
+
+    def _slots(
+        self, group: Group, i: int, start: Affine, *, each_phase: bool = False
+    ) -> tuple[Affine, Affine]:
+        """Value and slope d/ds of a collocated group at stage i.
+
+        start : value at contact.  each_phase : the group has this value at the beginning of each phase.
+        """
+        s = self.stages[i]
+        # Slope of the polynomial through the element's beginning and its stages, by the inverse of Radau's A:
+        # `weights` of the stages' values, weight `start` of the beginning's.
+        slope = Affine.zeros(group.size)
+        for m, w in zip(s.members, s.weights, strict=True):
+            slope = slope + group[m] * w
+        begins = s.previous < 0 or (each_phase and s.new_phase)
+        before = start if begins else group[s.previous]
+        return group[i], slope + before * s.start
+
+    def _place(self, s: CollocationPoint) -> Place:
+        time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
+        # a scenario's name may have braces, and the text is a format for the time
+        suffix = self.suffix.replace("{", "{{").replace("}", "}}")
+        return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
+
+    def _travel(self, i: int) -> list[Affine]:
+        """Slots d1, T1, d, T of y = y0 + T1 d1 + T d at a stage."""
+        s = self.stages[i]
+        T1, d1, _ = self._before(s.phase)
+        return [d1, T1, self.d[i], self.T[s.phase][0]]
+
+    def _bound_torques(self, place: Place, outputs: Index, most: float) -> None:
+        """Bound servo torques over limit (n) at a stage; add them as variables if a term is about drives."""
+        b, term = self._b, f"{self._b.limits.torque.name} in collision"
+        common: dict[str, Any] = {"term": term, "place": place, "lower": -most, "upper": most}
+        common["measure"] = percent("over its limit", of=most)
+        if b.problem.of_drives:
+            # terms use these torques again, and an output of a block may be in one constraint only
+            name = f"torque in collision, {place.name}"
+            self.torques.append(b.lift(name, outputs, labels=b.robot.joint_names, **common)[0])
+        else:
+            b.constraints.add(components=b.robot.joint_names, outputs=outputs, **common)
+
+    def drives(self) -> list[DrivePoint]:
+        """Torques and joint motions at each stage, if a term is about drives.
+
+        Call it after `Collision.add_constraints`.
+        """
+        pairs = zip(self.stages, self.torques, strict=True)
+        return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
+
+    def wrenches(self) -> list[tuple[Place, Affine]]:
+        """Wrenches on soles and supporting hands at each stage."""
+        return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
+
+    def _motion(self, i: int) -> list[Affine]:
+        """Slots of `impactopt.problem.block.joint_motion` at a stage."""
+        # value and slope of u, which is ydot already: so the S of ydot = r/S is one
+        rates = self._slots(self.u, i, self.contact.u0[0])
+        return [self.contact.state.y, *self._travel(i), *rates, Affine.constant(1.0), self.legs[i]]
+
+    def contact_end(self) -> ContactEnd:
+        state, u0, last = self.contact.state, self.contact.u0[0], self.end[-1]
+        before = joint_motion_slots(state.y, u0, u0 * 0.0, Affine.constant(1.0), state.legs)
+        place = Place.plain(f"after contact{self.suffix}")
+        return ContactEnd(place, before, self._motion(last), self.u[last] - u0)
+
+    def _joints(self, x: Array, law: ContactLaw) -> dict[str, Array]:
+        """Joint velocities and accelerations (1 + stages, n), the first just after contact, for solver
+        variables.
+        """
+        b, c, state = self._b, self._b.coordinates, self.contact.state
+        y, rates, legs = (e.evaluate(x) for e in (state.y, self.contact.u0[0], state.legs))
+        velocity = [c.complete_motion(y, rates, 0 * rates, legs)[1][c.base :]]
+        acceleration = [jump_at_contact(b.problem, c, law, y, rates, legs)[3]]
+        for i in range(len(self.stages)):
+            # slots of `_motion`; the S among them is one
+            y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
+            _, v, a = c.complete_motion(y0 + T1 * d1 + T * d, u, slope / T, legs_there)
+            velocity.append(v[c.base :])
+            acceleration.append(a[c.base :])
+        return {"velocity": np.array(velocity), "acceleration": np.array(acceleration)}
+
+    def _add_integral(self, i: int, place: Place, integrals: Group, rate: Group) -> None:
+        """Add the constraints of integrals over the phase so far: Radau quadrature of the rates' values."""
+        s, labels = self.stages[i], integrals.labels
+        integral = integrals[i]
+        for m, w in zip(s.members, s.quadrature, strict=True):
+            # d_i = d_start + h sum_j a_ij u_j, with the A whose inverse gives the slopes of u
+            integral = integral - rate[m] * w
+        if not s.new_phase:
+            integral = integral - integrals[s.previous]
+        self._b.constraints.add(
+            term="collision kinematics",
+            place=place,
+            components=labels,
+            affine=integral,
+            lower=0,
+            upper=0,
+            measure=rates(labels),
+        )
 
     # ------------------------------------------------------------------ constraints
     def add_constraints(self, at: dict[str, tuple[int, int]]) -> None:

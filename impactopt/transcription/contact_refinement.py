@@ -91,21 +91,19 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
     )
 
 
-def refined_elements(
-    error: ContactError | None, elements: Elements, tolerance: float = TOLERANCE_PCT
-) -> Elements | None:
-    """Elements that bring the error of a contact below a tolerance [%].
+def refined_elements(error: ContactError | None, elements: Elements) -> Elements | None:
+    """Elements that bring the error of a contact below `TOLERANCE_PCT`.
 
     An element is cut into the more parts, the larger its error, and in two if a gear carries too much in it;
     all are cut if an event is missed.
 
-    None if the error is below the tolerance, or phases may have no more elements.
+    None if the error is below it already, or phases may have no more elements.
     """
     strained = error is not None and any(map(any, error.strained))
-    if error is None or (abs(error.coarse) <= tolerance and not error.missed and not strained):
+    if error is None or (abs(error.coarse) <= TOLERANCE_PCT and not error.missed and not strained):
         return None
     # Errors of elements add up, so each gets an equal part of the tolerance.
-    most = tolerance / sum(map(len, elements))  # of an element
+    most = TOLERANCE_PCT / sum(map(len, elements))  # of an element
     out = []
     none = [(False,) * len(lengths) for lengths in elements]
     for lengths, errors, loads in zip(elements, error.of_elements, error.strained or none, strict=True):

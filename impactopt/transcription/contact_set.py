@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,8 @@ class ContactSet:
     expected, scenarios : the collisions; all of them, the expected one first, are `collisions`.
     elements, stages : of every collision, and their collocation points.
     shares : as above; () without freezes.
+    mass [kg] : effective, of the robot at its striker, where inverse kinematics reaches the target; only of
+        collisions that last.
     guarded : the elements were given, because a plan was wrong on others. Its force may have pulled within a
         phase, which is forbidden now.
     first : first instants of the collisions that last, if a term needs them.
@@ -58,6 +60,7 @@ class ContactSet:
         if not p.lasts:
             self.expected = InstantImpact(b, contact)
             return
+        self.mass = mass_at_contact(p)
         common: dict[str, Any] = {"mass": self.mass, "guarded": self.guarded}
         kind: Callable[..., Collision] = Collision
         if p.frozen is not None:
@@ -80,11 +83,6 @@ class ContactSet:
     def lasting(self) -> list[Collision]:
         """The collisions that have a duration: all or none."""
         return [c for c in self.collisions if isinstance(c, Collision)]
-
-    @cached_property
-    def mass(self) -> float:
-        """Effective mass [kg] of the robot at its striker, where inverse kinematics reaches the target."""
-        return mass_at_contact(self._b.problem)
 
     # ------------------------------------------------------------------ constraints
     def add_constraints(self) -> None:
@@ -130,8 +128,8 @@ class ContactSet:
 
     def update_parameters(self, *, anew: bool) -> None:
         """Take the parameters of the builder's problem (`Collision.update_parameters`)."""
-        # the mass is of the new problem's point
-        self.__dict__.pop("mass", None)
+        if self.lasting:
+            self.mass = mass_at_contact(self._b.problem)
         for collision in self.lasting:
             collision.update_parameters(self.mass, anew=anew)
         for first, collision in zip(self.first, self.lasting, strict=False):

@@ -81,7 +81,7 @@ def block_functions(
     recipe = (*_coordinates_recipe(coordinates), problem.striker, edges)
     target = problem.target
     frozen = () if problem.frozen is None else (problem.frozen,)
-    contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
+    contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen)
     springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
     rubs = () if problem.friction is None else ("rubs", len(problem.friction.parameters))

@@ -12,6 +12,7 @@ import pytest
 from support.causes import searched
 
 from impactopt import (
+    Effort,
     FreeMass,
     ImpactProblem,
     Impulse,
@@ -98,6 +99,12 @@ def test_a_window_that_takes_nearly_all_is_told(arm: ImpactProblem) -> None:
     assert narrow.status.usable
     assert "[collision] duration_s allows, 15 ms" in narrow.window
     assert narrow.window in narrow.summary()["caution"]
+    # effort is a cost: the same impulse leaves less, of which the same gain is a larger part
+    costly = solve(dataclasses.replace(narrow.problem, objectives=(Impulse(), Effort(weight=0.03))))
+    told, of_less = (float(s.window.split("gains ")[1].split(" %")[0]) for s in (narrow, costly))
+    assert costly.impulse == pytest.approx(narrow.impulse, rel=1e-3)
+    left = 1 - 0.03 * costly.objectives["effort"] / costly.impulse
+    assert of_less == pytest.approx(told / left, rel=0.02)
     wide = solve(dataclasses.replace(problem, contact_duration=(0.0, 0.2)))
     assert wide.window == ""
     assert wide.impulse > 10 * narrow.impulse

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,8 @@ from impactopt import (
 from impactopt.cli.app import app
 from impactopt.codegen.compiler import find_compiler
 from impactopt.collision.sdc import FROZEN, frozen_model
-from impactopt.planning.models import good_enough
+from impactopt.planning.budget import Budget
+from impactopt.planning.models import climbed, good_enough
 from impactopt.planning.solution import ModelError
 from impactopt.problem.problem import COLLISIONS
 from impactopt.solvers.ipm import solve_ipm
@@ -197,6 +199,22 @@ def test_auto_takes_what_is_good_enough(run: Any, monkeypatch: pytest.MonkeyPatc
     assert climbed.impulse == pytest.approx(dear.impulse, rel=1e-5)
     first, last = climbed.attempts
     assert last.kept and not first.kept and last.iterations < 0.7 * dear.result.iterations
+
+
+def test_compiling_the_first_model_takes_no_time_from_the_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("impactopt.planning.models._skips_first", lambda *_: False)
+    problem = dataclasses.replace(load_problem("arm_planar"), collision="auto", auto_impulse_pct=0.05)
+    cheap = optimize_strike(dataclasses.replace(problem, collision="sdc"))
+    given: list[float | None] = []
+
+    def run(_: ImpactProblem, start: Any, budget: Budget) -> Any:
+        given.append(budget.time_limit)
+        time.sleep(0.05)  # longer than the limit
+        return dataclasses.replace(cheap, build_seconds=0.04, solve_seconds=0.01)
+
+    budget = Budget(solver="ipm", options=None, time_limit=0.03, callback=None)
+    assert climbed(problem, run, budget).build_seconds == pytest.approx(0.08)
+    assert given == [pytest.approx(0.03), pytest.approx(0.02)]
 
 
 def test_auto_skips_what_cannot_do() -> None:

@@ -47,9 +47,15 @@ def driven(nail: Nail) -> float:
 class Solver:
     """Blows of WORK; what it was asked for."""
 
-    def __init__(self, *, fails_at: tuple[int, ...] = (), drives: Callable[[Nail], float] = driven) -> None:
+    def __init__(
+        self,
+        *,
+        fails_at: tuple[int, ...] = (),
+        drives: Callable[[Nail], float] = driven,
+        fails: Status = Status.INFEASIBLE,
+    ) -> None:
         self.asked: list[tuple[ImpactProblem, Any, dict[str, Any]]] = []
-        self.fails_at, self.drives = fails_at, drives
+        self.fails_at, self.drives, self.fails = fails_at, drives, fails
 
     def __call__(self, problem: ImpactProblem, *, start: Any, **options: Any) -> Any:
         self.asked.append((problem, start, options))
@@ -58,7 +64,7 @@ class Solver:
         collision = SimpleNamespace(outcome={"depth_m": self.drives(problem.target)}, peak_force=900.0)
         return SimpleNamespace(
             problem=problem,
-            status=Status.INFEASIBLE if k in self.fails_at else Status.SOLVED,
+            status=self.fails if k in self.fails_at else Status.SOLVED,
             plan=SimpleNamespace(collision=collision, hand_speed=3.0),
             result=SimpleNamespace(x=np.full(4, float(k)), iterations=7, message="no way"),
             impulse=5.0,
@@ -150,3 +156,10 @@ def test_the_command_drives_the_nail_in(
     assert [round(1e3 * blow["driven_m"], 1) for blow in kept["blows"]] == [7.8, 7.0, 6.4]
     early = CliRunner().invoke(app, [*base, "--most", "1"])
     assert early.exit_code == 1 and "the nail is not in yet" in early.output
+
+
+def test_a_series_that_is_stopped_solves_no_more(solver: Solver) -> None:
+    solver.fails_at, solver.fails = (2,), Status.INTERRUPTED
+    series = drive_nail(nailing(), depth=0.05)
+    assert len(solver.asked) == 2
+    assert len(series.blows) == 1 and series.reason == "blow 2 has no plan: no way"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -198,3 +200,13 @@ def test_what_cannot_be_bent_is_said(arm: Solution) -> None:
         stopped.moved(mass=0.06)
     with pytest.raises(InputError, match="margin"):
         arm.moved(margin=-1.0)
+
+
+def test_a_plan_that_was_moved_is_freed(arm: Solution) -> None:
+    solution = replace(arm)
+    known = weakref.ref(solution)
+    moved = solution.moved(mass=1.01 * solution.problem.target.parameters["mass"])
+    assert moved.status.usable
+    del solution
+    gc.collect()
+    assert known() is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -488,3 +489,17 @@ def test_a_method_that_is_gone_names_its_replacement() -> None:
     for method in ("shooting", "shoting"):
         with pytest.raises(InputError, match='give "collocation", or leave it out'):
             optimize_strike(arm_problem(), method=method)
+
+
+def test_ctrl_c_between_iterates_keeps_the_best_one() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+
+    def report(text: str) -> None:
+        if text.startswith("program of"):
+            signal.raise_signal(signal.SIGINT)
+
+    try:
+        found = optimize_strike(arm_problem(), report=report)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert found.status is Status.INTERRUPTED and np.isfinite(found.result.x).all()

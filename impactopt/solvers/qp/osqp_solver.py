@@ -19,6 +19,8 @@ _INFEASIBLE = (osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE, osqp.SolverStatus.OSQP_
 _UNFINISHED = (osqp.SolverStatus.OSQP_MAX_ITER_REACHED, osqp.SolverStatus.OSQP_TIME_LIMIT_REACHED)
 _MAX_DENSE = 300  # variables, up to which dense factorizations are cheap
 _MAX_ERROR = 1e-2  # of a usable solution
+_EPS = 1e-6  # OSQP's own tolerance
+_STAGES = (200, 500, 1000, 2000, 4000, 8000)  # OSQP's iterations before each refinement of its solution
 _MAX_CORRECTIONS = 5  # of the active set of an initial guess: constraints added or dropped
 
 
@@ -34,17 +36,9 @@ class OsqpSolver:
     setups : number of times OSQP was set up (rather than updated in place).
     """
 
-    def __init__(
-        self,
-        *,
-        tolerance: float = 1e-6,
-        eps: float = 1e-6,
-        stages: tuple[int, ...] = (200, 500, 1000, 2000, 4000, 8000),
-    ):
-        """eps : OSQP's tolerance.  stages : its iterations before each refinement of its solution."""
+    def __init__(self, *, tolerance: float = 1e-6) -> None:
         self.tolerance = tolerance
         self.setups = 0
-        self._eps, self._stages = eps, stages
         self._active_set, self._near = ActiveSetSolver(), ActiveSetSolver(max_iterations=_MAX_CORRECTIONS)
         self._solver: osqp.OSQP | None = None
         self._pattern: list[np.ndarray] = []
@@ -94,7 +88,7 @@ class OsqpSolver:
         assert self._solver is not None
         iterations, best = 0, without_solution(qp, QPStatus.FAILED)
         least_error = _MAX_ERROR
-        for more in self._stages:
+        for more in _STAGES:
             left = deadline - time.perf_counter()
             if left <= 0.0:
                 break
@@ -160,7 +154,7 @@ class OsqpSolver:
             # No scaling, as rows have norm 1 already, and no polishing: `_refined` does that.
             solver.setup(
                 P, qp.q, sp.csc_matrix(C), lower, upper,
-                eps_abs=self._eps, eps_rel=self._eps, scaling=0, polishing=False,
+                eps_abs=_EPS, eps_rel=_EPS, scaling=0, polishing=False,
                 adaptive_rho_interval=25, check_termination=10, eps_prim_inf=1e-7, eps_dual_inf=1e-7,
                 verbose=False,
             )  # fmt: skip

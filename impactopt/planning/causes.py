@@ -202,6 +202,7 @@ class _CauseSearch:
         options = IPMOptions(
             max_iterations=most,
             time_limit=left,
+            violation_tolerance=_TOLERANCE,
             kkt_tolerance=_TOLERANCE,
             complementarity_tolerance=_TOLERANCE,
             **more,

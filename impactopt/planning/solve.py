@@ -45,6 +45,7 @@ from impactopt.planning.strike import clear_strike
 from impactopt.problem.feasibility import hopeless
 from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.strength import strongest_posture
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.initial_guess import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.mesh import NO_MORE
@@ -169,6 +170,9 @@ def _planned(
     guesses = partial(_guesses, t, given, range(which.start, last), seed)
     # A solution of a similar problem is more than an estimate, so with one all iterations are allowed.
     outcome = _best(guesses, len(which), solver, doubted=bool(doubts) and not isinstance(given, SolverResult))
+    violated = ended_with_violations(outcome.program, outcome.result)
+    if isinstance(given, str) and given == "reach" and violated and budget.left != 0:
+        outcome = _else_from_plain_posture(t, outcome, solver)
     if refined and margins is None:
         outcome = solver.on(outcome)
     # Reasons that need no search come first.
@@ -312,6 +316,20 @@ def _best(
         return outcome
     # A motion within all bounds refutes the estimate: it gets the iterations that are left.
     return outcome.else_then(solver.from_guess(Guess(program=program, start=result)))
+
+
+def _else_from_plain_posture(
+    t: Transcription, outcome: Outcome[Transcription], solver: PlanSolver
+) -> Outcome[Transcription]:
+    """Outcome of a guess with the problem's posture at contact, if failed ones had another; else the old one.
+
+    From the strongest posture there may be no motion, such as to a soft board that breaks.
+    """
+    posture = t.problem.contact_posture
+    if np.array_equal(strongest_posture(t.problem), posture):
+        return outcome
+    solver.budget.say("no motion was found: solving again from the posture at contact nearest to the start")
+    return outcome.else_then(solver.from_guess(Guess(program=t, start=first_iterate(t, posture=posture))))
 
 
 def _diagnosed(

@@ -82,8 +82,17 @@ class ReachedState:
     legs: Array
 
 
-def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> ReachedState:
-    """State at contact by inverse kinematics (`strongest_posture`).
+def reached(
+    t: ContactProgram,
+    *,
+    posture: Array | None = None,
+    speed: float = 1.0,
+    noise: float = 0.0,
+    seed: int = 0,
+) -> ReachedState:
+    """State at contact by inverse kinematics.
+
+    posture (nq,) : at contact; None: `strongest_posture`.
 
     speed : of the striking points [m/s]; less if joints are not that fast. If the target's speed after the
         impact is bounded, or the contact's events have an order of their own, the nearest speed with which a
@@ -93,7 +102,7 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     """
     p, c = t.problem, t.coordinates
     rng = np.random.default_rng(seed)
-    y, legs = c.split(strongest_posture(p, seed))
+    y, legs = c.split(strongest_posture(p, seed) if posture is None else posture)
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)
@@ -117,9 +126,16 @@ def _within(rates: Array, limit: Array) -> float:
     return min(1.0, float((limit / np.maximum(np.abs(rates), 1e-9)).min()))
 
 
-def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Array:
+def first_iterate(
+    t: Transcription,
+    *,
+    posture: Array | None = None,
+    speed: float = 1.0,
+    noise: float = 0.0,
+    seed: int = 0,
+) -> Array:
     """Initial guess (n,) of a motion: quintic splines to the state of :func:`reached`, and back."""
-    hit = reached(t, speed=speed, noise=noise, seed=seed)
+    hit = reached(t, posture=posture, speed=speed, noise=noise, seed=seed)
     zero, (swing_T, follow_T) = np.zeros(len(t.y0)), _durations(t)
     start, end = _ends(t.problem, t.coordinates, t.problem.blow)
     swing = quintic(start, zero, hit.y, hit.rates, swing_T, t.swing.breaks)

@@ -39,7 +39,7 @@ def read_urdf(
 
     Raises
     ------
-    InputError : the file cannot be read; links with non-physical inertias.
+    InputError : the file cannot be read; joints without limits; links with non-physical inertias.
     """
     urdf = existing(path, "URDF")
     joints = (pin.JointModelFreeFlyer(),) if floating else ()
@@ -49,6 +49,7 @@ def read_urdf(
             f"{urdf} is a xacro file, not yet a URDF: run `xacro {Path(urdf).name} > robot.urdf`, and give "
             "robot.urdf"
         )
+    _check_limits(root, urdf)
     try:
         if _without_negative_limits(root):
             model = pin.buildModelFromXML(root.toxml(), *joints)
@@ -80,6 +81,24 @@ def _parsed(urdf: str) -> Any:
         return expatbuilder.parse(urdf, namespaces=False).documentElement
     except ExpatError as error:
         raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
+
+
+def _check_limits(root: Any, urdf: str) -> None:
+    """InputError with all joints that lack a limit of effort or velocity, without which no URDF is read."""
+    found = Mistakes()
+    for joint in _children(root, "joint"):
+        limits, kind = _children(joint, "limit"), joint.getAttribute("type")
+        if limits:
+            lacks = [key for key in ("effort", "velocity") if not limits[0].getAttribute(key)]
+        else:
+            lacks = ["effort", "velocity"] if kind in ("revolute", "prismatic") else []
+        if lacks:
+            keys = " and ".join(lacks)
+            found.found.append(
+                f"URDF {urdf}: joint {joint.getAttribute('name')!r} has no {keys} in a <limit>; give {keys} "
+                "there, 0 if unknown"
+            )
+    found.raise_if_any(f"URDF {urdf}")
 
 
 def _without_negative_limits(root: Any) -> bool:

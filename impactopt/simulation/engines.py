@@ -166,7 +166,8 @@ def _step_error(
     for other in (own if step > own else 2 * step, step / 2):
         try:
             # only to shortly after the impact, up to which impulses are compared
-            compared = run(*given, **options, step=other, until=until)
+            shorter = {"step": other, "until": min(until, options.get("until", np.inf))}
+            compared = run(*given, **{**options, **shorter})
         except InputError:
             continue  # twice the step may be too long for the servo
         impulses = [sum(touch[2] for touch in s.touches if touch[0] <= until) for s in (simulation, compared)]
@@ -209,7 +210,7 @@ def simulate(
 
     Raises
     ------
-    InputError : an unknown engine or option; a step or a time to settle out of range.
+    InputError : an unknown engine or option; a step, an end or a time to settle out of range.
     """
     check_choice("unknown engine", engine, ENGINES)
     run = ENGINES[engine]
@@ -233,13 +234,15 @@ def simulate(
 
 
 def _check_times(options: Mapping[str, Any], end: float) -> None:
-    """Raises an InputError for a step or a time to settle out of range."""
+    """Raises an InputError for a step, an end or a time to settle out of range."""
     given = {name: 0.0 if options[name] is None else options[name] for name in ("step", "settle")}
     step, settle = (float(check_array(f"{name} [s]", value, ())) for name, value in given.items())
     if not STEP_RANGE[0] <= step <= STEP_RANGE[1]:
         raise InputError(f"step [s]: {step:g}; give a number of {STEP_RANGE[0]:g} to {STEP_RANGE[1]:g}")
     if not 0 <= settle <= MAX_SETTLE:
         raise InputError(f"settle [s]: {settle:g}; give a number of 0 to {MAX_SETTLE:g}")
+    if options["until"] != np.inf and check_array("until [s]", options["until"], ()) < step:
+        raise InputError(f"until [s]: {options['until']:g}; give a time of at least one step, {step:g} s")
     if (end + settle) / step > MAX_STEPS:
         raise InputError(
             f"a replay of {end + settle:g} s in steps of {step:g} s has {(end + settle) / step:.2g} of them; "

@@ -75,6 +75,17 @@ def test_all_bad_inertias_and_limits_are_told_at_once(tmp_path: Path) -> None:
     assert "'right_elbow'" in error.value.mistakes[0] and "torque limit" in error.value.mistakes[1]
 
 
+def test_limits_that_a_urdf_must_have_are_named_for_all_joints(tmp_path: Path) -> None:
+    """Its parser refuses the file at the first such joint, and names it only in its own output."""
+    path, text = tmp_path / "walker.urdf", urdfs.biped()
+    before, last = text.replace(' effort="80.0"', "", 1).rsplit("<limit ", 1)
+    path.write_text(before + last[last.index("/>") + 2 :])
+    with pytest.raises(InputError) as error:
+        Robot.from_urdf(path)
+    lacks = [mistake.split("has no ")[1].split(" in a <limit>")[0] for mistake in error.value.mistakes]
+    assert lacks == ["effort", "effort and velocity"]
+
+
 def test_repairs_have_to_be_said_and_are_listed(tmp_path: Path) -> None:
     path = tmp_path / "walker.urdf"
     path.write_text(urdfs.biped(moments=LOST))

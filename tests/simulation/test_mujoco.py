@@ -510,6 +510,16 @@ def test_engines_by_name_refuse_what_they_do_not_have(punch: Solution) -> None:
         simulate(problem, motion, engine="mujoco", stp=1e-4)
 
 
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
+def test_a_replay_ends_where_it_is_told_to(punch: Solution, engine: str) -> None:
+    end = 0.5 * punch.trajectory.contact_start
+    sim = punch.validate(engine=engine, until=end, step=1e-3)
+    assert end - 0.01 < sim.time[-1] < end + 1e-9 and sim.impulse == 0
+    for bad in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match=r"until \[s\]"):
+            punch.validate(engine=engine, until=bad)
+
+
 def test_a_replay_far_from_the_plan_does_not_pass_for_one_that_stands(punch: Solution) -> None:
     sim = punch.validate(engine="mujoco", step=1e-3, perturbation=Perturbation(torque_limit=0.3))
     assert sim.standing is False

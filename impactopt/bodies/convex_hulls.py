@@ -24,9 +24,8 @@ ROD = 0.012  # [m] radius of a tool
 _SHORTEST_SIDE = 0.02  # [m] of a box of inertia
 # a shape is too large above both this size [m] and this multiple of the box of its inertia
 _LARGE, _LARGE_RATIO = 1.0, 8.0
-STAND_IN = (
-    0.5  # length of collision shapes, over that of the visual ones, below which they only stand for a link
-)
+# length of collision shapes, over that of the visual ones, below which they only stand for a link
+STAND_IN = 0.5
 MAX_PIECES = 8  # of a link; more, as of one that is exported screw by screw, become one
 _MAX_NEIGHBOURS = 200  # of a vertex: coal counts them in a byte
 _MERGE_DISTANCE = 1e-4  # [m] of vertices of hulls with more neighbours; doubled until there are few enough

@@ -55,7 +55,11 @@ class ContactFriction(Described):
     @property
     def parameters(self) -> tuple[float, ...]:
         """Parameters (coefficient, slip_speed [m/s]), with bristles also their stiffness [N/m]."""
-        return (self.coefficient, self.slip_speed, *((self.stiffness,) if self.stiffness else ()))
+        return (self.coefficient, self.slip_speed, *((self.stiffness,) if self.bristles else ()))
+
+    @property
+    def bristles(self) -> bool:
+        return self.stiffness > 0
 
     def way(self, normal: Array, speed: Array, deflection: Array = UNBENT, force: float = 0.0) -> Array:
         """Force on the target (3,) over its normal part, for a velocity (3,) [m/s] of the striking point.
@@ -63,7 +67,7 @@ class ContactFriction(Described):
         It is the normal (3,) plus the friction per normal force. With bristles that depends on their
         deflection (3,) [m] and the normal force [N].
         """
-        if not self.stiffness:
+        if not self.bristles:
             return np.asarray(pushed_way(normal, speed, *self.parameters))
         return normal + self.coefficient * lean(deflection, force, self.coefficient, self.stiffness)
 
@@ -72,7 +76,7 @@ class ContactFriction(Described):
 
         normal, speed, deflection, force : as of `way`.
         """
-        if not (self.stiffness and force > 0):
+        if not (self.bristles and force > 0):
             return UNBENT
         slide = speed - normal * (normal @ speed)
         # lean is linear in the deflection but for its denominator, which stays that of the step's start

@@ -20,7 +20,7 @@ class SlidingPoints:
     """
 
     def __init__(self, friction: ContactFriction) -> None:
-        self.friction, self.bristles = friction, friction.stiffness > 0
+        self.friction, self.bristles = friction, friction.bristles
         self._normal, self._v = np.zeros(3), np.zeros(0)
         self._jacobians: Sequence[Array] = ()
 

@@ -164,7 +164,7 @@ class Builder:
             block,
             frozen=frozen,
             second=second,
-            bristles=friction is not None and friction.stiffness > 0,
+            bristles=friction is not None and friction.bristles,
         )
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}

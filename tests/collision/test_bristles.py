@@ -12,16 +12,14 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.derivative_checks import check_derivatives
-from support.small_plans import BODILESS, arm_problem, biped_problem, transcribed
-from support.small_robots import arm, biped, disc, table
+from support.small_plans import arm_problem
+from support.small_robots import WALL_STIFFNESS, arm, biped, disc, on_a_wall
 
 from impactopt import (
     SDC,
     ContactFriction,
     FreeMass,
     FullDynamics,
-    Incidence,
     KelvinVoigt,
     MujocoDynamics,
     Nail,
@@ -33,28 +31,9 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, problem_data, problem_from_data
 from impactopt.kinematics.operational_space import holding_torque, striking_velocity
 from impactopt.kinematics.stance import FixedBase, Free
-from impactopt.problem.terms import GearLoad
-from impactopt.simulation import scene_of, simulate_mujoco, simulate_pinocchio
-from impactopt.solvers.ipm import solve_ipm
-from impactopt.transcription.initial_guess import first_iterate
 
-STIFFNESS = 2e4  # [N/m] along the normal
-BENDING = ContactFriction(coefficient=0.6, stiffness=0.8 * STIFFNESS)
+BENDING = ContactFriction(coefficient=0.6, stiffness=0.8 * WALL_STIFFNESS)
 NO_CREEP = 1e-7  # [m/s]
-
-
-def on_a_wall(kind: Any, friction: ContactFriction, damping: float = 0.0, **options: Any) -> Any:
-    """A model of a mass of 4 kg along x and 2 kg along y, at a wall across x."""
-    return kind(
-        robot=table(4.0),
-        striker="tip",
-        normal=[1.0, 0.0, 0.0],
-        law=SpringDamper(stiffness=STIFFNESS, damping=damping),
-        target=RigidWall(),
-        stance=FixedBase(),
-        contact_friction=friction,
-        **options,
-    )
 
 
 @pytest.mark.parametrize(
@@ -65,12 +44,12 @@ def on_a_wall(kind: Any, friction: ContactFriction, damping: float = 0.0, **opti
 def test_a_mass_that_sticks_swings_with_the_frequency_of_its_bristles(
     kind: Any, options: Any, ratio: float
 ) -> None:
-    friction = ContactFriction(coefficient=10.0, slip_speed=NO_CREEP, stiffness=ratio * STIFFNESS)
+    friction = ContactFriction(coefficient=10.0, slip_speed=NO_CREEP, stiffness=ratio * WALL_STIFFNESS)
     across = 1e-3  # [m/s], so that friction is far from its limit
     found = on_a_wall(kind, friction, **options).collide(np.zeros(2), np.array([1.0, across]), np.zeros(2))
-    duration = np.pi * np.sqrt(4.0 / STIFFNESS)
+    duration = np.pi * np.sqrt(4.0 / WALL_STIFFNESS)
     assert found.duration == pytest.approx(duration, abs=2e-5)
-    swing = np.cos(np.sqrt(ratio * STIFFNESS / 2.0) * duration)
+    swing = np.cos(np.sqrt(ratio * WALL_STIFFNESS / 2.0) * duration)
     assert found.velocity[1] / across == pytest.approx(swing, abs=2e-3)
 
 
@@ -120,7 +99,7 @@ def test_energy_never_grows_and_the_push_is_in_the_cone(
         np.zeros(2),
         contact_damping=damping,
         friction_coefficient=coefficient,
-        friction_stiffness=ratio * STIFFNESS,
+        friction_stiffness=ratio * WALL_STIFFNESS,
         friction_slip_speed=slip_speed,
     )
     along, side = found.velocity
@@ -148,7 +127,7 @@ def test_friction_pushes_against_the_slide_in_the_tangent_plane() -> None:
     model, data = robot.model, robot.model.createData()
     model.gravity = pin.Motion.Zero()
     shared = {"robot": robot, "striker": "fist", "normal": n, "target": FreeMass(mass=3.0)}
-    shared |= {"law": SpringDamper(stiffness=STIFFNESS, damping=20.0), "stance": Free()}
+    shared |= {"law": SpringDamper(stiffness=WALL_STIFFNESS, damping=20.0), "stance": Free()}
     found = FullDynamics(**shared, contact_friction=BENDING).collide(q, v, np.zeros(robot.n))
     begin = pin.computeCentroidalMomentum(model, data, q, v).linear.copy()
     end = pin.computeCentroidalMomentum(model, data, found.configuration, found.velocity).linear
@@ -166,7 +145,7 @@ def test_mujoco_agrees() -> None:
     q = robot.posture("start")
     v = striking_velocity(robot, q, "hand", [0.0, 1.0, 0.0], 1.0, stance=FixedBase())
     shared = {"robot": robot, "striker": "hand", "normal": n, "target": FreeMass(mass=3.0)}
-    shared |= {"law": KelvinVoigt(stiffness=STIFFNESS, damping=20.0), "stance": FixedBase()}
+    shared |= {"law": KelvinVoigt(stiffness=WALL_STIFFNESS, damping=20.0), "stance": FixedBase()}
     found = [
         kind(**shared, contact_friction=BENDING).collide(q, v, np.zeros(robot.n))
         for kind in (FullDynamics, MujocoDynamics)
@@ -184,7 +163,7 @@ def oblique(kind: Any = SDC, **options: Any) -> tuple[Any, tuple[Any, Any, Any]]
         robot=robot,
         striker="fist",
         normal=[0.8, 0.0, 0.6],
-        law=SpringDamper(stiffness=STIFFNESS, damping=20.0),
+        law=SpringDamper(stiffness=WALL_STIFFNESS, damping=20.0),
         target=FreeMass(mass=3.0),
         contact_friction=BENDING,
         **options,
@@ -243,31 +222,6 @@ def test_derivatives_are_those_of_differences() -> None:
         ]
         slope = float(ends[0] - ends[1]) / (2 * h)
         assert float(slopes[name] @ way) == pytest.approx(slope, rel=1e-6)
-
-
-def test_derivatives_of_plans_are_those_of_differences() -> None:
-    # gears are there from the start: with the first instant of a damped contact
-    terms = (*BODILESS, GearLoad())
-    t = transcribed(dataclasses.replace(biped_problem(), friction=BENDING, terms=terms))
-    x = first_iterate(t)
-    check_derivatives(t.program, x + 0.01 * np.random.default_rng(1).standard_normal(len(x)))
-
-
-def test_a_plan_with_bristles_is_what_both_engines_replay() -> None:
-    friction, sliding = ContactFriction(coefficient=0.4, stiffness=8e3), (*BODILESS, Incidence(speed=0.5))
-    problem = dataclasses.replace(arm_problem(), friction=friction, terms=sliding)
-    t = transcribed(problem)
-    result = solve_ipm(t.program, first_iterate(t))
-    assert result.status.usable, result.message
-    plan = t.decode(result.x)
-    way = plan.trajectory()
-    until = float(way.contact_end) + 0.02
-    for engine in (simulate_pinocchio, simulate_mujoco):
-        done = engine(problem.robot, way, scene_of(problem), until=until)
-        assert done.impulse == pytest.approx(plan.impulse, rel=2e-3)
-    smooth = scene_of(dataclasses.replace(problem, friction=None))
-    done = simulate_pinocchio(problem.robot, way, smooth, until=until)
-    assert abs(done.impulse / plan.impulse - 1) > 4e-3
 
 
 def test_a_file_has_bristles() -> None:

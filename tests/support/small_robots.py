@@ -8,9 +8,19 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt import Actuator, Robot, Sole, Striker
+from impactopt import (
+    Actuator,
+    ContactFriction,
+    FixedBase,
+    RigidWall,
+    Robot,
+    Sole,
+    SpringDamper,
+    Striker,
+)
 from impactopt.robots.couplings import Coupling, coupled
 
+WALL_STIFFNESS = 2e4  # [N/m] of `on_a_wall`
 HALF_SITTING = {"hip pitch": -0.4, "knee": 0.8, "ankle pitch": -0.4}
 
 
@@ -200,6 +210,20 @@ def table(mass: float, **options: Any) -> Robot:
         **options,
     }
     return Robot.from_model(model, **settings)
+
+
+def on_a_wall(kind: Any, friction: ContactFriction | None, damping: float = 0.0, **options: Any) -> Any:
+    """Model of a mass of 4 kg along x and 2 kg along y, at a wall across x."""
+    return kind(
+        robot=table(4.0),
+        striker="tip",
+        normal=[1.0, 0.0, 0.0],
+        law=SpringDamper(stiffness=WALL_STIFFNESS, damping=damping),
+        target=RigidWall(),
+        stance=FixedBase(),
+        contact_friction=friction,
+        **options,
+    )
 
 
 def disc(mass: float, radius: float) -> Robot:

@@ -37,10 +37,8 @@ TRAVEL_FACTORS = (1.0, 0.75, 0.55, 0.4)  # on the travel, tried while joint limi
 # least distance of the start behind the target's plane: the smaller of so many [m] and so much of the reach
 BEHIND = 0.06, 0.15
 DURATION_FACTORS = (0.8, 3.0)  # shortest and longest duration over the time at the velocity limits
-AFTER, AFTER_STEP = (
-    0.6,
-    0.03,
-)  # [s] in which a target that flies away may not meet the base, [m] between tests
+AFTER = 0.6  # [s] in which a target that flies away may not meet the base
+AFTER_STEP = 0.03  # [m] of its travel between two tests
 ITERATIONS, SECONDS = 150, 30.0  # limits of a trial strike or plan: most need a third of that
 
 

@@ -115,7 +115,7 @@ class Shapes:
         keys: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
         where = dict(zip(keys, ranges, strict=True))
         # work memory of the C code
-        self.room = np.zeros(len(self.points) + 3 * len(self.of) + links.robot.model.njoints + 1)
+        self.room = np.zeros(len(self.points) + 4 * len(self.of) + links.robot.model.njoints + 1)
         piece_index = {id(piece): k for k, piece in enumerate(links.pieces)}
         pairs, number, hulls, pieces_of, radius = [], [], [], [], []
         for (a, b), pieces in pairs_of_links.items():
@@ -148,51 +148,43 @@ class Shapes:
     def __len__(self) -> int:
         return len(self.pairs)
 
-    def look(self, at: Placed, within: float, directions: Array, wanted: NDArray[np.bool_]) -> Looked:
+    def look(
+        self,
+        at: Placed,
+        within: float | Array,
+        directions: Array,
+        wanted: NDArray[np.bool_],
+        before: tuple[Placed, Looked] | None = None,
+    ) -> Looked:
         """Distances of the pairs ``wanted`` (P,); those above ``within`` [m] may be lower bounds.
 
+        within : a number, or one for each instant and pair (K, P).
         directions (K, P, 3) : initial guesses of separating directions, zero if unknown; those found are
             written to it.
+        before : distances at other placements, which bound those here by how far both bodies have moved.
         """
         (k, j), w, p = at.joints.shape[:2], at.world.shape[1], len(self)
         gaps, near = np.empty((k, p)), np.empty((k * p, 2), dtype=np.int64)
+        within = np.ascontiguousarray(np.broadcast_to(within, gaps.shape), dtype=float)
         # `near` has room for all pairs at all instants; the C code returns how many it has written.
         chosen, library = wanted.astype(np.uint8), _library()
         if library is None:
-            found = separation_numpy.look(self, at, within, directions, wanted, gaps)
+            found = separation_numpy.look(self, at, within, directions, wanted, gaps, before)
             return Looked(gaps, *found)
         counts = (ctypes.c_int64(n) for n in (k, j, w, p, len(self.of)))
         bodies = (self.of, self.balls, self.boxes, self.pairs, self.pieces, self.hulls, self.radius)
+        known = (None,) * 3 if before is None else (before[0].joints, before[0].world, before[1].gaps)
         n = library.look(
             *counts,
             *map(address, (at.joints, at.world, *bodies, at.present, chosen, self.blocks)),
             ctypes.c_double(1 / ROUNDING),
-            ctypes.c_double(within),
+            address(within),
+            *(None if array is None else address(array) for array in known),
             *map(address, (directions, gaps, self.room)),
             ctypes.c_int64(len(near)),
             address(near),
         )
         return Looked(gaps, near[:n, 0].copy(), near[:n, 1].copy())
-
-    def may_meet(
-        self, one: tuple[Placed, Looked], two: tuple[Placed, Looked], wanted: NDArray[np.bool_]
-    ) -> tuple[Index, Index]:
-        """Instants and indices of pairs that have clearance in both placements, but may penetrate in between.
-
-        These are pairs that move by more than the sum of both distances: both in the world, and one relative
-        to the other.
-        """
-        (k, j), w, p = one[0].joints.shape[:2], one[0].world.shape[1], len(self)
-        near = np.empty((k * p, 2), dtype=np.int64)
-        chosen, library = wanted.astype(np.uint8), _library()
-        if library is None:
-            return separation_numpy.may_meet(self, one, two, wanted)
-        counts = (ctypes.c_int64(n) for n in (k, j, w, p, len(self.of)))
-        places = (one[0].joints, one[0].world, two[0].joints, two[0].world)
-        bodies = (self.of, self.balls, self.pairs, self.pieces)
-        arrays = (*places, *bodies, chosen, one[1].gaps, two[1].gaps, self.room)
-        n = library.may_meet(*counts, *map(address, arrays), ctypes.c_int64(len(near)), address(near))
-        return near[:n, 0].copy(), near[:n, 1].copy()
 
 
 class Separations:
@@ -335,6 +327,6 @@ def _corners(half: Array) -> Array:
 def _library() -> Any:
     library = native_library("impactopt.bodies", "separation")
     if library is not None:
-        library.look.restype = library.may_meet.restype = ctypes.c_int64
+        library.look.restype = ctypes.c_int64
         library.separation.restype = None
     return library

@@ -246,7 +246,13 @@ def _of_pairs(shapes: Any, at: Any, spot: Index, pair: Index) -> tuple[Array, Ar
 
 
 def look(
-    shapes: Any, at: Any, within: float, directions: Array, wanted: NDArray[np.bool_], gaps: Array
+    shapes: Any,
+    at: Any,
+    within: Array,
+    directions: Array,
+    wanted: NDArray[np.bool_],
+    gaps: Array,
+    before: tuple[Any, Any] | None,
 ) -> tuple[Index, Index]:
     """NumPy version of `Shapes.look`: writes gaps and directions, returns the near pairs."""
     spot, pair = (a.ravel() for a in np.indices(gaps.shape))
@@ -274,8 +280,11 @@ def look(
     )
     u = np.where(world[:, None], face, x)
     u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-300)
+    if before is not None:
+        places, known_gaps = before[0], before[1].gaps
+        bound = np.maximum(bound, known_gaps[spot, pair] - _ways(shapes, places, at, spot, pair))
     gaps[spot, pair] = bound
-    close = bound <= within
+    close = bound <= within[spot, pair]
     spot, pair, turn, shift, u = spot[close], pair[close], turn[close], shift[close], u[close]
     known = directions[spot, pair]
     u = np.where(np.any(known != 0, axis=1)[:, None], known, u)
@@ -283,32 +292,26 @@ def look(
         u, found = _Pairs(shapes.points, shapes.hulls[pair], turn, shift).separate(u)
         gaps[spot, pair] = found.separation - shapes.radius[pair]
         directions[spot, pair] = u
-    near = gaps[spot, pair] < within
+    near = gaps[spot, pair] < within[spot, pair]
     return spot[near], pair[near]
 
 
-def may_meet(
-    shapes: Any, one: tuple[Any, Any], two: tuple[Any, Any], wanted: NDArray[np.bool_]
-) -> tuple[Index, Index]:
-    """NumPy version of `Shapes.may_meet`."""
-    before, after = one[1].gaps, two[1].gaps
-    # Pairs farther apart than 5 m cannot meet in a step; this also leaves out those with the gap 1e3.
-    spot, pair = np.nonzero(wanted & (before > 0) & (after > 0) & (before + after <= 5.0))
-    other = shapes.pairs[pair, 1]
+def _ways(shapes: Any, one: Any, two: Any, spot: Index, pair: Index) -> Array:
+    """Upper bounds (m,) [m] of how far pairs have approached each other between two placements.
+
+    They are the ways of both bodies, or that of the first relative to the second if it is less.
+    """
     first, second = shapes.pieces[pair].T
-    places0, places1 = one[0], two[0]
-    moved = _moved(places0.joints, places1.joints, shapes.of, shapes.balls)
-    of_second = moved[spot, second]
+    moved = _moved(one.joints, two.joints, shapes.of, shapes.balls)
+    of_second, other = moved[spot, second], shapes.pairs[pair, 1]
     world = other < 0  # bodies of the world do not turn
     at = spot[world], -1 - other[world]
-    of_second[world] = np.linalg.norm((places1.world[at] - places0.world[at])[:, 9:], axis=1)
-    # of the first relative to the second
-    (turn0, shift0), (turn1, shift1) = (_of_pairs(shapes, p, spot, pair) for p in (places0, places1))
+    of_second[world] = np.linalg.norm((two.world[at] - one.world[at])[:, 9:], axis=1)
+    (turn0, shift0), (turn1, shift1) = (_of_pairs(shapes, p, spot, pair) for p in (one, two))
     balls = shapes.balls[first]
     way = np.einsum("mij,mj->mi", turn1 - turn0, balls[:, :3]) + shift1 - shift0
     relative = np.linalg.norm(way, axis=1) + _angle(turn0, turn1) * balls[:, 3]
-    met = np.minimum(moved[spot, first] + of_second, relative) >= before[spot, pair] + after[spot, pair]
-    return spot[met], pair[met]
+    return np.minimum(moved[spot, first] + of_second, relative)
 
 
 def _moved(before: Array, after: Array, of: Index, balls: Array) -> Array:

@@ -176,12 +176,14 @@ class Watch:
         neighbours = self._shapes.between < NEIGHBOUR_JOINTS
         self._include = np.where(neighbours, INCLUDE_NEIGHBOURS, INCLUDE)
         self._trigger = np.where(neighbours, TRIGGER_NEIGHBOURS, TRIGGER)
-        self._x: Array | None = None
+        # the last iterate, its placements and gaps
+        self._x, self._at = x.copy(), self._placed(x)
+        within = np.where(self._has, 0.0, TRIGGER)
+        self._found = self._at, self._shapes.look(self._at, within, self._directions, margins.wanted)
         # the last accepted trial: variables, directions, placements and gaps
         self._next: tuple[Array, Array, tuple[Placed, Looked]] | None = None
         self._interruptions, self.left = 0, False
         self.state: BarrierState | None = None
-        self._go_to(x)
 
     def constraints(self, within: float = INCLUDE) -> Constraints:
         """New constraints for all pairs that are near at the last iterate and have none. They count as
@@ -189,7 +191,7 @@ class Watch:
 
         within [m] : distance that is near; neighbouring links are near at a proportional part of it.
         """
-        _, near = self._gaps_at(self._at, self._directions, within)
+        near = self._gaps_at(self._at, self._directions, within)[1]
         new = (near.gap < within / INCLUDE * self._include[near.pair]) & ~self._has[near.spot, near.pair]
         out = Constraints()
         for k, n in zip(near.spot[new].tolist(), near.pair[new].tolist(), strict=True):
@@ -224,7 +226,7 @@ class Watch:
             directions = self._directions.copy()
             found = self._gaps_at(self._placed(trial), directions)
             clear = not self._violates_clearance(here[1], found[1])
-            if clear and not self._passes(x, step, length, here, found):
+            if clear and not self._passes(x + 0.5 * length * step, here, found):
                 self._next = trial, directions, found
                 break
             # After the last halving the step is taken as it is, 2^-8 of the first: no step
@@ -235,7 +237,7 @@ class Watch:
     # ------------------------------------------------------------------ placements and gaps
     def _go_to(self, x: Array) -> None:
         """Update placements, gaps and separating directions to an iterate (n,)."""
-        if self._x is not None and np.array_equal(self._x, x):
+        if np.array_equal(self._x, x):
             return
         # The solver mostly moves to the trial that `limit` accepted last: its placements are known.
         if self._next is not None and np.array_equal(self._next[0], x):
@@ -251,8 +253,13 @@ class Watch:
         return self._margins.bodies.placed(Places.of(self._t.robot, q, self._travel, self._phase))
 
     def _gaps_at(self, at: Placed, directions: Array, within: float = TRIGGER) -> tuple[Placed, Looked]:
-        """Gaps of all pairs, exact if less than ``within``; updates the directions of these in place."""
-        return at, self._shapes.look(at, within, directions, self._margins.wanted)
+        """Gaps of all pairs; updates directions in place.
+
+        Those without a constraint are exact if less than ``within``. The others are lower bounds, by how far
+        the bodies have moved, while these are positive: the program keeps such pairs apart.
+        """
+        exact_within = np.where(self._has, 0.0, within)
+        return at, self._shapes.look(at, exact_within, directions, self._margins.wanted, self._found)
 
     # ------------------------------------------------------------------ clearance violations
     def _bare(self, found: Looked, within: Array | float) -> NDArray[np.bool_]:
@@ -268,19 +275,15 @@ class Watch:
         fell = found.gap < GAP_FRACTION * before.gaps[found.spot, found.pair]
         return bool((fell & self._bare(found, MIN_GAP)).any())
 
-    def _passes(
-        self, x: Array, step: Array, length: float, one: tuple[Placed, Looked], two: tuple[Placed, Looked]
-    ) -> bool:
-        """True if bodies are clear before and after a step, but penetrate each other half way."""
-        spot, pair = self._shapes.may_meet(one, two, self._margins.wanted)
-        if not len(spot):
-            return False
-        suspects = np.zeros(len(self._shapes), dtype=bool)
-        suspects[pair] = True
-        half_way = self._placed(x + 0.5 * length * step)
-        found = self._shapes.look(half_way, TRIGGER, self._directions.copy(), suspects)
-        allowed = np.where(self._has[spot, pair], -MAX_MIDSTEP_PENETRATION, 0.0)
-        return bool((found.gaps[spot, pair] < allowed).any())
+    def _passes(self, half_way: Array, one: tuple[Placed, Looked], two: tuple[Placed, Looked]) -> bool:
+        """True if bodies are clear before and after a step, but penetrate each other half way, at variables
+        (n,).
+        """
+        clear = (one[1].gaps > 0) & (two[1].gaps > 0)
+        allowed = np.where(self._has, -MAX_MIDSTEP_PENETRATION, 0.0)
+        within, directions = np.where(clear, allowed, -np.inf), self._directions.copy()
+        found = self._shapes.look(self._placed(half_way), within, directions, self._margins.wanted, one)
+        return len(found.spot) > 0
 
 
 def solve_with_clearance(budget: Budget, margins: Margins | None, guess: Guess[Program]) -> Outcome[Program]:

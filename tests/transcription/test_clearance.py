@@ -31,8 +31,9 @@ from impactopt import (
     standin,
     talos,
 )
+from impactopt.bodies import separation
 from impactopt.bodies.clearance import Places
-from impactopt.bodies.separation import THIN
+from impactopt.bodies.separation import ROUNDING, THIN
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.planning.budget import Budget
 from impactopt.planning.clearance_constraints import (
@@ -274,6 +275,34 @@ def test_constraints_are_met_at_the_start(biped_transcription: Transcription) ->
     gaps = shapes.look(margins.bodies.placed(at), 1.0, np.zeros((1, len(shapes), 3)), margins.wanted).gaps[0]
     for row, held in rows.items():
         assert gaps[shapes.index[row[1:]]] > held.least_distance, row
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_gaps_are_bounded_by_how_far_bodies_have_moved(
+    biped_transcription: Transcription, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By their gaps in another posture: never too large, and exact where bodies may have met."""
+    if not compiled:
+        monkeypatch.setattr(separation, "_library", lambda: None)
+    margins, problem = margins_of(biped_transcription), biped_transcription.problem
+    bodies, shapes, model = margins.bodies, margins.bodies.shapes, problem.robot.model
+    turns = np.random.default_rng(5).uniform(-1, 1, (20, model.nv))
+    # five postures each that differ by less than a micrometre, a little, much, and altogether
+    turns *= np.repeat([1e-6, 0.01, 0.3, 1.0], 5)[:, None]
+
+    def placed(turns: Array, travel: float) -> Any:
+        q = np.array([pin.integrate(model, problem.start_posture, turn) for turn in turns])
+        return bodies.placed(Places.of(problem.robot, q, np.full(20, travel), np.zeros(20, dtype=np.intp)))
+
+    one, two = placed(0.0 * turns, 0.0), placed(turns, 0.03)
+    directions = np.zeros((20, len(shapes), 3))
+    before = shapes.look(one, np.inf, directions, margins.wanted)
+    exact = shapes.look(two, np.inf, directions.copy(), margins.wanted)
+    found = shapes.look(two, 0.0, directions.copy(), margins.wanted, (one, before))
+    # bounds of balls are of sharp hulls, whose distances exceed those of rounded ones
+    assert (found.gaps <= exact.gaps + 2 * ROUNDING * np.log(100)).all()
+    inside = exact.gaps < 0
+    assert inside.any() and np.array_equal(found.gaps[inside], exact.gaps[inside])
 
 
 def test_only_what_is_switched_off_is_not_kept_apart(biped_transcription: Transcription) -> None:

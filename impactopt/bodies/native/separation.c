@@ -14,68 +14,72 @@
 /* Rounded support in one direction; mean and covariance of the vertices, weighted by their share of it. */
 typedef struct { double h, mean[3], cov[6]; } Support;
 
-/* Vertices are stored in blocks of EIGHT: eight x, eight y, eight z. The last block is padded with copies. */
+/* Vertices are stored in blocks of EIGHT: eight x, eight y, eight z. The last block is padded with copies.
+ * Compilers do not vectorize loops over a block by themselves, as maxima and branches are in them: so a block's numbers
+ * are vectors (an extension of gcc and clang, which split them where the processor's are shorter). */
 #define EIGHT 8
 #define BLOCK (3 * EIGHT)
-#define COORDINATE(p, i, k) (p)[BLOCK * ((i) / EIGHT) + EIGHT * (k) + (i) % EIGHT]
+typedef double Vector __attribute__((vector_size(8 * EIGHT), aligned(8), may_alias));
+typedef int64_t Bits __attribute__((vector_size(8 * EIGHT), aligned(8), may_alias)); /* of a comparison: -1 or 0 each */
+#define LANES(p) (*(const Vector *)(p))
+
+static inline Vector larger(Vector a, Vector b) {
+    const Bits first = a > b;
+    return (Vector)(((Bits)a & first) | ((Bits)b & ~first));
+}
+static inline double sum(Vector v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
+static inline int any(Bits b) { return ((b[0] | b[4]) | (b[1] | b[5]) | (b[2] | b[6]) | (b[3] | b[7])) != 0; }
 
 /* Heights of n vertices in direction u, written to far; returns the largest. */
 static inline double support_heights(int64_t n, const double *restrict p, const double *u, double *restrict far) {
-    double most[EIGHT], top;
-    const double x = u[0], y = u[1], z = u[2];
-    for (int j = 0; j < EIGHT; ++j) most[j] = -1e300;
-    for (int64_t i = 0; i < n; i += EIGHT, p += BLOCK, far += EIGHT)
-        for (int j = 0; j < EIGHT; ++j) {
-            const double f = p[j] * x + p[EIGHT + j] * y + p[2 * EIGHT + j] * z;
-            far[j] = f;
-            most[j] = f > most[j] ? f : most[j];
-        }
-    top = most[0];
+    Vector most = LANES(p) * u[0] + LANES(p + EIGHT) * u[1] + LANES(p + 2 * EIGHT) * u[2];
+    *(Vector *)far = most;
+    for (int64_t i = EIGHT; i < n; i += EIGHT) {
+        p += BLOCK; far += EIGHT;
+        const Vector f = LANES(p) * u[0] + LANES(p + EIGHT) * u[1] + LANES(p + 2 * EIGHT) * u[2];
+        *(Vector *)far = f;
+        most = larger(f, most);
+    }
+    double top = most[0];
     for (int j = 1; j < EIGHT; ++j) top = most[j] > top ? most[j] : top;
     return top;
 }
 
-/* exp(x) for x <= 0 within 2 ulp, without branches, so that loops over it are vectorized: x = n log 2 + r, Taylor's
- * polynomial in r, and n added to the exponent's bits. Adding 1.5 * 2^52 rounds to the integer n. */
-static inline double decay(double x) {
-    const double whole = 0x1.8p52, c = x < -700.0 ? -700.0 : x, shifted = c * 0x1.71547652b82fep0 + whole, n = shifted - whole;
-    const double r = (c - n * 0x1.62e42fefa39efp-1) - n * 0x1.abc9e3b39803fp-56;
-    double e = 0x1.ae64567f544e4p-26; /* 1 / 11! */
-    e = e * r + 0x1.27e4fb7789f5cp-22; e = e * r + 0x1.71de3a556c734p-19; e = e * r + 0x1.a01a01a01a01ap-16;
-    e = e * r + 0x1.a01a01a01a01ap-13; e = e * r + 0x1.6c16c16c16c17p-10; e = e * r + 0x1.1111111111111p-7;
-    e = e * r + 0x1.5555555555555p-5; e = e * r + 0x1.5555555555555p-3; e = e * r + 0.5; e = e * r + 1.0; e = e * r + 1.0;
-    union { double d; uint64_t i; } in = {shifted}, out;
-    out.i = (in.i + 1023) << 52;
-    return e * out.d;
+/* exp(x) for x <= 0 within 2 ulp: x = n log 2 + r, Taylor's polynomial in r, and n added to the exponent's bits. Adding
+ * 1.5 * 2^52 rounds to the integer n. */
+static inline Vector decay(Vector x) {
+    const double whole = 0x1.8p52;
+    const Vector c = larger(x, (Vector){0} - 700.0), shifted = c * 0x1.71547652b82fep0 + whole, n = shifted - whole;
+    const Vector r = (c - n * 0x1.62e42fefa39efp-1) - n * 0x1.abc9e3b39803fp-56;
+    /* 1 / k!, summed by pairs (Estrin), as one multiplication after the other would wait for each */
+    const Vector r2 = r * r, r4 = r2 * r2, low = (r + 1.0) + (r * 0x1.5555555555555p-3 + 0.5) * r2;
+    const Vector mid = (r * 0x1.1111111111111p-7 + 0x1.5555555555555p-5) + (r * 0x1.a01a01a01a01ap-13 + 0x1.6c16c16c16c17p-10) * r2;
+    const Vector high = (r * 0x1.71de3a556c734p-19 + 0x1.a01a01a01a01ap-16) + (r * 0x1.ae64567f544e4p-26 + 0x1.27e4fb7789f5cp-22) * r2;
+    const Vector e = low + (mid + high * r4) * r4;
+    return e * (Vector)(((Bits)shifted + 1023) << 52);
 }
 
 /* Support of n vertices in direction u.  sharp [1/m]: 1 / rounding. */
 static void support(int64_t n, const double *restrict p, const double *u, double sharp, double *restrict far,
                     Support *out) {
     const double most = support_heights(n, p, u, far), least = most - MAX_EXPONENT / sharp;
-    double s[10][EIGHT] = {{0}}, t[10] = {0};
-    int64_t top = 0;
-    while (far[top] != most) ++top;
-    const double ox = COORDINATE(p, top, 0), oy = COORDINATE(p, top, 1), oz = COORDINATE(p, top, 2);
+    const double ox = p[0], oy = p[EIGHT], oz = p[2 * EIGHT]; /* any vertex: moments about a distant point cancel */
+    Vector s[10] = {{0}};
     for (int64_t i = n; i % EIGHT; ++i) far[i] = -1e300; /* copies do not count */
     for (int64_t i = 0; i < n; i += EIGHT, p += BLOCK, far += EIGHT) {
-        double near = far[0];
-        for (int j = 1; j < EIGHT; ++j) near = far[j] > near ? far[j] : near;
-        if (near < least) continue;
-        for (int j = 0; j < EIGHT; ++j) {
-            const double e = decay(sharp * (far[j] - most));
-            const double x = p[j] - ox, y = p[EIGHT + j] - oy, z = p[2 * EIGHT + j] - oz, ex = e * x, ey = e * y, ez = e * z;
-            s[0][j] += e; s[1][j] += ex; s[2][j] += ey; s[3][j] += ez;
-            s[4][j] += ex * x; s[5][j] += ex * y; s[6][j] += ex * z;
-            s[7][j] += ey * y; s[8][j] += ey * z; s[9][j] += ez * z;
-        }
+        const Vector height = LANES(far);
+        if (!any(height >= least)) continue;
+        const Vector e = decay(sharp * (height - most));
+        const Vector x = LANES(p) - ox, y = LANES(p + EIGHT) - oy, z = LANES(p + 2 * EIGHT) - oz, ex = e * x, ey = e * y, ez = e * z;
+        s[0] += e; s[1] += ex; s[2] += ey; s[3] += ez;
+        s[4] += ex * x; s[5] += ex * y; s[6] += ex * z;
+        s[7] += ey * y; s[8] += ey * z; s[9] += ez * z;
     }
-    for (int k = 0; k < 10; ++k) for (int j = 0; j < EIGHT; ++j) t[k] += s[k][j];
-    const double one = 1.0 / t[0], m0 = t[1] * one, m1 = t[2] * one, m2 = t[3] * one;
-    out->h = most + log(t[0]) / sharp;
+    const double total = sum(s[0]), one = 1.0 / total, m0 = sum(s[1]) * one, m1 = sum(s[2]) * one, m2 = sum(s[3]) * one;
+    out->h = most + log(total) / sharp;
     out->mean[0] = ox + m0; out->mean[1] = oy + m1; out->mean[2] = oz + m2;
-    out->cov[0] = t[4] * one - m0 * m0; out->cov[1] = t[5] * one - m0 * m1; out->cov[2] = t[6] * one - m0 * m2;
-    out->cov[3] = t[7] * one - m1 * m1; out->cov[4] = t[8] * one - m1 * m2; out->cov[5] = t[9] * one - m2 * m2;
+    out->cov[0] = sum(s[4]) * one - m0 * m0; out->cov[1] = sum(s[5]) * one - m0 * m1; out->cov[2] = sum(s[6]) * one - m0 * m2;
+    out->cov[3] = sum(s[7]) * one - m1 * m1; out->cov[4] = sum(s[8]) * one - m1 * m2; out->cov[5] = sum(s[9]) * one - m2 * m2;
 }
 
 static inline double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -306,7 +310,8 @@ EXPORT void separation(int64_t count, int64_t n, const double *z, const double *
  * half sides and inflation of the world's bodies.  pairs (P, 2): joint, and joint or -1 - the world's body.
  * pieces (P, 2): the same pairs by pieces.  hulls (P, 4).  extra (P,): inflation of the second body.  present (K, W).
  * directions (K, P, 3): updated; zero if unknown.  gaps (K, P): separations, or lower bounds of those that are not
- * below `within`.  room: work memory for the heights of the largest hull, and (2 B + J) numbers.
+ * below `within` (K, P).  joints0, world0, gaps0: other placements and their gaps, or null: a gap is no less than there
+ * minus the ways of both bodies.  room: work memory for the heights of the largest hull, and (4 B + J) numbers.
  * Returns the number of pairs below `within`; their indices are in near (2 each), at most `most`. */
 /* Placement of a in b's frame. */
 static void relative(const double *a, const double *b, double *R) {
@@ -334,14 +339,42 @@ static void centre_of(const double *place, const double *ball, double *c) {
     times(place, ball, c);
     for (int j = 0; j < 3; ++j) c[j] += place[9 + j];
 }
+static double angle_between(const double *R0, const double *R1) {
+    double trace = 0.0;
+    for (int j = 0; j < 9; ++j) trace += R0[j] * R1[j];
+    return acos(fmax(-1.0, fmin(1.0, 0.5 * (trace - 1.0))));
+}
+static double length_between(const double *a, const double *b) {
+    const double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
+    return sqrt(dot(d, d));
+}
+/* Largest way of any point of a ball, placed at a0 and at a1, relative to a body that is placed at b0 and at b1. */
+static double relative_way(const double *a0, const double *b0, const double *a1, const double *b1, const double *ball) {
+    double R0[12], R1[12], x0[3], x1[3];
+    relative(a0, b0, R0); relative(a1, b1, R1);
+    centre_of(R0, ball, x0); centre_of(R1, ball, x1);
+    return length_between(x0, x1) + angle_between(R0, R1) * ball[3];
+}
+/* Largest way (B,) of any point of the pieces' balls between placements of the joints (J, 12).  turned: memory (J,). */
+static void motions(int64_t J, int64_t B, const double *from, const double *to, const int64_t *of, const double *balls,
+                    double *turned, double *moved) {
+    for (int64_t j = 0; j < J; ++j) turned[j] = angle_between(from + 12 * j, to + 12 * j);
+    for (int64_t i = 0; i < B; ++i) {
+        double c0[3], c1[3];
+        centre_of(from + 12 * of[i], balls + 4 * i, c0); centre_of(to + 12 * of[i], balls + 4 * i, c1);
+        moved[i] = length_between(c0, c1) + turned[of[i]] * balls[4 * i + 3];
+    }
+}
 EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, int64_t B, const double *joints, const double *world,
                     const int64_t *of, const double *balls, const double *boxes, const int64_t *pairs,
                     const int64_t *pieces, const int64_t *hulls, const double *extra, const uint8_t *present,
-                    const uint8_t *wanted, const double *points, double sharp, double within, double *directions,
+                    const uint8_t *wanted, const double *points, double sharp, const double *within,
+                    const double *joints0, const double *world0, const double *gaps0, double *directions,
                     double *gaps, double *room, int64_t most, int64_t *near) {
     int64_t found = 0;
-    double *centres = room, *far = room + 3 * B;
+    double *centres = room, *moved = room + 3 * B, *turned = moved + B, *far = turned + J;
     for (int64_t k = 0; k < K; ++k) {
+        if (gaps0) motions(J, B, joints0 + 12 * k * J, joints + 12 * k * J, of, balls, turned, moved);
         for (int64_t i = 0; i < B; ++i) centre_of(joints + 12 * (k * J + of[i]), balls + 4 * i, centres + 3 * i);
         for (int64_t i = 0; i < P; ++i) {
             double *u = directions + 3 * (k * P + i), *gap = gaps + k * P + i;
@@ -355,8 +388,16 @@ EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, int64_t B, const
                 for (int j = 0; j < 3; ++j) way[j] = c[j] - centres[3 * two + j];
                 bound = sqrt(dot(way, way)) - balls[4 * one + 3] - balls[4 * two + 3];
             } else bound = from_box(c, b, boxes - 4 * (1 + other), way) - balls[4 * one + 3] - boxes[3 - 4 * (1 + other)];
+            if (gaps0 && bound <= within[k * P + i]) {
+                const double *b0 = other < 0 ? world0 + 12 * (k * W - 1 - other) : joints0 + 12 * (k * J + other);
+                const double before = gaps0[k * P + i], second = other < 0 ? length_between(b0 + 9, b + 9) : moved[two];
+                double least = before - moved[one] - second;
+                if (least <= within[k * P + i] && before > within[k * P + i])
+                    least = before - relative_way(joints0 + 12 * (k * J + pairs[2 * i]), b0, joints + 12 * (k * J + pairs[2 * i]), b, balls + 4 * one);
+                if (least > bound) bound = least;
+            }
             *gap = bound;
-            if (bound > within) continue;
+            if (bound > within[k * P + i]) continue;
             relative(joints + 12 * (k * J + pairs[2 * i]), b, R);
             if (u[0] == 0.0 && u[1] == 0.0 && u[2] == 0.0) {
                 if (other >= 0) { double x[3]; times_t(b, way, x); for (int j = 0; j < 3; ++j) way[j] = x[j]; }
@@ -368,55 +409,11 @@ EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, int64_t B, const
             times_t(R, down, local);
             double rough = dot(u, R + 9) - support_heights(h[1], points + 3 * h[0], local, far) - support_heights(h[3], points + 3 * h[2], u, far) - extra[i];
             rough -= 10.0 / sharp;
-            if (rough > within) { *gap = rough; continue; }
+            if (rough > within[k * P + i]) { *gap = rough; continue; }
             Side at;
             separate(R, R + 9, h[1], points + 3 * h[0], h[3], points + 3 * h[2], u, sharp, DISTANCES, far, &at);
             *gap = at.s - extra[i];
-            if (*gap < within && found < most) { near[2 * found] = k; near[2 * found + 1] = i; ++found; }
-        }
-    }
-    return found;
-}
-static double angle_between(const double *R0, const double *R1) {
-    double trace = 0.0;
-    for (int j = 0; j < 9; ++j) trace += R0[j] * R1[j];
-    return acos(fmax(-1.0, fmin(1.0, 0.5 * (trace - 1.0))));
-}
-static double length_between(const double *a, const double *b) {
-    const double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
-    return sqrt(dot(d, d));
-}
-/* Pairs that may have collided between two sets of placements: they are separated at both, but moved farther than both
- * gaps together: the balls of both in the world, and that of the first relative to the second. The first is quick to
- * tell, the second finds what moves with the whole robot.  Returns their number; indices are in met (2 each). */
-EXPORT int64_t may_meet(int64_t K, int64_t J, int64_t W, int64_t P, int64_t B, const double *joints0, const double *world0,
-                        const double *joints1, const double *world1, const int64_t *of, const double *balls,
-                        const int64_t *pairs, const int64_t *pieces, const uint8_t *wanted, const double *gaps0,
-                        const double *gaps1, double *room, int64_t most, int64_t *met) {
-    int64_t found = 0;
-    double *moved = room, *turned = room + B;
-    for (int64_t k = 0; k < K; ++k) {
-        const double *from = joints0 + 12 * k * J, *to = joints1 + 12 * k * J;
-        for (int64_t j = 0; j < J; ++j) turned[j] = angle_between(from + 12 * j, to + 12 * j);
-        for (int64_t i = 0; i < B; ++i) {
-            double c0[3], c1[3];
-            centre_of(from + 12 * of[i], balls + 4 * i, c0); centre_of(to + 12 * of[i], balls + 4 * i, c1);
-            moved[i] = length_between(c0, c1) + turned[of[i]] * balls[4 * i + 3];
-        }
-        for (int64_t i = 0; i < P; ++i) {
-            const double before = gaps0[k * P + i], after = gaps1[k * P + i], g = before + after;
-            if (!wanted[i] || before <= 0.0 || after <= 0.0 || g > 5.0) continue;
-            const int64_t other = pairs[2 * i + 1], joint = pairs[2 * i], one = pieces[2 * i];
-            /* bodies of the world do not turn */
-            const double *b0 = other < 0 ? world0 + 12 * (k * W - 1 - other) : from + 12 * other;
-            const double *b1 = other < 0 ? world1 + 12 * (k * W - 1 - other) : to + 12 * other;
-            if (moved[one] + (other < 0 ? length_between(b0 + 9, b1 + 9) : moved[pieces[2 * i + 1]]) < g) continue;
-            double R0[12], R1[12], x0[3], x1[3];
-            relative(from + 12 * joint, b0, R0); relative(to + 12 * joint, b1, R1);
-            centre_of(R0, balls + 4 * one, x0); centre_of(R1, balls + 4 * one, x1);
-            if (length_between(x0, x1) + angle_between(R0, R1) * balls[4 * one + 3] >= g && found < most) {
-                met[2 * found] = k; met[2 * found + 1] = i; ++found;
-            }
+            if (*gap < within[k * P + i] && found < most) { near[2 * found] = k; near[2 * found + 1] = i; ++found; }
         }
     }
     return found;

@@ -21,6 +21,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.robots.checks import check_configuration
 from impactopt.robots.couplings import axis_of
 from impactopt.robots.joint_angles import JointAngles
 from impactopt.robots.rigid_body._spatial import (
@@ -432,16 +433,7 @@ class Coordinates:
 
     def from_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """These coordinates (nq,) of Pinocchio's q; angles of continuous joints in (-pi, pi]."""
-        q = check_array("q (pinocchio)", q, (self.tree.nq,))
-        unit_vectors = [("quaternion", 3, 7)] if self.tree.floating else []
-        unit_vectors += [
-            (f"joint {j.name!r} (cos, sin)", j.q, j.q + 2) for j in self.tree.joints if j.continuous
-        ]
-        for part, k, end in unit_vectors:
-            if abs(np.linalg.norm(q[k:end]) - 1.0) > 1e-6:
-                raise InputError(
-                    f"q (pinocchio): {part}, q[{k}:{end}], must be of norm 1; pin.normalize(model, q)"
-                )
+        q = check_configuration(self.tree.model, q, "q (pinocchio)")
         if self.base == "quaternion":
             return q
         if not self.tree.floating:

@@ -31,9 +31,7 @@ from impactopt.collision.native.sizes import (
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
 
-# files of the time stepping, and of its discrete adjoint
 _IMPLICIT = ("", "_factor", "_step", "_remainders", "_events", "_run")  # parts of implicit.h
-_ADJOINT = {"rk4": ("rk4_adjoint.h", "steps_adjoint.h"), "implicit": ("implicit_adjoint.h",)}
 # The generated code of the tree is long and without branches. These options make it a sixth faster than -Og
 # for half a second more of the compiler; -O2 takes another half and gains nothing.
 _TREE, _QUICK_TREE = '"O1", "expensive-optimizations", "reciprocal-math", "schedule-insns2"', '"O0"'
@@ -210,10 +208,10 @@ def _code(
         *of_differences,
     ]
     method = collision.stepping
-    steps = ["rk4.h", "steps.h"] if method == "rk4" else [f"implicit{part}.h" for part in _IMPLICIT]
+    steps = ["rk4.h"] if method == "rk4" else [f"implicit{part}.h" for part in _IMPLICIT]
     files_used = ["freeze.h", "instant.h", "histories.h", *steps, "segments.h"]
     if gradient:
-        files_used += ["adjoint.h", *_ADJOINT[method], "freeze_adjoint.h", "gradient.c"]
+        files_used += ["adjoint.h", f"{method}_adjoint.h", "freeze_adjoint.h", "gradient.c"]
     elif jacobian:
         tangents = [f"{name}_tangent.h" for name in ("freeze", "implicit", "histories", "run")]
         files_used += ["final_outputs.h", "tangent.h", *tangents, "jacobian.c"]

@@ -90,7 +90,8 @@ def check_choice(what: str, given: object, known: Iterable[str]) -> None:
 def check_kind(name: str, given: object, kind: type) -> None:
     """InputError unless an argument is an instance of a class."""
     if not isinstance(given, kind):
-        raise InputError(f"{name} must be a {kind.__name__}, not {shortened(repr(given))}")
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise InputError(f"{name} must be {article} {kind.__name__}, not {shortened(repr(given))}")
 
 
 def missing_package(what: str, package: str, extra: str) -> InputError:

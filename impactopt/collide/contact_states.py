@@ -364,21 +364,14 @@ class ContactStates:
 
     def _moved(self, start: Array, names: tuple[str, ...], by: Array) -> tuple[Array, Reasons]:
         """Configurations (P, nq) with the named joints moved by angles (P, joints), and reasons (P)."""
-        robot, model = self.robot, self.robot.model
-        q = np.repeat(start[None], len(by), axis=0)
-        reason = np.full(len(by), "", dtype=object)
-        own = robot.joint_positions(start)
+        robot, reason = self.robot, np.full(len(by), "", dtype=object)
+        angles = np.repeat(robot.joint_positions(start)[None], len(by), axis=0)
         for name, angle in zip(names, by.T, strict=True):
             k = robot.joint_index(name)
-            joint = model.joints[model.getJointId(name)]
-            index = int(joint.idx_q)
-            if joint.nq == 1:
-                q[:, index] += angle
-            else:  # a continuous joint: cosine and sine
-                q[:, index], q[:, index + 1] = np.cos(own[k] + angle), np.sin(own[k] + angle)
-            out = (own[k] + angle < robot.lower[k] - 1e-9) | (own[k] + angle > robot.upper[k] + 1e-9)
+            angles[:, k] += angle
+            out = (angles[:, k] < robot.lower[k] - 1e-9) | (angles[:, k] > robot.upper[k] + 1e-9)
             _set_reason(reason, out, f"{name} would be beyond its limit")
-        return q, reason
+        return robot.angles.put(np.repeat(start[None], len(by), axis=0), angles), reason
 
     def _call(self, name: str, inputs: Array) -> Array:
         """Outputs (N, ...) of a compiled function for inputs (N, size), in blocks of a fixed size."""

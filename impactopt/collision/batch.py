@@ -34,6 +34,7 @@ from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.settings import NO_LIMIT
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array, raw_array
+from impactopt.robots.checks import unit_parts
 
 Array = NDArray[np.float64]
 _ALIGNED = 8  # doubles that a work array is longer, as the C code aligns it
@@ -237,10 +238,9 @@ def _inputs(
     if not count:
         raise InputError("q: no collision; give at least one, (N, nq)")
     given["v"] = check_array("v", v, (count, robot.nv))
-    if robot.floating:
-        off = np.abs(np.linalg.norm(given["q"][:, 3:7], axis=1) - 1)
-        if off.max() > 1e-6:
-            robot.check_configuration(given["q"][off.argmax()], name=f"q of collision {off.argmax()}")
+    for _, part in unit_parts(robot.model):
+        worst = int(np.abs(np.linalg.norm(given["q"][:, part], axis=1) - 1).argmax())
+        robot.check_configuration(given["q"][worst], name=f"q of collision {worst}")
     if model.effects.feedforward:
         if torque is None:
             raise InputError("torque: give the feed-forward torque (N, n) [N m], or (n) for all")

@@ -96,15 +96,6 @@ def check_frozen(frozen: dict[str, Array]) -> None:
             raise InputError(f"q: the frozen dynamics have no finite {name} here; check the robot's inertias")
 
 
-def ill_conditioned_cases(frozen: dict[str, Array]) -> Any:
-    """Mask (N) of the cases that `check_frozen` refuses, from frozen quantities (N, ...)."""
-    bad = ~(frozen["pivots"] > LEAST_PIVOT).all(axis=1)
-    bad |= ~(frozen["freedom"][:, 0] > LEAST_PIVOT) & (frozen["m"][:, 0] != 0)
-    for name in {*frozen} - {"pivots", "freedom"}:
-        bad |= ~np.isfinite(frozen[name]).all(axis=1)
-    return bad
-
-
 def without_contact(impulse: Array, duration: Array, step: Any = 0.0) -> Any:
     """True for contacts so short that rounding hides their force, or within one explicit step [s]."""
     return (duration > 0) & ((impulse < 0) | (duration <= step))
@@ -295,7 +286,7 @@ class Stability:
         return _STABILITY_LIMIT / max(rates)
 
     def unstable(self, given: Mapping[str, Array]) -> NDArray[np.bool_]:
-        """Mask (N) of the cases of a batch with an unstable step, or with dependent constraints.
+        """Mask (N) of the cases of a batch with an unstable step.
 
         given : inputs by name, with a first axis of N or 1.
         """
@@ -311,5 +302,4 @@ class Stability:
         data: dict[str, Any] = frozen | {name: given[name] for name in collision.settings}
         own = {name: x for name, x in data.items() if name in self._model.data}
         own |= {name: np.zeros((1, *shape)) for name, shape in self._model.data.items() if name not in own}
-        unstable = _unstable_cases(self._model, self._slope, own, collision.step_length)
-        return np.asarray(unstable | ill_conditioned_cases(frozen))
+        return np.asarray(_unstable_cases(self._model, self._slope, own, collision.step_length))

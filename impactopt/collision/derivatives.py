@@ -33,6 +33,7 @@ from impactopt.collision.native.source import least_size
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
+from impactopt.robots.checks import unit_parts
 from impactopt.robots.rigid_body import RigidBody
 
 Array = NDArray[np.float64]
@@ -299,32 +300,22 @@ def _size(model: SteppedModel, name: str) -> Array:
 def _configuration(model: SteppedModel) -> tuple[Any, Any]:
     """ca.Functions q -> q with unit-length parts normalized (None without any), and q -> T (nv, nq)."""
     robot = model.robot
-    units = _units(robot.model)
+    units = unit_parts(robot.model)
     q = ca.MX.sym("q", robot.nq)
     if not units:
         return None, ca.Function("to_tangent", [q], [ca.MX.eye(robot.nv)])
     rb = RigidBody(robot.model)
     given, lengths, square = ca.SX.sym("q", robot.nq), ca.SX.ones(robot.nq), np.ones(robot.nv)
-    for begin, end, velocities in units:
-        lengths[begin:end] = ca.norm_2(given[begin:end])
-        square[velocities] = (end - begin) ** 2 / 4  # the columns of dq/dv have length 1/2 for a quaternion
+    for i, part in units:
+        lengths[part] = ca.norm_2(given[part])
+        if robot.model.joints[i].nq == 7:  # a free-flyer, the root
+            square[3:6] = 4.0  # the columns of dq/dv have length 1/2 for a quaternion
     unit = given / lengths
     basis = ca.Function("basis", [rb.q], [rb.tangent_map()])
     to_tangent = ca.mtimes(ca.diag(ca.DM(square)), basis(unit).T)
     # T is constant along a ray of q, so its derivative there is over the length; along the ray it is zero
     to_tangent = ca.mtimes(to_tangent, ca.diag(1 / lengths))
     return ca.Function("unit", [given], [unit]), ca.Function("to_tangent", [given], [to_tangent])
-
-
-def _units(model: Any) -> list[tuple[int, int, slice]]:
-    """Unit-length parts of q, quaternions or (cosine, sine): start and end in q, and the slice in v."""
-    found = []
-    for joint in model.joints:
-        if joint.nq == 7:
-            found.append((joint.idx_q + 3, joint.idx_q + 7, slice(joint.idx_v + 3, joint.idx_v + 6)))
-        elif joint.nq > joint.nv:
-            found.append((joint.idx_q, joint.idx_q + joint.nq, slice(joint.idx_v, joint.idx_v + joint.nv)))
-    return found
 
 
 _RESERVED_NAMES = ("collision", "collision_gradient", "collision_jacobian", "collision_differences")

@@ -67,13 +67,13 @@ class Collision:
     penetration: Array
     hand_speed: Array
     target_speed: Array
-    joint_velocity: Array | None
-    torque: Array | None
-    demand: Array | None
-    sole_wrench: Array | None
-    hand_wrench: Array | None
-    ground_wrench: Array | None
-    zmp: Array | None
+    joint_velocity: Array | None = None
+    torque: Array | None = None
+    demand: Array | None = None
+    sole_wrench: Array | None = None
+    hand_wrench: Array | None = None
+    ground_wrench: Array | None = None
+    zmp: Array | None = None
     freeze_error: float = np.nan
     caution: str = ""
 
@@ -98,11 +98,8 @@ class Collision:
         out["separated"] = bool(round(out["separated"]))
         given = out.pop("target_result", np.zeros(0))
         out["target_result"] = dict(zip(target.results, map(float, given), strict=True))
-        for name in HISTORIES:
-            out.setdefault(name, None)
-        for name in ("sole_wrench", "hand_wrench"):
-            if out[name] is not None:
-                out[name] = out[name].reshape(int(kept.sum()), -1, 6)
+        for name in {"sole_wrench", "hand_wrench"} & {*out}:
+            out[name] = out[name].reshape(int(kept.sum()), -1, 6)
         return cls(**out)
 
 
@@ -139,6 +136,8 @@ class CollisionModel(ABC):
 
     def __post_init__(self) -> None:
         check_kind("robot", self.robot, Robot)
+        if self.stance is not None:
+            check_kind("stance", self.stance, Stance)
         frame = self.robot.striker(self.striker).model_frame
         if frame in self.held_by.constraint_frames(self.robot):
             raise InputError(f"striker {self.striker!r}: it is held by the stance; strike with another")

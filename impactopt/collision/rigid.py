@@ -14,6 +14,7 @@ from impactopt.errors import InputError, check_array, check_choice, check_number
 from impactopt.kinematics.operational_space import ConstrainedDynamics
 
 Array = NDArray[np.float64]
+MIN_MOBILITY = 1e-12  # [1/kg] of hand and target together; with less, rounding decides about the impulse
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,42 +81,40 @@ class RigidImpact(CollisionModel):
         q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
         for name in overrides:
             check_choice("there is no setting", name, self.settings)
-        known = self.settings | {n: float(check_array(n, x, ())) for n, x in overrides.items()}
-        numbers = {name: known[f"target_{name}"] for name in self.target.parameters}
-        state = np.zeros(self.target.n_states)
-        before = float(self.target.velocity(state, numbers))
+        changes = {n.removeprefix("target_"): float(check_array(n, x, ())) for n, x in overrides.items()}
+        target = type(self.target)(**{**self.target.parameters, **changes})  # which checks the numbers
+        numbers, state = target.parameters, np.zeros(target.n_states)
+        before = float(target.velocity(state, numbers))
         hand, change = self._by_unit_impulse(q)
         speed, inverse_mass = float(hand @ v), float(hand @ change)
         # change of the target's state, and of its velocity [1/kg], by a unit impulse
         # both targets are linear in the force, so a unit force for a unit of time is a unit impulse
-        gain = np.array(self.target.derivative(state, 1.0, numbers), dtype=float)
+        gain = np.array(target.derivative(state, 1.0, numbers), dtype=float)
         # the velocity is linear in the state, with `before` at zero
-        of_target = float(self.target.velocity(gain, numbers)) - before
+        of_target = float(target.velocity(gain, numbers)) - before
         e = self.coefficient_of_restitution
+        if not inverse_mass + of_target > MIN_MOBILITY:
+            raise InputError(
+                "q: the held frames leave the striking point no motion along the normal here, and a wall has "
+                "none either; bend the arm, or turn the normal"
+            )
         # a hand that does not approach does not hit
         impulse = max((1 + e) * (speed - before) / (inverse_mass + of_target), 0.0)
         after, state = v - change * impulse, gain * impulse
-        values = self.target.result(state, numbers)
+        values = target.result(state, numbers)
         at = np.zeros(1)
         return Collision(
             impulse=impulse,
             peak_force=np.inf if impulse else 0.0,
             duration=0.0,
-            energy=float(self.target.energy(state, numbers)),
+            energy=float(target.energy(state, numbers)),
             separated=True,
             velocity=after,
             configuration=q,
-            target_result=dict(zip(self.target.results, map(float, values), strict=True)),
+            target_result=dict(zip(target.results, map(float, values), strict=True)),
             time=at,
             force=at,
             penetration=at,
             hand_speed=np.array([speed - inverse_mass * impulse]),
-            target_speed=np.array([float(self.target.velocity(state, numbers))]),
-            joint_velocity=None,
-            torque=None,
-            demand=None,
-            sole_wrench=None,
-            hand_wrench=None,
-            ground_wrench=None,
-            zmp=None,
+            target_speed=np.array([float(target.velocity(state, numbers))]),
         )

@@ -13,7 +13,7 @@ from impactopt.collision.checks import caution, more_often
 from impactopt.collision.settings import Effects, JointFriction, servo_settings
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import ContactFriction, ContactLaw, FreeMass, SpringDamper, Target
-from impactopt.errors import InputError, check_array, check_choice
+from impactopt.errors import InputError, check_array, check_choice, check_kind
 from impactopt.kinematics.stance import BothSoles, FixedBase, Stance
 from impactopt.robots.robot import Robot
 
@@ -67,6 +67,9 @@ class SDC(SymbolicModel):
     accuracy: float | None = 1e-2
 
     def __post_init__(self) -> None:
+        check_kind("effects", self.effects, Effects)
+        if self.friction is not None:
+            check_kind("friction", self.friction, JointFriction)
         if self.effects.friction and self.friction is None:
             raise InputError("effects.friction is on: give friction=JointFriction(viscous=..., coulomb=...)")
         if self.friction is not None and not self.effects.friction:

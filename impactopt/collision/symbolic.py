@@ -23,7 +23,7 @@ from impactopt.collision.checks import (
     freeze_error,
     left_out_by_breaking,
 )
-from impactopt.collision.derivatives import differentiable, export, in_order
+from impactopt.collision.derivatives import Part, differentiable, export, in_order, native_part
 from impactopt.collision.graph import Description, collision_graph, describe, target_start
 from impactopt.collision.interface import Collision
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
@@ -150,7 +150,17 @@ class SymbolicModel(SteppedModel):
 
     def _gradient(self, output: str) -> Any:
         """Likewise, with all settings as inputs."""
-        return self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
+        if not self.n_freezes:
+            return self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
+        # The length of a segment, and the posture that it is frozen at, depend on the segment before: there
+        # is no adjoint.
+        part = Part("collision_differences", (output,), ("q", "v"))
+        slopes = self._compiled(part.name, *native_part(self, part, 1))
+        value = self._collision(tuple(dict.fromkeys((output, "separated"))))
+        inputs = [ca.MX.sym(name, *value.size_in(name)) for name in value.name_in()]
+        out = [value.call(inputs)[0], *map(ca.vec, slopes.call(inputs))]
+        names = [output, f"{output}_by_q", f"{output}_by_v"]
+        return ca.Function("collision_gradient", inputs, out, value.name_in(), names)
 
     def jacobian_function(
         self,

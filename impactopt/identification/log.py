@@ -187,7 +187,7 @@ def _hand(
     model, data = robot.model, robot.model.createData()
     angles = np.column_stack([_joint(columns, robot, k, name) for k in range(robot.n)])
     travel, mass = np.empty((2, len(angles)))
-    for k, q in enumerate(_configurations(robot, angles)):
+    for k, q in enumerate(robot.angles.put(np.empty((len(angles), robot.nq)), angles)):
         pin.framesForwardKinematics(model, data, q)
         travel[k] = n @ data.oMf[model.getFrameId(frame)].translation
         mass[k] = 1.0 / (n @ ConstrainedDynamics.at(model, q, (), frame).inverse_mass() @ n)
@@ -211,17 +211,6 @@ def _joint(columns: Mapping[str, Array], robot: Robot, k: int, name: str) -> Arr
 
 def _turns(robot: Robot, k: int) -> bool:
     return bool(axis_of(robot.model, robot.joint_models[k].id).subspace[3:].any())
-
-
-def _configurations(robot: Robot, angles: Array) -> Array:
-    """Configurations (k, nq) of joint positions (k, n); a continuous joint has its cosine and sine."""
-    out = np.empty((len(angles), robot.nq))
-    for joint, values in zip(robot.joint_models, angles.T, strict=True):
-        if joint.nq == 2:
-            out[:, joint.idx_q], out[:, joint.idx_q + 1] = np.cos(values), np.sin(values)
-        else:
-            out[:, joint.idx_q] = values
-    return out
 
 
 _MIN_CONTACT_FORCE, _MIN_PEAK = 0.1, 0.2  # of contact, and of an impact's peak, over the log's largest force

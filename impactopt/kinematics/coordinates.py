@@ -16,10 +16,10 @@ robot the coordinates are the base's pose and all joints.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -29,6 +29,7 @@ from scipy.linalg.lapack import dgesv
 
 from impactopt.errors import InputError
 from impactopt.robots.checks import LEG, check_arms, check_legs
+from impactopt.robots.joint_angles import JointAngles
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
 from impactopt.robots.tools import check_held
@@ -44,67 +45,38 @@ _DAMPING = 1e-12 * np.eye(6)  # a stretched leg's Jacobian is singular
 _EXTRAPOLATION = ((1.0,), (-1.0, 2.0), (1.0, -3.0, 3.0))
 
 
-class Limb(NamedTuple):
-    """Limb whose last six joints keep a frame at its placement in the world.
-
-    columns (6,) : of these joints in v.
-    """
-
-    frame: str
-    placement: pin.SE3
-    columns: Index
-
-
 class LegClosure:
     """Inverse kinematics of a stance's legs, and their rates and accelerations from the soles' constraint.
 
     It holds all that is common to the thousands of postures of references and clearance checks.
     """
 
-    def __init__(
-        self,
-        model: pin.Model,
-        data: pin.Data,
-        limbs: Sequence[Limb],
-        *,
-        base: int,
-        independent: Index,
-        join: Callable[[Array, Array], Array],
-    ) -> None:
-        """base : number of the base's coordinates, 6 or 0.  independent : columns in v of joints that are
-        coordinates.  join : function that gives q (nq,) of coordinates (ny,) and legs (nl,).
-        """
-        self._model, self._data, self._base, self._join = model, data, base, join
-        self._frames = [model.getFrameId(limb.frame) for limb in limbs]
+    def __init__(self, c: StanceCoordinates, placements: Sequence[pin.SE3]) -> None:
+        """placements : of the constrained frames in the world."""
+        self._model, self._data, self._base, self._join = c.model, c.data, c.base, c.join
+        self._frames = [c.model.getFrameId(frame) for frame in c.frames]
         self._limbs = [
-            (frame, limb.placement, limb.columns, slice(6 * k, 6 * k + 6))
-            for k, (frame, limb) in enumerate(zip(self._frames, limbs, strict=True))
+            (frame, placement, c.base + leg.joints, slice(6 * k, 6 * k + 6))
+            for k, (frame, placement, leg) in enumerate(zip(self._frames, placements, c.legs, strict=True))
         ]
-        none = np.zeros(0, dtype=np.intp)
-        self._dependent = np.concatenate([none, *(limb.columns for limb in limbs)])
-        self._independent = independent
-        of_column = {joint.idx_v: joint for joint in model.joints if joint.nv}
-        joints = [of_column[int(column)] for column in self._dependent]
-        # indices in q of the leg joints; None if one is continuous, as Pinocchio has (cos, sin) of its angle
-        # in q
-        simple = all(joint.nq == 1 for joint in joints)
-        self._leg_indices = np.array([joint.idx_q for joint in joints], dtype=np.intp) if simple else None
+        self._dependent, self._independent = c.base + c.dependent, c.base + c.independent
+        self._leg_angles = JointAngles([c.robot.joint_models[j] for j in c.dependent])
 
     def legs(self, y: Array, guess: Array) -> Array:
         """`StanceCoordinates.solve_legs`."""
-        return self._close(self._join(y, guess), y, guess)
+        return self._close(self._join(y, guess), guess)
 
-    def _close(self, q: Array, y: Array, guess: Array) -> Array:
-        """Legs (nl,) of coordinates y (ny,) by Newton's method; InputError if it does not converge.
+    def _close(self, q: Array, guess: Array) -> Array:
+        """Legs (nl,) by Newton's method; InputError if it does not converge.
 
-        q (nq,) : a configuration with these coordinates; the legs are written to it.
+        q (nq,) : a configuration with the coordinates; the legs are written to it.
         """
         legs = np.array(guess, dtype=float)
         if not self._limbs:
             return legs
         model, data, worst = self._model, self._data, np.inf
         for _ in range(_MAX_STEPS):
-            self._set_legs(q, y, legs)
+            self._leg_angles.put(q, legs)
             pin.computeJointJacobians(model, data, q)
             worst = 0.0
             for frame, placement, columns, own in self._limbs:
@@ -118,19 +90,12 @@ class LegClosure:
                 step = dgesv(jac.T @ jac + _DAMPING, jac.T @ error)[2]
                 legs[own] += np.minimum(np.maximum(step, -_LARGEST_STEP), _LARGEST_STEP)
             if worst < _CONVERGED:
-                self._set_legs(q, y, legs)
+                self._leg_angles.put(q, legs)
                 return legs
         raise InputError(
             f"the legs cannot hold the soles in place here (off by {worst:.2g} m or rad): the base is out of "
             "the legs' reach"
         )
-
-    def _set_legs(self, q: Array, y: Array, legs: Array) -> None:
-        """Write legs (nl,) to a configuration (nq,) of coordinates y (ny,)."""
-        if self._leg_indices is None:
-            q[:] = self._join(y, legs)
-        else:
-            q[self._leg_indices] = legs
 
     def follow(self, coordinates: Array, guess: Array) -> Iterator[tuple[Array, Array]]:
         """Configurations (nq,) and legs (nl,) along a continuous motion in coordinates (k, ny), one by one.
@@ -140,9 +105,9 @@ class LegClosure:
         # All configurations without legs in one call: one by one they take as long as the legs.
         q = self._join(coordinates, np.zeros((len(coordinates), len(self._dependent))))
         previous = [guess]
-        for k, y in enumerate(coordinates):
+        for k in range(len(coordinates)):
             weights = np.array(_EXTRAPOLATION[len(previous) - 1])
-            legs = self._close(q[k], y, weights @ np.array(previous))
+            legs = self._close(q[k], weights @ np.array(previous))
             # The caller's guess is no solution of an instant, so it is not extrapolated from.
             previous = [*(previous if k else ())[-2:], legs]
             yield q[k], legs
@@ -569,15 +534,7 @@ class StanceCoordinates:
     @cached_property
     def leg_closure(self) -> LegClosure:
         """Numerical solver of the legs' closure."""
-        limbs = [Limb(leg.frame, leg.placement, self.base + leg.joints) for leg in self.legs]
-        return LegClosure(
-            self.model,
-            self.data,
-            limbs,
-            base=self.base,
-            independent=self.base + self.independent,
-            join=self.join,
-        )
+        return LegClosure(self, [leg.placement for leg in self.legs])
 
     @cached_property
     def start(self) -> Array:

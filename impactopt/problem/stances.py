@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, check_array, shortened
-from impactopt.kinematics.coordinates import LegClosure, Limb, StanceCoordinates
+from impactopt.kinematics.coordinates import LegClosure, StanceCoordinates
 from impactopt.kinematics.stance import BothSoles, OneSole, Stance
 from impactopt.kinematics.support import corners_at, overlap
 from impactopt.problem.scenario import Phase
@@ -149,18 +149,17 @@ def stepped_posture(c: StanceCoordinates, moved: Mapping[str, NDArray[np.float64
     ------
     InputError : the legs do not reach within their joints' limits; soles overlap.
     """
-    limbs, corners = [], {}
+    placements, corners = [], {}
     for leg in c.legs:
         step = np.append(moved.get(leg.name, np.zeros(2)), 0.0)
-        placement = pin.SE3(leg.placement.rotation, leg.placement.translation + step)
-        limbs.append(Limb(leg.frame, placement, c.base + leg.joints))
+        placements.append(pin.SE3(leg.placement.rotation, leg.placement.translation + step))
         if leg.sole is not None:
-            corners[leg.name] = corners_at(leg.sole.polygon, placement)[:, :2]
+            corners[leg.name] = corners_at(leg.sole.polygon, placements[-1])[:, :2]
     steps = ", ".join(f"{name} by {np.round(step, 3).tolist()} m" for name, step in moved.items())
     for (one, a), (other, b) in combinations(corners.items(), 2):
         if overlap(a, b):
             raise InputError(f"stances: soles {one} and {other} overlap after steps of {steps}")
-    closure = LegClosure(c.model, c.data, limbs, base=c.base, independent=c.base + c.independent, join=c.join)
+    closure = LegClosure(c, placements)
     mean = np.mean([moved.get(leg.name, np.zeros(2)) for leg in c.legs], axis=0)
     lower, upper = c.robot.lower[c.dependent], c.robot.upper[c.dependent]
     for descent in _DESCENTS:

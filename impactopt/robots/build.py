@@ -18,6 +18,7 @@ from impactopt.errors import InputError, check_array, check_choice, raw_array, s
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.attachments import Striker
 from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame, reduced, tell_apart
+from impactopt.robots.joint_angles import JointAngles
 
 Array = NDArray[np.float64]
 MAX_ATTACHMENTS = 100  # soles, strikers or tools of a robot; more are a mistake
@@ -234,16 +235,6 @@ def srdf_pairs(srdf: str | PathLike[str] | None) -> list[tuple[str, str]]:
     return [(e.get("link1", ""), e.get("link2", "")) for e in excluded]
 
 
-def joint_positions(model: pin.Model, q: Array) -> Array:
-    """(n,) joint angles [rad] of a configuration (nq,), or (n, k) of several (nq, k)."""
-    return np.array(
-        [
-            q[joint.idx_q] if joint.nq == 1 else np.arctan2(q[joint.idx_q + 1], q[joint.idx_q])
-            for joint in moving_joints(model)
-        ]
-    )
-
-
 ROOT = "root of the MJCF"  # reference configuration with the root's orientation only; no posture
 
 
@@ -261,13 +252,10 @@ def neutral(model: pin.Model) -> Array:
 
 def set_joints(model: pin.Model, q: Array, angles: Mapping[str, float], what: str) -> Array:
     """A copy of the configuration with some joint angles set by name."""
-    q = np.array(q, dtype=np.float64)
     names, joints = joint_names(model), moving_joints(model)
-    for name, value in angles.items():
-        joint = joints[joint_index(names, name, what)]
-        angle = float(check_array(f"{what}: joint {name!r}", value, ()))
-        q[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
-    return q
+    own = [joints[joint_index(names, name, what)] for name in angles]
+    values = [float(check_array(f"{what}: joint {name!r}", angle, ())) for name, angle in angles.items()]
+    return JointAngles(own).put(np.array(q, dtype=np.float64), values)
 
 
 def reference_configurations(model: pin.Model) -> dict[str, Array]:

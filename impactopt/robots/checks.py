@@ -293,18 +293,30 @@ def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]
 def check_configuration(model: pin.Model, q: ArrayLike, name: str) -> Array:
     """`q` as a float64 copy (nq,); InputError unless it is a configuration of the model."""
     q = check_array(name, q, (model.nq,))
-    for i in range(1, model.njoints):
-        joint = model.joints[i]
-        part = (
-            q[joint.idx_q + 3 : joint.idx_q + 7] if joint.nq == 7 else q[joint.idx_q : joint.idx_q + joint.nq]
-        )
-        if joint.nq > 1 and abs(np.linalg.norm(part) - 1) > 1e-6:
-            kind = "quaternion (x, y, z, w)" if joint.nq == 7 else "(cosine, sine)"
+    for i, part in unit_parts(model):
+        if not abs((length := np.linalg.norm(q[part])) - 1) <= UNIT_TOLERANCE:
+            kind = "quaternion (x, y, z, w)" if model.joints[i].nq == 7 else "(cosine, sine)"
             raise InputError(
-                f"{name}: the {kind} of joint {model.names[i]!r} has norm {np.linalg.norm(part):.6g}; "
+                f"{name}: the {kind} of joint {model.names[i]!r} has norm {length:.6g}; "
                 "normalize it (pin.normalize(model, q))"
             )
     return q
+
+
+UNIT_TOLERANCE = 1e-6  # of the length of a part of a configuration that should be one
+
+
+def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:
+    """Parts of q whose length is one: quaternion of a free-flyer, cosine and sine of a continuous joint.
+
+    Each has the index of its joint, and its slice in q.
+    """
+    joints = ((i, model.joints[i]) for i in range(1, model.njoints))
+    return [
+        (i, slice(joint.idx_q + (3 if joint.nq == 7 else 0), joint.idx_q + joint.nq))
+        for i, joint in joints
+        if joint.nq > max(joint.nv, 1)
+    ]
 
 
 def check_positions(joints: Sequence[str], angles: Array, lower: Array, upper: Array, name: str) -> None:

@@ -142,6 +142,7 @@ PLANAR = (
     link("wrist", "elbow", "y", (0.0, 0.0, 0.36), (-1.9, 1.9),
          (40.0, 8.0, 100.0, 4e-6), 1.0, (0.07, 0.07, 0.10), (0.0, 0.0, 0.03)),
 )
+_FIST = [0.0, 0.0, FLANGE - 0.08]  # [m] from the last joint to the middle of the flange
 _DEG = np.pi / 180
 
 
@@ -203,6 +204,15 @@ def planar_arm(**overrides: Any) -> Robot:
     return robot.with_tool(Tool.hammer(frame="wrist", grip=[0.0, 0.0, WRIST]))
 
 
+def _of_arm7() -> dict[str, Any]:
+    """Servo, striker and posture of the arm with seven joints."""
+    return {
+        "kd": _soft_kd(ARM7),
+        "strikers": (Striker(name="fist", frame="joint_7", point=np.array(_FIST)),),
+        "postures": {"ready": {"joint_2": -0.3, "joint_4": 1.6, "joint_6": 0.27}},
+    }
+
+
 def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
     """An arm of seven joints on a fixed base, of the class of KUKA's LBR iiwa 7; it needs no files.
 
@@ -217,15 +227,8 @@ def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
 
     `tool` is `Tool.hammer` along the flange's axis when left out. `overrides` go to `Robot.from_model`.
     """
-    options: dict[str, Any] = {
-        "name": "arm7",
-        "kd": _soft_kd(ARM7),
-        "strikers": (Striker(name="fist", frame="joint_7", point=np.array([0.0, 0.0, FLANGE - 0.08])),),
-        "postures": {"ready": {"joint_2": -0.3, "joint_4": 1.6, "joint_6": 0.27}},
-    }
-    robot = Robot.from_model(arm_model("arm7", ARM7), **{**options, **overrides})
-    grip = [0.0, 0.0, FLANGE - 0.08]
-    return robot.with_tool(Tool.hammer(frame="joint_7", grip=grip) if tool is None else tool)
+    robot = Robot.from_model(arm_model("arm7", ARM7), **{"name": "arm7", **_of_arm7(), **overrides})
+    return robot.with_tool(Tool.hammer(frame="joint_7", grip=_FIST) if tool is None else tool)
 
 
 def space_arm(**overrides: Any) -> Robot:
@@ -235,13 +238,7 @@ def space_arm(**overrides: Any) -> Robot:
 
     `overrides` go to `Robot.from_model`.
     """
-    options: dict[str, Any] = {
-        "name": "space_arm",
-        "kd": _soft_kd(ARM7),
-        "gravity": [0.0, 0.0, 0.0],
-        "strikers": (Striker(name="fist", frame="joint_7", point=np.array([0.0, 0.0, FLANGE - 0.08])),),
-        "postures": {"ready": {"joint_2": -0.3, "joint_4": 1.6, "joint_6": 0.27}},
-    }
+    options = {"name": "space_arm", "gravity": [0.0, 0.0, 0.0], **_of_arm7()}
     bus = Box(mass=60.0, sides=(0.5, 0.5, 0.5), center=(0.0, 0.0, -0.1))  # up to the first joint
     return Robot.from_model(arm_model("space_arm", ARM7, bus), **{**options, **overrides})
 

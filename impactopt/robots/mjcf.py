@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, missing_package
 from impactopt.robots.build import ROOT, existing, friction, set_friction
 from impactopt.robots.description import Description, Tie, between
+from impactopt.robots.joint_angles import JointAngles
 from impactopt.robots.tendons import Tendon
 
 Array = NDArray[np.float64]
@@ -542,10 +543,10 @@ class _Reader(Compiled):
         mj = self.mj
         for k in range(mj.nkey):
             q, inside = pin.neutral(self.model), True
-            for j, i in self.joint.items():
-                angle, at = float(mj.key_qpos[k][mj.jnt_qposadr[j]]), self.model.joints[i]
+            angles = [float(mj.key_qpos[k][mj.jnt_qposadr[j]]) for j in self.joint]
+            for j, angle in zip(self.joint, angles, strict=True):
                 inside &= not mj.jnt_limited[j] or mj.jnt_range[j][0] <= angle <= mj.jnt_range[j][1]
-                q[at.idx_q : at.idx_q + at.nq] = angle if at.nq == 1 else (np.cos(angle), np.sin(angle))
+            JointAngles([self.model.joints[i] for i in self.joint.values()]).put(q, angles)
             if self.floating and self._free(self.roots[0]):
                 start = int(mj.jnt_qposadr[int(mj.body_jntadr[self.roots[0]])])
                 where = mj.key_qpos[k][start : start + 7]

@@ -22,6 +22,7 @@ from impactopt.robots.attachments import SoftGrip, Sole, Source, Striker, Tool, 
 from impactopt.robots.checks import GIVEN, REPAIRED, check_inertias, tell_apart
 from impactopt.robots.couplings import Coupling, couplings_of, follower_axes, restore_followers
 from impactopt.robots.forward_kinematics import ForwardKinematics
+from impactopt.robots.joint_angles import JointAngles
 from impactopt.robots.tendons import Ranges, Tendon, check_tendons
 from impactopt.robots.tools import check_sole, with_hinges
 
@@ -312,6 +313,11 @@ class Robot:
         return tuple(build.moving_joints(self.model))
 
     @cached_property
+    def angles(self) -> JointAngles:
+        """Angles of its joints in configurations."""
+        return JointAngles(self.joint_models)
+
+    @cached_property
     def couplings(self) -> dict[str, Coupling]:
         """Couplings by the follower's name. Followers have no motor, and are not in `joint_names`."""
         return couplings_of(self.model)
@@ -442,7 +448,7 @@ class Robot:
         A continuous joint's lies in [-pi, pi].
         """
         shape = (None,) * (raw_array("q", q).ndim - 1) + (self.nq,)
-        return build.joint_positions(self.model, check_array("q", q, shape, finite=False).T).T
+        return self.angles.of(check_array("q", q, shape, finite=False))
 
     def place(self, q: ArrayLike, soles: Sequence[Sole] | None = None) -> Array:
         """The configuration with the base moved: mean of the soles at the origin of the ground, at yaw 0.

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import MISSED, Places
-from impactopt.errors import InputError, check_array, check_choice
+from impactopt.errors import InputError, check_array, check_choice, check_kind, check_number, check_whole
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.collision_geometry import FLOOR, Solid, Solids, UnintendedContact
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.mujoco_engine import simulate_mujoco
+from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.result import Scene, Simulation
 
@@ -210,11 +211,11 @@ def simulate(
 
     Raises
     ------
-    InputError : an unknown engine or option; a step, an end or a time to settle out of range.
+    InputError : an unknown engine or option; an option of a wrong kind or out of its range.
     """
     check_choice("unknown engine", engine, ENGINES)
     run = ENGINES[engine]
-    known = set(run.__kwdefaults__ or {})
+    known = run.__kwdefaults__ or {}
     if "controller" in options:
         options["controller"] = controller_of(options["controller"])
         if "controller" not in known and options.pop("controller") is not None:
@@ -225,7 +226,7 @@ def simulate(
                 f"engine {engine!r} replays what was planned, no perturbation; take engine 'mujoco'"
             )
         check_choice(f"engine {engine!r} has no option", name, sorted(known))
-    _check_times({**(run.__kwdefaults__ or {}), **options}, float(reference.end))
+    _check_options(options, known, float(reference.end))
     simulation = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
     name, beyond = problem.robot.ranges.excess(problem.robot.joint_positions(simulation.q))
     beyond_range = (name, beyond) if beyond > ALLOWED_RANGE else ("", 0.0)
@@ -233,10 +234,23 @@ def simulate(
     return with_clearance(problem, simulation)
 
 
-def _check_times(options: Mapping[str, Any], end: float) -> None:
-    """Raises an InputError for a step, an end or a time to settle out of range."""
-    given = {name: 0.0 if options[name] is None else options[name] for name in ("step", "settle")}
-    step, settle = (float(check_array(f"{name} [s]", value, ())) for name, value in given.items())
+def _check_options(given: Mapping[str, Any], defaults: Mapping[str, Any], end: float) -> None:
+    """Raises an InputError for an option of an engine of a wrong kind or out of its range.
+
+    end [s] : of the reference.
+    """
+    options = {**defaults, **given}
+    for name in {"record", "iterations"} & {*options}:
+        check_whole(name, options[name], least=1, most=MAX_STEPS)
+    if (tolerance := check_number("tolerance", options.get("tolerance", 0.0))) < 0:
+        raise InputError(f"tolerance: {tolerance:g}; give a number >= 0")
+    check_kind("missing", options.get("missing", False), bool)
+    if options.get("perturbation") is not None:
+        check_kind("perturbation", options["perturbation"], Perturbation)
+    step = float(check_array("step [s]", options["step"], ()))
+    # None of an engine that has a default of its own
+    none = options["settle"] is None and defaults["settle"] is None
+    settle = 0.0 if none else float(check_array("settle [s]", options["settle"], ()))
     if not STEP_RANGE[0] <= step <= STEP_RANGE[1]:
         raise InputError(f"step [s]: {step:g}; give a number of {STEP_RANGE[0]:g} to {STEP_RANGE[1]:g}")
     if not 0 <= settle <= MAX_SETTLE:

@@ -30,10 +30,7 @@ class Servo:
         self.n = robot.n
         self.kp, self.kd, self.limit = kp * robot.kp, kd * robot.kd, limit * robot.torque_limit
         self.time = np.asarray(reference.time)
-        joints = robot.joint_models
-        self.place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
-        # q has the cosine and sine of a continuous joint's angle
-        self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
+        self.continuous = robot.angles.continuous
         angles = robot.joint_positions(reference.q)
         angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
         rates, torques = np.array(reference.v[:, -robot.n :]), np.array(reference.torque)
@@ -43,14 +40,6 @@ class Servo:
         torques[:, passive] = torques[0, passive]
         self.limit[passive] = np.inf
         self.reference = np.hstack([angles, rates, torques])
-
-    def angles(self, q: Array) -> Array:
-        """Joint angles (n,) of a configuration; those of continuous joints in [-pi, pi]."""
-        # as `Robot.joint_positions`, without its checks: it is called in every step
-        out = q[self.place]
-        for k in self.continuous:
-            out[k] = np.arctan2(q[self.place[k] + 1], q[self.place[k]])
-        return out
 
     def target(self, t: float) -> Array:
         """Reference angles, rates and feed-forward (3 n,) at a time [s]; at a jump, the values after it."""

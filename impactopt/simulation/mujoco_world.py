@@ -353,10 +353,6 @@ class MujocoRobot:
         joints = [world.joint(name) for name in robot.joint_names]
         self.dof = np.array([joint.dofadr[0] for joint in joints])
         self.qpos_index = np.array([joint.qposadr[0] for joint in joints])
-        models = robot.joint_models
-        self._q_index = np.array([joint.idx_q for joint in models], dtype=np.intp)
-        # Pinocchio's q has the cosine and sine of a continuous joint's angle
-        self._continuous = np.flatnonzero([joint.nq == 2 for joint in models])
         self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._jacobian, self.normal_jacobian = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
         self.sliding = None if friction is None else SlidingPoints(friction)
@@ -368,7 +364,7 @@ class MujocoRobot:
         d, robot = self.data, self.robot
         if self.floating:
             d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]  # MuJoCo's quaternions begin with w
-        d.qpos[self.qpos_index] = robot.joint_positions(q)
+        d.qpos[self.qpos_index] = robot.angles.of(q)
         if v is not None:
             if self.floating:
                 # MuJoCo's linear velocity is in world axes, Pinocchio's in those of the base
@@ -383,11 +379,7 @@ class MujocoRobot:
         if self.floating:
             q[:3], q[3:6], q[6] = qpos[:3], qpos[4:7], qpos[3]
             v[:3], v[3:6] = self.base_rotation().T @ qvel[:3], qvel[3:6]
-        angles = qpos[self.qpos_index]
-        q[self._q_index] = angles
-        for k in self._continuous:
-            at = self._q_index[k]
-            q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
+        self.robot.angles.put(q, qpos[self.qpos_index])
         v[-self._n :] = qvel[self.dof]
         return q, v
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
 from impactopt.simulation.motors import CutWatch, Delay, GearWatch, Motors, Servo
-from impactopt.simulation.pinocchio_robot import PinocchioBody
+from impactopt.simulation.pinocchio_robot import Body, recursive_body
 from impactopt.simulation.result import (
     FollowedReference,
     Scene,
@@ -69,7 +69,7 @@ class _World:
         self.robot, self.scene, self.missing, self.followed = robot, scene, missing, reference
         self.model, self.base = robot.model, robot.model.nv - robot.n
         self._soles = [robot.model.getFrameId(frame) for frame in scene.soles]
-        self._bodies: dict[int, tuple[NDArray[np.intp], PinocchioBody]] = {}
+        self._bodies: dict[int, tuple[NDArray[np.intp], Body]] = {}
         self._stance = stance_at(reference, 0.0)
         self.fixed, self.body = self._body_of(self._stance)
         self.servo, self.contact = Servo(robot, reference), TargetContact(scene)
@@ -79,7 +79,7 @@ class _World:
         """Sets the reference that the servo follows from now on."""
         self.servo, self.followed = Servo(self.robot, reference), reference
 
-    def _body_of(self, stance: int) -> tuple[NDArray[np.intp], PinocchioBody]:
+    def _body_of(self, stance: int) -> tuple[NDArray[np.intp], Body]:
         """Indices of the soles and hands that are fixed in a stance phase, and the robot's dynamics then."""
         if stance not in self._bodies:
             scene = self.scene
@@ -88,7 +88,7 @@ class _World:
             if scene.standing.size:
                 fixed = np.flatnonzero(scene.standing[stance])
             chosen = tuple(frames[k] for k in fixed)
-            body = PinocchioBody(
+            body = recursive_body(
                 self.robot, chosen, np.zeros(6), scene.strikers, scene.normal, scene.friction
             )
             self._bodies[stance] = fixed, body
@@ -122,7 +122,7 @@ class _World:
 
     def _without_contact(self, t: float, q: Array, v: Array, travel: float) -> _State:
         """State before any contact."""
-        commanded = np.array(self.servo.torque(t, self.servo.angles(q), v[self.base :]))
+        commanded = np.array(self.servo.torque(t, self.robot.angles.of(q), v[self.base :]))
         drive = self.motors.cut(commanded[1], v[self.base :])
         h = len(self.scene.strikers)
         return _State(q, v, travel, self.contact.untouched, np.zeros(h), drive, np.zeros((h, 3)))
@@ -143,7 +143,7 @@ class _World:
         speed = body.update(s.q, s.v)
         speeds, depths = body.normal_jacobian @ s.v, self.depths(s)
         joints = s.v[self.base :]
-        commanded = np.array(self.servo.torque(t, self.servo.angles(s.q), joints))
+        commanded = np.array(self.servo.torque(t, self.robot.angles.of(s.q), joints))
         demand, saturated = self.delay.at(t, commanded)
         cut = self.motors.cut(saturated, joints)
         torque = self.motors.now(s.drive, cut)

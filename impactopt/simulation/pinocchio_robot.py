@@ -7,6 +7,7 @@ and Pinocchio's recursive algorithms.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -104,6 +105,7 @@ class Body(ABC):
 
     def _update_contact(self, q: Array, v: Array) -> None:
         """Sets `normal_jacobian`, `force_map` and the springs' torques; needs the joints' Jacobians."""
+        self._state = q, v
         if self.robot.springs:
             self._springs = self.robot.spring_torque(q)
         jacobians = [self._jacobian(i)[:3] for i in self.strikers]
@@ -122,6 +124,20 @@ class Body(ABC):
         if self.sliding is None or not self.sliding.bristles:
             return deflections
         return self.sliding.deflected(deflections, forces, step)
+
+    def after_touchdown(self, v: Array) -> Array:
+        """Velocity (nv,) after an inelastic impact that stops the fixed frames, in the current state."""
+        # v - H^-1 J' (J H^-1 J')^-1 J v: the impulse at the frames that makes J v zero
+        J = np.vstack([self._jacobian(frame) for frame in self.frames])
+        response = np.linalg.solve(mass_matrix(self.model, self.data, self._state[0]), J.T)
+        return np.asarray(v - response @ np.linalg.solve(J @ response, J @ v))
+
+    def normal_accelerations(self, a: Array) -> Array:
+        """Accelerations (h,) [m/s2] of the striking points along the normal, for accelerations a (nv,)."""
+        model, data = self.model, self.data
+        pin.forwardKinematics(model, data, *self._state, a)
+        motions = [pin.getFrameClassicalAcceleration(model, data, i, _AXES) for i in self.strikers]
+        return np.array([self.normal @ motion.linear for motion in motions])
 
     def _generalized_forces(self, torque: Array, force: float | Array) -> Array:
         """Generalized forces (nv,) of joint torques (n,), springs and contact forces (h,)."""
@@ -142,7 +158,7 @@ class DenseBody(Body):
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         size = self.nv + 6 * len(self.frames)
-        self._matrix, self._right = np.zeros((size, size)), np.zeros(size)
+        self._matrix, self._right = np.zeros((size, size), order="F"), np.zeros(size)  # LAPACK's order
         # constant; the other blocks are written at every update
         self._matrix[self.nv :, self.nv :] = np.diag(self.compliance)
         self._zero = np.zeros(self.nv)
@@ -176,8 +192,6 @@ class DenseBody(Body):
 class PinocchioBody(Body):
     """Pinocchio's constrained dynamics, or its articulated-body algorithm without fixed frames.
 
-    Neither supports joints that follow others (Pinocchio 4.1): such robots use the dense system.
-
     Raises
     ------
     InputError : the stance is compliant, which Pinocchio does not support.
@@ -190,7 +204,7 @@ class PinocchioBody(Body):
                 "form 'pinocchio' fixes soles exactly only; take form='lagrange' for a virtual base, "
                 "or a stance without base_mass and base_inertia"
             )
-        model, self._dense = self.model, DenseBody(*args) if self.robot.couplings else None
+        model = self.model
         self._constraints = pin.StdVec_RigidConstraintModel()
         self._constraint_data = pin.StdVec_RigidConstraintData()
         for i in self.frames:
@@ -208,23 +222,18 @@ class PinocchioBody(Body):
             self._constraints.append(constraint)
             self._constraint_data.append(constraint.createData())
         self._dynamics = model.createData()
-        if self.frames and self._dense is None:
+        if self.frames:
             pin.initConstraintDynamics(model, self._dynamics, self._constraints, self._constraint_data)
         # accuracy, regularization, and iterations, which remove the error of the regularization
         self._proximal = pin.ProximalSettings(1e-14, 1e-12, 5)
 
     def update(self, q: Array, v: Array) -> float:
-        self._state = q, v
         pin.forwardKinematics(self.model, self.data, q, v)
         pin.computeJointJacobians(self.model, self.data)
         self._update_contact(q, v)
         return float(self.normal_jacobian[0] @ v)
 
     def accelerate(self, torque: Array, force: float | Array) -> Array:
-        if self._dense is not None:
-            self._dense.update(*self._state)
-            self._dense.force_map = self.force_map
-            return self._dense.accelerate(torque, force)
         tau, model = self._generalized_forces(torque, force), self.model
         if not self.frames:
             return np.array(pin.aba(model, self._dynamics, *self._state, tau))
@@ -233,17 +242,7 @@ class PinocchioBody(Body):
         )
         return np.array(a)
 
-    def after_touchdown(self, v: Array) -> Array:
-        """Velocity (nv,) after an inelastic impact that stops the fixed frames, in the current state."""
-        # v - H^-1 J' (J H^-1 J')^-1 J v: the impulse at the frames that makes J v zero
-        J = np.vstack([self._jacobian(frame) for frame in self.frames])
-        H = mass_matrix(self.model, self._dynamics, self._state[0])
-        response = np.linalg.solve(H, J.T)
-        return np.asarray(v - response @ np.linalg.solve(J @ response, J @ v))
-
     def wrenches(self) -> Array:
-        if self._dense is not None:
-            return self._dense.wrenches()
         out = np.empty((len(self.frames), 6))
         for k, placement in enumerate(self.placements()):
             local = self._constraint_data[k].contact_force  # in the frame's axes
@@ -251,12 +250,10 @@ class PinocchioBody(Body):
             out[k, 3:] = placement.rotation @ local.angular
         return out
 
-    def normal_accelerations(self, a: Array) -> Array:
-        """Accelerations (h,) [m/s2] of the striking points along the normal, for accelerations a (nv,)."""
-        model, data = self.model, self.data
-        pin.forwardKinematics(model, data, *self._state, a)
-        motions = [pin.getFrameClassicalAcceleration(model, data, i, _AXES) for i in self.strikers]
-        return np.array([self.normal @ motion.linear for motion in motions])
+
+def recursive_body(robot: Robot, *args: Any) -> Body:
+    """`PinocchioBody`; or the dense system for joints that follow others, which Pinocchio lacks (4.1)."""
+    return (DenseBody if robot.couplings else PinocchioBody)(robot, *args)
 
 
-FORMS: dict[str, type[Body]] = {"lagrange": DenseBody, "pinocchio": PinocchioBody}
+FORMS: dict[str, Callable[..., Body]] = {"lagrange": DenseBody, "pinocchio": recursive_body}

@@ -78,6 +78,7 @@ class ContactProgram(ABC):
     angular_momentum : after contact, a group of three variables, if it is in the objective.
     objectives : of the problem, as far as this program has them, with their quantities.
     clearance_constraints : clearance constraints, in the program's order; they are its last constraints.
+    postures : of `strongest_posture` that are known, by seed; copies of the program share them.
     """
 
     def __init__(self, builder: Builder, hit: ContactSet) -> None:
@@ -87,6 +88,7 @@ class ContactProgram(ABC):
         self.angular_momentum: Group | None = None
         self.objectives: list[tuple[Objective, Quantity]] = []
         self.clearance_constraints: Mapping[ClearanceKey, SeparatingDirection] = {}
+        self.postures: dict[int, Array] = {}
 
     # ------------------------------------------------------------------ for terms and objectives
     @property
@@ -271,7 +273,7 @@ class ContactProgram(ABC):
         All functions registered by `Builder.follow` are called. `StructuredProgram.same_parameters` tells
         whether that has updated everything that depends on the problem.
         """
-        self.problem = problem
+        self.problem, self.postures = problem, {}
         # without clearance constraints the program's builder is that one itself, which is to be updated once
         builders = [self._without_clearance]
         if self.builder is not self._without_clearance:

@@ -102,7 +102,9 @@ def reached(
     """
     p, c = t.problem, t.coordinates
     rng = np.random.default_rng(seed)
-    y, legs = c.split(strongest_posture(p, seed) if posture is None else posture)
+    if posture is None and seed not in t.postures:
+        t.postures[seed] = strongest_posture(p, seed)
+    y, legs = c.split(t.postures[seed] if posture is None else posture)
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)

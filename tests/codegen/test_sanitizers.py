@@ -20,7 +20,12 @@ from support.native_cases import ROBOTS, robot_named, situation
 
 from impactopt import SDC, Board, ContactFriction, Effects, FreeMass, HuntCrossley, Nail, SpringDamper
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision.native import native_collision, native_gradient, native_jacobian
+from impactopt.collision.native import (
+    native_collision,
+    native_differences,
+    native_gradient,
+    native_jacobian,
+)
 
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-g1")
 BRANCHES = {"widest": (), "AVX2": ("-mno-avx512f",), "SSE2": ("-mno-avx",)}
@@ -92,7 +97,10 @@ PROGRAMS: dict[str, tuple[dict[str, Any], Callable[[SDC], Any]]] = {
     ),
     "gradient": ({}, lambda one: native_gradient(one, "impulse")),
     "gradient, bent law": ({"law": HUNT, "kd": GAINS}, lambda one: native_gradient(one, "impulse")),
-    "gradient, freezes": ({"freezes": 1}, lambda one: native_gradient(one, "impulse")),
+    "differences, freezes": (
+        {"freezes": 1},
+        lambda one: native_differences(one, ("impulse",), ("q", "v")),
+    ),
     "Jacobian": ({}, lambda one: native_jacobian(one, ("impulse", "torque"))),
     "Jacobian, bent law": (
         {"law": HUNT, "kd": GAINS},

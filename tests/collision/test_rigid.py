@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from support.small_robots import arm, biped
+from support.small_robots import arm, biped, slider
 
 from impactopt import (
     SDC,
@@ -124,6 +124,13 @@ def test_bodies_that_part_do_not_hit() -> None:
     assert found.impulse == 0.0 and np.array_equal(found.velocity, -v)
 
 
+def test_a_hand_that_no_joint_moves_along_the_normal_is_refused_at_a_wall() -> None:
+    robot = slider(2.0)  # along x
+    model = RigidImpact(robot=robot, striker="tip", normal=[0.0, 1.0, 0.0], target=RigidWall())
+    with pytest.raises(InputError, match="no motion along the normal here"):
+        model.collide([0.0], [1.0])
+
+
 def test_other_numbers_and_bad_input() -> None:
     robot, stance = arm(), FixedBase()
     q, v = moving(robot, stance)
@@ -132,6 +139,10 @@ def test_other_numbers_and_bad_input() -> None:
     assert model.collide(q, v, target_mass=4.0).impulse == heavier.collide(q, v).impulse
     with pytest.raises(InputError, match=r"no setting 'target_mas'.*target_mass"):
         model.collide(q, v, target_mas=4.0)
+    with pytest.raises(InputError, match=r"mass \[kg\]: -4; give a number > 0"):
+        model.collide(q, v, target_mass=-4.0)
+    with pytest.raises(InputError, match="stance must be a Stance, not 'soles'"):
+        blow(robot, "soles")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"between 0 and 1, not 1\.1"):
         blow(robot, stance, coefficient_of_restitution=1.1)
     with pytest.raises(InputError, match="FreeMass and RigidWall only, not Nail"):

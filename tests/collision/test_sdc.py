@@ -26,6 +26,7 @@ from support.frozen_cases import (
     two_masses,
     with_heavy_feet,
 )
+from support.small_robots import arm
 
 from impactopt import (
     SDC,
@@ -612,6 +613,9 @@ def test_stable_step_is_where_the_method_turns_unstable():
         ({"effects": Effects(friction=True)}, r"JointFriction"),
         ({"friction": FRICTION}, r"effects.friction is off"),
         ({"robot": "talos"}, r"robot must be a Robot, not 'talos'"),
+        ({"stance": "both"}, r"stance must be a Stance, not 'both'"),
+        ({"effects": "paper"}, r"effects must be an Effects, not 'paper'"),
+        ({"effects": Effects(friction=True), "friction": 0.1}, r"friction must be a JointFriction, not 0.1"),
         ({"law": SpringDamper}, r"law must be a ContactLaw, not <class"),
         ({"law": None}, r"law must be a ContactLaw, not None"),
         ({"target": 5.0}, r"target must be a Target, not 5.0"),
@@ -627,6 +631,18 @@ def test_bad_models_are_refused_before_anything_is_built(options, message):
     }
     with pytest.raises(InputError, match=message):
         SDC(**(scene | options))
+
+
+def test_a_batch_refuses_the_configurations_that_a_collision_refuses():
+    robot = arm()  # whose first joint is continuous
+    sdc = SDC(robot=robot, striker="hand", normal=X, law=LAW, target=TARGET, accuracy=None)
+    q, v = robot.posture("start"), np.ones(robot.nv)
+    twice = np.concatenate([2 * q[:2], q[2:]])
+    message = r"\(cosine, sine\) of joint 'turn' has norm 2"
+    with pytest.raises(InputError, match=message):
+        sdc.collide(twice, v, np.zeros(robot.n))
+    with pytest.raises(InputError, match=f"q of collision 1: the {message}"):
+        sdc.batch([q, twice], [v, v], np.zeros(robot.n))
 
 
 def test_bad_numbers_are_refused():

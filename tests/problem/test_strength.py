@@ -9,6 +9,7 @@ import pytest
 from impactopt import HandOrientation, load_problem, solve
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.strength import strongest_posture, touches
+from impactopt.transcription import initial_guess
 
 
 def _off(problem: ImpactProblem, q: np.ndarray) -> tuple[float, float]:
@@ -46,3 +47,15 @@ def test_one_initial_guess_is_as_good_as_several() -> None:
     problem = load_problem("arm7")
     plain, several = solve(problem), solve(problem, starts=3)
     assert plain.status.usable and plain.impulse > 0.98 * several.impulse
+
+
+def test_a_solve_searches_its_posture_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scale of the prices and the initial guess take the same one."""
+    searched = list[int]()
+
+    def counted(problem: ImpactProblem, seed: int = 0) -> np.ndarray:
+        searched.append(seed)
+        return strongest_posture(problem, seed)
+
+    monkeypatch.setattr(initial_guess, "strongest_posture", counted)
+    assert solve(load_problem("arm7")).status.usable and searched == [0]

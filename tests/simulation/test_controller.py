@@ -23,7 +23,7 @@ from impactopt.simulation.controller import controller_of
 from impactopt.simulation.controller.clearance import Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
 from impactopt.simulation.controller.tracking_reference import Recovery, TrackingReference
-from impactopt.simulation.controller.whole_body import ConstrainedDynamics, TorqueQP, wrench_cone
+from impactopt.simulation.controller.whole_body import TorqueQP, TorqueResponse, wrench_cone
 from impactopt.simulation.mujoco_engine import _Replay
 from impactopt.simulation.mujoco_world import MujocoOptions
 
@@ -75,7 +75,7 @@ def test_torques_move_a_held_robot_by_its_equation_of_motion() -> None:
     robot = biped()
     ref, where = still(robot)
     q = np.asarray(ref.q[0])
-    held = ConstrainedDynamics(robot, where.soles, where.strikers, where.normal, q)
+    held = TorqueResponse(robot, where.soles, where.strikers, where.normal, q)
     held.update(q, np.zeros(robot.nv), forces=40.0)
     torque = 20 * np.sin(np.arange(robot.n))
     a, wrench = held.A @ torque + held.a0, held.B @ torque + held.b0
@@ -125,7 +125,7 @@ def test_the_state_is_known_exactly_without_errors_of_sensors() -> None:
     robot = biped()
     ref, where = still(robot)
     q0 = np.asarray(ref.q[0])
-    held = ConstrainedDynamics(robot, where.soles, where.strikers, where.normal, q0)
+    held = TorqueResponse(robot, where.soles, where.strikers, where.normal, q0)
     held.update(q0, np.zeros(robot.nv))
     v = 0.1 * (
         held.A @ np.sin(np.arange(robot.n))

@@ -510,6 +510,24 @@ def test_engines_by_name_refuse_what_they_do_not_have(punch: Solution) -> None:
         simulate(problem, motion, engine="mujoco", stp=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("engine", "options", "text"),
+    [
+        ("pinocchio", {"record": 0}, "record: 0; give a whole number from 1"),
+        ("pinocchio", {"missing": "yes"}, "missing must be a bool, not 'yes'"),
+        ("pinocchio", {"settle": None}, r"settle \[s\]"),
+        ("mujoco", {"iterations": -3}, "iterations: -3; give a whole number from 1"),
+        ("mujoco", {"tolerance": -1.0}, "tolerance: -1; give a number >= 0"),
+        ("mujoco", {"perturbation": 3}, "perturbation must be a Perturbation, not 3"),
+    ],
+)
+def test_options_of_engines_are_checked(
+    punch: Solution, engine: str, options: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(InputError, match=text):
+        simulate(punch.problem, punch.trajectory, engine=engine, **options)
+
+
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
 def test_a_replay_ends_where_it_is_told_to(punch: Solution, engine: str) -> None:
     end = 0.5 * punch.trajectory.contact_start

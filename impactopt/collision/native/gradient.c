@@ -24,46 +24,6 @@ static double final_value(const Data *d, const Outcome *c, State *y_) {
 #endif
 }
 
-#if FREEZES
-/* With several freezes by central differences, at a far smaller tolerance of the steps: the length of a segment, and
-   the posture that it is frozen at, depend on the segment before. */
-static double value_at(const double **arg, const double *q, const double *v, Work *w) {
-  const double *in[N_IN];
-  Outcome c;
-  State unused;
-  FOR(k, N_IN) in[k] = arg[k];
-  in[ARG_q] = q, in[ARG_v] = v;
-  collide(in, 0, w, &c);
-  return final_value(&w->data, &c, &unused);
-}
-
-static void evaluate(const double **arg, double **res, Work *w) {
-  double q[NQ], v[NV], there[NQ], displacement[NV] = {0}, ends[2];
-  copy_or_zero(arg[ARG_q], q, NQ);
-  copy_or_zero(arg[ARG_v], v, NV);
-  if (res[0]) *res[0] = value_at(arg, q, v, w);
-  FOR(i, NV) {
-    FOR(side, 2) {
-      if (!res[1]) break;
-      displacement[i] = side ? -DIFFERENCE : DIFFERENCE;
-      const double *in[] = {q, displacement};
-      double *out[] = {there};
-      integrate(in, out, 0, 0, 0);
-      ends[side] = value_at(arg, there, v, w);
-    }
-    if (res[1]) res[1][i] = (ends[0] - ends[1]) / (2 * DIFFERENCE);
-    displacement[i] = 0.0;
-    const double here = v[i];
-    FOR(side, 2) {
-      if (!res[2]) break;
-      v[i] = here + (side ? -DIFFERENCE : DIFFERENCE);
-      ends[side] = value_at(arg, q, v, w);
-    }
-    v[i] = here;
-    if (res[2]) res[2][i] = (ends[0] - ends[1]) / (2 * DIFFERENCE);
-  }
-}
-#else
 static void evaluate(const double **arg, double **res, Work *w) {
   Outcome c;
   FrozenAdjoint all;
@@ -88,4 +48,3 @@ static void evaluate(const double **arg, double **res, Work *w) {
     if (res[2]) res[2][i] = by_v[i] + 0.0 * value;
   }
 }
-#endif

@@ -116,3 +116,8 @@ static void step_adjoint(const Data *d, const State *y, State *y_, FrozenAdjoint
   if (left < LENGTH) total.time -= h_;
   *y_ = total;
 }
+
+/* From derivatives by the final state to derivatives by the frozen model. */
+static void run_adjoint(const Data *d, const Tape *tape, State *y_, FrozenAdjoint *all) {
+  for (int i = tape->made - 1; i >= 0; i--) step_adjoint(d, &tape->states[i], y_, all);
+}

@@ -31,9 +31,7 @@ from impactopt.collision.native.sizes import (
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
 
-# files of the time stepping, and of its discrete adjoint
 _IMPLICIT = ("", "_factor", "_step", "_remainders", "_events", "_run")  # parts of implicit.h
-_ADJOINT = {"rk4": ("rk4_adjoint.h", "steps_adjoint.h"), "implicit": ("implicit_adjoint.h",)}
 # The generated code of the tree is long and without branches. These options make it a sixth faster than -Og
 # for half a second more of the compiler; -O2 takes another half and gains nothing.
 _TREE, _QUICK_TREE = '"O1", "expensive-optimizations", "reciprocal-math", "schedule-insns2"', '"O0"'
@@ -67,19 +65,19 @@ def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every
 def native_gradient(collision: SteppedModel, output: str) -> NativeCode | ca.Function:
     """C code of the function that `gradient_graph` builds.
 
-    Without a compiler the graph is used in its place, but not for implicit steps or several freezes: its
-    Runge-Kutta steps diverge under stiff contacts or servos without an error, and have no derivative of the
-    contact's duration.
+    Without a compiler the graph is used in its place, but not for implicit steps: its Runge-Kutta steps
+    diverge under stiff contacts or servos without an error, and have no derivative of the contact's duration.
+    For one freeze only.
     """
 
     def graph() -> Any:
-        if collision.stepping == "implicit" or collision.n_freezes:
+        if collision.stepping == "implicit":
             raise InputError(
                 _NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4' and no freezes")
             )
         return _guarded(collision, gradient_graph(collision, output))
 
-    if collision.contact_friction is not None and not collision.n_freezes:
+    if collision.contact_friction is not None:
         return graph()
     return NativeCode(
         name="collision_gradient",
@@ -157,10 +155,10 @@ def _code(
     scalars = scalar_functions(model, method=collision.stepping)
     shapes, of_tree = shapes_out(collision, outputs, every), tree.functions
     differs = name == "collision_differences"
-    if differs or (gradient and collision.n_freezes):
+    of_differences: list[str] = []
+    if differs:
         # errors of the steps have to be small beside the differences
         collision = replace(collision, tolerance=min(collision.tolerance, _OF_DIFFERENCES))
-    of_differences = [f"#define DIFFERENCE {_DIFFERENCE[collision.stepping]}"]
     if gradient:
         of_tree = [*of_tree, *backwards(of_tree), to_velocity_basis(frozen)]
         scalars += backwards(scalars)
@@ -176,7 +174,8 @@ def _code(
     if differs:
         entries = [rows * columns for rows, columns in shapes.values()]
         inputs = shapes_in(collision)
-        of_differences += [
+        of_differences = [
+            f"#define DIFFERENCE {_DIFFERENCE[collision.stepping]}",
             f"#define N_BY {len(by)}",
             f"#define ENTRIES {sum(entries) + 1}",
             f"#define LONGEST {max(rows * columns for rows, columns in inputs.values())}",
@@ -198,7 +197,7 @@ def _code(
         c_code("tree", of_tree),
         "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
         c_code("scalars", scalars),
-        f"#define GRADIENT {int((gradient and not collision.n_freezes) or jacobian)}",
+        f"#define GRADIENT {int(gradient or jacobian)}",
         f"#define NAME {name}\n#define OF_NAME(part) {name}_##part",
         *text("vectors.h"),
         *lanes,
@@ -209,15 +208,10 @@ def _code(
         *of_differences,
     ]
     method = collision.stepping
-    steps = ["rk4.h", "steps.h"] if method == "rk4" else [f"implicit{part}.h" for part in _IMPLICIT]
+    steps = ["rk4.h"] if method == "rk4" else [f"implicit{part}.h" for part in _IMPLICIT]
     files_used = ["freeze.h", "instant.h", "histories.h", *steps, "segments.h"]
     if gradient:
-        files_used += (
-            ["final_outputs.h"]
-            if collision.n_freezes
-            else ["adjoint.h", *_ADJOINT[method], "freeze_adjoint.h"]
-        )
-        files_used += ["gradient.c"]
+        files_used += ["adjoint.h", f"{method}_adjoint.h", "freeze_adjoint.h", "gradient.c"]
     elif jacobian:
         tangents = [f"{name}_tangent.h" for name in ("freeze", "implicit", "histories", "run")]
         files_used += ["final_outputs.h", "tangent.h", *tangents, "jacobian.c"]

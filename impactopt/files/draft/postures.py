@@ -291,11 +291,9 @@ def eased(robot: Robot, limbs: Sequence[Limb], q: Array) -> Array:
 
 def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:
     """The configuration with other angles of some joints; own : their indices in arrays of length n."""
-    out, joints = q.copy(), robot.joint_models
-    for index, angle in zip(own, angles, strict=True):
-        joint = joints[int(index)]
-        out[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
-    return out
+    every = robot.angles.of(q)
+    every[own] = angles
+    return robot.angles.put(q.copy(), every)
 
 
 def _path(robot: Robot, joints: Sequence[int]) -> float:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.files.export.content import Export, body_name
 from impactopt.files.export.motion import Motion, motion_at
+from impactopt.robots.joint_angles import JointAngles
 
 Array = NDArray[np.float64]
 
@@ -81,11 +82,9 @@ def _state(export: Export, motion: Motion, k: int) -> tuple[Array, Array]:
     """q (nq,) and v (nv,) of Pinocchio at a frame."""
     robot = export.robot
     q, v = pin.neutral(robot.model), np.zeros(robot.nv)
-    own = robot.joint_models
-    for column, at in enumerate(export.order):
-        joint, angle = own[at], motion.position[k, column]
-        q[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(angle), np.sin(angle)) if joint.nq == 2 else angle
-        v[joint.idx_v] = motion.velocity[k, column]
+    own = [robot.joint_models[at] for at in export.order]
+    JointAngles(own).put(q, motion.position[k])
+    v[[joint.idx_v for joint in own]] = motion.velocity[k]
     if (base := motion.base) is not None:
         q[:3], q[3:7] = base.position[k], base.quaternion[k, [1, 2, 3, 0]]
         turned = pin.Quaternion(q[3:7]).toRotationMatrix().T

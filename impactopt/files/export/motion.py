@@ -167,7 +167,7 @@ def _curves(reference: Trajectory, robot: Robot) -> tuple[Array, Array, Array]:
     The base has seven: position, and quaternion w, x, y, z.
     """
     q, v, a = reference.q, reference.v, reference.a
-    continuous = [k for k, joint in enumerate(robot.joint_models) if joint.nq == 2]
+    continuous = robot.angles.continuous
     angle = robot.joint_positions(q)
     angle[:, continuous] = np.unwrap(angle[:, continuous], axis=0)
     values, firsts, seconds = [angle], [v[:, -robot.n :]], [a[:, -robot.n :]]

@@ -21,7 +21,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.robots.checks import check_configuration
 from impactopt.robots.couplings import axis_of
+from impactopt.robots.joint_angles import JointAngles
 from impactopt.robots.rigid_body._spatial import (
     IDENTITY,
     Matrix,
@@ -425,33 +427,20 @@ class Coordinates:
 
     # ------------------------------------------------------------ numeric
     @cached_property
-    def _single_coordinate_joints(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indices in q and in v of the joints with one coordinate; cached, as replays need them often."""
-        joints = [j for j in self.tree.joints[1:] if not j.continuous and j.kind is not Kind.FREE]
-        return np.array([j.q for j in joints], dtype=np.intp), np.array([j.v for j in joints], dtype=np.intp)
+    def _angles(self) -> JointAngles:
+        """Angles of the joints in Pinocchio's q, in the order of v; cached, as replays need them often."""
+        return JointAngles([joint for joint in list(self.tree.model.joints)[1:] if joint.nv == 1])
 
     def from_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """These coordinates (nq,) of Pinocchio's q; angles of continuous joints in (-pi, pi]."""
-        q = check_array("q (pinocchio)", q, (self.tree.nq,))
-        unit_vectors = [("quaternion", 3, 7)] if self.tree.floating else []
-        unit_vectors += [
-            (f"joint {j.name!r} (cos, sin)", j.q, j.q + 2) for j in self.tree.joints if j.continuous
-        ]
-        for part, k, end in unit_vectors:
-            if abs(np.linalg.norm(q[k:end]) - 1.0) > 1e-6:
-                raise InputError(
-                    f"q (pinocchio): {part}, q[{k}:{end}], must be of norm 1; pin.normalize(model, q)"
-                )
+        q = check_configuration(self.tree.model, q, "q (pinocchio)")
         if self.base == "quaternion":
             return q
-        out = np.empty(self.nq)
-        if self.tree.floating:
-            out[:3] = q[:3]
-            out[3:6] = pin.rpy.matrixToRpy(pin.XYZQUATToSE3(q[:7]).rotation)
-        for joint in self.tree.joints[1:]:
-            if joint.kind is not Kind.FREE:
-                out[joint.v] = np.arctan2(q[joint.q + 1], q[joint.q]) if joint.continuous else q[joint.q]
-        return out
+        if not self.tree.floating:
+            return self._angles.of(q)
+        return np.concatenate(
+            [q[:3], pin.rpy.matrixToRpy(pin.XYZQUATToSE3(q[:7]).rotation), self._angles.of(q)]
+        )
 
     def to_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """Pinocchio's q, (..., model.nq), of one configuration (nq,) or of several (k, nq)."""
@@ -462,12 +451,7 @@ class Coordinates:
         if self.tree.floating:
             half_angles = np.moveaxis(q[..., 3:6] / 2, -1, 0)
             out[..., :3], out[..., 3:7] = q[..., :3], _quaternion(*half_angles)
-        in_q, in_v = self._single_coordinate_joints
-        out[..., in_q] = q[..., in_v]
-        for joint in self.tree.joints[1:]:
-            if joint.continuous:
-                out[..., joint.q], out[..., joint.q + 1] = np.cos(q[..., joint.v]), np.sin(q[..., joint.v])
-        return out
+        return self._angles.put(out, q[..., 6 if self.tree.floating else 0 :])
 
 
 def _quaternion(roll: Any, pitch: Any, yaw: Any) -> NDArray[np.float64]:

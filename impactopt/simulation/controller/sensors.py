@@ -83,12 +83,9 @@ class StateEstimate:
     """
 
     def __init__(self, robot: Robot, soles: tuple[str, ...], q0: Array) -> None:
-        self.model, self.floating = robot.model, robot.floating
+        self.model, self.floating, self._angles = robot.model, robot.floating, robot.angles
         self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv
         self.data: Any = robot.model.createData()
-        joints = robot.joint_models
-        self._q_index = np.array([joint.idx_q for joint in joints], dtype=np.intp)
-        self._continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
         self._placements = dict[int, Any]()  # of the standing soles, by frame number
         self.stand(soles, q0)
 
@@ -108,11 +105,7 @@ class StateEstimate:
         points (soles, 3) [m] : point of each sole that is at rest, in the sole's frame.
         """
         model, data = self.model, self.data
-        q, v = np.zeros(self._nq), np.zeros(self._nv)
-        q[self._q_index] = measured.angles
-        for k in self._continuous:
-            at = self._q_index[k]
-            q[at], q[at + 1] = np.cos(measured.angles[k]), np.sin(measured.angles[k])
+        q, v = self._angles.put(np.zeros(self._nq), measured.angles), np.zeros(self._nv)
         v[-self._n :] = measured.rates
         if not self.floating:
             return q, v

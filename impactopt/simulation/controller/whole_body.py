@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
-from impactopt.robots.mass_matrix import mass_matrix
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.clearance import MAX_CONSTRAINTS, Clearance
 from impactopt.simulation.controller.sensors import Sensors, StateEstimate
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.controller.tracking_reference import Recovery, ReferenceSample, TrackingReference
 from impactopt.simulation.motors import Servo
+from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.result import Scene, stance_at, stance_begins
 
 Array = NDArray[np.float64]
@@ -88,16 +88,14 @@ class TorqueQP:
 _AXES = pin.LOCAL_WORLD_ALIGNED
 
 
-class ConstrainedDynamics:
+class TorqueResponse(DenseBody):
     """Dynamics of a robot with its soles and supporting hands fixed, affine in the torques tau (n,).
 
     frames = soles, then supporting hands; h = number of striking points.
 
     A (nv, n), a0 (nv,) : accelerations A tau + a0
     B (6 frames, n), b0 : wrenches of the ground on the frames at their origins, world axes
-    placements : of the frames
-    striking_points (h, 3) [m] : positions
-    striking_jacobians (h, 3, nv) : of their velocities
+    striking_jacobians (h, 3, nv) : of the striking points' velocities
     striking_drift (h, 3) [m/s^2] : their accelerations for a = 0
     stabilizing_wrenches : part of b0 that returns the soles to their initial height and tilt
     impulse_response (nv, h) : change of v by a unit impulse against the normal at each striking point
@@ -113,61 +111,41 @@ class ConstrainedDynamics:
         *,
         holding: tuple[str, ...] = (),
     ) -> None:
-        self._robot, self.model, self.normal = robot, robot.model, normal
-        self.data: Any = robot.model.createData()
-        self._soles = [self.model.getFrameId(name) for name in soles]
-        self._fixed = [*self._soles, *(self.model.getFrameId(name) for name in holding)]
-        self._strikers = [self.model.getFrameId(name) for name in strikers]
-        nv, n, m, h = robot.nv, robot.n, 6 * len(self._fixed), len(strikers)
-        self._n, self._nv = n, nv
-        # linear system [H, -J'; J, 0] [a; w] = right-hand sides, in LAPACK's column order. Columns of the
-        # right-hand side: each torque (n), no torque, stabilization of the soles, each striking force (h)
-        self._left = np.zeros((nv + m, nv + m), order="F")
-        self._right = np.zeros((nv + m, n + 2 + h), order="F")
-        self.striking_jacobians = np.zeros((h, 3, nv))
-        self.striking_points, self.striking_drift = np.zeros((2, h, 3))
-        self._right[nv - n : nv, :n] = np.eye(n)
-        self._zero = np.zeros(nv)
+        super().__init__(robot, (*soles, *holding), np.zeros(6), strikers, normal)
+        # Columns of right-hand sides: each torque (n), no torque, stabilization of the soles, each striking
+        # force (h)
+        self._columns = np.zeros((len(self._right), self.n + 2 + len(strikers)), order="F")
+        self._columns[self.nv - self.n : self.nv, : self.n] = np.eye(self.n)
         pin.framesForwardKinematics(self.model, self.data, q0)
-        self._initial = [self.data.oMf[i].copy() for i in self._soles]
+        self._initial = self.placements()[: len(soles)]  # a grip needs no stabilization
 
-    def update(self, q: Array, v: Array, forces: Array | float = 0.0, bandwidth: float = 0.0) -> None:
+    def update(self, q: Array, v: Array, forces: Array | float = 0.0, bandwidth: float = 0.0) -> float:
         """Evaluates the dynamics at q (nq,), v (nv,).
 
         forces : (h,) [N] on the striking points, against the normal.
         bandwidth : [rad/s] of the stabilization of the soles (Baumgarte's, in height, roll and pitch).
         """
-        model, data, nv, n = self.model, self.data, self._nv, self._n
-        left, right = self._left, self._right
-        pin.forwardKinematics(model, data, q, v, self._zero)
-        pin.computeJointJacobians(model, data)
-        left[:nv, :nv] = mass_matrix(model, data, q)
-        right[:nv, n] = -self._robot.nonlinear_effects(data, q, v)
-        self.placements = []
-        for k, i in enumerate(self._fixed):
+        speed, nv, n, right = super().update(q, v), self.nv, self.n, self._columns
+        right[:nv, n] = self._generalized_forces(np.zeros(n), np.zeros(len(self.strikers))) - self._bias
+        right[nv:, n] = self._right[nv:]
+        for k, (now, initial) in enumerate(zip(self.placements(), self._initial, strict=False)):
             rows = slice(nv + 6 * k, nv + 6 * k + 6)
-            self.placements.append(pin.updateFramePlacement(model, data, i).copy())
-            J = pin.getFrameJacobian(model, data, i, _AXES)
-            left[rows, :nv], left[:nv, rows] = J, -J.T
-            right[rows, n] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
-            if k >= len(self._soles):  # a grip needs no stabilization
-                continue
-            now, initial = self.placements[-1], self._initial[k]
             rotation_error = pin.log3(now.rotation @ initial.rotation.T)
             error = np.zeros(6)  # horizontal position and yaw stay zero: a sole that slid is not pulled back
             error[2], error[3:5] = now.translation[2] - initial.translation[2], rotation_error[:2]
-            right[rows, n + 1] = -(bandwidth**2) * error - 2 * bandwidth * (J @ v)
-        for k, i in enumerate(self._strikers):
-            self.striking_points[k] = pin.updateFramePlacement(model, data, i).translation
-            self.striking_jacobians[k] = np.reshape(pin.getFrameJacobian(model, data, i, _AXES), (6, nv))[:3]
-            self.striking_drift[k] = pin.getFrameClassicalAcceleration(model, data, i, _AXES).linear
-            right[:nv, n + 2 + k] = -self.normal @ self.striking_jacobians[k]
-        _, _, solved, _ = dgesv(left, right)
-        by_forces = solved[:, n + 2 :] @ np.broadcast_to(forces, len(self._strikers))
-        self.A, self.a0 = solved[:nv, :n], (solved[:, n] + by_forces + solved[:, n + 1])[:nv]
+            right[rows, n + 1] = -(bandwidth**2) * error - 2 * bandwidth * (self._matrix[rows, :nv] @ v)
+        self.striking_jacobians = np.array([self._jacobian(i)[:3] for i in self.strikers])
+        drifts = [pin.getFrameClassicalAcceleration(self.model, self.data, i, _AXES) for i in self.strikers]
+        self.striking_drift = np.array([drift.linear for drift in drifts])
+        right[:nv, n + 2 :] = -self.normal_jacobian.T
+        _, _, solved, _ = dgesv(self._matrix, right)
+        by_forces = solved[:, n + 2 :] @ np.broadcast_to(forces, len(self.strikers))
+        constant = solved[:, n] + by_forces + solved[:, n + 1]
+        self.A, self.a0 = solved[:nv, :n], constant[:nv]
         self.impulse_response = solved[:nv, n + 2 :]
-        self.B, self.b0 = solved[nv:, :n], (solved[:, n] + by_forces + solved[:, n + 1])[nv:]
+        self.B, self.b0 = solved[nv:, :n], constant[nv:]
         self.stabilizing_wrenches = solved[nv:, n + 1]
+        return speed
 
     def fix_torques(self, which: NDArray[np.bool_], torque: Array) -> None:
         """Moves the torques (n,) [N m] of some joints, as of springs, from the unknowns to a0 and b0."""
@@ -289,7 +267,7 @@ class StanceProblem:
         """standing : indices of the scene's soles that stand.  q0 (nq,) : configuration with them placed."""
         self.frames = tuple(scene.soles[k] for k in standing)
         self.swing_feet = [robot.model.getFrameId(name) for name in scene.soles if name not in self.frames]
-        self.dynamics = ConstrainedDynamics(
+        self.dynamics = TorqueResponse(
             robot, self.frames, scene.strikers, scene.normal, q0, holding=scene.hands
         )
         mass, n, fixed = float(pin.computeTotalMass(robot.model)), robot.n, len(standing) + len(scene.hands)
@@ -396,7 +374,7 @@ class WholeBodyController:
         dynamics = self.stance_problem.dynamics
         dynamics.update(q, rates, self.striking_force, s.sole_bandwidth)
         if self.has_passive:
-            angles = self.robot.joint_positions(q)
+            angles = self.robot.angles.of(q)
             dynamics.fix_torques(self.passive, self.springs(angles, rates[-self.n :]))
         x = self._solve(t, q, rates, aim)[: self.n]
         torque = self.limit * x
@@ -456,7 +434,7 @@ class WholeBodyController:
         m = problem.cones.m
         # clearance constraints that no pair of bodies needs read 0 x >= -1, which always holds
         C, c = np.zeros((m + MAX_CONSTRAINTS, n + 2)), np.full(m + MAX_CONSTRAINTS, -1.0)
-        C[:m, : n + 1], c[:m] = problem.cones.constraints(dynamics.placements, B, dynamics.b0)
+        C[:m, : n + 1], c[:m] = problem.cones.constraints(dynamics.placements(), B, dynamics.b0)
         if recovers or self.tracking.bounced:  # up to the impact the plan keeps bodies apart, at speed
             J, lower = self.clearance.constraints(dynamics.data)
             its = slice(m, m + len(lower))
@@ -477,7 +455,7 @@ class WholeBodyController:
             return
         for J, point, drift, goal in zip(
             dynamics.striking_jacobians,
-            dynamics.striking_points,
+            dynamics.striking_points(),
             dynamics.striking_drift,
             aim.striking_points,
             strict=True,
@@ -522,7 +500,7 @@ class WholeBodyController:
         s, data, mass = self.settings, self.data, self.mass
         Ag = pin.ccrba(self.robot.model, data, q, v)
         com = np.array(data.com[0])
-        for k, placement in enumerate(dynamics.placements):
+        for k, placement in enumerate(dynamics.placements()):
             momentum_map[3:, 6 * k : 6 * k + 3] = pin.skew((placement.translation - com) / mass)
         # feedback on the divergent component of motion com + rate / omega: its error decays at `gain`
         gain, omega = s.capture_gain, math.sqrt(np.linalg.norm(self.gravity) / max(com[2], 0.1))

@@ -165,6 +165,7 @@ class Builder:
             frozen=frozen,
             second=second,
             bristles=friction is not None and friction.bristles,
+            moves_target=friction is not None and friction.moves_target,
         )
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}

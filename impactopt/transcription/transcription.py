@@ -85,8 +85,9 @@ def block_functions(
     springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
     rubs = () if problem.friction is None else ("rubs", len(problem.friction.parameters))
+    moves = ("moves",) if problem.friction is not None and problem.friction.moves_target else ()
     keys = {"force": (*contact, *second), "first": (*contact[:1], *rubs), "coasting": frozen}
-    keys |= {"collision": (*frozen, *springs, *second, *rubs), **dict.fromkeys(SECOND_BLOCKS, second)}
+    keys |= {"collision": (*frozen, *springs, *second, *rubs, *moves), **dict.fromkeys(SECOND_BLOCKS, second)}
     if chosen := problem.gain_joints:
         keys |= {name: (*keys.get(name, ()), chosen) for name in ("collision", "spring")}
     found = {

@@ -17,7 +17,7 @@ from impactopt.collision.interface import CollisionModel
 from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS
 from impactopt.collision.settings import Effects, JointFriction, Settings
 from impactopt.contact import ContactFriction, ContactLaw, Target
-from impactopt.contact.friction import check_friction
+from impactopt.contact.friction import check_friction, moves_target
 from impactopt.errors import InputError, check_array, check_choice, check_positive
 
 
@@ -216,7 +216,7 @@ class SteppedModel(CollisionModel):
     @property
     def moves_target(self) -> bool:
         """True if friction moves the target across the normal."""
-        return self.contact_friction is not None and self.contact_friction.moves_target
+        return moves_target(self.contact_friction)
 
     @property
     def stepping(self) -> str:

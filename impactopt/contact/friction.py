@@ -106,10 +106,14 @@ def check_friction(name: str, given: Any, target: Target) -> None:
         )
 
 
+def moves_target(friction: ContactFriction | None) -> bool:
+    """True if there is friction that moves the target across the normal."""
+    return friction is not None and friction.moves_target
+
+
 def tangential_mobility(friction: ContactFriction | None, target: Target, parameters: Parameters) -> Any:
     """Inverse mass [1/kg] of the target across the normal; 0 if friction does not move it."""
-    moved = friction is not None and friction.moves_target
-    return 1 / target.tangential_mass(parameters) if moved else 0.0
+    return 1 / target.tangential_mass(parameters) if moves_target(friction) else 0.0
 
 
 def tangential_outcome(velocity: Array) -> dict[str, float]:

@@ -82,7 +82,7 @@ def slide(problem: ImpactProblem, plan: Plan) -> float:
 def _target_displacement(collision: PlannedCollision) -> NDArray[np.float64]:
     """Displacement (`CONTACT_SAMPLES`, 3) [m] of the target across the normal during contact."""
     v, time, at = collision.tangential_velocity, collision.time, np.linspace(0.0, 1.0, CONTACT_SAMPLES)
-    if not len(v):
+    if v is None:
         return np.zeros((CONTACT_SAMPLES, 3))
     moved = np.vstack([np.zeros(3), np.cumsum(np.diff(time)[:, None] * (v[1:] + v[:-1]) / 2, axis=0)])
     return np.column_stack([np.interp(at * time[-1], time, x) for x in moved.T])

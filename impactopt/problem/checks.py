@@ -15,7 +15,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.world import Ground, Obstacle, TargetBody
-from impactopt.contact.friction import check_friction
+from impactopt.contact.friction import check_friction, moves_target
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN, is_order
@@ -222,8 +222,7 @@ def check_collision(problem: Any) -> None:
             f"{type(problem.law).__name__}"
         )
     check_friction("friction", problem.friction, problem.target)
-    moves = problem.friction is not None and problem.friction.moves_target
-    if moves and any(isinstance(objective, TargetEnergy) for objective in problem.objectives):
+    if moves_target(problem.friction) and any(isinstance(o, TargetEnergy) for o in problem.objectives):
         raise InputError(
             "objectives: TargetEnergy is of motion along the normal, and friction's moves_target adds some "
             "across it: leave one of them out"

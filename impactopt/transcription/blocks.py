@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 
 from impactopt.collision.settings import Effects
+from impactopt.contact.friction import moves_target
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
@@ -365,7 +366,7 @@ def own_blocks(
         second="" if problem.second is None else problem.second.striker,
         gain_groups=problem.gain_joints,
         friction=0 if problem.friction is None else len(problem.friction.parameters),
-        moves_target=problem.friction is not None and problem.friction.moves_target,
+        moves_target=moves_target(problem.friction),
     )
 
 

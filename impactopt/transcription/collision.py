@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt.contact.friction import tangential_mobility, tangential_outcome
+from impactopt.contact.friction import moves_target, tangential_mobility, tangential_outcome
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets.base import SEPARATION, TOUCH, TURN
 from impactopt.kinematics.coordinates import StanceCoordinates
@@ -259,8 +259,7 @@ class Collision(ContactParameters):
         self.xt = add("target travel", 1, labels=["target"])
         bent = 3 * len(p.strikers) if len(friction_parameters(p)) > 2 else 0
         self.bristles = add("bristle deflection", bent, scale=DEPTH_SCALE)
-        moves = p.friction is not None and p.friction.moves_target
-        self.tangential = add("target tangential velocity", 3 * moves)
+        self.tangential = add("target tangential velocity", 3 * moves_target(p.friction))
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
         # from the third phase on: before the second one the mean rate is the d of the first
@@ -302,7 +301,7 @@ class Collision(ContactParameters):
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of each block's instances, one a stage."""
-        b, p = self._b, self._b.problem
+        p = self._b.problem
         zero, at_rest = Affine.zeros(1), Affine.zeros(p.target.n_states)
         collision, force = [], []
         for i, s in enumerate(self.stages):
@@ -312,13 +311,8 @@ class Collision(ContactParameters):
             impulse_slope, x1 = self._slots(self.p, i, zero)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
             force.append([*self._hand_slots(i), self.f[i], *state, *travel, x1, impulse_slope])
-        mobility = [tangential_mobility(p.friction, p.target, self.target)] if self.tangential.size else []
-        common = np.concatenate(
-            [*self._gains(), b.robot.torque_limit, b.limits.units, friction_parameters(p), mobility]
-        )
-        collision_p = [np.concatenate([p.normal, [s.place], common]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
-            "collision": (collision, collision_p),
+            "collision": (collision, self.dynamics_parameters()),
             "force": (force, self.force_parameters()),
             **self._reference(),
         }
@@ -326,6 +320,13 @@ class Collision(ContactParameters):
             join = self._join()
             out["join"] = join, [np.zeros(0)] * len(join)
         return out
+
+    def dynamics_parameters(self) -> list[Array]:
+        """Parameters of the block ``collision`` at each stage."""
+        b, p = self._b, self._b.problem
+        mobility = [tangential_mobility(p.friction, p.target, self.target)] if self.tangential.size else []
+        common = [*self._gains(), b.robot.torque_limit, b.limits.units, friction_parameters(p), mobility]
+        return [np.concatenate([p.normal, [s.place], *common]) for s in self.stages]
 
     def _dynamics(self, i: int) -> list[Affine]:
         """Slots of the block ``collision``."""
@@ -761,7 +762,7 @@ class Collision(ContactParameters):
         own = slice(start, start + len(self.stages))
         torque = outputs["collision"][own, b.parts("collision")["torque"]]
         speed = outputs["force"][own, b.parts("force")["speed"][0]]
-        outcome, tangential = target.outcome(self.state.read(x)[-1], self.target), np.zeros((0, 3))
+        outcome, tangential = target.outcome(self.state.read(x)[-1], self.target), None
         if self.tangential.size:
             tangential = np.vstack([np.zeros(3), self.tangential.read(x)])
             outcome |= tangential_outcome(tangential[-1])

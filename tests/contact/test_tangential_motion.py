@@ -36,6 +36,7 @@ from impactopt import (
     VirtualMass,
     holding_torque,
     load_problem,
+    solve,
     striking_velocity,
 )
 from impactopt.files.problem_file import problem_data, problem_from_data
@@ -287,11 +288,27 @@ def test_a_plan_is_what_both_engines_replay(friction: ContactFriction) -> None:
     )
     assert done.impulse == pytest.approx(planned.impulse, rel=2e-3)
     assert done.outcome == pytest.approx(planned.collision.outcome, rel=5e-3)
-    fixed = dataclasses.replace(plan.collision, tangential_velocity=np.zeros((0, 3)))
+    fixed = dataclasses.replace(plan.collision, tangential_velocity=None)
     assert slide(problem, plan) < slide(problem, dataclasses.replace(plan, collision=fixed))
     held = dataclasses.replace(problem, friction=dataclasses.replace(friction, moves_target=False))
     done = simulate_pinocchio(problem.robot, way, scene_of(held), until=until)
     assert "tangential_speed_m_s" not in done.outcome
+
+
+def test_plans_follow_the_targets_mass() -> None:
+    """Which is in the equations of motion, by its velocity across the normal."""
+    problem = dataclasses.replace(arm_problem(), friction=MOVES, terms=(*BODILESS, Incidence(speed=0.5)))
+    mass = problem.target.parameters["mass"]
+
+    def solved(mass: float) -> Any:
+        return solve(dataclasses.replace(problem, target=FreeMass(mass=mass)))
+
+    plan, heavy = solved(mass), solved(1.3 * mass)
+    moved = plan.moved(mass=1.3 * mass)
+    assert moved.plan.impulse == pytest.approx(heavy.plan.impulse, rel=1e-4)
+    assert moved.collision.outcome == pytest.approx(heavy.collision.outcome, rel=1e-3)
+    slope = (solved(1.01 * mass).plan.impulse - solved(0.99 * mass).plan.impulse) / (0.02 * mass)
+    assert plan.sensitivity("target.mass").impulse == pytest.approx(slope, rel=1e-4)
 
 
 @pytest.mark.parametrize(

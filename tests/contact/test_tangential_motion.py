@@ -186,6 +186,7 @@ def test_compiled_code_is_its_graph(kind: Any, options: Any, friction: ContactFr
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 @FRICTIONS
 def test_freezes_in_numpy_are_those_in_c(friction: ContactFriction, monkeypatch: pytest.MonkeyPatch) -> None:
     model, at = oblique(contact_friction=friction, freezes=2, accuracy=None)
